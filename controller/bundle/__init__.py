@@ -1,0 +1,1 @@
+"""Bundles: what a kiosk plays; format, writer, reader, signing."""

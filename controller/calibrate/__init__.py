@@ -1,0 +1,1 @@
+"""From captures to the light transport's parts: decode, radiometry, geometry, metapixels."""

@@ -1,0 +1,113 @@
+"""What a calibration consists of. Pixel coordinates are (x, y) = (column, row), pixel centres at whole numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.arrays import Float64, FloatImage, Mask
+
+
+@dataclass(frozen=True, slots=True)
+class Correspondence:
+    """Where each camera pixel looks on one projector's image plane.
+
+    ``projector_px`` (rows, columns, 2) float32: x and y in projector pixels, NaN where not valid
+    ``modulation`` (rows, columns) float32: contrast of the finest pattern, 0..1, lowered by blur
+    ``valid`` (rows, columns) bool
+    """
+
+    projector_px: FloatImage
+    modulation: FloatImage
+    valid: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class Metapixels:
+    """One projector's pixels as they appear in the camera: elliptical Gaussians (paper 4.2.2, eq. 8).
+
+    Shapes are those of the projector's image, (rows, columns, ...).
+
+    ``centre_px`` (..., 2) float32: camera x and y, NaN where not valid
+    ``covariance_px2`` (..., 3) float32: the covariance's xx, xy, yy in camera pixels squared
+    ``valid`` (...) bool: the camera sees the pixel and trusts it
+    """
+
+    centre_px: FloatImage
+    covariance_px2: FloatImage
+    valid: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class Radiometry:
+    """How one projector turns device values into light.
+
+    ``response`` (3, 256) float64: linear light of each 8-bit value per channel, 0 at black, 1 at white, rising
+    ``mixing`` (3, 3) float64: camera channel (row) by projector channel (column), each row summing to 1, so that
+    white is white; the strength of the light is in the projector's white image
+    """
+
+    response: Float64
+    mixing: Float64
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorCalibration:
+    """All that the transport needs of one projector.
+
+    ``white`` (camera rows, columns, 3) float32: HDR image of this projector alone at white, less the black image;
+    linear camera units, >= 0, 0 where the projector does not reach
+    """
+
+    name: str
+    metapixels: Metapixels
+    radiometry: Radiometry
+    white: FloatImage
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole:
+    """A camera or projector: x_px ~ K [R | t] X, with two radial distortion terms in normalised coordinates.
+
+    ``matrix`` (3, 3) K; ``distortion`` (2,) k1, k2; ``rotation`` (3, 3); ``translation_m`` (3,)
+    """
+
+    matrix: Float64
+    distortion: Float64
+    rotation: Float64
+    translation_m: Float64
+    size_px: tuple[int, int]
+    """(width, height)"""
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """The self-calibrated stage; the camera is the origin.
+
+    ``points_m`` (rows, columns, 3) float32: object position at each camera pixel, NaN where unknown
+    ``normals`` (rows, columns, 3) float32: outward unit normals, NaN where unknown
+    """
+
+    camera: Pinhole
+    projectors: tuple[Pinhole, ...]
+    points_m: FloatImage
+    normals: FloatImage
+    reprojection_rms_px: float
+    scale_known: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A whole stage as the solver needs it.
+
+    ``black`` (rows, columns, 3) float32: all projectors at black, ambient light included (K)
+    ``object_mask`` (rows, columns): camera pixels on the object that at least one projector lights
+    ``camera_to_xyz`` (3, 3): linear camera RGB to CIE XYZ (D65), from the camera's own colour matrix
+    """
+
+    projectors: tuple[ProjectorCalibration, ...]
+    black: FloatImage
+    object_mask: Mask
+    camera_to_xyz: npt.NDArray[np.float64]

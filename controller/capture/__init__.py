@@ -1,0 +1,1 @@
+"""Patterns, exposure brackets, acquisition and the store of captures."""

@@ -1,0 +1,44 @@
+"""The one error tree of the controller; device errors (``hal.errors``) join it at the command line."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class VelaturaError(Exception):
+    """Something went wrong that a person can act on.
+
+    Parameters
+    ----------
+    code : stable, lower case with hyphens, e.g. ``"stage-key-unknown"``
+    what : one sentence on what happened
+    remedy : one sentence on what to do
+
+    ``exit_code`` is what the command line returns: 1 the work failed, 2 wrong use, 3 a device failed.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, code: str, *, what: str, remedy: str) -> None:
+        super().__init__(f"{what} {remedy}")
+        self.code = code
+        self.what = what
+        self.remedy = remedy
+
+
+class UsageError(VelaturaError):
+    """Wrong arguments, a wrong stage.toml, a file that is not what it should be."""
+
+    exit_code = 2
+
+
+class WorkError(VelaturaError):
+    """The work could not be done: no solution, no space, too little light."""
+
+
+class CalibrationError(WorkError):
+    """The captures do not allow a trustworthy calibration."""
+
+
+class BundleError(WorkError):
+    """A bundle is damaged, not ours, or does not fit this stage."""

@@ -1,0 +1,1 @@
+"""State machine, journal, runner, lamp safety."""

@@ -1,0 +1,1 @@
+"""Compensation images: the bounded solver, appearances, targets, metrics."""

@@ -1,0 +1,1 @@
+"""The light transport T and its products."""

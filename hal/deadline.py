@@ -1,0 +1,59 @@
+"""Deadlines and cancellation: every blocking call takes a ``Deadline``."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+
+from hal.errors import DeviceError, DeviceTimeout
+
+
+class Cancelled(DeviceError):
+    """The caller asked for the work to stop."""
+
+    def __init__(self) -> None:
+        super().__init__("cancelled", what="The work was stopped on request.", remedy="Start it again to go on.")
+
+
+@dataclass(frozen=True, slots=True)
+class Deadline:
+    """A moment on the monotonic clock by which a call must have ended, and the means to end it sooner.
+
+    ``at_s`` is in seconds of ``time.monotonic()``; ``cancel``, where given, is shared with whoever may stop the work.
+    """
+
+    at_s: float
+    cancel: threading.Event | None = field(default=None, compare=False)
+
+    def left_s(self) -> float:
+        """Seconds left, never negative."""
+        return max(0.0, self.at_s - time.monotonic())
+
+    @property
+    def passed(self) -> bool:
+        return time.monotonic() >= self.at_s
+
+    def within(self, seconds: float) -> Deadline:
+        """The earlier of this deadline and ``seconds`` from now, with the same cancellation."""
+        return Deadline(min(self.at_s, time.monotonic() + seconds), self.cancel)
+
+    def check(self, code: str, *, what: str, remedy: str) -> None:
+        """Raise ``Cancelled`` if cancelled and ``DeviceTimeout`` with these sentences if passed."""
+        if self.cancel is not None and self.cancel.is_set():
+            raise Cancelled
+        if self.passed:
+            raise DeviceTimeout(code, what=what, remedy=remedy)
+
+    def sleep(self, seconds: float) -> None:
+        """Sleep at most ``seconds``, at most until the deadline; raise ``Cancelled`` as soon as cancelled."""
+        wait_s = min(seconds, self.left_s())
+        if self.cancel is None:
+            time.sleep(wait_s)
+        elif self.cancel.wait(wait_s):
+            raise Cancelled
+
+
+def in_seconds(seconds: float, cancel: threading.Event | None = None) -> Deadline:
+    """A deadline ``seconds`` from now."""
+    return Deadline(time.monotonic() + seconds, cancel)

@@ -1,0 +1,52 @@
+"""The error tree of the hardware layer.
+
+Every error carries a stable ``code`` (for logs, tests and translation), ``what`` happened in one sentence, and the
+``remedy`` in one sentence. Both sentences are for the technician, not for the programmer.
+"""
+
+from __future__ import annotations
+
+
+class DeviceError(Exception):
+    """A device, or the way to it, failed.
+
+    Parameters
+    ----------
+    code : stable, lower case with hyphens, e.g. ``"projector-no-answer"``
+    what : one sentence on what happened
+    remedy : one sentence on what to do
+    """
+
+    def __init__(self, code: str, *, what: str, remedy: str) -> None:
+        super().__init__(f"{what} {remedy}")
+        self.code = code
+        self.what = what
+        self.remedy = remedy
+
+
+class DeviceGone(DeviceError):
+    """The device left its bus, or was never there."""
+
+
+class DeviceBusy(DeviceError):
+    """The device is there and asked to be left alone; trying again later may work."""
+
+
+class DeviceTimeout(DeviceError):
+    """No answer, or no confirmation, before the deadline."""
+
+
+class DeviceRefused(DeviceError):
+    """The device understood, and will not do it."""
+
+
+class ProtocolError(DeviceError):
+    """Bytes that the protocol does not allow. ``theirs`` says whether the device or the caller broke it."""
+
+    def __init__(self, code: str, *, what: str, remedy: str, theirs: bool = True) -> None:
+        super().__init__(code, what=what, remedy=remedy)
+        self.theirs = theirs
+
+
+class PluginError(DeviceError):
+    """A driver could not be found, loaded or configured."""

@@ -1,0 +1,117 @@
+"""Values that pass between drivers and their callers: frozen, with units in their names."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceIdentity:
+    """Who a device says it is. Every string comes from the device: escape it before showing it in a page."""
+
+    maker: str
+    model: str
+    serial: str = ""
+    firmware: str = ""
+
+
+class Power(enum.Enum):
+    """Power state of a projector as far as the device tells."""
+
+    OFF = "off"
+    WARMING = "warming"
+    ON = "on"
+    COOLING = "cooling"
+    FAULT = "fault"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class LampRules:
+    """What a lamp needs so that it is not harmed; times in seconds.
+
+    ``warm_up_s``: from strike to light; ``stable_s``: from strike until photometric work is allowed;
+    ``cool_down_s``: fans run on after off; ``minimum_off_s``: from off to the next strike.
+    """
+
+    warm_up_s: float
+    stable_s: float
+    cool_down_s: float
+    minimum_off_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorCapabilities:
+    """What a projector's driver can do; callers ask, never guess by model."""
+
+    lamp_hours: bool
+    shutter: bool
+    inputs: tuple[str, ...]
+    errors: bool
+    lamp_rules: LampRules
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorStatus:
+    """One consistent answer about a projector. ``faults`` are the profile's words, e.g. ``"lamp-failed"``."""
+
+    power: Power
+    faults: tuple[str, ...] = ()
+    lamp_hours: int | None = None
+
+
+class FileKind(enum.Enum):
+    RAW = "raw"
+    JPEG = "jpeg"
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureSettings:
+    """Exposure of one photograph. ``aperture_f`` None: leave as it is."""
+
+    exposure_s: float
+    iso: int
+    aperture_f: float | None = None
+    raw: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCapabilities:
+    """What a camera's driver can do. Lists are ascending; empty means not settable."""
+
+    exposures_s: tuple[float, ...]
+    isos: tuple[int, ...]
+    apertures_f: tuple[float, ...]
+    raw: bool
+    jpeg: bool
+    live_view: bool = False
+    bulb: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CapturedFile:
+    """A file of one photograph, complete and fsynced. ``sha256`` is the hex digest of its bytes."""
+
+    path: Path
+    kind: FileKind
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class OutputInfo:
+    """One projector output of a display."""
+
+    name: str
+    width_px: int
+    height_px: int
+
+
+@dataclass(frozen=True, slots=True)
+class Presented:
+    """When a frame set became visible at the display's outputs: ``at_s`` on this machine's monotonic clock."""
+
+    sequence: int
+    at_s: float

@@ -1,0 +1,1 @@
+"""Emulated devices that misbehave like real ones, and the optical bench behind them."""
