@@ -1,0 +1,82 @@
+"""Show, wait, photograph: the one place where display and camera work together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from controller.arrays import ByteImage
+from controller.errors import WorkError
+from hal.deadline import Deadline
+from hal.interfaces import Camera, Display
+from hal.values import CapturedFile, ExposureSettings, FileKind
+
+TRANSFER_MARGIN_S = 20.0
+"""Longest that a camera may take beyond the exposure itself: mirror, write-out and transfer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One photograph of one set of frames. ``name`` is unique in a run and names the file."""
+
+    name: str
+    frames: Mapping[str, ByteImage]
+    exposure_s: float
+
+
+class Acquirer:
+    """Takes shots; sets the camera only when the exposure changes, and shows frames only when they change.
+
+    Parameters
+    ----------
+    settle_s : seconds between the display's word that frames are presented and the opening of the shutter; at least the
+        projectors' own delay, so that no photograph shows the pattern before
+    """
+
+    def __init__(
+        self, display: Display, camera: Camera, *, iso: int, aperture_f: float | None, settle_s: float
+    ) -> None:
+        self._display = display
+        self._camera = camera
+        self._iso = iso
+        self._aperture_f = aperture_f
+        self._settle_s = settle_s
+        self._confirmed: tuple[float, ExposureSettings] | None = None
+
+    def exposures_s(self) -> tuple[float, ...]:
+        """The exposures that the camera offers, ascending, in seconds."""
+        return self._camera.capabilities.exposures_s
+
+    def take(self, shot: Shot, folder: Path, *, deadline: Deadline) -> tuple[CapturedFile, float]:
+        """Take one shot into ``folder``; return the RAW file (JPEG where there is no RAW) and the confirmed exposure.
+
+        Raises
+        ------
+        WorkError("camera-no-file")  the camera sent nothing
+        and every error of the display and the camera
+        """
+        confirmed = self._set(shot.exposure_s, deadline)
+        shown = self._display.show(shot.frames, deadline=deadline.within(10.0))
+        deadline.sleep(max(0.0, shown.at_s + self._settle_s - time.monotonic()))
+        bound = deadline.within(2 * confirmed.exposure_s + TRANSFER_MARGIN_S)
+        files = self._camera.capture(folder / shot.name, deadline=bound)
+        if not files:
+            raise WorkError(
+                "camera-no-file",
+                what=f"The camera took picture {shot.name} and sent no file.",
+                remedy="Check its memory card and its image quality setting (RAW), then go on with the same command.",
+            )
+        raw = [file for file in files if file.kind is FileKind.RAW]
+        return (raw or files)[0], confirmed.exposure_s
+
+    def forget_settings(self) -> None:
+        """After a reconnect: set the camera again before the next shot."""
+        self._confirmed = None
+
+    def _set(self, exposure_s: float, deadline: Deadline) -> ExposureSettings:
+        if self._confirmed is None or self._confirmed[0] != exposure_s:
+            wanted = ExposureSettings(exposure_s=exposure_s, iso=self._iso, aperture_f=self._aperture_f)
+            self._confirmed = (exposure_s, self._camera.configure(wanted, deadline=deadline.within(15.0)))
+        return self._confirmed[1]

@@ -1,0 +1,74 @@
+"""report.html and report.json from what a run measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from controller.arrays import ByteImage
+from controller.report.pictures import ERROR_SCALE_DELTA_E, data_uri, scale_bar
+from controller.storage import write_atomically
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    caption: str
+    image: ByteImage
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One appearance on the page: a title, its figures in words, and its pictures from left to right."""
+
+    title: str
+    figures: tuple[tuple[str, str], ...]
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """A figure with what was asked for; ``holds`` None where nothing was asked."""
+
+    name: str
+    value: str
+    goal: str = ""
+    holds: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    title: str
+    summary: str
+    goals: tuple[Goal, ...]
+    rows: tuple[Row, ...]
+    galleries: tuple[tuple[str, str, tuple[Picture, ...]], ...] = ()
+    steps: tuple[tuple[str, float], ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+def render(page: Page) -> str:
+    """The page as one self-contained HTML file; every text is escaped, since device names are hostile input."""
+    source = resources.files("controller.report").joinpath("report.html").read_text("utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["uri"] = data_uri
+    return environment.from_string(source).render(
+        page=page,
+        scale=scale_bar(),
+        scale_top=ERROR_SCALE_DELTA_E,
+        slowest=max((s for _, s in page.steps), default=1.0),
+    )
+
+
+def write_report(folder: Path, page: Page, figures: Mapping[str, Any]) -> tuple[Path, Path]:
+    """Write ``report.html`` and ``report.json`` (keys: docs/report.md) into ``folder``; return both paths."""
+    html, machine = folder / "report.html", folder / "report.json"
+    write_atomically(machine, (json.dumps(figures, indent=2, allow_nan=False) + "\n").encode())
+    write_atomically(html, render(page).encode())
+    return html, machine
