@@ -58,7 +58,7 @@ def _explained(error: OSError, path: Path) -> WorkError:
         return WorkError(
             "no-space",
             what=f"There was no space left to write {path.name}.",
-            remedy=f"Free some space on the disk that holds {path.parent} and start again; nothing was left half-written.",
+            remedy=f"Free some on the disk that holds {path.parent} and start again; nothing is left half-written.",
         )
     return WorkError(
         "cannot-write",
