@@ -1,0 +1,1 @@
+"""Device profiles, units and settings that are data, not code; found with ``importlib.resources``."""

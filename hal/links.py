@@ -1,0 +1,212 @@
+"""Byte links: how bytes reach a device and come back, always with a deadline.
+
+A link knows nothing of protocols; a codec knows nothing of links. ``hal.serial_link`` holds the link over a serial
+port, ``hal.transcript`` the one that replays a recording.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+from abc import ABC, abstractmethod
+from typing import Final, Protocol
+
+from hal.deadline import Deadline
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
+from hal.transcript import Transcript
+
+SLICE_S: Final = 0.05
+"""Longest single wait, so that a cancelled call ends soon."""
+_BLOCK: Final = 4096
+_LARGEST_DRAIN: Final = 1 << 20
+
+
+class ByteLink(Protocol):
+    """A two-way stream of bytes to one device.
+
+    Every call raises DeviceGone when the link is lost, DeviceTimeout when the deadline passes, Cancelled when asked
+    to stop. What was read in part stays readable.
+    """
+
+    def read_until(self, terminator: bytes, *, limit: int, deadline: Deadline) -> bytes:
+        """Read up to and including ``terminator``; ProtocolError if it is not among the first ``limit`` bytes."""
+
+    def read_exactly(self, count: int, *, deadline: Deadline) -> bytes:
+        """Read ``count`` bytes."""
+
+    def write(self, data: bytes, *, deadline: Deadline) -> None:
+        """Write all of ``data``."""
+
+    def drain(self) -> bytes:
+        """Take everything that has arrived, without waiting."""
+
+    def close(self) -> None:
+        """Let go of the port or connection; harmless when called twice."""
+
+
+class BufferedLink(ABC):
+    """What all real links share: a buffer, deadlines in short waits, and the transcript.
+
+    A subclass waits and moves bytes in ``_receive`` and ``_send``, and turns its errors into ``hal.errors``.
+    """
+
+    def __init__(self, name: str, transcript: Transcript | None = None) -> None:
+        self.name = name
+        self._buffer = bytearray()
+        self._transcript = transcript
+
+    @abstractmethod
+    def _receive(self, wait_s: float) -> bytes:
+        """Bytes that arrive within ``wait_s``; b"" if none did."""
+
+    @abstractmethod
+    def _send(self, data: bytes, wait_s: float) -> int:
+        """Send some of ``data`` within ``wait_s``; return how many bytes went."""
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+    def read_until(self, terminator: bytes, *, limit: int, deadline: Deadline) -> bytes:
+        while True:
+            end = self._buffer.find(terminator, 0, limit)
+            if end >= 0:
+                return self._take(end + len(terminator))
+            if len(self._buffer) >= limit:
+                raise ProtocolError(
+                    "answer-too-long",
+                    what=f"{self.name} sent {limit} bytes without ending its answer.",
+                    remedy="Check the baud rate and that the right device is on this cable.",
+                )
+            self._fill(deadline)
+
+    def read_exactly(self, count: int, *, deadline: Deadline) -> bytes:
+        while len(self._buffer) < count:
+            self._fill(deadline)
+        return self._take(count)
+
+    def write(self, data: bytes, *, deadline: Deadline) -> None:
+        left = memoryview(data)
+        while left:
+            self._check(deadline, "did not take the command")
+            sent = self._send(bytes(left), min(SLICE_S, deadline.left_s()))
+            if sent and self._transcript is not None:
+                self._transcript.sent(bytes(left[:sent]))
+            left = left[sent:]
+
+    def drain(self) -> bytes:
+        while len(self._buffer) < _LARGEST_DRAIN and self._pump(0.0):
+            pass
+        return self._take(len(self._buffer))
+
+    def _fill(self, deadline: Deadline) -> None:
+        self._check(deadline, "did not answer")
+        self._pump(min(SLICE_S, deadline.left_s()))
+
+    def _pump(self, wait_s: float) -> bool:
+        data = self._receive(wait_s)
+        if data and self._transcript is not None:
+            self._transcript.received(data)
+        self._buffer += data
+        return bool(data)
+
+    def _take(self, count: int) -> bytes:
+        taken = bytes(self._buffer[:count])
+        del self._buffer[:count]
+        return taken
+
+    def _check(self, deadline: Deadline, failing: str) -> None:
+        deadline.check(
+            "link-no-answer",
+            what=f"{self.name} {failing} in time.",
+            remedy="Check that the device has power and that its cable is plugged in at both ends.",
+        )
+
+
+class TcpLink(BufferedLink):
+    """A TCP connection to ``host``:``port``.
+
+    Raises
+    ------
+    DeviceGone     nothing listens there, or the host is not reachable
+    DeviceTimeout  no connection before the deadline
+    """
+
+    def __init__(self, host: str, port: int, *, deadline: Deadline, transcript: Transcript | None = None) -> None:
+        super().__init__(f"{host}:{port}", transcript)
+        self._socket = self._connect(host, port, deadline)
+
+    def _connect(self, host: str, port: int, deadline: Deadline) -> socket.socket:
+        self._check(deadline, "was not reached")
+        try:
+            connected = socket.create_connection((host, port), timeout=max(deadline.left_s(), 1e-3))
+        except TimeoutError as error:
+            raise DeviceTimeout(
+                "link-no-connection",
+                what=f"{self.name} did not accept a connection in time.",
+                remedy="Check the network cable and that the device's network is on in standby.",
+            ) from error
+        except OSError as error:
+            raise self._lost(error) from error
+        connected.setblocking(False)
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return connected
+
+    def _receive(self, wait_s: float) -> bytes:
+        try:
+            readable, _, _ = select.select([self._socket], [], [], wait_s)
+            if not readable:
+                return b""
+            data = self._socket.recv(_BLOCK)
+        except BlockingIOError:
+            return b""
+        except (OSError, ValueError) as error:
+            raise self._lost(error) from error
+        if not data:
+            raise self._lost(None)
+        return data
+
+    def _send(self, data: bytes, wait_s: float) -> int:
+        try:
+            _, writable, _ = select.select([], [self._socket], [], wait_s)
+            return self._socket.send(data) if writable else 0
+        except BlockingIOError:
+            return 0
+        except (OSError, ValueError) as error:
+            raise self._lost(error) from error
+
+    def _lost(self, error: Exception | None) -> DeviceGone:
+        reason = getattr(error, "strerror", None) or "the connection was closed"
+        return DeviceGone(
+            "link-lost",
+            what=f"{self.name} is not there: {reason}.",
+            remedy="Check the address, the network cable and that the device has power.",
+        )
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.close()
+
+
+def host_and_port(address: str, default_port: int) -> tuple[str, int]:
+    """Split ``"host:port"`` or ``"host"`` (an IPv6 host in brackets); DeviceError("address-wrong") otherwise."""
+    host, colon, port = address.rpartition(":")
+    if not colon or address.endswith("]"):
+        host, port = address, str(default_port)
+    host = host.removeprefix("[").removesuffix("]")
+    if not host or not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise DeviceError(
+            "address-wrong",
+            what=f"The address {address!r} is not of the form host:port.",
+            remedy=f'Write it like "192.168.0.20:{default_port}" in stage.toml.',
+        )
+    return host, int(port)
+
+
+def taken(name: str) -> DeviceBusy:
+    """The error of a link that another program holds."""
+    return DeviceBusy(
+        "port-taken",
+        what=f"{name} is in use by another program.",
+        remedy="Stop the other program (another velatura, a terminal, a modem manager) and start again.",
+    )
