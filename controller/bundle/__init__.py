@@ -1,1 +1,1 @@
-"""Bundles: what a kiosk plays; format, writer, reader, signing."""
+"""Bundles: what a kiosk plays; format, writer, reader, signing, install."""

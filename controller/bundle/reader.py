@@ -1,0 +1,184 @@
+"""Reads bundles: memory-mapped, every size checked before it is used, decoding into buffers that the caller owns."""
+
+from __future__ import annotations
+
+import hashlib
+import mmap
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+import numpy.typing as npt
+import xxhash
+import zstandard
+
+from controller.bundle import format as fmt
+from controller.bundle.format import damaged
+from controller.bundle.signing import BLOCK_BYTES, check_signature
+from controller.errors import BundleError
+
+_MAX_WINDOW_BYTES: Final = 2**23
+_STRIPES_PER_TASK: Final = 3
+
+
+class Bundle:
+    """An opened bundle: ``index`` says what it holds, ``signed_by`` who signed it (a public key, or None).
+
+    ``identity`` is the SHA-256 of its index in hex: it changes with every pixel. Safe to decode from several threads.
+    """
+
+    def __init__(self, data: mmap.mmap, path: Path, *, trusted: Sequence[bytes], allow_unsigned: bool) -> None:
+        self._data = data
+        self.path = path
+        start = data[: fmt.HEADER_BYTES]
+        header = fmt.parse_header(start, file_size=len(data), trailer_bytes=BLOCK_BYTES)
+        end = header.index_offset + header.index_length
+        index_bytes, block = data[header.index_offset : end], data[end : end + BLOCK_BYTES]
+        if hashlib.sha256(index_bytes).digest() != header.index_sha256:
+            raise damaged("its index does not have the hash that its header says")
+        self.signed_by = check_signature(start, index_bytes, block, trusted=trusted, allow_unsigned=allow_unsigned)
+        self.index = fmt.parse_index(index_bytes, data_end=header.index_offset)
+        self.identity = header.index_sha256.hex()
+        self._data_end = header.index_offset
+
+    @classmethod
+    def open(cls, path: Path, *, trusted: Sequence[bytes] = (), allow_unsigned: bool = False) -> Self:
+        """Map a bundle and check header, index and signature (not yet the pixels: see ``verify``).
+
+        ``trusted``: public keys, 32 bytes each. Raises BundleError, with code "bundle-unreadable" for a file that can
+        not be opened, and those of ``format.parse_header``, ``format.parse_index`` and ``signing.check_signature``.
+        """
+        try:
+            with path.open("rb") as file:
+                data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except OSError as error:
+            raise BundleError(
+                "bundle-unreadable",
+                what=f"The bundle {path} can not be read: {error.strerror}.",
+                remedy="Check the path and the file's permissions.",
+            ) from error
+        except ValueError as error:
+            raise damaged("it is empty") from error
+        try:
+            return cls(data, path, trusted=trusted, allow_unsigned=allow_unsigned)
+        except BaseException:
+            data.close()
+            raise
+
+    def close(self) -> None:
+        """Release the mapping. Harmless when called twice."""
+        self._data.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def verify(self) -> None:
+        """Check the SHA-256 of every stripe and thumbnail, and that nothing but zeros lies between them.
+
+        Raises BundleError("bundle-damaged") at the first that is wrong.
+        """
+        position = fmt.HEADER_BYTES
+        for blob in sorted(self._blobs(), key=lambda blob: blob.offset):
+            if hashlib.sha256(self._view(blob)).digest() != blob.sha256:
+                raise damaged(f"the bytes from {blob.offset} do not have their hash")
+            self._check_gap(position, blob.offset)
+            position = max(position, blob.offset + blob.length)
+        self._check_gap(position, self._data_end)
+
+    def _check_gap(self, start: int, end: int) -> None:
+        if end - start >= fmt.ALIGNMENT or self._data[start:end].strip(b"\0"):
+            raise damaged(f"there is something between its parts, at {start}")
+
+    def _blobs(self) -> list[fmt.Blob]:
+        found = []
+        for appearance in self.index.appearances:
+            found += [blob for blobs in appearance.stripes.values() for blob in blobs]
+            found += [appearance.thumbnail] if appearance.thumbnail else []
+        return found
+
+    def _view(self, blob: fmt.Blob) -> memoryview:
+        return memoryview(self._data)[blob.offset : blob.offset + blob.length]
+
+    def thumbnail(self, appearance: str) -> bytes | None:
+        """The PNG file of an appearance, or None. Raises BundleError as ``decode``."""
+        blob = self.index.appearance(appearance).thumbnail
+        if blob is None:
+            return None
+        data = bytes(self._view(blob))
+        if hashlib.sha256(data).digest() != blob.sha256 or not fmt.is_png(data):
+            raise damaged(f"the thumbnail of {appearance!r} does not have its hash")
+        return data
+
+    def decode(self, appearance: str, output: str) -> npt.NDArray[np.uint8]:
+        """One output's image of an appearance, (rows, columns, 3) uint8.
+
+        Raises BundleError("bundle-no-appearance", "bundle-no-output" or "bundle-damaged").
+        """
+        layout = self.index.output(output)
+        image = np.empty((layout.height_px, layout.width_px, 3), np.uint8)
+        self.decode_into(appearance, {output: image})
+        return image
+
+    def decode_into(
+        self, appearance: str, buffers: Mapping[str, npt.NDArray[np.uint8]], pool: Executor | None = None
+    ) -> None:
+        """Decode into ``buffers``, output name -> C-contiguous (rows, columns, 3) uint8, on the threads of ``pool``.
+
+        Checks the quick checksum of every stripe. Raises as ``decode``; the buffers' content is then undefined.
+        ValueError if a buffer does not have its output's shape.
+        """
+        found = self.index.appearance(appearance)
+        tasks = []
+        for name, buffer in buffers.items():
+            layout = self.index.output(name)
+            if buffer.shape != (layout.height_px, layout.width_px, 3) or buffer.dtype != np.uint8:
+                raise ValueError(f"the buffer for {name} has shape {buffer.shape} and dtype {buffer.dtype}")
+            stripes, step = found.stripes[name], _STRIPES_PER_TASK
+            for first in range(0, len(stripes), step):
+                rows = buffer[first * layout.stripe_rows : (first + step) * layout.stripe_rows]
+                tasks.append((stripes[first : first + step], rows, layout.stripe_rows))
+        if pool is None:
+            for task in tasks:
+                self._decode_stripes(*task)
+        else:
+            for future in [pool.submit(self._decode_stripes, *task) for task in tasks]:
+                future.result()
+
+    def _decode_stripes(self, blobs: Sequence[fmt.Blob], rows: npt.NDArray[np.uint8], stripe_rows: int) -> None:
+        for number, blob in enumerate(blobs):
+            self._inflate(blob, rows[number * stripe_rows : (number + 1) * stripe_rows])
+        undo_row_differences(rows, stripe_rows)
+
+    def _inflate(self, blob: fmt.Blob, rows: npt.NDArray[np.uint8]) -> None:
+        """Decompress one stripe into ``rows``; the frame must hold exactly that many bytes."""
+        view = self._view(blob)
+        if xxhash.xxh3_64_intdigest(view) != blob.xxh3:
+            raise damaged(f"the stripe at {blob.offset} does not have its checksum")
+        try:
+            if zstandard.frame_content_size(view) != rows.nbytes:
+                raise damaged(f"the stripe at {blob.offset} does not hold the pixels of its rows")
+            unpacker = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
+            with unpacker.stream_reader(view, read_size=len(view)) as stream:
+                filled = stream.readinto(rows.data.cast("B"))
+        except zstandard.ZstdError as error:
+            raise damaged(f"the stripe at {blob.offset} can not be decompressed") from error
+        if filled != rows.nbytes:
+            raise damaged(f"the stripe at {blob.offset} ends too early")
+
+
+def undo_row_differences(rows: npt.NDArray[np.uint8], stripe_rows: int) -> None:
+    """Add to each row the row above it, modulo 256, in place, stripe by stripe.
+
+    Stripes of equal height go together: one addition a row for all of them is the quickest that numpy offers.
+    """
+    whole, row_bytes = len(rows) // stripe_rows, rows.shape[1] * 3
+    together = rows[: whole * stripe_rows].reshape(whole, stripe_rows, row_bytes)
+    last = rows[whole * stripe_rows :].reshape(1, -1, row_bytes)
+    for block in (together, last):
+        for row in range(1, block.shape[1]):
+            np.add(block[:, row], block[:, row - 1], out=block[:, row])

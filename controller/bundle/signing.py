@@ -1,0 +1,127 @@
+"""Ed25519 signatures over a bundle's header and index, and the key files (docs/bundle-format.md, "Signature").
+
+The index holds the SHA-256 of every stripe, so what is signed fixes every pixel.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from nacl.exceptions import BadSignatureError, CryptoError
+from nacl.signing import SigningKey, VerifyKey
+
+from controller.bundle.format import damaged
+from controller.errors import BundleError, UsageError
+from controller.storage import sync_folder, write_atomically
+
+BLOCK: Final = struct.Struct("<8s32s64s24x")
+BLOCK_BYTES: Final = BLOCK.size
+UNSIGNED_BLOCK: Final = bytes(BLOCK_BYTES)
+_MAGIC: Final = b"VELSIGN1"
+_CONTEXT: Final = b"velatura bundle signature 1\0"
+_SIGNING_PREFIX: Final = "velatura-signing-key-1 "
+_PUBLIC_PREFIX: Final = "velatura-public-key-1 "
+_KEY_BYTES: Final = 32
+_KEY_FILE_BYTES: Final = 1024
+
+
+def generate_key(path: Path) -> bytes:
+    """Make a new key: the secret in ``path`` (mode 0600), the public one in ``path`` with ``.pub`` added.
+
+    Returns the 32 bytes of the public key. Raises UsageError("key-exists") rather than replace a key.
+    """
+    if path.exists():
+        raise UsageError(
+            "key-exists",
+            what=f"There is a key in {path} already.",
+            remedy="Give another name, or remove the old key if no kiosk trusts it any more.",
+        )
+    key = SigningKey.generate()
+    public = bytes(key.verify_key)
+    write_atomically(path, f"{_SIGNING_PREFIX}{bytes(key).hex()}\n".encode(), mode=0o600)
+    write_atomically(path.with_name(path.name + ".pub"), f"{_PUBLIC_PREFIX}{public.hex()}\n".encode())
+    sync_folder(path.parent)
+    return public
+
+
+def load_signing_key(path: Path) -> SigningKey:
+    """Read a secret key. Raises UsageError("key-unreadable"), or ("key-open-to-others") unless its mode is 0600."""
+    data = _key_bytes(path, _SIGNING_PREFIX)
+    if path.stat().st_mode & 0o077:
+        raise UsageError(
+            "key-open-to-others",
+            what=f"Others may read the secret key {path}.",
+            remedy=f"Type 'chmod 600 {path}', and make a new key if someone may have copied it.",
+        )
+    return SigningKey(data)
+
+
+def load_public_key(path: Path) -> bytes:
+    """The 32 bytes of a public key file. Raises UsageError("key-unreadable")."""
+    return _key_bytes(path, _PUBLIC_PREFIX)
+
+
+def _key_bytes(path: Path, prefix: str) -> bytes:
+    try:
+        with path.open("rb") as file:
+            text = file.read(_KEY_FILE_BYTES).decode("ascii").strip()
+        if not text.startswith(prefix):
+            raise ValueError(f"it does not begin with '{prefix.strip()}'")
+        data = bytes.fromhex(text.removeprefix(prefix))
+        if len(data) != _KEY_BYTES:
+            raise ValueError("it does not hold 32 bytes")
+    except (OSError, ValueError) as error:
+        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+        raise UsageError(
+            "key-unreadable",
+            what=f"{path} is not a readable key file ({reason}).",
+            remedy="Give a key file that 'velatura keys' made.",
+        ) from error
+    return data
+
+
+def sign(header: bytes, index: bytes, key: SigningKey) -> bytes:
+    """The 128-byte signature block for these header and index bytes."""
+    return BLOCK.pack(_MAGIC, bytes(key.verify_key), key.sign(_CONTEXT + header + index).signature)
+
+
+def check_signature(
+    header: bytes, index: bytes, block: bytes, *, trusted: Sequence[bytes], allow_unsigned: bool
+) -> bytes | None:
+    """Who signed: one of the ``trusted`` public keys, or None for an unsigned bundle that ``allow_unsigned`` lets pass.
+
+    ``allow_unsigned`` lets pass only what carries no signature at all; a wrong one is refused in any case. With no
+    trusted key and ``allow_unsigned``, a signature is checked against the key that it names.
+
+    Raises BundleError("bundle-unsigned", "bundle-untrusted", "bundle-signature-wrong" or "bundle-damaged").
+    """
+    if block == UNSIGNED_BLOCK:
+        if allow_unsigned:
+            return None
+        raise BundleError(
+            "bundle-unsigned",
+            what="The bundle carries no signature, so anyone may have made it.",
+            remedy="Sign it with 'velatura bundle sign', or allow unsigned bundles in stage.toml on a test stage.",
+        )
+    magic, public, signature = BLOCK.unpack(block)
+    if magic != _MAGIC or block != BLOCK.pack(magic, public, signature):
+        raise damaged("its signature block is not one")
+    if public not in trusted and (trusted or not allow_unsigned):
+        raise BundleError(
+            "bundle-untrusted",
+            what=f"The bundle is signed with the key {public.hex()[:16]}…, which this stage does not trust.",
+            remedy="Add that public key to the stage's trusted keys if it is yours; otherwise do not use the bundle.",
+        )
+    try:
+        VerifyKey(public).verify(_CONTEXT + header + index, signature)
+    except (BadSignatureError, CryptoError, ValueError) as error:
+        raise BundleError(
+            "bundle-signature-wrong",
+            what="The bundle's signature does not fit its content: it was changed after signing.",
+            remedy="Copy or publish the bundle again; nothing of this one was used.",
+        ) from error
+    return bytes(public)

@@ -1,0 +1,141 @@
+"""Writes bundles: the same input and the same codec library give the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+import xxhash
+import zstandard
+from nacl.signing import SigningKey
+
+from controller.bundle import format as fmt
+from controller.bundle.signing import BLOCK_BYTES, UNSIGNED_BLOCK, sign
+from controller.errors import BundleError
+from controller.storage import stream_atomically
+
+
+@dataclass(frozen=True, slots=True)
+class NewAppearance:
+    """An appearance to be published.
+
+    ``frames``: for every output its (rows, columns, 3) uint8 device values; ``thumbnail``: a PNG file's bytes or None;
+    ``metadata``: a table of JSON values, kept as given.
+    """
+
+    name: str
+    frames: Mapping[str, npt.NDArray[np.uint8]]
+    thumbnail: bytes | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_bundle(
+    path: Path,
+    *,
+    stage: str,
+    calibration: str,
+    created_unix_s: int,
+    outputs: Sequence[tuple[str, int, int]],
+    appearances: Iterable[NewAppearance],
+    key: SigningKey | None = None,
+    revision: int = 0,
+) -> fmt.Index:
+    """Write a bundle atomically and return its index.
+
+    Parameters
+    ----------
+    outputs : (name, width_px, height_px) of each output, in stage order
+    appearances : taken one at a time, so that a long list need not be in memory at once
+    key : signs the bundle; None leaves it unsigned, and players refuse it unless told otherwise
+
+    Raises BundleError for frames that do not fit the outputs and for names, thumbnails or metadata that the format
+    does not allow; WorkError("no-space") when the disk is full. ``path`` is then as it was.
+    """
+    layouts = tuple(fmt.OutputLayout(n, w, h, -(-h // fmt.STRIPES_PER_IMAGE)) for n, w, h in outputs)
+    written: list[fmt.Index] = []
+
+    def write(file: BinaryIO) -> None:
+        file.write(bytes(fmt.ALIGNMENT))
+        parts = tuple(_write_appearance(file, layouts, appearance) for appearance in appearances)
+        index = fmt.Index(stage, calibration, created_unix_s, revision, layouts, parts)
+        _finish(file, index, key)
+        written.append(index)
+
+    stream_atomically(path, write)
+    return written[0]
+
+
+def _finish(file: BinaryIO, index: fmt.Index, key: SigningKey | None) -> None:
+    end = _align(file)
+    data = fmt.encode_index(index)
+    try:
+        fmt.parse_index(data, data_end=end)
+    except BundleError as error:
+        raise BundleError(
+            "bundle-not-writable",
+            what=error.what.replace("The bundle is damaged", "The bundle can not be written"),
+            remedy="Change the name or size that is not allowed; docs/bundle-format.md lists the limits.",
+        ) from error
+    size = end + len(data) + BLOCK_BYTES
+    header = fmt.pack_header(fmt.Header(end, len(data), size, hashlib.sha256(data).digest()))
+    file.write(data)
+    file.write(UNSIGNED_BLOCK if key is None else sign(header, data, key))
+    file.seek(0)
+    file.write(header)
+
+
+def _write_appearance(file: BinaryIO, layouts: Sequence[fmt.OutputLayout], appearance: NewAppearance) -> fmt.Appearance:
+    if set(appearance.frames) != {layout.name for layout in layouts}:
+        raise _unfit(appearance, "has not exactly one frame for each output")
+    stripes = {}
+    for layout in layouts:
+        frame = appearance.frames[layout.name]
+        if frame.dtype != np.uint8 or frame.shape != (layout.height_px, layout.width_px, 3):
+            raise _unfit(
+                appearance,
+                f"has a frame of shape {frame.shape}, dtype {frame.dtype} for {layout.name}, which takes "
+                f"({layout.height_px}, {layout.width_px}, 3), uint8",
+            )
+        stripes[layout.name] = tuple(_write_blob(file, data) for data in compress_image(frame, layout))
+    thumbnail = appearance.thumbnail
+    if thumbnail is not None and (not fmt.is_png(thumbnail) or len(thumbnail) > fmt.MAX_THUMBNAIL_BYTES):
+        raise _unfit(appearance, f"has a thumbnail that is not a PNG file of at most {fmt.MAX_THUMBNAIL_BYTES} bytes")
+    blob = None if thumbnail is None else _write_blob(file, thumbnail)
+    return fmt.Appearance(appearance.name, stripes, blob, dict(appearance.metadata))
+
+
+def _unfit(appearance: NewAppearance, detail: str) -> BundleError:
+    return BundleError(
+        "bundle-frame-unfit",
+        what=f"The appearance {appearance.name!r} {detail}.",
+        remedy="Solve it again for the outputs of this stage.",
+    )
+
+
+def compress_image(frame: npt.NDArray[np.uint8], layout: fmt.OutputLayout) -> Iterable[bytes]:
+    """The compressed stripes of one (rows, columns, 3) uint8 image: rows less the row above, modulo 256, then zstd."""
+    packer = zstandard.ZstdCompressor(level=1, write_checksum=False, write_content_size=True)
+    for top in range(0, layout.height_px, layout.stripe_rows):
+        stripe = frame[top : top + layout.stripe_rows]
+        delta = stripe.copy()
+        np.subtract(stripe[1:], stripe[:-1], out=delta[1:])
+        yield packer.compress(delta.tobytes())
+
+
+def _write_blob(file: BinaryIO, data: bytes) -> fmt.Blob:
+    offset = _align(file)
+    file.write(data)
+    return fmt.Blob(offset, len(data), xxhash.xxh3_64_intdigest(data), hashlib.sha256(data).digest())
+
+
+def _align(file: BinaryIO) -> int:
+    """Fill up with zeros to the next aligned offset; return it."""
+    position = file.tell()
+    padding = -position % fmt.ALIGNMENT
+    file.write(bytes(padding))
+    return position + padding
