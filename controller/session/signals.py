@@ -1,0 +1,56 @@
+"""Ctrl-C and friends ask for a stop; they never tear the work apart."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextlib.contextmanager
+def cancelled_by_signals() -> Iterator[threading.Event]:
+    """An event that the first SIGINT, SIGTERM or SIGHUP sets; more of them change nothing.
+
+    Put it into the run's ``Deadline`` and keep the context open around the cooling of the lamps, so that an impatient
+    second Ctrl-C can't skip it. On leaving, the former handlers come back. Outside the main thread, where Python
+    handles no signals, the event is a plain one.
+    """
+    cancel = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield cancel
+        return
+    # A handler that set the event itself could meet the main thread inside Event.wait, holding the event's lock, and
+    # hang. The interpreter writes a byte for each signal instead, and a thread turns the byte into the event.
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    watcher = threading.Thread(target=_watch, args=(ours, cancel), name="signals", daemon=True)
+    watcher.start()
+    former = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+    handlers = {number: signal.getsignal(number) for number in STOPPING}
+    try:
+        for number, handler in handlers.items():
+            if handler is not signal.SIG_IGN:  # nohup, or a shell's background job: it stays ignored
+                signal.signal(number, _noticed)
+        yield cancel
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        signal.set_wakeup_fd(former)
+        theirs.close()
+        watcher.join()
+        ours.close()
+
+
+def _noticed(number: int, frame: FrameType | None) -> None:
+    """Takes the place of the handler that would raise KeyboardInterrupt; the byte on the socket does the work."""
+
+
+def _watch(ours: socket.socket, cancel: threading.Event) -> None:
+    while numbers := ours.recv(64):
+        if any(number in STOPPING for number in numbers):
+            cancel.set()
