@@ -1,0 +1,171 @@
+"""Frozen dataclasses to TOML and back, with errors that name the key and the line.
+
+A value may be bool, int, float, str, a nested tuple of these with fixed lengths, a dataclass (a table), or a tuple of
+dataclasses of any length (an array of tables).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Final, TypeVar, get_args, get_origin, get_type_hints
+
+from hal.errors import DeviceError
+
+Table = TypeVar("Table")
+Path_ = tuple[str | int, ...]
+_HEADER: Final = re.compile(r"^\s*(\[\[?)\s*([\w.-]+)\s*\]\]?")
+_ALLOWED: Final = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text in quotes"}
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Between:
+    """In ``Annotated[float, Between(low, high)]``: the number, or every number of the tuple, must lie there."""
+
+    low: float
+    high: float
+
+
+_ANY_NUMBER: Final = Between(-math.inf, math.inf)
+
+
+def dump(value: object) -> str:
+    """The TOML text of a dataclass; ``load`` gives the same value back."""
+    return "\n".join(_lines(value, "")).lstrip("\n") + "\n"
+
+
+def load(text: str, kind: type[Table], *, file: str) -> Table:
+    """Read ``kind`` from TOML text; ``file`` is the name used in errors.
+
+    Raises DeviceError: ``bench-file-unreadable`` (not TOML), ``bench-key-unknown``, ``bench-key-missing`` or
+    ``bench-key-wrong``; the last three name the key, its line, and what is allowed.
+    """
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise DeviceError(
+            "bench-file-unreadable",
+            what=f"{file} is not valid TOML: {error}.",
+            remedy="Mend that line, or prepare the stage anew.",
+        ) from error
+    return _Reader(text, file).table(content, kind, ())
+
+
+def _lines(value: object, prefix: str) -> Iterator[str]:
+    tables: list[tuple[str, object]] = []
+    for field in dataclasses.fields(value):  # type: ignore[arg-type]
+        item = getattr(value, field.name)
+        if dataclasses.is_dataclass(item) or (isinstance(item, tuple) and item and dataclasses.is_dataclass(item[0])):
+            tables.append((field.name, item))
+        else:
+            yield f"{field.name} = {_literal(item)}"
+    for name, item in tables:
+        path = f"{prefix}{name}"
+        several = isinstance(item, tuple)
+        for one in item if isinstance(item, tuple) else (item,):
+            yield ""
+            yield f"[[{path}]]" if several else f"[{path}]"
+            yield from _lines(one, path + ".")
+
+
+def _literal(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_literal(item) for item in value) + "]"
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+    return repr(value)
+
+
+class _Reader:
+    def __init__(self, text: str, file: str) -> None:
+        self._lines = text.splitlines()
+        self._file = file
+
+    def table(self, content: Mapping[str, Any], kind: type[Table], path: Path_) -> Table:
+        hints = get_type_hints(kind, include_extras=True)
+        fields = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        for key in content:
+            if key not in fields:
+                raise self._error("unknown", (*path, key), f"is not known; allowed are {', '.join(fields)}")
+        for key in fields:
+            if key not in content:
+                raise self._error("missing", (*path, key), "is missing")
+        values = {key: self.value(content[key], hints[key], (*path, key)) for key in fields}
+        return kind(**values)
+
+    def value(self, item: Any, hint: Any, path: Path_, limits: Between = _ANY_NUMBER) -> Any:
+        if get_origin(hint) is Annotated:
+            return self.value(item, get_args(hint)[0], path, get_args(hint)[1])
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            if not isinstance(item, dict):
+                raise self._error("wrong", path, "must be a table")
+            return self.table(item, hint, path)
+        if get_origin(hint) is tuple:
+            return self._sequence(item, get_args(hint), path, limits)
+        return self._scalar(item, hint, path, limits)
+
+    def _sequence(self, item: Any, hints: tuple[Any, ...], path: Path_, limits: Between) -> tuple[Any, ...]:
+        open_ended = len(hints) == 2 and hints[1] is Ellipsis
+        if not isinstance(item, list) or (not open_ended and len(item) != len(hints)) or not item:
+            count = "one or more" if open_ended else str(len(hints))
+            raise self._error("wrong", path, f"must be a list of {count} values")
+        each = [hints[0]] * len(item) if open_ended else hints
+        return tuple(
+            self.value(one, hint, (*path, i), limits) for i, (one, hint) in enumerate(zip(item, each, strict=True))
+        )
+
+    def _scalar(self, item: Any, hint: type, path: Path_, limits: Between) -> Any:
+        if hint is float and isinstance(item, int) and not isinstance(item, bool):
+            item = float(item)
+        if type(item) is not hint or (isinstance(item, float) and not math.isfinite(item)):
+            raise self._error("wrong", path, f"must be {_ALLOWED[hint]}")
+        if isinstance(item, int | float) and not limits.low <= item <= limits.high:
+            raise self._error("wrong", path, f"is {item}, and must lie between {limits.low:g} and {limits.high:g}")
+        return item
+
+    def _error(self, code: str, path: Path_, what: str) -> DeviceError:
+        key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).lstrip(".")
+        return DeviceError(
+            f"bench-key-{code}",
+            what=f"{self._file}, line {self._line(path)}: the key {key} {what}.",
+            remedy="Correct that line, or prepare the stage anew.",
+        )
+
+    def _line(self, path: Path_) -> int:
+        """Line of the key, or of the table that should hold it; 1-based. tomllib keeps no positions."""
+        best, matched, counts = 1, 0, dict[str, int]()
+        wanted = [(i, part) for i, part in enumerate(path) if isinstance(part, str)]
+        current: Path_ = ()
+        for number, line in enumerate(self._lines, start=1):
+            header = _HEADER.match(line)
+            if header:
+                current = _position(header.group(2), header.group(1) == "[[", counts)
+                depth = len(current) if path[: len(current)] == current else 0
+                if depth > matched:
+                    best, matched = number, depth
+                continue
+            key = line.partition("=")[0].strip().strip("\"'")
+            for index, part in wanted:
+                if key == part and path[:index] == current and "=" in line:
+                    return number
+        return best
+
+
+def _position(name: str, is_array: bool, counts: dict[str, int]) -> Path_:
+    """The path of a table header, with the running index of each array of tables it goes through."""
+    if is_array:
+        counts[name] = counts.get(name, -1) + 1
+    path: list[str | int] = []
+    parts = name.split(".")
+    for i, part in enumerate(parts):
+        path.append(part)
+        whole = ".".join(parts[: i + 1])
+        if whole in counts:
+            path.append(counts[whole])
+    return tuple(path)
