@@ -1,0 +1,64 @@
+"""Between images (rows, columns, 3), as everyone else has them, and planes (3, ...), as the products want them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from controller.arrays import FloatImage
+from controller.compiled import compiled
+
+
+@compiled(parallel=True)
+def _split(pixels: FloatImage, planes: FloatImage) -> None:
+    for i in prange(pixels.shape[0]):
+        for c in range(3):
+            planes[c, i] = pixels[i, c]
+
+
+@compiled(parallel=True)
+def _join(planes: FloatImage, pixels: FloatImage) -> None:
+    for i in prange(pixels.shape[0]):
+        for c in range(3):
+            pixels[i, c] = planes[c, i]
+
+
+def image_planes(image: npt.NDArray[np.floating]) -> FloatImage:
+    """(rows, columns, 3) to (3, rows, columns) float32."""
+    pixels = np.ascontiguousarray(image, np.float32)
+    planes = np.empty((3, *image.shape[:2]), np.float32)
+    _split(pixels.reshape(-1, 3), planes.reshape(3, -1))
+    return planes
+
+
+def plane_image(planes: FloatImage) -> FloatImage:
+    """(3, rows, columns) to (rows, columns, 3)."""
+    image = np.empty((*planes.shape[1:], 3), np.float32)
+    _join(np.ascontiguousarray(planes).reshape(3, -1), image.reshape(-1, 3))
+    return image
+
+
+def frame_planes(frames: Sequence[npt.NDArray[np.floating]]) -> FloatImage:
+    """One (rows, columns, 3) image a projector to (3, pixels of all projectors)."""
+    planes = np.empty((3, sum(frame.shape[0] * frame.shape[1] for frame in frames)), np.float32)
+    at = 0
+    for frame in frames:
+        count = frame.shape[0] * frame.shape[1]
+        _split(np.ascontiguousarray(frame, np.float32).reshape(-1, 3), planes[:, at : at + count])
+        at += count
+    return planes
+
+
+def plane_frames(planes: FloatImage, sizes: Sequence[tuple[int, int]]) -> list[FloatImage]:
+    """(3, pixels of all projectors) to one (rows, columns, 3) image for each of ``sizes``."""
+    frames = []
+    at = 0
+    for rows, columns in sizes:
+        frame = np.empty((rows, columns, 3), np.float32)
+        _join(planes[:, at : at + rows * columns], frame.reshape(-1, 3))
+        frames.append(frame)
+        at += rows * columns
+    return frames
