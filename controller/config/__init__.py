@@ -1,0 +1,26 @@
+"""stage.toml as typed, validated models. The only place with pydantic."""
+
+from controller.config.loader import Stage, check_driver_settings, load_stage
+from controller.config.models import (
+    AppearanceTable,
+    CameraTable,
+    DisplayTable,
+    OpenTable,
+    ProjectorTable,
+    StageTables,
+)
+from controller.config.writer import toml_text, write_stage
+
+__all__ = [
+    "AppearanceTable",
+    "CameraTable",
+    "DisplayTable",
+    "OpenTable",
+    "ProjectorTable",
+    "Stage",
+    "StageTables",
+    "check_driver_settings",
+    "load_stage",
+    "toml_text",
+    "write_stage",
+]

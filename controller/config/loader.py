@@ -1,0 +1,222 @@
+"""Reading stage.toml: syntax, keys, and what must agree between tables."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from controller.config.lines import KeyLines, KeyPath
+from controller.config.models import OpenTable, StageTables, Table
+from controller.config.problems import Place, printable
+from controller.errors import UsageError
+from hal.registry import Driver
+
+LARGEST_BYTES: Final = 1 << 20
+FILE: Final = "stage.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A stage folder and what its stage.toml says."""
+
+    folder: Path
+    tables: StageTables
+
+    def path(self, relative: str) -> Path:
+        """A path of stage.toml; relative ones start at the stage's folder."""
+        return self.folder / relative
+
+
+def load_stage(path: Path) -> Stage:
+    """Read ``path``: a stage folder or its stage.toml.
+
+    Raises UsageError with code "stage-missing", "stage-unreadable", "stage-syntax", "stage-key-unknown",
+    "stage-key-missing", "stage-key-type" or "stage-key-value"; all but the first two name the line.
+    """
+    file = path / FILE if path.is_dir() else path
+    text = _text(file)
+    try:
+        content = tomllib.loads(text)
+        place = Place(file.name, KeyLines(text))
+    except (ValueError, RecursionError) as error:
+        raise _syntax(file, error) from error
+    return Stage(file.parent.resolve(), parse_stage(content, place))
+
+
+def parse_stage(content: Mapping[str, Any], place: Place) -> StageTables:
+    """Check the parsed content of a stage.toml that stands at ``place``. Raises as ``load_stage``."""
+    try:
+        tables = StageTables.model_validate(dict(content))
+    except ValidationError as invalid:
+        raise _first_problem(invalid, place) from invalid
+    for path, table in _tables(tables, ()):
+        table.placed(place.at(*path))
+    _check_agreement(tables)
+    return tables
+
+
+def check_driver_settings(table: OpenTable, driver: Driver) -> dict[str, Any]:
+    """The settings with which to open ``driver``, checked against what it understands.
+
+    Raises UsageError("stage-key-unknown") or UsageError("stage-key-missing") with the line.
+    """
+    return table.settings(driver.settings, driver.required)
+
+
+def _text(file: Path) -> str:
+    try:
+        data = file.read_bytes() if file.stat().st_size <= LARGEST_BYTES else None
+    except FileNotFoundError as error:
+        raise UsageError(
+            "stage-missing",
+            what=f"There is no {file}.",
+            remedy="Give the stage's folder, which holds stage.toml; `velatura demo --prepare-only` writes an example.",
+        ) from error
+    except OSError as error:
+        raise _unreadable(file, f"can't be read: {error.strerror}", "Check the file's permissions.") from error
+    if data is None:
+        raise _unreadable(file, f"is larger than {LARGEST_BYTES} bytes", "Is it the right file?")
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise _unreadable(file, f"is not UTF-8 text (line {line})", "Save it as a text file in UTF-8.") from error
+
+
+def _unreadable(file: Path, problem: str, remedy: str) -> UsageError:
+    return UsageError("stage-unreadable", what=f"{file} {problem}.", remedy=remedy)
+
+
+def _syntax(file: Path, error: Exception) -> UsageError:
+    message = printable(str(error)) or "it is nested too deeply"
+    where = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
+    line = f", line {where[1]}" if where and where[1] else ", at its end" if where else ""
+    problem = message[: where.start()] if where else message
+    return UsageError(
+        "stage-syntax",
+        what=f"{file.name}{line}: this is not TOML: {problem}.",
+        remedy='Mend the line; text needs quotes (name = "left"), and tables brackets ([camera], [[projectors]]).',
+    )
+
+
+def _first_problem(invalid: ValidationError, place: Place) -> UsageError:
+    """The problem that stands first in the file; but a misspelt key before the missing one that it stands for."""
+    problems = invalid.errors(include_url=False)
+    first = min(problems, key=lambda found: (found["type"] != "extra_forbidden", place.lines.line(tuple(found["loc"]))))
+    return _problem(first, place)
+
+
+_PROBLEMS: Final = {
+    "int_type": "is not a whole number",
+    "float_type": "is not a number",
+    "finite_number": "is not a finite number",
+    "bool_type": "is neither true nor false",
+    "string_type": "is not text in quotes",
+    "string_pattern_mismatch": "is not of the allowed form",
+    "string_too_short": "is too short",
+    "string_too_long": "is too long",
+    "tuple_type": "is not a list",
+    "too_short": "has too few items",
+    "too_long": "has too many items",
+    "model_type": "is not a table",
+    "literal_error": "is not allowed",
+    "greater_than": "is not above {gt}",
+    "greater_than_equal": "is below {ge}",
+    "less_than_equal": "is above {le}",
+}
+
+
+def _problem(detail: ErrorDetails, place: Place) -> UsageError:
+    path: KeyPath = tuple(detail["loc"])
+    model, depth = _model_at(path)
+    # A position in a list of values (trusted_keys, from_px) is told by the name of the list.
+    table, key = place.at(*path[:depth]), str(path[depth]) if depth < len(path) else str(path[-1])
+    field = model.model_fields.get(key)
+    allowed = (field.description if field is not None else None) or "left out"
+    if detail["type"] == "missing" and depth + 1 < len(path):
+        return table.wrong_value(key, detail["input"], _PROBLEMS["too_short"], allowed)
+    if detail["type"] == "missing":
+        return table.missing(
+            key, allowed, written=[other for other in detail["input"] if other not in model.model_fields]
+        )
+    if detail["type"] == "extra_forbidden":
+        return table.unknown(key, model.model_fields)
+    problem = _PROBLEMS.get(detail["type"], f"is wrong ({detail['msg']})").format(**detail.get("ctx", {}))
+    kind = table.wrong_type if detail["type"].endswith("_type") else table.wrong_value
+    return kind(key, detail["input"], problem, allowed)
+
+
+def _model_at(path: KeyPath) -> tuple[type[BaseModel], int]:
+    """The innermost model on the way to ``path``, and how many parts lead to it."""
+    model: type[BaseModel] = StageTables
+    depth = 0
+    for position, part in enumerate(path):
+        if isinstance(part, int):
+            continue
+        inner = _inner_model(model, part)
+        if inner is None:
+            break
+        following = position + 1
+        if following < len(path) and isinstance(path[following], int):
+            following += 1
+        if following >= len(path):
+            break
+        model, depth = inner, following
+    return model, depth
+
+
+def _inner_model(model: type[BaseModel], key: str) -> type[BaseModel] | None:
+    field = model.model_fields.get(key)
+    if field is None:
+        return None
+    arguments = (field.annotation, *getattr(field.annotation, "__args__", ()))
+    return next((kind for kind in arguments if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+
+
+def _tables(table: Table, path: KeyPath) -> Iterator[tuple[KeyPath, Table]]:
+    yield path, table
+    for key in type(table).model_fields:
+        value = getattr(table, key)
+        if isinstance(value, Table):
+            yield from _tables(value, (*path, key))
+        elif isinstance(value, tuple):
+            for position, item in enumerate(value):
+                if isinstance(item, Table):
+                    yield from _tables(item, (*path, key, position))
+
+
+def _check_agreement(tables: StageTables) -> None:
+    """Names that must differ, and outputs that must exist."""
+    _all_different(tables.projectors, "name")
+    _all_different(tables.projectors, "output")
+    _all_different(tables.display.outputs, "name")
+    _all_different(tables.appearances, "name")
+    outputs = [output.name for output in tables.display.outputs]
+    if not outputs:
+        return  # real windows: only the display itself knows its outputs
+    listed = ", ".join(outputs)
+    if len(tables.projectors) > len(outputs):
+        surplus = tables.projectors[len(outputs)]
+        problem = f"has no output left: there are {len(tables.projectors)} projectors and {len(outputs)} outputs"
+        raise surplus.place.wrong_value("output", surplus.output, problem, f"one of {listed}, each for one projector")
+    for projector in tables.projectors:
+        if projector.output not in outputs:
+            problem = "is not an output of the display"
+            raise projector.place.wrong_value("output", projector.output, problem, f"one of {listed}")
+
+
+def _all_different(tables: tuple[Table, ...], key: str) -> None:
+    lines: dict[str, int] = {}
+    for table in tables:
+        value = getattr(table, key)
+        if value in lines:
+            allowed = (type(table).model_fields[key].description or "") + ", not used twice"
+            raise table.place.wrong_value(key, value, f"is taken already in line {lines[value]}", allowed)
+        lines[value] = table.place.line(key)

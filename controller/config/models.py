@@ -1,0 +1,192 @@
+"""What stage.toml may hold. A field's description says what is allowed: errors and the documentation quote it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+
+from controller.config.problems import Place, check_keys
+from hal.values import LampRules
+
+Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f/\\]+$")]
+Seconds = Annotated[float, Field(ge=0, le=86_400)]
+Positive = Annotated[float, Field(gt=0)]
+Size = Annotated[int, Field(ge=1, le=16_384)]
+
+
+class Table(BaseModel):
+    """A table of stage.toml; knows where it stands in the file."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+    _place: Place | None = PrivateAttr(default=None)
+
+    @property
+    def place(self) -> Place:
+        """Where errors about this table's keys point to."""
+        if self._place is None:
+            raise ValueError("this table was not read from a file")
+        return self._place
+
+    def placed(self, place: Place) -> Self:
+        self._place = place
+        return self
+
+
+class OpenTable(Table):
+    """A table with further keys that only somebody else understands: a driver, or a kind of appearance."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="allow", allow_inf_nan=False)
+
+    def settings(self, allowed: Mapping[str, str], required: tuple[str, ...] = ()) -> dict[str, Any]:
+        """The keys written in this table that the other side understands, Velatura's own among them, checked.
+
+        ``allowed`` maps each key to what it may be. Raises UsageError("stage-key-unknown", "stage-key-missing").
+        """
+        written = {key: _plain(value) for key, value in self.model_dump(exclude_unset=True).items()}
+        own = {key: field.description or "" for key, field in type(self).model_fields.items()}
+        check_keys(self.place, written, {**own, **allowed}, required)
+        return {key: value for key, value in written.items() if key in allowed}
+
+
+def _plain(value: Any) -> Any:
+    """As TOML has it: lists, not tuples."""
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+class StageTable(Table):
+    name: Name = Field(description="the stage's name, 1 to 64 printable characters")
+
+
+class ProjectorTable(OpenTable):
+    name: Name = Field(description="a name for people, different for every projector, 1 to 64 printable characters")
+    output: Name = Field(description="the name of the display output that feeds this projector")
+    driver: Name = Field(description='the name of a projector driver, e.g. "serial"')
+
+
+class CameraTable(OpenTable):
+    driver: Name = Field(description='the name of a camera driver, e.g. "ptp"')
+    iso: int = Field(ge=25, le=819_200, description="the camera's sensitivity, a whole number from 25 to 819200")
+    aperture_f: Annotated[float, Field(ge=0.5, le=128)] | None = Field(
+        default=None, description="the f-number from 0.5 to 128; left out: as the lens is set"
+    )
+    focal_length_px: Positive = Field(
+        description="the focal length in pixels of the camera's full image, a number above 0 (from the lens and sensor)"
+    )
+    focal_length_rel_sigma: float = Field(
+        default=0.02, gt=0, le=1, description="how far focal_length_px may be off as a share of it, above 0, at most 1"
+    )
+    distance_m: Positive | None = Field(
+        default=None, description="metres from the camera to the middle of the object, above 0; left out: not measured"
+    )
+    distance_rel_sigma: float = Field(
+        default=0.01, gt=0, le=1, description="how far distance_m may be off as a share of it, above 0, at most 1"
+    )
+
+
+class OutputTable(Table):
+    name: Name = Field(description="the output's name, different for every output, 1 to 64 printable characters")
+    width_px: Size = Field(description="the output's width in pixels, a whole number from 1 to 16384")
+    height_px: Size = Field(description="the output's height in pixels, a whole number from 1 to 16384")
+
+
+class DisplayTable(OpenTable):
+    driver: Name = Field(description='the name of a display driver, e.g. "player"')
+    frames: str | None = Field(
+        default=None, min_length=1, description="the file of a memory output; left out: windows on real outputs"
+    )
+    outputs: Annotated[tuple[OutputTable, ...], Field(strict=False)] = Field(
+        default=(), description="a list of [[display.outputs]] tables with name, width_px and height_px"
+    )
+
+
+class DistanceTable(Table):
+    """Two points of the object in the camera's image, and how far they are apart."""
+
+    from_px: Annotated[tuple[float, float], Field(strict=False)] = Field(description="[x, y] in camera pixels")
+    to_px: Annotated[tuple[float, float], Field(strict=False)] = Field(description="[x, y] in camera pixels")
+    distance_m: Positive = Field(description="metres between the two points, above 0")
+
+
+class ObjectTable(Table):
+    distances: Annotated[tuple[DistanceTable, ...], Field(strict=False)] = Field(
+        default=(), description="a list of [[object.distances]] tables with from_px, to_px and distance_m"
+    )
+
+
+class CaptureTable(Table):
+    settle_s: float = Field(
+        default=0.15, ge=0, le=10, description="seconds from a frame's presentation to the shutter, 0 to 10"
+    )
+    longest_exposure_s: float = Field(
+        default=4.0, gt=0, le=3600, description="the longest exposure in seconds, above 0, at most 3600"
+    )
+
+
+class SolveTable(Table):
+    exposure_share: float = Field(
+        default=0.9, gt=0, le=1, description="the share of the reachable light that targets may use, above 0, at most 1"
+    )
+    smoothness: float = Field(
+        default=0.05, ge=0, le=100, description="the weight of equal neighbours in a compensation image, 0 to 100"
+    )
+    mode: Literal["full", "scaled"] = Field(
+        default="full", description='"full" (a solve for every appearance) or "scaled" (base image x scale image)'
+    )
+
+
+class SafetyTable(Table):
+    power_up_s: Seconds = Field(
+        default=1800.0, description="seconds that lamps may take until they are steady, 0 to 86400"
+    )
+    power_down_s: Seconds = Field(default=60.0, description="seconds that switching the lamps off may take, 0 to 86400")
+    warm_up_s: Seconds = Field(default=0.0, description="seconds from strike to light, if longer than the driver says")
+    stable_s: Seconds = Field(
+        default=0.0, description="seconds from strike to steady light, if longer than the driver says"
+    )
+    cool_down_s: Seconds = Field(default=0.0, description="seconds of cooling, if longer than the driver says")
+    minimum_off_s: Seconds = Field(
+        default=0.0, description="seconds from off to the next strike, if longer than the driver says"
+    )
+
+    def at_least(self) -> LampRules:
+        """The stage's own lamp rules, which only make the device's stricter."""
+        return LampRules(self.warm_up_s, self.stable_s, self.cool_down_s, self.minimum_off_s)
+
+
+class BundleTable(Table):
+    allow_unsigned: bool = Field(
+        default=False, description="true or false: whether a bundle without signature may play"
+    )
+    trusted_keys: Annotated[tuple[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")], ...], Field(strict=False)] = Field(
+        default=(), description="a list of public keys, each 64 hexadecimal digits in lower case"
+    )
+
+
+class AppearanceTable(OpenTable):
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
+        description="a name of 1 to 64 letters, digits, - and _, different for every appearance",
+    )
+    kind: Name = Field(description='the kind of target, e.g. "photograph"')
+    file: str | None = Field(default=None, min_length=1, description="a picture file, relative to the stage's folder")
+
+
+class StageTables(Table):
+    """The whole of stage.toml."""
+
+    stage: StageTable = Field(description="the table [stage] with the stage's name")
+    projectors: Annotated[tuple[ProjectorTable, ...], Field(strict=False, min_length=1, max_length=32)] = Field(
+        description="1 to 32 tables [[projectors]], one a projector"
+    )
+    camera: CameraTable = Field(description="the table [camera]")
+    display: DisplayTable = Field(description="the table [display]")
+    object: ObjectTable = Field(default_factory=ObjectTable, description="the table [object]")
+    capture: CaptureTable = Field(default_factory=CaptureTable, description="the table [capture]")
+    solve: SolveTable = Field(default_factory=SolveTable, description="the table [solve]")
+    safety: SafetyTable = Field(default_factory=SafetyTable, description="the table [safety]")
+    bundle: BundleTable = Field(default_factory=BundleTable, description="the table [bundle]")
+    appearances: Annotated[tuple[AppearanceTable, ...], Field(strict=False)] = Field(
+        default=(), description="a list of [[appearances]] tables"
+    )
