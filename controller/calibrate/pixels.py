@@ -1,0 +1,63 @@
+"""Metapixels from the phase map, its inverse and the modulation of fine sinusoids (paper 4.2.2, without dots)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller.arrays import FloatImage, Mask
+from controller.calibrate.blur import measure_blur
+from controller.calibrate.captures import Captures
+from controller.calibrate.decode import frame_margin_px
+from controller.calibrate.inversion import Inversion, invert_map
+from controller.calibrate.values import Correspondence, Metapixels
+from controller.capture.patterns import PatternPlan
+
+
+def fit_metapixels(captures: Captures, plan: PatternPlan, correspondence: Correspondence) -> Metapixels:
+    """One projector's metapixels: centre where the phase map equals the pixel, covariance J S J'.
+
+    Parameters
+    ----------
+    captures : needs ``black`` and ``blur-*``; linear photographs in one unit
+    correspondence : what ``decode`` made of the same captures
+
+    Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
+    """
+    inverse = invert_map(correspondence, plan.size_px)
+    blur, blur_valid = measure_blur(captures, plan, correspondence)
+    valid = inverse.valid & blur_valid
+    covariance = carry_covariance(inverse.jacobian, blur)
+    margin = int(np.ceil(frame_margin_px(correspondence.modulation[correspondence.valid])))
+    return _extend_to_frame(inverse, covariance, valid, margin)
+
+
+def _extend_to_frame(inverse: Inversion, covariance: FloatImage, valid: Mask, margin: int) -> Metapixels:
+    """Continue the outermost trusted pixels to the frame's border, where the phase can't be trusted."""
+    rows, columns = valid.shape
+    row, column = np.mgrid[0:rows, 0:columns]
+    from_row = np.clip(row, min(margin, rows // 2), max(rows - 1 - margin, rows // 2))
+    from_column = np.clip(column, min(margin, columns // 2), max(columns - 1 - margin, columns // 2))
+    a, b, c, d = np.moveaxis(inverse.jacobian[from_row, from_column], -1, 0)
+    dx, dy = column - from_column, row - from_row
+    centre = inverse.centre_px[from_row, from_column] + np.stack([a * dx + b * dy, c * dx + d * dy], axis=-1)
+    valid = valid[from_row, from_column]
+    centre[~valid] = np.nan
+    covariance = np.where(valid[:, :, None], covariance[from_row, from_column], np.nan)
+    return Metapixels(centre.astype(np.float32), covariance.astype(np.float32), valid)
+
+
+def carry_covariance(jacobian: FloatImage, covariance_px2: FloatImage) -> FloatImage:
+    """J S J' of each pixel.
+
+    ``jacobian`` (..., 4) a, b, c, d of [[a, b], [c, d]]; ``covariance_px2`` (..., 3) xx, xy, yy; returns (..., 3).
+    """
+    a, b, c, d = np.moveaxis(jacobian, -1, 0)
+    xx, xy, yy = np.moveaxis(covariance_px2, -1, 0)
+    return np.stack(
+        [
+            a * a * xx + 2 * a * b * xy + b * b * yy,
+            a * c * xx + (a * d + b * c) * xy + b * d * yy,
+            c * c * xx + 2 * c * d * xy + d * d * yy,
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,82 @@
+"""Linear light to a projector's 8-bit device values."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller.arrays import ByteImage, Float64, FloatImage
+from controller.compiled import compiled
+from controller.errors import UsageError
+
+
+def encode_frame(linear: FloatImage, response: Float64, *, dither: bool = True) -> ByteImage:
+    """Device values whose light is closest to ``linear``.
+
+    Parameters
+    ----------
+    linear : (rows, columns, 3) float32, clipped to [0, 1]; NaN counts as 0
+    response : (3, 256) light of each device value, not falling, 0 at black, 1 at white
+    dither : pass each pixel's rounding error on to its neighbours (Floyd and Steinberg 1976, rows in alternating
+        direction, errors in linear light), so that areas keep their mean; the same input gives the same output
+
+    Raises UsageError("frame-shape-wrong") or UsageError("response-not-rising").
+    """
+    if linear.ndim != 3 or linear.shape[2] != 3:
+        raise UsageError(
+            "frame-shape-wrong",
+            what=f"A frame must be (rows, columns, 3); this one is {linear.shape}.",
+            remedy="Give one linear RGB image of the projector's size.",
+        )
+    table = np.ascontiguousarray(response, dtype=np.float32)
+    if table.shape != (3, 256) or not np.all(np.isfinite(table)) or np.any(np.diff(table, axis=1) < 0):
+        raise UsageError(
+            "response-not-rising",
+            what="The projector's response table is not 3 rows of 256 rising values.",
+            remedy="Measure the projector's response again.",
+        )
+    device = np.empty(linear.shape, np.uint8)
+    _quantise(np.ascontiguousarray(linear, dtype=np.float32), table, dither, device)
+    return device
+
+
+def device_flat(level: tuple[int, int, int], size_px: tuple[int, int]) -> ByteImage:
+    """One colour in device values over the whole frame of ``size_px`` (width, height)."""
+    return np.full((size_px[1], size_px[0], 3), level, np.uint8)
+
+
+@compiled()
+def _nearest(table: FloatImage, light: float) -> int:
+    low, high = 0, 255
+    while high - low > 1:
+        middle = (low + high) // 2
+        if table[middle] <= light:
+            low = middle
+        else:
+            high = middle
+    return low if light - table[low] <= table[high] - light else high
+
+
+@compiled()
+def _quantise(linear: FloatImage, response: FloatImage, dither: bool, device: ByteImage) -> None:
+    rows, columns, channels = linear.shape
+    for channel in range(channels):
+        table = response[channel]
+        # one column more at both sides takes the errors that fall off the frame
+        here, below = np.zeros(columns + 2, np.float32), np.zeros(columns + 2, np.float32)
+        for row in range(rows):
+            step = 1 if row % 2 == 0 else -1
+            for index in range(columns):
+                column = index if step == 1 else columns - 1 - index
+                wanted = linear[row, column, channel]
+                wanted = min(max(wanted, 0.0), 1.0) if wanted == wanted else 0.0  # noqa: PLR0124  (NaN)
+                light = wanted + here[column + 1]
+                value = _nearest(table, light)
+                device[row, column, channel] = value
+                if dither and 0.0 < wanted < 1.0:
+                    error = light - table[value]
+                    here[column + 1 + step] += error * (7 / 16)
+                    below[column + 1 - step] += error * (3 / 16)
+                    below[column + 1] += error * (5 / 16)
+                    below[column + 1 + step] += error * (1 / 16)
+            here, below = below, here
+            below[:] = 0

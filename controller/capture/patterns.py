@@ -1,0 +1,234 @@
+"""What is shown to one projector during a calibration: a plan of named patterns, and their images.
+
+Everything is a pure function of the projector's size. Cells and phases fit together so that no camera pixel is
+ambiguous: the Gray code counts cells of half the phase's period, so a pixel whose cell is read one off, which
+happens only at the border of two cells, still lies 4 px inside the period it is given.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from controller.arrays import ByteImage, FloatImage
+from controller.capture.encoding import device_flat, encode_frame
+from controller.errors import UsageError
+
+__all__ = [
+    "CELL_PX",
+    "PERIOD_PX",
+    "Pattern",
+    "PatternKind",
+    "PatternPlan",
+    "device_frame",
+    "encode_frame",
+    "frame",
+    "plan_patterns",
+]
+
+CELL_PX = 8
+PERIOD_PX = 16
+PHASE_STEPS = 4
+BLUR_STEPS = 3
+BLUR_FREQUENCIES = {"x": (1 / 5, 0.0), "y": (0.0, 1 / 5), "d": (1 / 7, 1 / 7)}
+"""Cycles per projector pixel of the three sinusoids from which the blur is measured."""
+RAMP_LEVELS = (24, 56, 88, 120, 152, 184, 220)
+"""Device values of the grey ramp, beside 0 and 255."""
+
+
+class PatternKind(enum.Enum):
+    """How a pattern is generated."""
+
+    FLAT = "flat"
+    RAMP = "ramp"
+    GRAY = "gray"
+    SINUSOID = "sinusoid"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """One picture of the plan.
+
+    ``colour`` (FLAT) fraction of full light per channel; ``level`` (RAMP) device value 0..255; ``axis`` (GRAY) 0 for
+    x, 1 for y; ``bit`` (GRAY) 0 is the coarsest of ``bits``; ``frequency`` (SINUSOID) x and y in cycles per projector
+    pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (RANDOM).
+    """
+
+    name: str
+    kind: PatternKind
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    level: int = 0
+    axis: int = 0
+    bit: int = 0
+    bits: int = 0
+    frequency: tuple[float, float] = (0.0, 0.0)
+    phase_rad: float = 0.0
+    seed: int = 0
+
+    @property
+    def needs_response(self) -> bool:
+        """Whether the pattern has values between black and white, so that it waits for the projector's response."""
+        return self.kind in (PatternKind.SINUSOID, PatternKind.RANDOM)
+
+
+@dataclass(frozen=True, slots=True)
+class PatternPlan:
+    """The patterns of one projector in the order in which they are shown; those that need the response come last.
+
+    ``size_px`` (width, height) of the projector.
+    """
+
+    size_px: tuple[int, int]
+    patterns: tuple[Pattern, ...]
+
+    def __iter__(self) -> Iterator[Pattern]:
+        return iter(self.patterns)
+
+    def __len__(self) -> int:
+        return len(self.patterns)
+
+    def of_kind(self, kind: PatternKind) -> tuple[Pattern, ...]:
+        return tuple(pattern for pattern in self.patterns if pattern.kind is kind)
+
+    def gray(self, axis: int) -> tuple[Pattern, ...]:
+        """The Gray-code bits of one axis (0 x, 1 y), coarsest first."""
+        return tuple(pattern for pattern in self.of_kind(PatternKind.GRAY) if pattern.axis == axis)
+
+    def sinusoids(self, prefix: str) -> tuple[Pattern, ...]:
+        """The steps of one sinusoid in order; ``prefix`` is e.g. ``"phase-x"`` or ``"blur-d"``."""
+        return tuple(p for p in self.of_kind(PatternKind.SINUSOID) if p.name.rpartition("-")[0] == prefix)
+
+
+def plan_patterns(
+    size_px: tuple[int, int], *, ramp_levels: tuple[int, ...] = RAMP_LEVELS, random_patterns: int = 1
+) -> PatternPlan:
+    """The plan for a projector of ``size_px`` (width, height).
+
+    Names: ``black white red green blue``, ``ramp-024``.., ``gray-x-0``.., ``gray-y-0``.., ``phase-x-0..3``,
+    ``phase-y-0..3``, ``blur-x-0..2``, ``blur-y-0..2``, ``blur-d-0..2``, ``random-0``...
+
+    Raises UsageError("projector-too-small") below 2 cells a side.
+    """
+    width, height = size_px
+    if min(width, height) < 2 * CELL_PX:
+        raise UsageError(
+            "projector-too-small",
+            what=f"A projector of {width}x{height} pixels is too small to be calibrated.",
+            remedy=f"Give its true size in stage.toml; at least {2 * CELL_PX} pixels a side are needed.",
+        )
+    patterns = [
+        *_flats(),
+        *(Pattern(f"ramp-{level:03d}", PatternKind.RAMP, level=level) for level in ramp_levels),
+        *_gray_bits("x", 0, width),
+        *_gray_bits("y", 1, height),
+        *_steps("phase-x", (1 / PERIOD_PX, 0.0), PHASE_STEPS),
+        *_steps("phase-y", (0.0, 1 / PERIOD_PX), PHASE_STEPS),
+    ]
+    for name, frequency in BLUR_FREQUENCIES.items():
+        patterns += _steps(f"blur-{name}", frequency, BLUR_STEPS)
+    patterns += [Pattern(f"random-{n}", PatternKind.RANDOM, seed=n) for n in range(random_patterns)]
+    return PatternPlan(size_px, tuple(patterns))
+
+
+def _flats() -> list[Pattern]:
+    colours = {
+        "black": (0.0, 0.0, 0.0),
+        "white": (1.0, 1.0, 1.0),
+        "red": (1.0, 0.0, 0.0),
+        "green": (0.0, 1.0, 0.0),
+        "blue": (0.0, 0.0, 1.0),
+    }
+    return [Pattern(name, PatternKind.FLAT, colour=colour) for name, colour in colours.items()]
+
+
+def _gray_bits(letter: str, axis: int, pixels: int) -> list[Pattern]:
+    bits = max(1, math.ceil(math.log2(math.ceil(pixels / CELL_PX))))
+    return [Pattern(f"gray-{letter}-{n}", PatternKind.GRAY, axis=axis, bit=n, bits=bits) for n in range(bits)]
+
+
+def _steps(prefix: str, frequency: tuple[float, float], steps: int) -> list[Pattern]:
+    return [
+        Pattern(f"{prefix}-{n}", PatternKind.SINUSOID, frequency=frequency, phase_rad=2 * math.pi * n / steps)
+        for n in range(steps)
+    ]
+
+
+def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
+    """The pattern as linear light.
+
+    Returns
+    -------
+    float32 in [0, 1], (rows, columns) where the pattern is grey, (rows, columns, 3) where it is coloured
+
+    Raises UsageError("ramp-has-no-light") for a RAMP pattern, whose light is what is to be measured.
+    """
+    width, height = size_px
+    x, y = np.arange(width, dtype=np.float64)[None, :], np.arange(height, dtype=np.float64)[:, None]
+    match pattern.kind:
+        case PatternKind.FLAT:
+            return np.full((height, width, 3), pattern.colour, np.float32)
+        case PatternKind.GRAY:
+            line = _gray_line(pattern, (width, height)[pattern.axis])
+            across = line[None, :] if pattern.axis == 0 else line[:, None]
+            return np.broadcast_to(across, (height, width)).copy()
+        case PatternKind.SINUSOID:
+            angle = 2 * np.pi * (pattern.frequency[0] * x + pattern.frequency[1] * y) - pattern.phase_rad
+            return (0.5 + 0.5 * np.cos(angle)).astype(np.float32)
+        case PatternKind.RANDOM:
+            return _random_image(pattern.seed, size_px)
+        case PatternKind.RAMP:
+            raise UsageError(
+                "ramp-has-no-light",
+                what=f"Pattern {pattern.name} is given in device values; its light is not known.",
+                remedy="Use device_frame for it.",
+            )
+
+
+def device_frame(
+    pattern: Pattern,
+    size_px: tuple[int, int],
+    response: np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None = None,
+) -> ByteImage:
+    """The pattern as (rows, columns, 3) uint8 device values.
+
+    ``response`` (3, 256) is needed only where ``pattern.needs_response``; without it UsageError("response-missing").
+    """
+    width, height = size_px
+    if pattern.kind is PatternKind.RAMP:
+        return device_flat((pattern.level,) * 3, size_px)
+    light = frame(pattern, size_px)
+    if light.ndim == 2:
+        light = np.broadcast_to(light[:, :, None], (height, width, 3))
+    if not pattern.needs_response:
+        return (light > 0.5).astype(np.uint8) * np.uint8(255)
+    if response is None:
+        raise UsageError(
+            "response-missing",
+            what=f"Pattern {pattern.name} can't be shown before the projector's response is measured.",
+            remedy="Capture the grey ramp first.",
+        )
+    return encode_frame(np.ascontiguousarray(light), response)
+
+
+def _gray_line(pattern: Pattern, pixels: int) -> FloatImage:
+    cell = np.arange(pixels) // CELL_PX
+    code = cell ^ (cell >> 1)
+    return ((code >> (pattern.bits - 1 - pattern.bit)) & 1).astype(np.float32)
+
+
+def _random_image(seed: int, size_px: tuple[int, int]) -> FloatImage:
+    """Coloured blocks over smooth noise: every frequency that an appearance may hold, none of them in step."""
+    width, height = size_px
+    random = np.random.default_rng(seed + 7919)
+    blocks = random.random((height // 6 + 1, width // 6 + 1, 3), dtype=np.float32)
+    image = 0.4 * np.repeat(np.repeat(blocks, 6, axis=0), 6, axis=1)[:height, :width]
+    for sigma_px, share in ((1.5, 0.3), (12.0, 0.3)):
+        noise = cv2.GaussianBlur(random.standard_normal((height, width, 3), dtype=np.float32), (0, 0), sigma_px)
+        image += share * np.clip(0.5 + 0.25 * noise / noise.std(), 0, 1)
+    return np.ascontiguousarray(np.clip(image, 0, 1), dtype=np.float32)

@@ -1,0 +1,177 @@
+"""Photographs as linear light: RAW files of any Bayer camera, and JPEG files where the camera's response is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.arrays import Float64, FloatImage, Mask
+from controller.compiled import compiled
+from controller.errors import UsageError, WorkError
+
+SATURATED_SHARE = 0.985
+"""Of full scale: sensors bend shortly before they clip."""
+JPEG_SATURATED = 254
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """One exposure in linear light.
+
+    ``image`` (rows, columns, 3) float32 camera RGB, 0 at the black level, 1 at full scale; noise may go below 0
+    ``saturated`` (rows, columns) bool: some sample that this pixel is made of was clipped
+    ``camera_to_xyz`` (3, 3) linear camera RGB to CIE XYZ as the file tells it, None where it does not
+    """
+
+    image: FloatImage
+    saturated: Mask
+    camera_to_xyz: Float64 | None
+
+    def measured(self) -> FloatImage:
+        """The image with NaN where it was saturated: NaN means not measured everywhere in ``calibrate``."""
+        image = self.image.copy()
+        image[self.saturated] = np.nan
+        return image
+
+
+def read_photograph(path: Path, *, response: Float64 | None = None) -> Photograph:
+    """Read a RAW file (any kind that LibRaw knows, Bayer sensors), or a JPEG with its ``response`` (3, 256).
+
+    Raises
+    ------
+    WorkError("photograph-unreadable")  no such file, or damaged
+    UsageError("raw-not-bayer")  the sensor has no 2x2 colour pattern
+    UsageError("jpeg-response-missing")  a JPEG says nothing of light without the camera's response table
+    """
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        if response is None:
+            raise UsageError(
+                "jpeg-response-missing",
+                what=f"{path.name} is a JPEG, and the camera's response is not known.",
+                remedy="Set the camera to RAW, or measure its response first.",
+            )
+        return _read_jpeg(path, response)
+    return _read_raw(path)
+
+
+def _unreadable(path: Path, reason: object) -> WorkError:
+    return WorkError(
+        "photograph-unreadable",
+        what=f"The photograph {path.name} can't be read ({reason}).",
+        remedy="Take it again; if this happens often, check the camera's card and cable.",
+    )
+
+
+def _read_raw(path: Path) -> Photograph:
+    import rawpy
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            mosaic = raw.raw_image_visible.copy()
+            colours = _colour_of_sites(raw, path)
+            black, white = _levels(raw)
+            matrix = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
+    except (rawpy.LibRawError, OSError) as error:
+        raise _unreadable(path, error) from error
+    return develop(mosaic, colours, black, white, camera_to_xyz=_inverse(matrix))
+
+
+def _colour_of_sites(raw: Any, path: Path) -> npt.NDArray[np.int64]:
+    """(2, 2) of 0 red, 1 green, 2 blue at the visible area's first rows and columns."""
+    letters = raw.color_desc.decode("ascii")
+    sites = raw.raw_colors_visible[:4, :4] if raw.raw_pattern is not None else np.empty((0, 0), int)
+    regular = sites.shape == (4, 4) and np.array_equal(sites[:2, :2], sites[2:, 2:])
+    names = "".join(sorted(letters[index] for index in sites[:2, :2].ravel())) if regular else ""
+    if names != "BGGR":
+        raise UsageError(
+            "raw-not-bayer",
+            what=f"{path.name} comes from a sensor without a Bayer pattern.",
+            remedy="Use a camera with a Bayer sensor, or JPEG.",
+        )
+    return np.array([["RGB".index(letters[index]) for index in row] for row in sites[:2, :2]], np.int64)
+
+
+def _levels(raw: Any) -> tuple[Float64, Float64]:
+    """(2, 2) black and white level at each site of the colour pattern."""
+    sites = raw.raw_colors_visible[:2, :2]
+    black = np.asarray(raw.black_level_per_channel, np.float64)[sites]
+    per_channel = raw.camera_white_level_per_channel
+    known = per_channel is not None and min(np.asarray(per_channel)[sites].ravel()) > 0
+    white = np.asarray(per_channel, np.float64)[sites] if known else np.full((2, 2), float(raw.white_level))
+    return black, white
+
+
+def _inverse(xyz_to_camera: Float64) -> Float64 | None:
+    if xyz_to_camera.shape != (3, 3) or abs(np.linalg.det(xyz_to_camera)) < 1e-6:
+        return None
+    return np.asarray(np.linalg.inv(xyz_to_camera), np.float64)
+
+
+def develop(
+    mosaic: npt.NDArray[np.uint16],
+    colours: npt.NDArray[np.int64],
+    black: Float64,
+    white: Float64,
+    *,
+    camera_to_xyz: Float64 | None = None,
+) -> Photograph:
+    """Black level off, scaled to full scale, bilinear interpolation of the colours: linear in every sample.
+
+    ``mosaic`` (rows, columns) uint16; ``colours``, ``black``, ``white`` (2, 2) of the colour pattern's sites.
+    """
+    image = np.empty((*mosaic.shape, 3), np.float32)
+    saturated = np.empty(mosaic.shape, np.bool_)
+    scale = (1 / (white - black)).astype(np.float32)
+    clip = black + SATURATED_SHARE * (white - black)
+    _demosaic(np.ascontiguousarray(mosaic), colours, black.astype(np.float32), scale, clip, image, saturated)
+    return Photograph(image, saturated, camera_to_xyz)
+
+
+@compiled(parallel=False, fastmath=False)
+def _demosaic(
+    mosaic: npt.NDArray[np.uint16],
+    colours: npt.NDArray[np.int64],
+    black: FloatImage,
+    scale: FloatImage,
+    clip: Float64,
+    image: FloatImage,
+    saturated: Mask,
+) -> None:
+    rows, columns = mosaic.shape
+    total, count = np.zeros(3, np.float32), np.zeros(3, np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            total[:] = 0
+            count[:] = 0
+            clipped = False
+            for r in range(max(row - 1, 0), min(row + 2, rows)):
+                for c in range(max(column - 1, 0), min(column + 2, columns)):
+                    sample = mosaic[r, c]
+                    clipped |= sample >= clip[r & 1, c & 1]
+                    colour = colours[r & 1, c & 1]
+                    total[colour] += (sample - black[r & 1, c & 1]) * scale[r & 1, c & 1]
+                    count[colour] += 1
+            own = colours[row & 1, column & 1]
+            for colour in range(3):
+                image[row, column, colour] = total[colour] / count[colour]
+            # a sample's own colour is measured there, not interpolated
+            image[row, column, own] = (mosaic[row, column] - black[row & 1, column & 1]) * scale[row & 1, column & 1]
+            saturated[row, column] = clipped
+
+
+def _read_jpeg(path: Path, response: Float64) -> Photograph:
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if decoded is None:
+        raise _unreadable(path, "it is not a whole JPEG")
+    table = np.asarray(response, np.float32)
+    image = np.stack([table[channel][decoded[:, :, channel]] for channel in range(3)], axis=2)
+    return Photograph(image, np.any(decoded >= JPEG_SATURATED, axis=2), None)

@@ -1,0 +1,143 @@
+"""A projector, a surface and a camera made of nothing but resampling: the oracle for ``calibrate``.
+
+The projector's picture is enlarged with square pixels, blurred, looked up through a known smooth warp at 4x4 points
+of each camera pixel, blurred by the camera and averaged. No Gaussians per pixel, no shares, no transport matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from controller.arrays import ByteImage, Float64, FloatImage
+from controller.capture.patterns import PatternPlan, device_frame, plan_patterns
+
+ENLARGED = 10
+SUPERSAMPLED = 4
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything about the simulated stage; the defaults are in focus with noise."""
+
+    camera_px: tuple[int, int] = (264, 200)
+    projector_px: tuple[int, int] = (112, 88)
+    scale: float = 2.4
+    bend: float = 3.0
+    projector_blur_px: float = 0.3
+    camera_blur_px: float = 0.6
+    lit_share_of_pixel: int = 8
+    """of 10, a side; even, so that the pixel stays in the middle"""
+    exposure: float = 0.7
+    electrons: float = 30000.0
+    read_electrons: float = 6.0
+    gamma: float = 2.2
+    seed: int = 1
+    noisy: bool = True
+    mixing: tuple[tuple[float, float, float], ...] = ((0.88, 0.10, 0.02), (0.08, 0.85, 0.07), (0.01, 0.12, 0.87))
+
+    def projector_of(self, camera: Float64) -> Float64:
+        """(..., 2) camera px -> (..., 2) projector px: perspective, rotation and a gentle bulge."""
+        centre = (np.array(self.camera_px) - 1) / 2
+        d = (camera - centre) / self.scale
+        angle = 0.12
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        q = d @ turn.T
+        r2 = np.sum((q / 60) ** 2, axis=-1, keepdims=True)
+        w = 1 + 0.002 * q[..., :1]
+        bulge = self.bend * np.stack([np.sin(q[..., 1] / 25), np.cos(q[..., 0] / 30)], axis=-1)
+        return np.asarray(q * (1 + 0.05 * r2) / w + bulge + (np.array(self.projector_px) - 1) / 2)
+
+    def jacobian(self, camera: Float64) -> Float64:
+        """(..., 2, 2) d projector / d camera."""
+        step = 1e-3
+        columns = []
+        for axis in range(2):
+            d = np.zeros(2)
+            d[axis] = step
+            columns.append((self.projector_of(camera + d) - self.projector_of(camera - d)) / (2 * step))
+        return np.stack(columns, axis=-1)
+
+    def camera_of(self, projector: Float64) -> Float64:
+        """Inverse of ``projector_of`` by Newton's method."""
+        camera = np.broadcast_to((np.array(self.camera_px) - 1) / 2, projector.shape).copy()
+        for _ in range(30):
+            error = self.projector_of(camera) - projector
+            camera = camera - np.linalg.solve(self.jacobian(camera), error[..., None])[..., 0]
+        return camera
+
+    def true_centres(self) -> Float64:
+        width, height = self.projector_px
+        x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+        return self.camera_of(np.stack([x, y], axis=-1))
+
+    def true_covariance(self) -> Float64:
+        """(rows, columns, 2, 2) second moments of a projector pixel's light in the camera image."""
+        inverse = np.linalg.inv(self.jacobian(self.true_centres()))
+        box = (self.lit_share_of_pixel / ENLARGED) ** 2 / 12
+        projector = (box + self.projector_blur_px**2) * np.eye(2)
+        camera = (self.camera_blur_px**2 + 1 / 12) * np.eye(2)
+        return np.asarray(inverse @ projector @ np.swapaxes(inverse, -1, -2) + camera)
+
+    def response(self) -> Float64:
+        """(3, 256): an S-shaped curve on a gamma, as video projectors have."""
+        x = np.arange(256) / 255
+        curves = [
+            x ** (self.gamma + d) * (1 - s) + s * (3 * x**2 - 2 * x**3) for d, s in ((0, 0.2), (0.1, 0.3), (-0.1, 0.1))
+        ]
+        return np.stack([curve / curve[-1] for curve in curves])
+
+
+class Stage:
+    """Takes photographs of device frames; values in full scale, clipped at 1."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.random = np.random.default_rng(scene.seed)
+        columns, rows = scene.camera_px
+        s = SUPERSAMPLED
+        y, x = np.mgrid[0 : rows * s, 0 : columns * s]
+        sub = np.stack([(x + 0.5) / s - 0.5, (y + 0.5) / s - 0.5], axis=-1)
+        self._lookup = ((scene.projector_of(sub) + 0.5) * ENLARGED - 0.5).astype(np.float32)
+        smooth = cv2.resize(self.random.uniform(0.4, 1.0, (rows // 16, columns // 16, 3)), (columns * s, rows * s))
+        patches = (
+            self.random.uniform(0.5, 1.0, (rows // 10 + 1, columns // 10 + 1, 3)).repeat(10 * s, 0).repeat(10 * s, 1)
+        )
+        self._albedo = (smooth * patches[: rows * s, : columns * s]).astype(np.float32)
+
+    def light(self, linear: FloatImage) -> FloatImage:
+        """Noiseless camera image of a linear frame (rows, columns, 3), without the black level."""
+        scene = self.scene
+        u, lit = ENLARGED, scene.lit_share_of_pixel
+        pixel = np.zeros((u, u, 1), np.float32)
+        low = (u - lit) // 2
+        pixel[low : low + lit, low : low + lit] = 1
+        mixed = linear @ np.array(scene.mixing, np.float32).T
+        large = np.kron(mixed, pixel)
+        if scene.projector_blur_px > 0:
+            large = cv2.GaussianBlur(large, (0, 0), scene.projector_blur_px * u)
+        seen = cv2.remap(large, self._lookup, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        seen = cv2.GaussianBlur(seen * self._albedo, (0, 0), scene.camera_blur_px * SUPERSAMPLED)
+        small = cv2.resize(seen, scene.camera_px, interpolation=cv2.INTER_AREA)
+        return np.asarray(scene.exposure * small, np.float32)
+
+    def photograph(self, device: ByteImage) -> FloatImage:
+        scene = self.scene
+        linear = np.stack([scene.response()[c][device[:, :, c]] for c in range(3)], axis=-1).astype(np.float32)
+        image = self.light(0.002 + 0.998 * linear) + 0.003
+        if scene.noisy:
+            electrons = np.maximum(image, 0) * scene.electrons
+            noise = np.sqrt(electrons + scene.read_electrons**2) * self.random.standard_normal(image.shape)
+            image = ((electrons + noise) / scene.electrons).astype(np.float32)
+        return np.asarray(np.minimum(image, 1.0), np.float32)
+
+    def plan(self) -> PatternPlan:
+        return plan_patterns(self.scene.projector_px)
+
+    def captures(self) -> dict[str, FloatImage]:
+        """A photograph of every pattern of the plan, encoded with the true response."""
+        plan = self.plan()
+        response = self.scene.response()
+        return {p.name: self.photograph(device_frame(p, plan.size_px, response)) for p in plan}
