@@ -165,7 +165,7 @@ def _serial(root: Table) -> SerialTable:
     )
     if not made.terminator:
         raise line.wrong("terminator", "it is empty")
-    if not (made.address.isascii() and made.address.isalnum() or not made.address):
+    if not ((made.address.isascii() and made.address.isalnum()) or not made.address):
         raise line.wrong("address", f"{made.address!r} is not made of letters and digits")
     line.finish()
     replies.finish()

@@ -41,6 +41,8 @@ class SerialLink(BufferedLink):
             self._serial = serial.Serial(str(port), baudrate=baud, timeout=0, write_timeout=0, exclusive=True)
         except _LOST as error:
             raise self._not_opened(error) from error
+        if transcript is not None:
+            transcript.remark(f"opened {port.resolve()} at {baud} baud")
 
     def _receive(self, wait_s: float) -> bytes:
         try:

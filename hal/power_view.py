@@ -1,0 +1,87 @@
+"""The power state of a projector that only ever answers "on" or "off".
+
+Several serial families tell of warming and cooling by unsolicited lines, or not at all. This keeps what was seen and
+when, so that a fresh answer can be read in its light. A lamp that went off counts as hot until it told of standby or
+its cooling time is over; a lamp that came on counts as warming for its warm-up time. Pure: the caller brings the clock.
+"""
+
+from __future__ import annotations
+
+from hal.values import LampRules, Power
+
+
+class PowerView:
+    """Reads power answers in the light of commands and notices. Times are seconds of one monotonic clock."""
+
+    def __init__(self, rules: LampRules) -> None:
+        self._rules = rules
+        self._last: Power | None = None
+        self._phase: Power | None = None
+        self._since_s = 0.0
+        self._told = False
+        self._trouble: dict[str, None] = {}
+
+    @property
+    def trouble(self) -> tuple[str, ...]:
+        """What the projector reported since it was last switched on, in order."""
+        return tuple(self._trouble)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the projector reported something that stops it (any word but a warning)."""
+        return any(not word.endswith("-warning") for word in self._trouble)
+
+    def switched_on(self, now_s: float) -> None:
+        """The projector accepted an on command; what it reported before is history."""
+        self._trouble.clear()
+        self._enter(Power.WARMING, now_s, told=False)
+
+    def switched_off(self, now_s: float) -> None:
+        """The projector accepted an off command."""
+        self._enter(Power.COOLING, now_s, told=False)
+
+    def noticed_power(self, power: Power, now_s: float) -> None:
+        """The projector told of its power unasked."""
+        if power in (Power.WARMING, Power.COOLING):
+            self._enter(power, now_s, told=True)
+        else:
+            self._phase = None
+            self._last = power
+
+    def noticed_trouble(self, word: str) -> None:
+        self._trouble[word] = None
+
+    def in_transition(self, now_s: float) -> bool:
+        """Whether the lamp warms or cools, as far as is known."""
+        return self._phase_at(now_s) is not None
+
+    def told(self, power: Power, now_s: float) -> bool:
+        """Whether the projector itself said, unasked, that it is in ``power`` now."""
+        return self._told and self._phase_at(now_s) is power
+
+    def answered(self, answer: Power, now_s: float) -> Power:
+        """The power state, given a fresh ``answer``."""
+        changed = self._last is not None and self._last is not answer
+        self._last = answer
+        phase = self._phase_at(now_s)
+        if answer is Power.ON:
+            if changed and phase is None:
+                self._enter(Power.WARMING, now_s, told=False)
+            return Power.WARMING if self._phase_at(now_s) is Power.WARMING else Power.ON
+        if answer is Power.OFF:
+            if changed and phase is None:
+                self._enter(Power.COOLING, now_s, told=False)
+            phase = self._phase_at(now_s)
+            if phase is Power.COOLING or (phase is Power.WARMING and self._told and not self.failed):
+                return phase
+            return Power.FAULT if self.failed else Power.OFF
+        return answer
+
+    def _enter(self, phase: Power, now_s: float, *, told: bool) -> None:
+        self._phase, self._since_s, self._told = phase, now_s, told
+
+    def _phase_at(self, now_s: float) -> Power | None:
+        lasts_s = self._rules.warm_up_s if self._phase is Power.WARMING else self._rules.cool_down_s
+        if self._phase is not None and now_s - self._since_s >= lasts_s:
+            self._phase = None
+        return self._phase

@@ -1,0 +1,65 @@
+"""Fault knobs of an emulated device's wire: it misbehaves like real ones, on request."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class WireFaults:
+    """How the wire misbehaves now.
+
+    ``silent``: nothing is answered; ``garbage``: answers are noise; ``slow_s``: seconds before every answer;
+    ``drop``: that many next answers are lost on the way; ``busy``: every command is refused for now.
+    """
+
+    silent: bool = False
+    garbage: bool = False
+    slow_s: float = 0.0
+    drop: int = 0
+    busy: bool = False
+
+
+class Faults:
+    """Thread-safe holder of ``WireFaults``: a bench or a test sets, an emulator's thread reads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._now = WireFaults()
+
+    @property
+    def now(self) -> WireFaults:
+        with self._lock:
+            return self._now
+
+    def set(self, **knobs: Any) -> None:
+        """Turn some knobs, by the names of ``WireFaults``; the others stay. TypeError for a name it has not."""
+        with self._lock:
+            self._now = replace(self._now, **knobs)
+
+    def clear(self) -> None:
+        with self._lock:
+            self._now = WireFaults()
+
+    def drop_next_reply(self, count: int = 1) -> None:
+        self.set(drop=count)
+
+    def loses_this_one(self) -> bool:
+        """Whether the answer about to be sent is lost; counts ``drop`` down."""
+        with self._lock:
+            if self._now.silent:
+                return True
+            if self._now.drop > 0:
+                self._now = replace(self._now, drop=self._now.drop - 1)
+                return True
+            return False
+
+
+def noise(answer: bytes) -> bytes:
+    """Bytes of the same length that mean nothing, with the line end kept so that they look like an answer."""
+    return bytes((byte * 7 + 0x81) & 0xFF | 0x80 for byte in answer[:-1]) + answer[-1:]
+
+
+KNOBS = tuple(field.name for field in fields(WireFaults))

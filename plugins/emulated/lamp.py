@@ -1,0 +1,155 @@
+"""The lamp of an emulated projector: strike, warm-up, light, cooling, hours, and how it fails.
+
+The optical bench asks ``light_level``; the wire emulators strike and extinguish. Times are of the emulated lamp, not of
+any driver's opinion of it.
+"""
+
+from __future__ import annotations
+
+import enum
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+FIRST_LIGHT: Final = 0.3
+"""Share of full light right after the strike: an arc lamp starts dim and brightens while it warms."""
+
+
+class LampPhase(enum.Enum):
+    STANDBY = "standby"
+    WARMING = "warming"
+    LIT = "lit"
+    COOLING = "cooling"
+
+
+@dataclass(frozen=True, slots=True)
+class LampTiming:
+    """Seconds from strike to full light, and from off to standby."""
+
+    warm_up_s: float
+    cool_down_s: float
+
+
+class EmulatedLamp:
+    """One lamp with its thermal state. Thread-safe; phases follow from the clock, nothing runs in the background.
+
+    Parameters
+    ----------
+    timing : how long it warms and cools
+    hours : burning hours on its counter at the start
+    clock : seconds that only go up
+    """
+
+    def __init__(
+        self, timing: LampTiming, *, hours: float = 1200.0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._timing = timing
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._lit_since: float | None = None
+        self._off_since: float | None = None
+        self._hours = hours
+        self._strikes = 0
+        self._shutter_closed = False
+        self._failed = False
+        self._hot = False
+
+    def strike(self) -> bool:
+        """Try to light the lamp; False while it cools or is too hot. Harmless when it burns already.
+
+        A failed lamp takes the strike and stays dark.
+        """
+        with self._lock:
+            phase = self.phase
+            if phase in (LampPhase.WARMING, LampPhase.LIT):
+                return True
+            if phase is LampPhase.COOLING or self._hot:
+                return False
+            self._strikes += 1
+            if not self._failed:
+                self._lit_since = self._clock()
+            return True
+
+    def extinguish(self) -> None:
+        """Put the lamp out; it cools from now. Harmless when it is out."""
+        with self._lock:
+            if self._lit_since is not None:
+                self._hours += (self._clock() - self._lit_since) / 3600
+                self._lit_since, self._off_since = None, self._clock()
+
+    @property
+    def phase(self) -> LampPhase:
+        with self._lock:
+            now = self._clock()
+            if self._lit_since is not None:
+                warming = now - self._lit_since < self._timing.warm_up_s
+                return LampPhase.WARMING if warming else LampPhase.LIT
+            if self._off_since is not None and now - self._off_since < self._timing.cool_down_s:
+                return LampPhase.COOLING
+            return LampPhase.STANDBY
+
+    def light_level(self) -> float:
+        """Share of the projector's full light, 0..1: 0 when dark or behind the shutter, rising while it warms."""
+        with self._lock:
+            if self._lit_since is None or self._shutter_closed:
+                return 0.0
+            if self._timing.warm_up_s <= 0:
+                return 1.0
+            warmth = min(1.0, (self._clock() - self._lit_since) / self._timing.warm_up_s)
+            return FIRST_LIGHT + (1.0 - FIRST_LIGHT) * warmth
+
+    @property
+    def hours(self) -> int:
+        with self._lock:
+            burning = 0.0 if self._lit_since is None else (self._clock() - self._lit_since) / 3600
+            return int(self._hours + burning)
+
+    @property
+    def strikes(self) -> int:
+        with self._lock:
+            return self._strikes
+
+    @property
+    def shutter_closed(self) -> bool:
+        with self._lock:
+            return self._shutter_closed
+
+    @shutter_closed.setter
+    def shutter_closed(self, closed: bool) -> None:
+        with self._lock:
+            self._shutter_closed = closed
+
+    @property
+    def failed(self) -> bool:
+        with self._lock:
+            return self._failed
+
+    @property
+    def too_hot(self) -> bool:
+        with self._lock:
+            return self._hot
+
+    def fail(self) -> None:
+        """The lamp bursts: dark from now, and at every later strike until ``mend``."""
+        with self._lock:
+            self._failed = True
+            self.extinguish()
+
+    def overheat(self) -> None:
+        """The thermal switch puts the lamp out and refuses strikes until ``mend``."""
+        with self._lock:
+            self._hot = True
+            self.extinguish()
+
+    def mend(self) -> None:
+        """A new lamp is in, or the housing has cooled."""
+        with self._lock:
+            self._failed = self._hot = False
+
+    def warm_now(self) -> None:
+        """Skip the waiting, for a bench that starts with a burning projector: lit and fully warm."""
+        with self._lock:
+            self._lit_since = self._clock() - self._timing.warm_up_s
+            self._off_since = None

@@ -1,0 +1,179 @@
+"""An emulated projector on a pseudo terminal: real bytes, a real baud rate, and a plug that can be pulled."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import termios
+import threading
+import time
+import tty
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import Final
+
+from hal.errors import DeviceError
+from plugins.emulated.faults import Faults, noise
+from plugins.emulated.lamp import EmulatedLamp
+from plugins.emulated.optoma import OptomaBoard, OptomaQuirks
+
+_TICK_S: Final = 0.02
+
+
+class EmulatedSerialProjector:
+    """A projector on a pty, reached by the symlink ``port`` as a real one is by ``/dev/serial/by-id/...``.
+
+    Parameters
+    ----------
+    port : where the symlink to the tty is made
+    lamp : its lamp; the optical bench reads the same one
+    baud : the rate it listens at; at any other the line carries noise both ways
+    number : its own number on the line (it answers to 00 as well)
+
+    ``faults`` are its knobs. ``start`` and ``stop`` it, or use it in a ``with`` statement.
+    """
+
+    def __init__(
+        self,
+        port: Path,
+        lamp: EmulatedLamp,
+        *,
+        baud: int = 9600,
+        number: int = 1,
+        quirks: OptomaQuirks | None = None,
+    ) -> None:
+        self.port = port
+        self.lamp = lamp
+        self.faults = Faults()
+        self._speed = getattr(termios, f"B{baud}")
+        self._board = OptomaBoard(lamp, number=number, quirks=quirks)
+        self._lock = threading.Lock()
+        self._master: int | None = None
+        self._slave: int | None = None
+        self._path: str | None = None
+        self._last_path: str | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._due: deque[tuple[float, bytes]] = deque()
+
+    def start(self) -> None:
+        """Plug in and listen. Raises DeviceError("no-pty") if the system has no pseudo terminal left."""
+        self.replug()
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._run, name=f"projector {self.port.name}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Unplug and end. Harmless when called twice."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=2.0)
+            self._thread = None
+        self.unplug()
+
+    def __enter__(self) -> EmulatedSerialProjector:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    @property
+    def path(self) -> str | None:
+        """The tty behind the symlink now; None while unplugged."""
+        with self._lock:
+            return self._path
+
+    def unplug(self) -> None:
+        """Pull the adapter: the tty hangs up and its name disappears. The projector itself goes on."""
+        with self._lock:
+            if self._master is None:
+                return
+            self.port.unlink(missing_ok=True)
+            for handle in (self._master, self._slave):
+                if handle is not None:
+                    os.close(handle)
+            self._master = self._slave = self._path = None
+            self._due.clear()
+
+    def replug(self) -> None:
+        """Plug the adapter in again: it comes back as another tty, and the symlink follows."""
+        with self._lock:
+            if self._master is not None:
+                return
+            self._master, self._slave, self._path = self._another_pty()
+            self._last_path = self._path
+            self.port.parent.mkdir(parents=True, exist_ok=True)
+            temporary = self.port.with_name(f".{self.port.name}.new")
+            temporary.unlink(missing_ok=True)
+            temporary.symlink_to(self._path)
+            temporary.replace(self.port)
+
+    def _another_pty(self) -> tuple[int, int, str]:
+        """A pty at another path than the last one: the system would hand out the free number again."""
+        made = _new_pty()
+        if made[2] != self._last_path:
+            return made
+        another = _new_pty()
+        os.close(made[0])
+        os.close(made[1])
+        return another
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            with self._lock:
+                master = self._master
+            if master is None:
+                self._stop.wait(_TICK_S)
+                continue
+            try:
+                self._turn(master)
+            except OSError:
+                # The plug was pulled between two looks; the next one sees it.
+                self._stop.wait(_TICK_S)
+
+    def _turn(self, master: int) -> None:
+        readable, _, _ = select.select([master], [], [], _TICK_S)
+        faults = self.faults.now
+        if readable:
+            for answer in self._board.feed(self._heard(os.read(master, 4096)), busy=faults.busy):
+                if not self.faults.loses_this_one():
+                    self._due.append((time.monotonic() + faults.slow_s, noise(answer) if faults.garbage else answer))
+        for notice in self._board.notices():
+            if not faults.silent:
+                self._due.append((time.monotonic(), notice))
+        while self._due and self._due[0][0] <= time.monotonic():
+            self._say(master, self._due.popleft()[1])
+
+    def _say(self, master: int, data: bytes) -> None:
+        with self._lock:
+            if master == self._master:  # a new plug must not hear the old one's answers
+                os.write(master, self._heard(data))
+
+    def _heard(self, data: bytes) -> bytes:
+        """What arrives of ``data``: at another baud rate than ours, noise."""
+        if self._slave is None:
+            return data
+        same = termios.tcgetattr(self._slave)[5] == self._speed
+        return data if same else bytes((byte ^ 0x5A) | 0x80 for byte in data)
+
+
+def _new_pty() -> tuple[int, int, str]:
+    """A raw pseudo terminal: master, slave (kept open, so that a client may come and go), and the slave's path."""
+    try:
+        master, slave = os.openpty()
+    except OSError as error:
+        raise DeviceError(
+            "no-pty",
+            what=f"No pseudo terminal could be made: {error.strerror}.",
+            remedy="Close other terminals, or mount /dev/pts, and start the bench again.",
+        ) from error
+    with contextlib.suppress(termios.error):
+        tty.setraw(slave)
+    path = os.ttyname(slave)
+    os.set_blocking(master, False)
+    return master, slave, path

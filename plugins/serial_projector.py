@@ -1,0 +1,261 @@
+"""Projectors on a serial line, driven by a table (``firmware_configs/projectors``): Optoma's later models first."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from hal.deadline import Deadline
+from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
+from hal.links import SLICE_S, ByteLink
+from hal.power_view import PowerView
+from hal.profiles import ProjectorProfile, SerialTable
+from hal.registry import Driver, OpenContext, setting
+from hal.serial_link import SerialLink
+from hal.serial_protocol import Notice, Reply, parse_hours, parse_power
+from hal.transcript import Transcript
+from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
+from plugins.profile_files import load_profile
+from plugins.serial_conversation import SerialConversation
+
+
+class SerialProjector:
+    """A projector that speaks one of the table-driven serial protocols. Implements ``hal.interfaces.Projector``.
+
+    Parameters
+    ----------
+    open_link : opens the serial port; called again whenever the link was lost
+    profile : the family's table; its ``serial`` part must be there
+    name : how the technician knows it, for messages
+    address : the projector's address on the line, or None for the profile's
+    """
+
+    def __init__(
+        self,
+        open_link: Callable[[Deadline], ByteLink],
+        profile: ProjectorProfile,
+        *,
+        name: str,
+        address: str | None = None,
+        transcript: Transcript | None = None,
+    ) -> None:
+        table = _serial_table(profile)
+        self._name = name
+        self._profile = profile
+        self._table = table
+        self._view = PowerView(profile.lamp)
+        self._lock = threading.Lock()
+        self._transcript = transcript
+        self._talk = SerialConversation(
+            open_link,
+            name=name,
+            profile=profile,
+            table=table,
+            address=_checked_address(table, address),
+            notice=self._noticed,
+            slow=lambda: self._view.in_transition(time.monotonic()),
+        )
+
+    def open(self, deadline: Deadline) -> None:
+        """Open the port; asks nothing, because a projector that boots must not be disturbed."""
+        self._talk.open(deadline)
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        return ProjectorCapabilities(
+            lamp_hours="lamp_hours" in self._table.queries,
+            shutter="shutter_close" in self._table.commands,
+            inputs=(),
+            errors=bool(self._table.notices.trouble),
+            lamp_rules=self._profile.lamp,
+        )
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        with self._turn(deadline):
+            if "model" not in self._table.queries:
+                self._power(deadline)  # whoever answers is one of this family
+            model = self._told("model", deadline)
+            known = f"{self._profile.family}, model code {model}" if model else self._profile.family
+            return DeviceIdentity(self._profile.maker, known, firmware=self._told("firmware", deadline) or "")
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        with self._turn(deadline):
+            power = self._power(deadline)
+            hours = self._hours(power, deadline)
+            return ProjectorStatus(power, self._view.trouble, hours)
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        with self._turn(deadline):
+            power = self._power(deadline)
+            if power in (Power.ON, Power.WARMING):
+                return
+            if power is Power.COOLING:
+                raise self._refused("projector-cooling", "is still cooling its lamp, and was not switched on")
+            reply = self._talk.command("power_on", deadline=deadline)
+            if reply is Reply.REFUSED:
+                raise self._refused("projector-refused-on", "refused to switch on; its lamp may still be cooling")
+            if reply is Reply.ACCEPTED:
+                self._view.switched_on(time.monotonic())
+            self._confirm((Power.ON, Power.WARMING), "on", deadline)
+
+    def switch_off(self, *, deadline: Deadline) -> None:
+        with self._turn(deadline):
+            if self._power(deadline) in (Power.OFF, Power.COOLING, Power.FAULT):
+                return
+            reply = self._talk.command("power_off", deadline=deadline)
+            if reply is Reply.REFUSED:
+                raise self._refused("projector-refused-off", "refused to switch off; it may still be starting")
+            if reply is Reply.ACCEPTED:
+                self._view.switched_off(time.monotonic())
+            self._confirm((Power.OFF, Power.COOLING, Power.FAULT), "off", deadline)
+
+    def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
+        with self._turn(deadline):
+            if not self.capabilities.shutter:
+                raise self._refused("projector-no-shutter", "cannot block its light")
+            reply = self._talk.command("shutter_close" if closed else "shutter_open", deadline=deadline)
+            if reply is None:
+                raise self._talk.no_answer()
+            if reply is Reply.REFUSED:
+                raise self._refused("projector-refused-shutter", "refused to move its shutter; it may be off")
+
+    def close(self) -> None:
+        self._talk.close()
+        if self._transcript is not None:
+            self._transcript.close()
+
+    def _power(self, deadline: Deadline) -> Power:
+        answer = parse_power(self._talk.ask("power", deadline=deadline))
+        return self._view.answered(answer, time.monotonic())
+
+    def _hours(self, power: Power, deadline: Deadline) -> int | None:
+        try:
+            told = self._told("lamp_hours", deadline)
+            return None if told is None else parse_hours(told)
+        except (DeviceTimeout, ProtocolError):
+            # In standby some models leave this unanswered, or answer in another shape; lit, they must tell.
+            if power is Power.ON or deadline.passed:
+                raise
+            return None
+
+    def _told(self, question: str, deadline: Deadline) -> str | None:
+        """The answer to a question that a projector in standby may refuse; None then."""
+        if question not in self._table.queries:
+            return None
+        try:
+            return self._talk.ask(question, deadline=deadline)
+        except DeviceBusy:
+            return None
+
+    def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
+        """Wait until the power state shows what a command should have done, whether or not its reply arrived."""
+        patience = deadline.within(self._profile.timing.confirm_s)
+        while not self._shows(wanted, deadline):
+            if word == "on" and self._view.failed:
+                raise self._refused("projector-fault", f"did not switch on: it reports {', '.join(self._view.trouble)}")
+            if patience.passed:
+                raise DeviceTimeout(
+                    f"projector-not-{word}",
+                    what=f"The projector at {self._name} was told to switch {word}, and did not.",
+                    remedy="Look at its lamps and messages; if it shows nothing, switch it by its own button once.",
+                )
+            patience.sleep(self._profile.timing.interval_s)
+
+    def _shows(self, wanted: tuple[Power, ...], deadline: Deadline) -> bool:
+        try:
+            return self._power(deadline) in wanted
+        except (DeviceBusy, DeviceTimeout):
+            # Some models answer nothing while they start; only the caller's own deadline ends the waiting early.
+            if deadline.passed:
+                raise
+            return False
+
+    def _noticed(self, notice: Notice) -> None:
+        if notice.power is not None:
+            self._view.noticed_power(notice.power, time.monotonic())
+        if notice.trouble is not None:
+            self._view.noticed_trouble(notice.trouble)
+
+    def _refused(self, code: str, doing: str) -> DeviceRefused:
+        return DeviceRefused(
+            code,
+            what=f"The projector at {self._name} {doing}.",
+            remedy="Wait until it has cooled and shows standby; if it reports a fault, mend that first.",
+        )
+
+    @contextmanager
+    def _turn(self, deadline: Deadline) -> Iterator[None]:
+        """One caller at a time, and none after ``close``."""
+        explained = self._talk.no_answer()
+        deadline.check(explained.code, what=explained.what, remedy=explained.remedy)
+        while not self._lock.acquire(timeout=min(SLICE_S, deadline.left_s())):
+            deadline.check(explained.code, what=explained.what, remedy=explained.remedy)
+        try:
+            self._talk.check_open()
+            yield
+        finally:
+            self._lock.release()
+
+
+def _serial_table(profile: ProjectorProfile) -> SerialTable:
+    if profile.serial is None:
+        raise PluginError(
+            "profile-not-serial",
+            what=f"The profile {profile.name!r} has no serial commands.",
+            remedy='Use another profile, or the driver "pjlink".',
+        )
+    return profile.serial
+
+
+def _checked_address(table: SerialTable, address: str | None) -> str:
+    """The address to use; it must look like the profile's own, e.g. two digits."""
+    if address is None:
+        return table.address
+    alike = len(address) == len(table.address) and address.isascii() and address.isalnum()
+    if not alike or (table.address.isdigit() and not address.isdigit()):
+        raise PluginError(
+            "setting-wrong",
+            what=f"The address {address!r} is not like {table.address!r}.",
+            remedy="Set address in stage.toml to the projector's own number, or leave it out.",
+        )
+    return address
+
+
+def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
+    """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
+    profile = load_profile(setting(settings, "profile", str), context.stage)
+    table = _serial_table(profile)
+    # Not resolved: the symlink is the stable name, and leads elsewhere after the adapter was unplugged.
+    port = context.stage / setting(settings, "port", str)
+    baud = setting(settings, "baud", int, table.baud)
+    transcript = None
+    if context.transcripts is not None:
+        context.transcripts.mkdir(parents=True, exist_ok=True)
+        transcript = Transcript(context.transcripts / f"serial-{port.name}.txt")
+    projector = SerialProjector(
+        lambda until: SerialLink(port, baud=baud, deadline=until, transcript=transcript),
+        profile,
+        name=str(setting(settings, "port", str)),
+        address=setting(settings, "address", str),
+        transcript=transcript,
+    )
+    projector.open(deadline)
+    return projector
+
+
+DRIVER = Driver(
+    kind="projector",
+    name="serial",
+    summary="Projectors on a serial line, by a table of their family's commands.",
+    open=open_serial_projector,
+    settings={
+        "profile": "the family's table: a shipped name such as optoma-later, or a .toml file of the stage",
+        "port": "the serial port; a stable name such as /dev/serial/by-id/..., or a path relative to the stage",
+        "baud": "baud rate, if not the profile's",
+        "address": "the projector's number on the line, if not the profile's",
+    },
+    required=("profile", "port"),
+)
