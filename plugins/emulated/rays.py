@@ -120,7 +120,8 @@ def _cast_rows(truth: BenchTruth, thing: StageObject, scene: Any, first: int, la
     width = camera.lens.size_px[0]
     within = (np.arange(s) + 0.5) / s - 0.5
     y, x, dy, dx = np.meshgrid(np.arange(first, last), np.arange(width), within, within, indexing="ij")
-    ray = directions(camera.pose, camera.lens, (x + dx).ravel(), (y + dy).ravel())
+    at_x, at_y = np.asarray(x + dx, np.float64).ravel(), np.asarray(y + dy, np.float64).ravel()
+    ray = directions(camera.pose, camera.lens, at_x, at_y)
     origin = np.broadcast_to(np.asarray(camera.pose.position_m, np.float32), ray.shape).copy()
     found = scene.run(origin, ray.astype(np.float32), output=1)
     hit = found["primID"] >= 0

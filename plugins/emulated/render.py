@@ -37,7 +37,7 @@ def response(light: Light) -> npt.NDArray[np.float64]:
     A power law u = v^gamma, bent into a mild S by u + s u (1 - u) (2 u - 1).
     """
     power = (np.arange(256) / 255.0)[:, None] ** np.asarray(light.gamma)
-    return power + np.asarray(light.s_curve) * power * (1.0 - power) * (2.0 * power - 1.0)
+    return np.asarray(power + np.asarray(light.s_curve) * power * (1.0 - power) * (2.0 * power - 1.0))
 
 
 def emitted(light: Light, frame: ByteImage) -> FloatImage:
@@ -84,7 +84,7 @@ class Renderer:
 
         ``frames``: (rows, columns, 3) uint8 for each projector; ``levels``: its lamp's light, 0 dark to 1 full
         """
-        digests = [hashlib.blake2b(np.ascontiguousarray(frame), digest_size=16).digest() for frame in frames]
+        digests = [hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() for frame in frames]
         key = (*digests, *levels)
         if self._last is not None and self._last[0] == key:
             return self._last[1]
@@ -117,9 +117,9 @@ class Renderer:
 
     def _through_lens(self, total: FloatImage) -> FloatImage:
         width, height = self._truth.camera.lens.size_px
-        image = np.zeros((height * width, 3), dtype=np.float32)
-        image[self._samples.pixels] = total
-        image = image.reshape(height, width, 3)
+        flat = np.zeros((height * width, 3), dtype=np.float32)
+        flat[self._samples.pixels] = total
+        image: FloatImage = flat.reshape(height, width, 3)
         sigma = self._truth.camera.psf_sigma_px
         if sigma > 0.05:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)

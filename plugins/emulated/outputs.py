@@ -1,0 +1,162 @@
+"""What the player shows: the memory output file, read as pixels, and a short history of what was visible when.
+
+The file is read and not mapped: a player that shortens or replaces it while we look must not end the bench.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+ByteImage: TypeAlias = npt.NDArray[np.uint8]
+
+MAGIC: Final = b"VELFRAME"
+VERSION: Final = 1
+HEADER: Final = struct.Struct("<8sIIQdQ")
+ENTRIES_AT: Final = 64
+ENTRY: Final = struct.Struct("<40sIIQQ")
+MOST_OUTPUTS: Final = 16
+MOST_BYTES: Final = 1 << 30
+TRIES: Final = 20
+KEPT: Final = 32
+POLL_S: Final = 0.004
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSet:
+    """Frames (rows, columns, 3) uint8 by output name, presented together at ``presented_at_s`` (monotonic clock)."""
+
+    sequence: int
+    presented_at_s: float
+    frames: Mapping[str, ByteImage]
+
+
+class FrameReader:
+    """Reads the newest whole frame set of a memory output file that another process writes."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._last: tuple[tuple[int, int], FrameSet] | None = None
+
+    def latest(self) -> FrameSet | None:
+        """The newest frame set, the same object while it is unchanged; None while there is no (valid) file.
+
+        A set that is being written while we read is read again; when the writer never pauses, the last whole one stays.
+        """
+        try:
+            with self._path.open("rb", buffering=0) as file:
+                return self._read(file.fileno())
+        except OSError:
+            self._last = None
+            return None
+
+    def _read(self, handle: int) -> FrameSet | None:
+        status = os.fstat(handle)
+        identity = (status.st_dev, status.st_ino)
+        known = self._last[1] if self._last is not None and self._last[0] == identity else None
+        for _ in range(TRIES):
+            header = _header(os.pread(handle, ENTRIES_AT, 0))
+            if header is None:
+                return None
+            count, sequence, presented_at_s = header
+            if known is not None and known.sequence == sequence:
+                return known
+            if sequence % 2 == 0:
+                frames = _frames(handle, count, status.st_size)
+                after = _header(os.pread(handle, ENTRIES_AT, 0))
+                if after is not None and after[1] == sequence:
+                    if frames is None:
+                        return None
+                    found = FrameSet(sequence, presented_at_s, frames)
+                    self._last = (identity, found)
+                    return found
+            time.sleep(0.0005)
+        return known
+
+
+def _header(data: bytes) -> tuple[int, int, float] | None:
+    if len(data) < ENTRIES_AT:
+        return None
+    magic, version, count, sequence, presented_at_s, _ = HEADER.unpack_from(data)
+    if magic != MAGIC or version != VERSION or not 1 <= count <= MOST_OUTPUTS:
+        return None
+    return count, sequence, presented_at_s
+
+
+def _frames(handle: int, count: int, file_size: int) -> dict[str, ByteImage] | None:
+    """Every output's pixels, or None where an entry points outside the file."""
+    table = os.pread(handle, count * ENTRY.size, ENTRIES_AT)
+    if len(table) < count * ENTRY.size:
+        return None
+    frames: dict[str, ByteImage] = {}
+    for name, width, height, offset, _ in ENTRY.iter_unpack(table):
+        size = width * height * 3
+        if not 0 < size <= MOST_BYTES or offset + size > file_size:
+            return None
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        if os.preadv(handle, [pixels.reshape(-1).data], offset) != size:
+            return None
+        frames[name.rstrip(b"\0").decode("utf-8", "replace")] = pixels
+    return frames
+
+
+class VisibleFrames:
+    """Polls a memory output, and knows what the projectors showed when: each set is visible ``latency_s`` late."""
+
+    def __init__(self, path: Path, latency_s: float) -> None:
+        self._reader = FrameReader(path)
+        self._latency_s = latency_s
+        self._lock = threading.Lock()
+        self._history: deque[tuple[float, FrameSet | None]] = deque([(0.0, None)], maxlen=KEPT)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._poll, name="outputs", daemon=True)
+
+    def __enter__(self) -> VisibleFrames:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        with contextlib.suppress(RuntimeError):  # never started
+            self._thread.join(timeout=1.0)
+
+    def look(self) -> None:
+        """Read the memory output now."""
+        with self._lock:
+            found = self._reader.latest()
+            _, newest = self._history[-1]
+            if found is not newest:
+                at = time.monotonic() if found is None else found.presented_at_s
+                self._history.append((max(at + self._latency_s, self._history[-1][0]), found))
+
+    def during(self, start_s: float, end_s: float) -> list[tuple[float, FrameSet | None]]:
+        """The sets that were visible between two times, with their shares of that time (sum 1); None is no picture."""
+        self.look()
+        with self._lock:
+            history = list(self._history)
+        if end_s <= start_s:
+            end_s = start_s + 1e-9
+        shares: list[tuple[float, FrameSet | None]] = []
+        for index, (since, frames) in enumerate(history):
+            # What was shown before the oldest set we know is forgotten; the oldest stands in for it.
+            begin = start_s if index == 0 else max(since, start_s)
+            until = history[index + 1][0] if index + 1 < len(history) else end_s
+            share = (min(until, end_s) - begin) / (end_s - start_s)
+            if share > 0.0:
+                shares.append((share, frames))
+        return shares
+
+    def _poll(self) -> None:
+        while not self._stopped.wait(POLL_S):
+            self.look()
