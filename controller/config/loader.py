@@ -14,8 +14,9 @@ from pydantic_core import ErrorDetails
 
 from controller.config.lines import KeyLines, KeyPath
 from controller.config.models import OpenTable, StageTables, Table
-from controller.config.problems import Place, printable
+from controller.config.problems import Place
 from controller.errors import UsageError
+from controller.text import printable
 from hal.registry import Driver
 
 LARGEST_BYTES: Final = 1 << 20

@@ -9,6 +9,7 @@ from typing import Any
 
 from controller.config.lines import KeyLines, KeyPath
 from controller.errors import UsageError
+from controller.text import printable
 
 LONGEST_SHOWN = 40
 """Characters of a wrong value that an error repeats."""
@@ -84,8 +85,3 @@ def shown(value: Any) -> str:
     """A value as an error repeats it: short, and without control characters."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return printable(text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 1] + "…")
-
-
-def printable(text: str) -> str:
-    """Text whose control characters cannot reach a terminal."""
-    return "".join(character if character.isprintable() else "�" for character in text)

@@ -102,7 +102,7 @@ class LampGuard:
                 self._projector.switch_on(deadline=deadline)
             except DeviceRefused:
                 # Only a refusal proves that the lamp was not struck; after silence it counts as struck.
-                self._write(before)
+                self._write(replace(before, lit_s=self._record.lit_s))
                 raise
 
     def switch_off(self, *, deadline: Deadline) -> None:

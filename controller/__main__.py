@@ -1,0 +1,171 @@
+"""The command line. Each command is thin: it parses, calls one function elsewhere, and prints what that returns.
+
+Heavy imports happen inside the commands, so that ``velatura --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import os
+import platform
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from controller import console
+from controller.errors import VelaturaError
+
+DONE, FAILED, WRONG_USE, DEVICE_FAILED, STOPPED = 0, 1, 2, 3, 130
+
+StageFolder = Annotated[Path, typer.Argument(metavar="STAGE", help="The stage's folder, which holds stage.toml.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object a line, for machines.")]
+
+
+def states(
+    mermaid: Annotated[bool, typer.Option("--mermaid", help="Print the diagram in Mermaid's language.")] = False,
+) -> None:
+    """Show the states of a stage and what leads from one to the next."""
+    from controller.session.machine import TRANSITIONS
+    from controller.session.machine import mermaid as diagram
+
+    lines = (f"{before.value:12} {event.value:14} -> {after.value}" for (before, event), after in TRANSITIONS.items())
+    console.show_result(diagram() if mermaid else "\n".join(lines), as_json=False)
+
+
+COMMANDS: Final[tuple[Callable[..., None], ...]] = (states,)
+"""Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
+
+
+def work(target: str, *, as_json: bool, **arguments: Any) -> None:
+    """Call ``"package.module:function"`` for a command, and show what it returns (a mapping, a text or None).
+
+    The function gets ``arguments`` and besides ``reporter`` (a ``session.progress.Reporter``) and ``cancel`` (an event
+    for its ``Deadline``). It must cool the lamps itself before it returns or raises: while it runs, signals only set
+    the event.
+    """
+    from controller.session.signals import cancelled_by_signals
+
+    module, _, name = target.partition(":")
+    with cancelled_by_signals() as cancel, console.reporter(as_json=as_json) as reporter:
+        result = getattr(importlib.import_module(module), name)(**arguments, reporter=reporter, cancel=cancel)
+    console.show_result(result, as_json=as_json)
+
+
+def application() -> typer.Typer:
+    """The command line with every command of the table."""
+    app = typer.Typer(
+        name="velatura",
+        help="Gives a physical object a new appearance with light from several superimposed projectors.",
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    # With a callback a single command stays a command, instead of becoming the whole program.
+    app.callback()(_nothing_before_a_command)
+    for command in COMMANDS:
+        app.command(command.__name__.replace("_", "-"))(command)
+    return app
+
+
+def _nothing_before_a_command() -> None:
+    """Gives a physical object a new appearance with light from several superimposed projectors."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit: 0 done, 1 the work failed, 2 wrong use, 3 a device failed, 130 stopped."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    sys.exit(run(given))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code; every error has been shown by then."""
+    as_json = "--json" in arguments
+    try:
+        outcome = application()(args=list(arguments) or ["--help"], prog_name="velatura", standalone_mode=False)
+        sys.stdout.flush()
+    except SystemExit as exiting:  # by the command-line library, when the reader of our output went away
+        return exiting.code if isinstance(exiting.code, int) else FAILED
+    except BaseException as error:  # noqa: BLE001 - the last boundary: nobody above could show it
+        return _shown(error, as_json=as_json)
+    return outcome if isinstance(outcome, int) else DONE
+
+
+def _shown(error: BaseException, *, as_json: bool) -> int:
+    """Show ``error`` as two sentences and return the exit code."""
+    from hal.deadline import Cancelled
+    from hal.errors import DeviceError
+
+    if isinstance(error, typer.Exit):
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt | typer.Abort | Cancelled) or getattr(error, "code", None) == "cancelled":
+        console.show_error(
+            "cancelled", "The work was stopped on request.", "The same command goes on from here.", as_json=as_json
+        )
+        return STOPPED
+    if isinstance(error, VelaturaError | DeviceError):
+        console.show_error(error.code, error.what, error.remedy, as_json=as_json)
+        return error.exit_code if isinstance(error, VelaturaError) else DEVICE_FAILED
+    if isinstance(error, typer.TyperException):
+        return _wrong_use(error, as_json=as_json)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        name = error.filename or "the stage's folder"
+        console.show_error(
+            "no-space", f"There was no space left to write {name}.", "Free some space and start again.", as_json=as_json
+        )
+        return FAILED
+    return _crashed(error, as_json=as_json)
+
+
+def _wrong_use(error: typer.TyperException, *, as_json: bool) -> int:
+    message = error.format_message()
+    sentence = message if message.endswith((".", "?")) else f"{message}."
+    console.show_error(
+        "wrong-use", sentence, "`velatura --help` shows the commands and their options.", as_json=as_json
+    )
+    return WRONG_USE
+
+
+def _crashed(error: BaseException, *, as_json: bool) -> int:
+    """For what should never happen: the traceback goes into a file, a sentence to the person."""
+    report = "".join(
+        [
+            f"time: {time.strftime('%Y-%m-%d %H:%M:%S%z')}\n",
+            f"command: {sys.argv!r}\npython: {sys.version}\nsystem: {platform.platform()}\n\n",
+            *traceback.format_exception(error),
+        ]
+    )
+    name = f"crash-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    path = _kept(report, name, Path(state) / "velatura")
+    console.show_error(
+        "crash",
+        f"Velatura met an error that it does not know ({type(error).__name__}).",
+        f"Send {path} to the maintainers; it says what happened." if path else "No report of it could be written.",
+        as_json=as_json,
+    )
+    return FAILED
+
+
+def _kept(report: str, name: str, folder: Path) -> Path | None:
+    for place in (folder, Path(tempfile.gettempdir())):
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            path = place / name
+            # Only a new file, and only for this user: the folder may be shared with others.
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+                file.write(report)
+        except OSError:
+            continue
+        return path
+    return None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""The steps from photographs to a calibration: radiometry, correspondences and metapixels, geometry, grade."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from controller.arrays import Float64, FloatImage, Mask, load_arrays, save_arrays
+from controller.calibrate.decode import decode
+from controller.calibrate.geometry import reconstruct
+from controller.calibrate.pixels import fit_metapixels
+from controller.calibrate.radiometry import measure_radiometry
+from controller.calibrate.reconstruction import CameraPrior
+from controller.calibrate.regularize import regularize
+from controller.calibrate.values import Calibration, Correspondence, Metapixels, ProjectorCalibration, Radiometry
+from controller.capture.brackets import merge_bracket
+from controller.capture.patterns import PatternPlan, plan_patterns
+from controller.errors import CalibrationError
+from controller.session.capturing import capture_steps, code_step
+from controller.session.rig import Rig, RigProjector
+from controller.session.runner import Context, Step
+from controller.session.shots import Developed, Taken, read_index
+
+LIT_SHARE = 0.004
+"""A camera pixel counts as lit where a projector's white is above this share of the brightest white there is."""
+
+
+def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float) -> list[Step]:
+    """Everything from the first photograph to ``calibration.npz`` and ``geometry.npz``."""
+    steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
+    names = [projector.name for projector in rig.projectors]
+    for projector in rig.projectors:
+        steps.append(_radiometry_step(projector))
+        steps.append(code_step(rig, projector))
+        steps.append(_pixels_step(projector))
+    steps.append(
+        Step(
+            "geometry",
+            lambda context: _reconstruct(rig, prior, context),
+            inputs={"prior": repr(prior)},
+            after=tuple(f"pixels-{name}" for name in names),
+            title="Reconstructing the object and the poses",
+            weight=8,
+        )
+    )
+    return steps
+
+
+def _radiometry_step(projector: RigProjector) -> Step:
+    plan = plan_patterns(projector.size_px)
+    return Step(
+        f"radiometry-{projector.name}",
+        lambda context: _radiometry(projector, plan, context),
+        after=("black", f"light-{projector.name}"),
+        title=f"Measuring the response of {projector.name}",
+        weight=1.0,
+    )
+
+
+def _pixels_step(projector: RigProjector) -> Step:
+    plan = plan_patterns(projector.size_px)
+    return Step(
+        f"pixels-{projector.name}",
+        lambda context: _pixels(projector, plan, context),
+        after=("black", f"radiometry-{projector.name}", f"codes-{projector.name}"),
+        title=f"Decoding {projector.name} and fitting its metapixels",
+        weight=3.0,
+    )
+
+
+def _merge(taken: Sequence[Taken]) -> FloatImage:
+    """HDR radiance in full scales per second from photographs of one picture."""
+    return merge_bracket([t.read() for t in taken], [t.exposure_s for t in taken]).radiance
+
+
+def read_black(folder: Path) -> FloatImage:
+    """The HDR black image of a run, merged from its photographs."""
+    return _merge(list(read_index(folder, "black").values()))
+
+
+def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+    black = read_black(context.folder)
+    taken = read_index(context.folder, f"light-{projector.name}")
+    brackets = [item for name, item in taken.items() if name.startswith(f"{projector.name}-white-")]
+    white = _merge(brackets)
+    context.advance(0.5)
+    captures = Developed(_unprefixed(taken, projector.name), {"black": black, "white": white})
+    radiometry = measure_radiometry(captures, plan)
+    path = context.folder / f"radiometry-{projector.name}.npz"
+    matrix = brackets[0].read().camera_to_xyz
+    save_arrays(
+        path,
+        {
+            "response": radiometry.response,
+            "mixing": radiometry.mixing,
+            "white": np.maximum(white - black, 0).astype(np.float32),
+            "black": black,
+            "camera_to_xyz": _SRGB_TO_XYZ if matrix is None else matrix,
+        },
+    )
+    return [path]
+
+
+_SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+"""IEC 61966-2-1; for a camera that does not tell its own colours."""
+
+
+def _unprefixed(taken: dict[str, Taken], projector: str) -> dict[str, Taken]:
+    return {name.removeprefix(f"{projector}-"): item for name, item in taken.items()}
+
+
+def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+    light = load_arrays(context.folder / f"radiometry-{projector.name}.npz")
+    black = light["black"]
+    taken = _unprefixed(read_index(context.folder, f"codes-{projector.name}"), projector.name)
+    captures = Developed(taken, {"black": black, "white": light["white"] + black})
+    correspondence = decode(captures, plan)
+    if not correspondence.valid.any():
+        raise CalibrationError(
+            "projector-reaches-nothing",
+            what=f"No pixel of projector {projector.name} was found on the object.",
+            remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
+        )
+    context.advance(0.4, "correspondences")
+    metapixels = regularize(fit_metapixels(captures, plan, correspondence))
+    path = context.folder / f"pixels-{projector.name}.npz"
+    save_arrays(
+        path,
+        {
+            "projector_px": correspondence.projector_px,
+            "modulation": correspondence.modulation,
+            "seen": correspondence.valid,
+            "centre_px": metapixels.centre_px,
+            "covariance_px2": metapixels.covariance_px2,
+            "valid": metapixels.valid,
+        },
+    )
+    return [path]
+
+
+def read_correspondence(folder: Path, projector: str) -> Correspondence:
+    """What the step ``pixels-NAME`` decoded."""
+    arrays = load_arrays(folder / f"pixels-{projector}.npz")
+    return Correspondence(arrays["projector_px"], arrays["modulation"], arrays["seen"])
+
+
+def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Path]:
+    correspondences = [read_correspondence(context.folder, projector.name) for projector in rig.projectors]
+    rows, columns = correspondences[0].valid.shape
+    found = reconstruct(
+        correspondences,
+        (columns, rows),
+        [projector.size_px for projector in rig.projectors],
+        prior,
+        progress=lambda fraction: context.advance(fraction, "geometry"),
+    )
+    geometry = found.geometry
+    arrays, figures = context.folder / "geometry.npz", context.folder / "geometry.json"
+    save_arrays(arrays, {"points_m": geometry.points_m, "normals": geometry.normals})
+    from controller.session.geometry_files import write_poses
+
+    write_poses(figures, found, [projector.name for projector in rig.projectors])
+    return [arrays, figures]
+
+
+def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
+    """The calibration that a finished run left in ``folder``."""
+    parts = []
+    for name in projectors:
+        light = load_arrays(folder / f"radiometry-{name}.npz")
+        pixels = load_arrays(folder / f"pixels-{name}.npz")
+        metapixels = Metapixels(pixels["centre_px"], pixels["covariance_px2"], pixels["valid"])
+        radiometry = Radiometry(light["response"], light["mixing"])
+        parts.append(ProjectorCalibration(name, metapixels, radiometry, np.nan_to_num(light["white"])))
+    black = np.nan_to_num(light["black"])
+    camera_to_xyz: Float64 = light["camera_to_xyz"]
+    return Calibration(tuple(parts), black, object_mask(parts), camera_to_xyz)
+
+
+def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:
+    """Camera pixels that some projector lights noticeably in every channel."""
+    brightest = max(float(np.percentile(part.white, 99.9)) for part in parts)
+    masks = [part.white.min(axis=2) > LIT_SHARE * brightest for part in parts]
+    return np.logical_or.reduce(masks)
+
+
+def write_json(path: Path, content: object) -> None:
+    """Figures of a step, atomically."""
+    from controller.storage import write_atomically
+
+    write_atomically(path, json.dumps(content, indent=1, allow_nan=False).encode())

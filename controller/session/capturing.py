@@ -1,0 +1,176 @@
+"""The steps that photograph patterns: exposure, black, white and response, then the codes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+
+from controller.arrays import ByteImage, Float64, load_arrays
+from controller.capture.acquire import Shot
+from controller.capture.brackets import nearest_exposure, suggest_exposure
+from controller.capture.patterns import Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
+from controller.capture.raw import read_photograph
+from controller.errors import CalibrationError
+from controller.session.rig import Rig, RigProjector
+from controller.session.runner import Context, Step
+from controller.session.shots import Planned, take_all
+from controller.storage import write_atomically
+
+FIRST_EXPOSURE_S = 1 / 30
+EXPOSURE_TRIES = 8
+WHITE_BRACKET = (1 / 8, 1.0, 8.0)
+"""Exposures of the HDR white image, relative to the one at which white is well exposed."""
+BLACK_BRACKET = (8.0, 32.0)
+"""Exposures of the HDR black image, likewise."""
+SHOT_SECONDS = 0.4
+"""What a photograph costs on the reference machine beside its exposure; weighs the steps for the time left."""
+
+
+def plans_of(rig: Rig) -> dict[str, PatternPlan]:
+    """The pattern plan of each projector by name."""
+    return {projector.name: plan_patterns(projector.size_px) for projector in rig.projectors}
+
+
+def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
+    """All capture steps but the codes, which wait for the radiometry (see ``code_step``)."""
+    inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
+    plans = plans_of(rig)
+    steps = [
+        Step(
+            "exposure",
+            lambda context: _find_exposures(rig, context, longest_exposure_s),
+            inputs=inputs,
+            title="Finding the exposure",
+            weight=4 * len(rig.projectors) * SHOT_SECONDS,
+        ),
+        Step(
+            "black",
+            lambda context: _photograph_black(rig, context, longest_exposure_s),
+            inputs=inputs,
+            after=("exposure",),
+            title="Photographing black",
+            weight=4 * SHOT_SECONDS,
+        ),
+    ]
+    for projector in rig.projectors:
+        plan = plans[projector.name]
+        steps.append(
+            Step(
+                f"light-{projector.name}",
+                lambda context, p=projector, q=plan: _photograph_light(rig, p, q, context, longest_exposure_s),  # type: ignore[misc]
+                inputs=inputs,
+                after=("exposure",),
+                title=f"Photographing the light of {projector.name}",
+                weight=SHOT_SECONDS * (len(WHITE_BRACKET) + 3 + len(plan.of_kind(PatternKind.RAMP))),
+            )
+        )
+    return steps
+
+
+def code_step(rig: Rig, projector: RigProjector) -> Step:
+    """The step that photographs the codes, sinusoids and the random pattern; after ``radiometry-NAME``."""
+    plan = plan_patterns(projector.size_px)
+    coded = [pattern for pattern in plan if pattern.kind is PatternKind.GRAY or pattern.needs_response]
+    return Step(
+        f"codes-{projector.name}",
+        lambda context: _photograph_codes(rig, projector, plan, coded, context),
+        inputs={"sizes": _sizes(rig)},
+        after=("exposure", f"radiometry-{projector.name}"),
+        title=f"Photographing the patterns of {projector.name}",
+        weight=SHOT_SECONDS * len(coded),
+    )
+
+
+def exposures_of(folder: Path) -> dict[str, float]:
+    """What the exposure step found: seconds by projector name."""
+    return {str(name): float(value) for name, value in json.loads((folder / "exposure.json").read_text()).items()}
+
+
+def bracket(base_s: float, factors: Sequence[float], available_s: Sequence[float], longest_s: float) -> list[float]:
+    """Distinct exposures of the camera nearest to ``base_s`` times each factor, none above ``longest_s``."""
+    chosen = {nearest_exposure(min(base_s * factor, longest_s), available_s) for factor in factors}
+    return sorted(chosen)
+
+
+def _find_exposures(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
+    found = {}
+    for number, projector in enumerate(rig.projectors):
+        context.advance(number / len(rig.projectors), projector.name)
+        found[projector.name] = _find_exposure(rig, projector, context, longest_s)
+    path = context.folder / "exposure.json"
+    write_atomically(path, json.dumps(found, indent=1).encode())
+    return [path]
+
+
+def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> float:
+    """Photograph white until it is well exposed. These photographs are tries: they are not journalled."""
+    white = device_frame(_named(plan_patterns(projector.size_px), "white"), projector.size_px)
+    available = tuple(value for value in rig.acquirer.exposures_s() if value <= longest_s)
+    exposure_s = nearest_exposure(FIRST_EXPOSURE_S, available)
+    for number in range(EXPOSURE_TRIES):
+        context.check()
+        shot = Shot(f"try-{projector.name}-{number}", rig.on_outputs({projector.name: white}), exposure_s)
+        file, confirmed_s = rig.acquirer.take(shot, context.folder / "captures", deadline=context.deadline)
+        better_s = suggest_exposure(read_photograph(file.path), confirmed_s, available)
+        file.path.unlink()
+        if better_s == exposure_s:
+            return exposure_s
+        exposure_s = better_s
+    raise CalibrationError(
+        "exposure-not-found",
+        what=f"No exposure was found at which the white of projector {projector.name} is well exposed.",
+        remedy="Check that it shines on the object, that the room is dark, and the camera's aperture and ISO.",
+    )
+
+
+def _photograph_black(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
+    base_s = max(exposures_of(context.folder).values())
+    exposures = bracket(base_s, BLACK_BRACKET, rig.acquirer.exposures_s(), longest_s)
+    plan = [Planned(f"black-{number}", dict, exposure_s) for number, exposure_s in enumerate(exposures)]
+    return take_all(rig, context, plan, index="black")
+
+
+def _photograph_light(
+    rig: Rig, projector: RigProjector, plan: PatternPlan, context: Context, longest_s: float
+) -> Sequence[Path]:
+    base_s = exposures_of(context.folder)[projector.name]
+    exposures = bracket(base_s, WHITE_BRACKET, rig.acquirer.exposures_s(), longest_s)
+    planned = [
+        _planned(projector, _named(plan, "white"), exposure_s, None, suffix=f"-{number}")
+        for number, exposure_s in enumerate(exposures)
+    ]
+    shown = [_named(plan, colour) for colour in ("red", "green", "blue")] + list(plan.of_kind(PatternKind.RAMP))
+    planned += [_planned(projector, pattern, base_s, None) for pattern in shown]
+    return take_all(rig, context, planned, index=f"light-{projector.name}")
+
+
+def _photograph_codes(
+    rig: Rig, projector: RigProjector, plan: PatternPlan, coded: Sequence[Pattern], context: Context
+) -> Sequence[Path]:
+    response = load_arrays(context.folder / f"radiometry-{projector.name}.npz")["response"]
+    base_s = exposures_of(context.folder)[projector.name]
+    planned = [_planned(projector, pattern, base_s, response) for pattern in coded]
+    return take_all(rig, context, planned, index=f"codes-{projector.name}")
+
+
+def _planned(
+    projector: RigProjector, pattern: Pattern, exposure_s: float, response: Float64 | None, *, suffix: str = ""
+) -> Planned:
+    def frames() -> Mapping[str, ByteImage]:
+        return {projector.name: device_frame(pattern, projector.size_px, response)}
+
+    return Planned(f"{projector.name}-{pattern.name}{suffix}", frames, exposure_s)
+
+
+def _named(plan: PatternPlan, name: str) -> Pattern:
+    return next(pattern for pattern in plan if pattern.name == name)
+
+
+def _sizes(rig: Rig) -> str:
+    return " ".join(f"{p.name}:{p.output}:{p.size_px[0]}x{p.size_px[1]}" for p in rig.projectors)
+
+
+__all__ = ["bracket", "capture_steps", "code_step", "exposures_of", "plans_of"]
+

@@ -1,0 +1,47 @@
+"""The opened stage as the steps of a run see it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from controller.arrays import ByteImage
+from controller.capture.acquire import Acquirer
+from controller.session.safety import LampGuard
+from hal.interfaces import Camera, Display
+
+
+@dataclass(frozen=True, slots=True)
+class RigProjector:
+    """A projector with its picture: ``size_px`` (width, height) of the output it hangs on."""
+
+    name: str
+    output: str
+    size_px: tuple[int, int]
+    guard: LampGuard
+
+    def black(self) -> ByteImage:
+        """(rows, columns, 3) uint8 zeros."""
+        return np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Everything that is switched, shown or photographed. Made by ``controller.app`` alone."""
+
+    stage: Path
+    projectors: tuple[RigProjector, ...]
+    camera: Camera
+    display: Display
+    acquirer: Acquirer
+
+    @property
+    def guards(self) -> tuple[LampGuard, ...]:
+        return tuple(projector.guard for projector in self.projectors)
+
+    def on_outputs(self, frames: Mapping[str, ByteImage]) -> dict[str, ByteImage]:
+        """Frames by output from frames by projector; every projector that is not named shows black."""
+        return {projector.output: frames.get(projector.name, projector.black()) for projector in self.projectors}

@@ -1,0 +1,20 @@
+"""Words for people: what a device or a file said, made harmless; durations."""
+
+from __future__ import annotations
+
+
+def printable(text: str) -> str:
+    """Text whose control characters cannot reach a terminal; line breaks and tabs become spaces."""
+    return "".join(
+        character if character.isprintable() else " " if character.isspace() else "\ufffd" for character in text
+    )
+
+
+def duration(seconds: float) -> str:
+    """A duration for people: ``8 s``, ``2 min 05 s``, ``1 h 20 min``."""
+    whole = max(0, round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
