@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import shutil
 from collections.abc import Sequence
@@ -124,7 +123,7 @@ def _switch(folder: Path, target: Path) -> None:
 
 def _target(folder: Path, link: str) -> Path | None:
     try:
-        name = os.readlink(folder / link)
+        name = str((folder / link).readlink())
     except OSError:
         return None
     file = folder / name

@@ -1,0 +1,95 @@
+"""``python -m controller.play``: starts the player (docs/player-protocol.md says what it then understands)."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from controller.bundle.signing import load_public_key
+from controller.errors import UsageError, VelaturaError
+from controller.play.commands import Commands
+from controller.play.frames import FrameFile, OutputSize, parse_outputs
+from controller.play.loop import Player, Trust
+from controller.play.outputs import MemoryOutput, Output
+from controller.play.protocol import MAX_RATE_HZ
+from controller.play.server import Server
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the player until it is told to quit; the exit code is 0, 1 (failed) or 2 (wrong use)."""
+    options = _parser().parse_args(arguments)
+    try:
+        return _run(options)
+    except VelaturaError as error:
+        print(f"{error.what}\n{error.remedy}", file=sys.stderr)  # noqa: T201
+        return error.exit_code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m controller.play", description="Velatura's player.")
+    parser.add_argument("--socket", type=Path, required=True, help="unix socket to serve; made with mode 0600")
+    parser.add_argument("--outputs", required=True, help="NAME:WIDTHxHEIGHT of each output, with commas between")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--frames", type=Path, help="show in this file (machines without projectors)")
+    where.add_argument("--windows", action="store_true", help="show in one window over all outputs")
+    parser.add_argument("--bundle", type=Path, help="bundle to have ready")
+    parser.add_argument("--trusted", type=Path, action="append", default=[], help="public key file; may be repeated")
+    parser.add_argument("--allow-unsigned", action="store_true", help="play bundles without a signature, too")
+    parser.add_argument("--rate", type=float, default=60.0, help="pictures change at multiples of 1/RATE seconds")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    sizes = parse_outputs(options.outputs)
+    if not 1 <= options.rate <= MAX_RATE_HZ:
+        raise UsageError(
+            "rate-wrong",
+            what=f"A rate of {options.rate:g} pictures a second can not be played.",
+            remedy=f"Give a rate from 1 to {MAX_RATE_HZ:g}.",
+        )
+    trust = Trust(tuple(load_public_key(path) for path in options.trusted), options.allow_unsigned)
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(Server(options.socket))
+        inbox = FrameFile(options.socket.with_name(options.socket.name + ".inbox"), sizes)
+        stack.callback(inbox.path.unlink, missing_ok=True)
+        stack.callback(inbox.close)
+        output = _open_output(options, sizes)
+        stack.callback(output.close)
+        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake)
+        if options.bundle is not None:
+            player.load_bundle(options.bundle)
+        broken = _end_on_signals(player)
+        player.run(Commands(player, server, inbox).serve)
+    return 1 if broken.is_set() else 0
+
+
+def _open_output(options: argparse.Namespace, sizes: tuple[OutputSize, ...]) -> Output:
+    if options.windows:
+        from controller.play.windows import WindowOutput
+
+        return WindowOutput(sizes)
+    return MemoryOutput(options.frames, sizes)
+
+
+def _end_on_signals(player: Player) -> threading.Event:
+    """SIGTERM, SIGINT and a broken thread end the loop; the event tells the last case from the others."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: player.end())
+    broken = threading.Event()
+
+    def thread_broke(arguments: threading.ExceptHookArgs) -> None:
+        sys.__excepthook__(arguments.exc_type, arguments.exc_value or arguments.exc_type(), arguments.exc_traceback)
+        broken.set()
+        signal.raise_signal(signal.SIGTERM)
+
+    threading.excepthook = thread_broke
+    return broken
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Appearances decoded ahead, in threads, into a bounded number of frame sets."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
+
+from controller.bundle.reader import Bundle
+from controller.errors import BundleError, VelaturaError
+from controller.play.frames import FrameSet, OutputSize
+
+CACHE_BYTES: Final = 64 * 1024 * 1024
+_FEWEST_SETS: Final = 3
+_MOST_SETS: Final = 64
+_DECODE_THREADS: Final = 2
+
+
+def check_fits(bundle: Bundle, outputs: Sequence[OutputSize]) -> None:
+    """Raise BundleError("bundle-outputs-differ") unless the bundle was made for exactly these outputs."""
+    made_for = ", ".join(f"{o.name} {o.width_px}x{o.height_px}" for o in bundle.index.outputs)
+    ours = ", ".join(f"{o.name} {o.width_px}x{o.height_px}" for o in outputs)
+    if made_for != ours:
+        raise BundleError(
+            "bundle-outputs-differ",
+            what=f"The bundle was made for the outputs {made_for}; this player has {ours}.",
+            remedy="Calibrate and publish again with these outputs, or set the outputs as they were.",
+        )
+
+
+class DecodedAhead:
+    """Decodes what is wanted, in order, in the background; holds as many sets as its memory allows.
+
+    Called from the player's loop, except ``_work``. ``on_ready`` is called from the decoding thread.
+    """
+
+    def __init__(self, bundle: Bundle, outputs: Sequence[OutputSize], on_ready: Callable[[], None]) -> None:
+        self.bundle = bundle
+        self._outputs = tuple(outputs)
+        self._on_ready = on_ready
+        set_bytes = sum(o.width_px * o.height_px * 3 for o in outputs)
+        self._capacity = max(_FEWEST_SETS, min(_MOST_SETS, CACHE_BYTES // set_bytes))
+        self._changed = threading.Condition()
+        self._decoded: OrderedDict[str, FrameSet] = OrderedDict()
+        self._failed: dict[str, VelaturaError] = {}
+        self._wanted: deque[str] = deque()
+        self._pinned: frozenset[str] = frozenset()
+        self._decoding: str | None = None
+        self._ended = False
+        threading.Thread(target=self._work, name="decode", daemon=True).start()
+
+    @property
+    def look_ahead(self) -> int:
+        """How many sets may be wanted at once, beside the one that is shown."""
+        return self._capacity - 1
+
+    def want(self, names: Iterable[str]) -> None:
+        """What will be needed next, the soonest first; replaces what was wanted before.
+
+        The first ``look_ahead`` are kept once decoded, until they are no longer wanted.
+        """
+        ordered = list(dict.fromkeys(names))[: self.look_ahead]
+        with self._changed:
+            self._pinned = frozenset(ordered)
+            self._wanted = deque(n for n in ordered if n not in self._decoded and n != self._decoding)
+            for name in ordered:
+                self._failed.pop(name, None)
+            self._changed.notify()
+
+    def take(self, name: str) -> FrameSet | None:
+        """The decoded set, or None while it is not ready. Raises the BundleError that its decoding raised.
+
+        The set is valid until ``want`` is called without its name and further sets are decoded: prepare it at once.
+        """
+        with self._changed:
+            if name in self._failed:
+                raise self._failed.pop(name)
+            if name in self._decoded:
+                self._decoded.move_to_end(name)
+            return self._decoded.get(name)
+
+    def close(self) -> None:
+        """Stop decoding; the thread closes the bundle when it has ended. Does not wait."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+    def _work(self) -> None:
+        with ThreadPoolExecutor(_DECODE_THREADS, thread_name_prefix="decode") as pool:
+            while (job := self._next_job()) is not None:
+                name, frames = job
+                failure = None
+                try:
+                    buffers = {o.name: image for o, image in zip(self._outputs, frames.pixels, strict=True)}
+                    self.bundle.decode_into(name, buffers, pool)
+                except VelaturaError as error:
+                    failure = error
+                with self._changed:
+                    self._decoding = None
+                    if failure is None:
+                        self._decoded[name] = frames
+                    else:
+                        self._failed[name] = failure
+                self._on_ready()
+        self.bundle.close()
+
+    def _next_job(self) -> tuple[str, FrameSet] | None:
+        with self._changed:
+            while not self._wanted and not self._ended:
+                self._changed.wait()
+            if self._ended:
+                return None
+            self._decoding = self._wanted.popleft()
+            return self._decoding, self._free_set()
+
+    def _free_set(self) -> FrameSet:
+        """A set to decode into: a new one while there is room, else the one longest unused that nobody waits for."""
+        if len(self._decoded) >= self._capacity:
+            for name in self._decoded:
+                if name not in self._pinned:
+                    return self._decoded.pop(name)
+        return FrameSet.black(self._outputs)

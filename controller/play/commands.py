@@ -1,0 +1,97 @@
+"""Carries requests from the socket out on the player, and answers them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from controller.errors import UsageError, VelaturaError
+from controller.play import protocol
+from controller.play.frames import FrameFile, FrameSet
+from controller.play.loop import Player, Presented
+from controller.play.playlist import Playlist
+from controller.play.server import Client, Server
+
+
+class Commands:
+    """Between the socket, the inbox and the player; no request, however wrong, raises out of ``serve``."""
+
+    def __init__(self, player: Player, server: Server, inbox: FrameFile) -> None:
+        self._player, self._server, self._inbox = player, server, inbox
+        self._pattern = FrameSet.black(player.sizes)
+
+    def serve(self, timeout_s: float) -> None:
+        """Wait at most ``timeout_s`` seconds for requests and carry out those that came."""
+        for client, line in self._server.poll(timeout_s):
+            self._handle(client, line)
+
+    def _handle(self, client: Client, line: bytes) -> None:
+        ticket = None
+        try:
+            ticket, request = protocol.parse_request(line)
+            values = self._do(request, partial(self._tell, client, ticket))
+        except protocol.RequestWrong as error:
+            self._server.send(client, protocol.error_line(error.ticket, error))
+        except VelaturaError as error:
+            self._server.send(client, protocol.error_line(ticket, error))
+        else:
+            if values is not None:
+                self._server.send(client, protocol.answer_line(ticket, values))
+
+    def _tell(self, client: Client, ticket: Any, outcome: Presented | VelaturaError) -> None:
+        if isinstance(outcome, VelaturaError):
+            self._server.send(client, protocol.error_line(ticket, outcome))
+        else:
+            values = {"sequence": outcome.sequence, "presented_at": outcome.at_s}
+            self._server.send(client, protocol.answer_line(ticket, values))
+
+    def _do(
+        self, request: protocol.Request, told: Callable[[Presented | VelaturaError], None]
+    ) -> dict[str, Any] | None:
+        """Carry a request out; return its answer, or None where that comes once it is presented."""
+        match request:
+            case protocol.Hello():
+                return self._hello()
+            case protocol.Status():
+                return self._player.status()
+            case protocol.Show(sequence):
+                self._player.withdraw()  # the frames of an earlier show, not yet presented, are overwritten here
+                self._read_inbox(sequence)
+                self._player.show(self._pattern, told)
+            case protocol.Play(appearance):
+                self._player.play(Playlist(((appearance, 0.0),), repeat=1), told)
+            case protocol.Sequence(items, repeat, rate_hz):
+                self._player.play(Playlist(items, repeat), told, rate_hz=rate_hz)
+            case protocol.Stop():
+                self._player.stop(told)
+            case protocol.LoadBundle(path):
+                self._player.load_bundle(Path(path))
+                return {"bundle": self._player.bundle_identity}
+            case protocol.Quit():
+                self._player.end()
+                return {}
+        return None
+
+    def _read_inbox(self, sequence: int) -> None:
+        found = self._inbox.read(self._pattern)
+        if found != sequence:
+            raise UsageError(
+                "inbox-sequence",
+                what=f"The inbox holds frames number {found}, not {sequence}.",
+                remedy="Let only one program write to the inbox, and ask for what it has written.",
+            )
+
+    def _hello(self) -> dict[str, Any]:
+        player = self._player
+        return {
+            "player": "velatura",
+            "protocol": protocol.PROTOCOL,
+            "pid": os.getpid(),
+            "rate_hz": player.rate_hz,
+            "outputs": [{"name": o.name, "width_px": o.width_px, "height_px": o.height_px} for o in player.sizes],
+            "inbox": str(self._inbox.path.resolve()),
+            "bundle": player.bundle_identity,
+        }

@@ -1,0 +1,196 @@
+"""Sets of frames, and the mapped file in which they pass between processes (docs/player-protocol.md, "Frame file").
+
+The same layout serves the inbox (the controller writes, the player reads) and the memory output (the player writes,
+whoever emulates the projectors reads).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import mmap
+import os
+import re
+import struct
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.errors import UsageError, WorkError
+from controller.storage import stream_atomically
+
+MAGIC: Final = b"VELFRAME"
+VERSION: Final = 1
+HEAD: Final = struct.Struct("<8sIIQdQ24x")
+ENTRY: Final = struct.Struct("<40sIIQQ")
+ALIGNMENT: Final = 4096
+SEQUENCE_AT: Final = 16
+PRESENTED_AT: Final = 24
+MAX_OUTPUTS: Final = 16
+MAX_SIDE_PX: Final = 16384
+_OUTPUT: Final = re.compile(r"([^:,\s]{1,39}):([0-9]{1,5})x([0-9]{1,5})")
+
+
+@dataclass(frozen=True, slots=True)
+class OutputSize:
+    """One output of the player: its name and its picture's size."""
+
+    name: str
+    width_px: int
+    height_px: int
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return (self.height_px, self.width_px, 3)
+
+
+def parse_outputs(text: str) -> tuple[OutputSize, ...]:
+    """Read ``P1:280x210,P2:280x210``. Raises UsageError("outputs-wrong")."""
+    outputs = []
+    for part in text.split(","):
+        found = _OUTPUT.fullmatch(part)
+        if found is None or len(found[1].encode()) >= 40 or not found[1].isprintable():
+            raise _outputs_wrong(f"{part!r} is not NAME:WIDTHxHEIGHT")
+        outputs.append(OutputSize(found[1], int(found[2]), int(found[3])))
+    if len({output.name for output in outputs}) != len(outputs) or len(outputs) > MAX_OUTPUTS:
+        raise _outputs_wrong(f"there are more than {MAX_OUTPUTS}, or two have one name")
+    if any(not 1 <= side <= MAX_SIDE_PX for output in outputs for side in output.shape[:2]):
+        raise _outputs_wrong(f"a side is not 1 to {MAX_SIDE_PX} pixels")
+    return tuple(outputs)
+
+
+def _outputs_wrong(detail: str) -> UsageError:
+    return UsageError(
+        "outputs-wrong",
+        what=f"The list of outputs can not be used: {detail}.",
+        remedy="Give it as P1:1400x1050,P2:1400x1050 with each name once.",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSet:
+    """One picture for every output: ``pixels`` are (rows, columns, 3) uint8 device values, in the outputs' order."""
+
+    pixels: tuple[npt.NDArray[np.uint8], ...]
+
+    @classmethod
+    def black(cls, outputs: Sequence[OutputSize]) -> Self:
+        return cls(tuple(np.zeros(output.shape, np.uint8) for output in outputs))
+
+    @property
+    def nbytes(self) -> int:
+        return sum(image.nbytes for image in self.pixels)
+
+
+def layout_bytes(outputs: Sequence[OutputSize]) -> tuple[bytes, tuple[int, ...]]:
+    """The constant head of a frame file (sequence and time zero), and the offset of each output's pixels."""
+    position = HEAD.size + ENTRY.size * len(outputs)
+    entries, offsets = [], []
+    for output in outputs:
+        position += -position % ALIGNMENT
+        offsets.append(position)
+        entries.append(ENTRY.pack(output.name.encode(), output.width_px, output.height_px, position, 0))
+        position += output.width_px * output.height_px * 3
+    return HEAD.pack(MAGIC, VERSION, len(outputs), 0, 0.0, position) + b"".join(entries), tuple(offsets)
+
+
+class FrameFile:
+    """A mapped frame file of known outputs; one process writes, any number read.
+
+    The sequence number at byte 16 is a seqlock: odd while frames are being written, two more for each set.
+    """
+
+    def __init__(self, path: Path, outputs: Sequence[OutputSize]) -> None:
+        """Map ``path``, making it (mode 0600) unless it is there with these outputs already.
+
+        A file that is there goes on counting, so that readers who have it mapped see each new set.
+
+        Raises WorkError("no-space" or "cannot-write"), UsageError("frames-in-use") if another process writes to it.
+        """
+        self.path = path
+        head, offsets = layout_bytes(outputs)
+        size = offsets[-1] + outputs[-1].width_px * outputs[-1].height_px * 3
+        if not _has_layout(path, head, size):
+            stream_atomically(path, lambda file: _fill(file.fileno(), head, size), mode=0o600)
+        self._file = path.open("r+b")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._map = mmap.mmap(self._file.fileno(), size)
+        except BlockingIOError as error:
+            self._file.close()
+            raise UsageError(
+                "frames-in-use",
+                what=f"Another player writes to {path}.",
+                remedy="Stop it first, or give this one another file.",
+            ) from error
+        # One aligned 64-bit store each: a byte-wise store could be read half done.
+        self._sequence = np.frombuffer(self._map, "<u8", 1, SEQUENCE_AT)
+        self._presented_at = np.frombuffer(self._map, "<f8", 1, PRESENTED_AT)
+        self._pixels = tuple(
+            np.frombuffer(self._map, np.uint8, output.width_px * output.height_px * 3, offset).reshape(output.shape)
+            for output, offset in zip(outputs, offsets, strict=True)
+        )
+
+    @property
+    def sequence(self) -> int:
+        return int(self._sequence[0])
+
+    @property
+    def presented_at(self) -> float:
+        return float(self._presented_at[0])
+
+    def write(self, frames: FrameSet) -> None:
+        """Replace the set in the file, and say the monotonic time at which it was whole."""
+        sequence = self.sequence | 1
+        self._sequence[0] = sequence
+        for target, image in zip(self._pixels, frames.pixels, strict=True):
+            np.copyto(target, image)
+        self._presented_at[0] = time.monotonic()
+        self._sequence[0] = sequence + 1
+
+    def read(self, into: FrameSet) -> int:
+        """Copy the set out and return its sequence number.
+
+        Raises WorkError("frames-changing") if it was being written meanwhile.
+        """
+        before = self.sequence
+        for image, source in zip(into.pixels, self._pixels, strict=True):
+            np.copyto(image, source)
+        if before % 2 or self.sequence != before:
+            raise WorkError(
+                "frames-changing",
+                what="The frames changed while they were being read.",
+                remedy="Write all frames first, make the sequence number even, and then ask for them to be shown.",
+            )
+        return before
+
+    def close(self) -> None:
+        """Release the mapping; the file stays."""
+        del self._sequence, self._presented_at, self._pixels
+        with contextlib.suppress(BufferError):
+            self._map.close()
+        self._file.close()
+
+
+def _has_layout(path: Path, head: bytes, size: int) -> bool:
+    try:
+        with path.open("rb") as file:
+            found = file.read(len(head))
+            right_size = os.fstat(file.fileno()).st_size == size
+    except FileNotFoundError:
+        return False
+    counted = slice(SEQUENCE_AT, PRESENTED_AT + 8)
+    return (
+        right_size and found[: counted.start] == head[: counted.start] and found[counted.stop :] == head[counted.stop :]
+    )
+
+
+def _fill(handle: int, head: bytes, size: int) -> None:
+    # Blocks are reserved now: a full disk must stop us here and not kill the process at a store into the mapping.
+    os.posix_fallocate(handle, 0, size)
+    os.pwrite(handle, head, 0)

@@ -1,0 +1,51 @@
+"""Appearances in turn: which one, for how long, and which come after it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice
+
+
+class Playlist:
+    """Steps through (appearance, seconds) items, ``repeat`` times, or for ever if 0."""
+
+    def __init__(self, items: Sequence[tuple[str, float]], repeat: int) -> None:
+        self._items = tuple(items)
+        self._rounds_left = repeat if repeat else None
+        self._at = 0
+        self.look_ahead = 2
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(name for name, _ in self._items)
+
+    @property
+    def appearance(self) -> str:
+        """The item that is to be presented, or is."""
+        return self._items[self._at][0]
+
+    @property
+    def seconds(self) -> float:
+        """How long it stays."""
+        return self._items[self._at][1]
+
+    @property
+    def upcoming(self) -> list[str]:
+        """This item's appearance and the different ones that follow it, at most ``look_ahead`` in all."""
+        ordered = (self._items[(self._at + step) % len(self._items)][0] for step in range(len(self._items)))
+        return list(islice(dict.fromkeys(ordered), self.look_ahead))
+
+    def has_others(self, appearance: str | None) -> bool:
+        return bool(self.names - {appearance})
+
+    def advance(self) -> bool:
+        """Go to the next item; False when there is none."""
+        if self._at + 1 < len(self._items):
+            self._at += 1
+            return True
+        if self._rounds_left is not None:
+            self._rounds_left -= 1
+            if self._rounds_left <= 0:
+                return False
+        self._at = 0
+        return True
