@@ -1,0 +1,196 @@
+"""Exposures: which to take, and several of them merged into one linear image without a ceiling (HDR)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.arrays import FloatImage, Mask
+from controller.errors import UsageError
+
+TARGET = 0.75
+"""Of full scale, for the brightest lit pixels of a pattern: bright enough, and room for the lamp's flicker."""
+BRIGHT_PERCENTILE = 99.5
+LIT_SHARE = 0.05
+BRACKET_CEILING = 0.8
+BRACKET_DARK = 0.2
+BRACKET_STEP = 8.0
+"""Three stops: neighbours overlap where both are well above noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraNoise:
+    """Variance of a full-scale value v: ``shot`` v + ``read`` squared. The defaults suit a 12-bit APS-C camera."""
+
+    shot: float = 1 / 30_000
+    read: float = 6 / 30_000
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """``radiance`` (rows, columns, 3) float32 full-scale value per second, NaN where no exposure measured it.
+
+    ``sigma`` (rows, columns, 3) float32: its standard deviation by the noise model.
+    """
+
+    radiance: FloatImage
+    sigma: FloatImage
+
+
+def merge_brackets(
+    images: Sequence[FloatImage], exposures_s: Sequence[float], *, noise: CameraNoise | None = None
+) -> Merged:
+    """Merge exposures of one still scene, each weighted by the inverse of its variance.
+
+    The variance is taken from a first estimate of the radiance and not from each value itself: a value that noise
+    made small would otherwise get more weight, and the mean would be too dark.
+
+    Parameters
+    ----------
+    images : (rows, columns, 3) float32, 0 at black and 1 at full scale, NaN where saturated
+    exposures_s : of each image, > 0
+
+    Raises UsageError("bracket-mismatch").
+    """
+    noise = noise or CameraNoise()
+    if not images or len(images) != len(exposures_s) or len({image.shape for image in images}) != 1:
+        raise UsageError(
+            "bracket-mismatch",
+            what="The photographs of a bracket differ in size or number from their exposures.",
+            remedy="Give one exposure time for each photograph, all of one size.",
+        )
+    if min(exposures_s) <= 0:
+        raise UsageError(
+            "bracket-mismatch", what="An exposure time is not above zero.", remedy="Give exposure times in seconds."
+        )
+    estimate = _weighted(images, exposures_s, None, noise)[0]
+    radiance, weight = _weighted(images, exposures_s, np.maximum(np.nan_to_num(estimate), 0), noise)
+    with np.errstate(divide="ignore"):
+        sigma = np.where(weight > 0, 1 / np.sqrt(weight), np.nan)
+    return Merged(radiance, sigma.astype(np.float32))
+
+
+def _weighted(
+    images: Sequence[FloatImage], exposures_s: Sequence[float], radiance: FloatImage | None, noise: CameraNoise
+) -> tuple[FloatImage, FloatImage]:
+    total, weights = np.zeros(images[0].shape, np.float32), np.zeros(images[0].shape, np.float32)
+    for image, exposure_s in zip(images, exposures_s, strict=True):
+        measured = np.isfinite(image)
+        signal = radiance * np.float32(exposure_s) if radiance is not None else np.float32(0)
+        variance = (np.float32(noise.shot) * signal + np.float32(noise.read**2)) / np.float32(exposure_s**2)
+        weight = np.where(measured, 1 / variance, 0).astype(np.float32)
+        total += weight * np.where(measured, image, 0) / np.float32(exposure_s)
+        weights += weight
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / np.where(weights > 0, weights, np.nan), np.float32), weights
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureChoice:
+    """``exposure_s`` to use; ``settled`` False: take one photograph with it and choose again."""
+
+    exposure_s: float
+    settled: bool
+
+
+def choose_exposure(
+    image: FloatImage,
+    exposure_s: float,
+    available_s: Sequence[float],
+    *,
+    lit: Mask | None = None,
+    target: float = TARGET,
+) -> ExposureChoice:
+    """The exposure at which white's brightest lit pixels reach ``target`` of full scale and none much more.
+
+    Parameters
+    ----------
+    image : (rows, columns, 3) of white at ``exposure_s``, full scale, NaN where saturated
+    available_s : what the camera has
+    lit : pixels to look at; without it, those above 5 % of the brightest
+
+    Returns
+    -------
+    the longest available exposure that keeps the 99.5th percentile below ``target`` plus 7 %, settled when the image
+    shows that percentile unsaturated and not lost in noise
+    """
+    exposures = _ascending(available_s)
+    brightest = _brightest(image, lit)
+    if brightest is None:
+        return ExposureChoice(_at_most(exposures, exposure_s / 8), exposure_s <= exposures[0])
+    if brightest < 0.02:
+        longer = _at_most(exposures, exposure_s * min(16.0, 0.5 / max(brightest, 1e-3)))
+        return ExposureChoice(longer, longer <= exposure_s)
+    return ExposureChoice(_at_most(exposures, exposure_s * target * 1.07 / brightest), True)
+
+
+@dataclass(frozen=True, slots=True)
+class BracketChoice:
+    """``exposures_s`` rising; ``settled`` False: take the one exposure given and choose again."""
+
+    exposures_s: tuple[float, ...]
+    settled: bool
+
+
+def choose_brackets(
+    image: FloatImage,
+    exposure_s: float,
+    available_s: Sequence[float],
+    *,
+    lit: Mask | None = None,
+    most: int = 4,
+) -> BracketChoice:
+    """Exposures that measure the brightest lit pixels unsaturated and the darkest well above noise.
+
+    ``image`` as in ``choose_exposure``, in which the bright end is measured; the dark end is the 2nd percentile of
+    the lit pixels and is brought to a fifth of full scale, as far as ``most`` exposures reach in steps of three stops.
+    """
+    first = choose_exposure(image, exposure_s, available_s, lit=lit, target=BRACKET_CEILING / 1.07)
+    if not first.settled:
+        return BracketChoice((first.exposure_s,), False)
+    exposures = _ascending(available_s)
+    grey = np.nanmax(np.where(np.isfinite(image), image, 1.0), axis=2)
+    chosen = grey[lit] if lit is not None else grey[grey > LIT_SHARE * max(_brightest(image, None) or 1.0, 1e-6)]
+    dark = float(np.percentile(chosen, 2)) if chosen.size else BRACKET_DARK
+    longest = _at_most(exposures, exposure_s * BRACKET_DARK / max(dark, 1e-4))
+    taken = [first.exposure_s]
+    while taken[-1] < longest and len(taken) < most:
+        taken.append(max(_at_most(exposures, min(taken[-1] * BRACKET_STEP, longest)), _next(exposures, taken[-1])))
+    return BracketChoice(tuple(taken), True)
+
+
+def _ascending(available_s: Sequence[float]) -> list[float]:
+    exposures = sorted(float(exposure) for exposure in available_s if exposure > 0)
+    if not exposures:
+        raise UsageError(
+            "no-exposures",
+            what="The camera offers no exposure times to choose from.",
+            remedy="Set the camera to manual exposure, and connect it again.",
+        )
+    return exposures
+
+
+def _at_most(exposures: list[float], wanted_s: float) -> float:
+    return max((exposure for exposure in exposures if exposure <= wanted_s * 1.001), default=exposures[0])
+
+
+def _next(exposures: list[float], exposure_s: float) -> float:
+    return min((exposure for exposure in exposures if exposure > exposure_s), default=exposures[-1])
+
+
+def _brightest(image: FloatImage, lit: Mask | None) -> float | None:
+    """99.5th percentile of the lit pixels' strongest channel; None when it is saturated."""
+    strongest = np.max(np.where(np.isfinite(image), image, np.inf), axis=2)
+    if lit is not None:
+        strongest = strongest[lit]
+    finite = strongest[np.isfinite(strongest)]
+    if not finite.size:
+        return None if strongest.size else 0.0
+    if lit is None:
+        strongest = strongest[strongest > LIT_SHARE * np.percentile(finite, 99.9)]
+    if not strongest.size:
+        return 0.0
+    value = float(np.percentile(strongest, BRIGHT_PERCENTILE, method="higher"))
+    return value if np.isfinite(value) else None
