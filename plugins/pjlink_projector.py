@@ -1,0 +1,226 @@
+"""Projectors on the network that speak PJLink, class 1 or 2."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from hal import pjlink
+from hal.deadline import Deadline
+from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
+from hal.links import SLICE_S, ByteLink, TcpLink, host_and_port
+from hal.pjlink import Failure
+from hal.profiles import ProjectorProfile
+from hal.registry import Driver, OpenContext, setting
+from hal.transcript import Transcript
+from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
+from plugins.pjlink_conversation import PjLinkConversation
+from plugins.profile_files import load_profile
+
+
+class PjLinkProjector:
+    """A projector that speaks PJLink. Implements ``hal.interfaces.Projector``.
+
+    Every call has a connection of its own: the projector closes idle ones after 30 s, and what was left unread on an
+    old one can never be taken for a new answer.
+
+    Parameters
+    ----------
+    connect : opens a connection
+    profile : its patience and its lamp; the protocol tells neither
+    name : how the technician knows it, for messages
+    password : at most 32 characters, or None
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[Deadline], ByteLink],
+        profile: ProjectorProfile,
+        *,
+        name: str,
+        password: str | None = None,
+        transcript: Transcript | None = None,
+    ) -> None:
+        self._connect = connect
+        self._timing = profile.timing
+        self._lamp = profile.lamp
+        self._name = name
+        self._password = password
+        self._transcript = transcript
+        self._lock = threading.Lock()
+        self._closed = False
+        self._inputs: tuple[str, ...] = ()
+
+    def open(self, deadline: Deadline) -> None:
+        """Reach the projector once, check the password, and learn its inputs."""
+        with self._turn(deadline) as talk:
+            told = talk.ask("INST", deadline)
+            self._inputs = pjlink.parse_inputs(told) if isinstance(told, str) else ()
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        return ProjectorCapabilities(
+            lamp_hours=True, shutter=True, inputs=self._inputs, errors=True, lamp_rules=self._lamp
+        )
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        with self._turn(deadline) as talk:
+            maker, model = (talk.text(name, deadline) for name in ("INF1", "INF2"))
+            told = talk.ask("CLSS", deadline)
+            second = isinstance(told, str) and pjlink.parse_class(told) == 2
+            serial = talk.text("SNUM", deadline, 2) if second else ""
+            firmware = talk.text("SVER", deadline, 2) if second else talk.text("INFO", deadline)
+            return DeviceIdentity(maker or "unknown", model or "PJLink projector", serial, firmware)
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        with self._turn(deadline) as talk:
+            power = talk.power(deadline)
+            told = talk.ask("ERST", deadline)
+            trouble = pjlink.parse_errors(told) if isinstance(told, str) else ()
+            told = talk.ask("LAMP", deadline)
+            lamps = pjlink.parse_lamps(told) if isinstance(told, str) else ()
+            failed = any(not word.endswith("-warning") for word in trouble)
+            return ProjectorStatus(
+                Power.FAULT if failed and power is Power.OFF else power,
+                trouble,
+                max((lamp.hours for lamp in lamps), default=None),
+            )
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        with self._turn(deadline) as talk:
+            power = talk.power(deadline)
+            if power is Power.COOLING:
+                raise self._refused("projector-cooling", "is still cooling its lamp, and was not switched on")
+            if power is Power.OFF:
+                self._command(talk, "POWR", "1", "switch on", deadline)
+        if power is Power.OFF:
+            self._confirm((Power.ON, Power.WARMING), "on", deadline)
+
+    def switch_off(self, *, deadline: Deadline) -> None:
+        with self._turn(deadline) as talk:
+            burning = talk.power(deadline) in (Power.ON, Power.WARMING)
+            if burning:
+                self._command(talk, "POWR", "0", "switch off", deadline)
+        if burning:
+            self._confirm((Power.OFF, Power.COOLING), "off", deadline)
+
+    def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
+        with self._turn(deadline) as talk:
+            if self._command(talk, "AVMT", "11" if closed else "10", "move its shutter", deadline):
+                return
+            told = talk.ask("AVMT", deadline)
+            if not isinstance(told, str) or pjlink.parse_mute(told).video is not closed:
+                raise talk.no_answer()
+
+    def close(self) -> None:
+        self._closed = True
+        if self._transcript is not None:
+            self._transcript.close()
+
+    def _command(self, talk: PjLinkConversation, name: str, parameter: str, doing: str, deadline: Deadline) -> bool:
+        """Send a command once; False if its answer was lost (it may have worked: look at the state)."""
+        try:
+            told = talk.tell(name, parameter, deadline)
+        except (DeviceTimeout, DeviceGone):
+            if deadline.passed:
+                raise
+            return False
+        if told is Failure.UNAVAILABLE:
+            raise self._refused("projector-not-now", f"will not {doing} in the state it is in")
+        if isinstance(told, Failure):
+            raise self._refused("projector-refused", f"cannot {doing}: it answered {told.value}")
+        pjlink.accepted(told)
+        return True
+
+    def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
+        """Wait until the power state shows what a command should have done, whether or not its answer arrived."""
+        patience = deadline.within(self._timing.confirm_s)
+        while not self._shows(wanted, patience):
+            if patience.passed:
+                raise DeviceTimeout(
+                    f"projector-not-{word}",
+                    what=f"The projector at {self._name} was told to switch {word}, and did not.",
+                    remedy="Look at its lamps and messages; if it shows nothing, switch it by its own button once.",
+                )
+            patience.sleep(self._timing.boot_interval_s)
+
+    def _shows(self, wanted: tuple[Power, ...], deadline: Deadline) -> bool:
+        try:
+            with self._turn(deadline) as talk:
+                return talk.power(deadline) in wanted
+        except (DeviceBusy, DeviceTimeout, DeviceGone):
+            # A projector that starts may answer nothing for a while.
+            if self._closed:
+                raise
+            return False
+
+    def _refused(self, code: str, doing: str) -> DeviceRefused:
+        return DeviceRefused(
+            code,
+            what=f"The projector at {self._name} {doing}.",
+            remedy="Wait until it has cooled and shows standby; if it reports a fault, mend that first.",
+        )
+
+    @contextlib.contextmanager
+    def _turn(self, deadline: Deadline) -> Iterator[PjLinkConversation]:
+        """One caller at a time, none after ``close``; a conversation that ends with it."""
+        talk = PjLinkConversation(
+            self._connect, self._name, self._password, self._timing.answer_s, self._timing.command_s
+        )
+        talk.check(deadline)
+        while not self._lock.acquire(timeout=min(SLICE_S, deadline.left_s())):
+            talk.check(deadline)
+        try:
+            if self._closed:
+                raise DeviceGone(
+                    "projector-closed",
+                    what=f"The projector at {self._name} is no longer open.",
+                    remedy="Open the stage again.",
+                )
+            yield talk
+        finally:
+            talk.close()
+            self._lock.release()
+
+
+def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PjLinkProjector:
+    """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
+    address = str(setting(settings, "address", str))
+    host, port = host_and_port(address, pjlink.PORT)
+    password = setting(settings, "password", str)
+    if password is not None and not 0 < len(password) <= pjlink.LONGEST_PASSWORD:
+        raise PluginError(
+            "setting-wrong",
+            what=f"The password has {len(password)} characters; PJLink allows 1 to {pjlink.LONGEST_PASSWORD}.",
+            remedy="Correct password in stage.toml, or leave it out.",
+        )
+    profile = load_profile(setting(settings, "profile", str, "pjlink"), context.stage)
+    transcript = None
+    if context.transcripts is not None:
+        context.transcripts.mkdir(parents=True, exist_ok=True)
+        transcript = Transcript(context.transcripts / f"pjlink-{host.replace(':', '_')}-{port}.txt")
+    projector = PjLinkProjector(
+        lambda until: TcpLink(host, port, deadline=until, transcript=transcript),
+        profile,
+        name=address,
+        password=password,
+        transcript=transcript,
+    )
+    projector.open(deadline)
+    return projector
+
+
+DRIVER = Driver(
+    kind="projector",
+    name="pjlink",
+    summary="Projectors on the network that speak PJLink, class 1 or 2.",
+    open=open_pjlink_projector,
+    settings={
+        "address": 'host:port, or host alone for port 4352, e.g. "192.168.0.20"',
+        "password": "the PJLink password, if the projector has one",
+        "profile": "times of its lamp: pjlink (the default), or a .toml file of the stage",
+    },
+    required=("address",),
+)
