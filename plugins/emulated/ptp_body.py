@@ -1,0 +1,244 @@
+"""What every emulated camera body has: identity, card, battery, shutter, faults, and the operations of the standard."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from plugins.emulated.ptp_card import STORAGE, Card, Stored
+from plugins.emulated.ptp_wire import (
+    ALREADY_OPEN,
+    BUSY,
+    NO_SUCH_HANDLE,
+    NO_SUCH_PROPERTY,
+    NO_THUMBNAIL,
+    NOT_OPEN,
+    NOT_SUPPORTED,
+    STORE_FULL,
+    Gone,
+    Outcome,
+    text,
+    u16s,
+    u32s,
+)
+from plugins.emulated.shot import Expose, ShotSettings
+
+JPEG: Final = 0x3801
+_TICK_S: Final = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class CameraNames:
+    """Who the camera says it is."""
+
+    maker: str = "Velatura"
+    model: str = "Emulated camera"
+    serial: str = "0123456789"
+    firmware: str = "1.0.0"
+
+
+@dataclass(slots=True)
+class CameraFaults:
+    """Knobs, turned at any time. Counts go down as they are used; switches stay until they are turned back.
+
+    ``busy``: that many requests to set or release are answered with busy; ``drop_before_exposure``,
+    ``drop_after_exposure``, ``drop_in_transfer``: the connection ends there, that many times; ``lost_events``: that
+    many reports of a new picture never come; ``wrong_lengths``: that many data phases announce more than they send;
+    ``garbage``: that many answers are noise; ``slow_s``: before every answer; ``card_full``; ``silent``: no answers.
+    """
+
+    busy: int = 0
+    drop_before_exposure: int = 0
+    drop_after_exposure: int = 0
+    drop_in_transfer: int = 0
+    lost_events: int = 0
+    wrong_lengths: int = 0
+    garbage: int = 0
+    slow_s: float = 0.0
+    card_full: bool = False
+    silent: bool = False
+
+    def take(self, name: str) -> bool:
+        """Use up one of a count; False when none is left."""
+        left: int = getattr(self, name)
+        if left > 0:
+            setattr(self, name, left - 1)
+        return left > 0
+
+
+@dataclass(slots=True)
+class Exposed:
+    """One exposure on its way: what was set, and its files once the shutter has closed."""
+
+    settings: ShotSettings
+    to_host: bool
+    stored: list[Stored] = field(default_factory=list)
+
+
+class EmulatedBody:
+    """Answers operations; families override ``vendor`` and the hooks. All of it under ``self.lock``."""
+
+    operations: tuple[int, ...] = ()
+    events: tuple[int, ...] = (0x4002, 0x4003, 0x400A, 0x400D)
+    properties: tuple[int, ...] = (0x5001,)
+    capture_formats: tuple[int, ...] = (JPEG,)
+    vendor_extension = 0
+    raw_format = 0x3811
+    _common = (0x1001, 0x1002, 0x1003, 0x1004, 0x1005, 0x1006, 0x1007, 0x1008, 0x1009, 0x100A, 0x100B, 0x1014, 0x1015)
+
+    def __init__(
+        self, expose: Expose, *, names: CameraNames, time_scale: float, card_bytes: int, faults: CameraFaults
+    ) -> None:
+        self.lock = threading.RLock()
+        self.faults = faults
+        self.names = names
+        self.time_scale = time_scale
+        self.card = Card(card_bytes)
+        self.battery_percent = 90
+        self.exposures = 0
+        self.exposing = False
+        self.stopped = threading.Event()
+        self.on_event: Callable[[int, tuple[int, ...]], None] = lambda code, parameters: None
+        self.on_drop: Callable[[], None] = lambda: None
+        self._expose = expose
+        self._open = False
+        self._picture = 0
+
+    def power_on(self) -> None:
+        """Settings as after the battery was put in."""
+
+    def disconnected(self) -> None:
+        """The connection ended without goodbye."""
+        with self.lock:
+            self._open = False
+
+    def answer(self, code: int, parameters: tuple[int, ...], data: bytes) -> Outcome:
+        """Do one operation. Raises Gone where a fault ends the connection."""
+        with self.lock:
+            if code not in self._common and code not in self.operations:
+                return Outcome(NOT_SUPPORTED)
+            if not self._open and code not in (0x1001, 0x1002):
+                return Outcome(NOT_OPEN)
+            asked = parameters + (0,) * (5 - len(parameters))
+            found = self.standard(code, asked) if code in self._common else None
+            return found if found is not None else self.vendor(code, asked, data)
+
+    def standard(self, code: int, asked: tuple[int, ...]) -> Outcome | None:  # noqa: PLR0911
+        """Operations of the standard that every family has; None for those that differ."""
+        match code:
+            case 0x1001:
+                return Outcome(data=self._device_info())
+            case 0x1002:
+                was_open, self._open = self._open, True
+                return Outcome(ALREADY_OPEN) if was_open else Outcome()
+            case 0x1003:
+                self._open = False
+                return Outcome()
+            case 0x1004:
+                return Outcome(data=u32s(STORAGE))
+            case 0x1005:
+                return Outcome(data=self.card.storage_info())
+            case 0x1006:
+                return Outcome(parameters=(len(self.card.handles(asked[1], asked[2])),))
+            case 0x1007:
+                return Outcome(data=u32s(*self.card.handles(asked[1], asked[2])))
+            case 0x1008 | 0x1009 | 0x100A | 0x100B:
+                return self._object(code, asked[0])
+            case _:
+                return self._battery(code) if asked[0] == 0x5001 else None
+
+    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> Outcome:
+        """Everything else that is in ``operations``."""
+        return Outcome(NO_SUCH_PROPERTY)
+
+    def partial(self, asked: tuple[int, ...]) -> Outcome:
+        """GetPartialObject: handle, offset, most bytes."""
+        stored = self.card.find(asked[0])
+        if stored is None:
+            return Outcome(NO_SUCH_HANDLE)
+        piece = memoryview(stored.data)[asked[1] : asked[1] + asked[2]]
+        return Outcome(parameters=(len(piece),), data=piece)
+
+    def full(self) -> bool:
+        return self.faults.card_full or self.card.free < max(
+            (len(o.data) for o in self.card.objects.values()), default=1
+        )
+
+    def open_shutter(self, settings: ShotSettings, *, to_host: bool) -> Outcome:
+        """Begin an exposure, unless a fault, a full card or the last one is in the way."""
+        if self.faults.take("busy") or self.exposing:
+            return Outcome(BUSY)
+        if not to_host and self.full():
+            return Outcome(STORE_FULL)
+        if self.faults.take("drop_before_exposure"):
+            raise Gone
+        self.exposing = True
+        self.exposures += 1
+        threading.Thread(target=self._shutter, args=(Exposed(settings, to_host),), daemon=True).start()
+        return Outcome()
+
+    def exposed(self, exposed: Exposed) -> None:
+        """Hook: the files are stored; tell the computer."""
+
+    def _shutter(self, exposed: Exposed) -> None:
+        """The shutter's own thread: it stays open for its time, whatever happens to the connection."""
+        until = time.monotonic() + exposed.settings.exposure_s * self.time_scale
+        while (left_s := until - time.monotonic()) > 0 and not self.stopped.is_set():
+            self.stopped.wait(min(left_s, 1.0))
+        if self.stopped.is_set():
+            return
+        files = self._expose(exposed.settings)
+        with self.lock:
+            self._picture = self._picture % 9999 + 1
+            taken = time.strftime("%Y%m%dT%H%M%S")
+            for format_code, ending, data in ((self.raw_format, "DNG", files.raw), (JPEG, "JPG", files.jpeg)):
+                if data is not None:
+                    name = f"IMG_{self._picture:04d}.{ending}"
+                    exposed.stored.append(
+                        self.card.add_picture(format_code, name, data, taken, to_host=exposed.to_host)
+                    )
+            self.exposing = False
+            if self.faults.take("drop_after_exposure"):
+                self.on_drop()
+            self.exposed(exposed)
+
+    def _object(self, code: int, handle: int) -> Outcome:
+        stored = self.card.find(handle)
+        if stored is None:
+            return Outcome(NO_SUCH_HANDLE)
+        if code == 0x1008:
+            return Outcome(data=stored.info())
+        if code == 0x1009:
+            return Outcome(data=stored.data)
+        if code == 0x100A:
+            return Outcome(NO_THUMBNAIL)
+        self.card.objects.pop(handle, None)
+        self.card.waiting.pop(handle, None)
+        return Outcome()
+
+    def _battery(self, code: int) -> Outcome:
+        level = self.battery_percent
+        if code == 0x1015:
+            return Outcome(data=bytes([level]))
+        return Outcome(data=struct.pack("<HHBBBBBBB", 0x5001, 0x0002, 0, 100, level, 1, 0, 100, 1))
+
+    def _device_info(self) -> bytes:
+        codes = sorted({*self._common, *self.operations})
+        names = self.names
+        return b"".join(
+            (
+                struct.pack("<HIH", 100, self.vendor_extension, 100),
+                text(""),
+                struct.pack("<H", 0),
+                u16s(*codes),
+                u16s(*self.events),
+                u16s(*self.properties),
+                u16s(*self.capture_formats),
+                u16s(0x3001, JPEG, self.raw_format),
+                *(text(one) for one in (names.maker, names.model, names.firmware, names.serial)),
+            )
+        )

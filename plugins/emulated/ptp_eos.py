@@ -1,0 +1,241 @@
+"""Emulated Canon EOS bodies: ``new`` with 9128/9129, and ``old`` with 910F as the EOS 400D of the paper has it.
+
+They report by records of 9116, keep pictures for the computer (D11C = 4) until 9117, and report those again to whoever
+connects next, as long as nobody has confirmed them.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from plugins.emulated.ptp_body import JPEG, EmulatedBody, Exposed
+from plugins.emulated.ptp_card import STORAGE, Stored
+from plugins.emulated.ptp_wire import BUSY, NO_SUCH_HANDLE, OK, STORE_FULL, WRONG_VALUE, Outcome, u32s
+from plugins.emulated.shot import ShotSettings
+
+_HOST: Final = 4
+_CARD: Final = 2
+_MANUAL: Final = 3
+_FULL_REASON: Final = 7
+_JPEG_FINE: Final = (1, 0, 3)
+_JPEG_COARSE: Final = (1, 0, 2)
+_RAW: Final = (6, 0, 4)
+_FORMATS: Final = ((_JPEG_FINE,), (_JPEG_COARSE,), (_RAW,), (_RAW, _JPEG_FINE))
+
+
+def _thirds(first: int, last: int) -> tuple[int, ...]:
+    """Exposure codes in thirds of a stop."""
+    return tuple(code for code in range(first, last + 1) if code % 8 in (0, 3, 5))
+
+
+_SHUTTER: Final = _thirds(0x10, 0x98)
+_APERTURES: Final = _thirds(0x20, 0x50)
+_ISO_NAMES: Final = dict(
+    zip(
+        _thirds(0x48, 0x78),
+        (100, 125, 160, 200, 250, 320, 400, 500, 640, 800, 1000, 1250, 1600, 2000, 2500, 3200, 4000, 5000, 6400),
+        strict=True,
+    )
+)
+_OLD_ISOS: Final = (0x48, 0x50, 0x58, 0x60, 0x68)
+_EIGHTHS: Final = {0: 0.0, 3: 1 / 3, 5: 2 / 3}
+
+
+def _seconds(code: int) -> float:
+    return float(2.0 ** (7 - code // 8 - _EIGHTHS[code % 8]))
+
+
+def _f_number(code: int) -> float:
+    return float(2.0 ** ((code // 8 - 1 + _EIGHTHS[code % 8]) / 2))
+
+
+class EosBody(EmulatedBody):
+    """See ``EmulatedBody``."""
+
+    vendor_extension = 0x0000_000B
+    raw_format = 0xB103
+    capture_formats = (JPEG, 0xB103)
+    events = (0x4002, 0x4003, 0x4004, 0x4005, 0xC101)
+    isos: tuple[int, ...] = tuple(_ISO_NAMES)
+    operations: tuple[int, ...] = (
+        *(0x101B, 0x9101, 0x9102, 0x9107, 0x910F, 0x9110, 0x9114, 0x9115, 0x9116, 0x9117),
+        *(0x911A, 0x911B, 0x911C, 0x911D, 0x911E, 0x9128, 0x9129),
+    )
+
+    def power_on(self) -> None:
+        """Settings as after the battery was put in; the dial stands on M, the lens on manual focus."""
+        self._values: dict[int, int] = {
+            **{0xD101: 0x30, 0xD102: 0x60, 0xD103: 0x48, 0xD105: _MANUAL, 0xD106: 0, 0xD108: 3, 0xD111: 0, 0xD11B: 0},
+            **{0xD11C: _CARD, 0xD11E: STORAGE, 0xD1B0: 0},
+        }
+        self._lists = {0xD101: _APERTURES, 0xD102: _SHUTTER, 0xD103: self.isos, 0xD11C: (_CARD, _HOST)}
+        self._format: tuple[tuple[int, int, int], ...] = _FORMATS[0]
+        self._reports: list[bytes] = []
+        self._reporting = False
+        self._pressed = 0
+
+    def disconnected(self) -> None:
+        super().disconnected()
+        with self.lock:
+            self._reporting = False
+            self._reports.clear()
+
+    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> Outcome:  # noqa: PLR0911
+        match code:
+            case 0x101B | 0x9107:
+                return self.partial(asked)
+            case 0x9101:
+                return Outcome(data=u32s(STORAGE))
+            case 0x9102:
+                return Outcome(data=self.card.storage_info())
+            case 0x9110:
+                return self._set(data)
+            case 0x9115:
+                return self._report_everything(on=asked[0] != 0)
+            case 0x9116:
+                return self._changes()
+            case 0x9117:
+                return Outcome() if self.card.waiting.pop(asked[0], None) else Outcome(NO_SUCH_HANDLE)
+            case 0x911A:
+                self._change(0xD11B, 1000)
+                return Outcome()
+            case 0x910F:
+                return self._release_old()
+            case 0x9128 | 0x9129:
+                return self._button(asked[0], down=code == 0x9128)
+            case _:
+                return Outcome()  # remote mode, locks, keep-alive: accepted, nothing to see
+
+    def exposed(self, exposed: Exposed) -> None:
+        for stored in exposed.stored:
+            if not self.faults.take("lost_events"):
+                self._reports.append(_new_object(stored, waiting=exposed.to_host))
+        self._report(0xC18B, struct.pack("<I", 0))
+
+    def _button(self, button: int, *, down: bool) -> Outcome:
+        if not down:
+            self._pressed &= ~button
+            return Outcome()
+        if button & 2 and not self._pressed & 1:
+            return Outcome(BUSY)  # a full press begins with a half one
+        if button & 2 and self._pressed & 2:
+            return Outcome(BUSY)  # nobody let go
+        if button & 2:
+            outcome = self._fire()
+            if outcome.code != OK:
+                return outcome
+        self._pressed |= button
+        return Outcome()
+
+    def _release_old(self) -> Outcome:
+        outcome = self._fire()
+        if outcome.code == STORE_FULL:
+            return Outcome(parameters=(_FULL_REASON,))
+        return Outcome(outcome.code, (0,) if outcome.code == OK else ())
+
+    def _fire(self) -> Outcome:
+        to_host = self._values[0xD11C] == _HOST
+        if to_host and (self.faults.card_full or self._values[0xD11B] == 0):
+            return Outcome(STORE_FULL)
+        kinds = {kind for kind, _, _ in self._format}
+        settings = ShotSettings(
+            exposure_s=_seconds(self._values[0xD102]),
+            iso=_ISO_NAMES[self._values[0xD103]],
+            aperture_f=_f_number(self._values[0xD101]),
+            raw=6 in kinds,
+            jpeg=1 in kinds,
+        )
+        outcome = self.open_shutter(settings, to_host=to_host)
+        if outcome.code == OK:
+            self._report(0xC18B, struct.pack("<I", 1))
+            if to_host:
+                self._change(0xD11B, self._values[0xD11B] - 1)
+        return outcome
+
+    def _set(self, data: bytes) -> Outcome:
+        if self.faults.take("busy") or self.exposing:
+            return Outcome(BUSY)
+        if len(data) < 12 or struct.unpack_from("<I", data)[0] != len(data):
+            return Outcome(WRONG_VALUE)
+        code, value = struct.unpack_from("<II", data, 4)
+        if code == 0xD120:
+            wanted = _read_format(data[8:])
+            if wanted not in _FORMATS:
+                return Outcome(WRONG_VALUE)
+            self._format = wanted
+            self._report(0xC189, struct.pack("<I", code) + _format_bytes(wanted))
+            return Outcome()
+        if code not in self._values or value not in self._lists.get(code, (value,)):
+            return Outcome(WRONG_VALUE)
+        self._change(code, value)
+        return Outcome()
+
+    def _change(self, code: int, value: int) -> None:
+        if self._values[code] != value:
+            self._values[code] = value
+            self._report(0xC189, struct.pack("<II", code, value))
+
+    def _changes(self) -> Outcome:
+        records = b"".join(self._reports)
+        self._reports.clear()
+        return Outcome(data=records + struct.pack("<II", 8, 0))
+
+    def _report_everything(self, *, on: bool) -> Outcome:
+        self._reporting = on
+        self._reports.clear()
+        for code, value in self._values.items():
+            self._report(0xC189, struct.pack("<II", code, value))
+        self._report(0xC189, struct.pack("<I", 0xD120) + _format_bytes(self._format))
+        self._report(0xC189, struct.pack("<I", 0xD1AF) + self.names.serial.encode("ascii", "replace") + b"\0")
+        for code, values in self._lists.items():
+            self._report(0xC18A, struct.pack("<III", code, 3, len(values)) + b"".join(u32s(v)[4:] for v in values))
+        formats = b"".join(_format_bytes(one) for one in _FORMATS)
+        self._report(0xC18A, struct.pack("<III", 0xD120, 3, len(_FORMATS)) + formats)
+        self._report(0xC18B, struct.pack("<I", int(self.exposing)))
+        if on:
+            self._reports += [_new_object(stored, waiting=True) for stored in self.card.waiting.values()]
+        return Outcome()
+
+    def _report(self, code: int, body: bytes) -> None:
+        if self._reporting:
+            self._reports.append(_record(code, body))
+
+
+class OldEosBody(EosBody):
+    """The operations of the EOS 400D: one release, no buttons, whole stops of ISO."""
+
+    isos = _OLD_ISOS
+    operations = (
+        *(0x101B, 0x9101, 0x9102, 0x9107, 0x910F, 0x9110, 0x9114, 0x9115, 0x9116, 0x9117),
+        *(0x911A, 0x911B, 0x911C, 0x911D, 0x911E),
+    )
+
+    def power_on(self) -> None:
+        super().power_on()
+        del self._values[0xD1B0]  # no live view
+
+
+def _record(code: int, body: bytes) -> bytes:
+    padded = body + bytes(-len(body) % 4)
+    return struct.pack("<II", 8 + len(padded), code) + padded
+
+
+def _new_object(stored: Stored, *, waiting: bool) -> bytes:
+    name = stored.name.encode("ascii") + b"\0"
+    size = len(stored.data)
+    if waiting:
+        return _record(0xC186, struct.pack("<IIIII", stored.handle, stored.format, 0, size, 0) + name)
+    head = struct.pack("<IIIII", stored.handle, STORAGE, stored.format, 0, 0)
+    return _record(0xC181, head + struct.pack("<III", size, stored.parent, 0) + name)
+
+
+def _format_bytes(parts: tuple[tuple[int, int, int], ...]) -> bytes:
+    return struct.pack("<I", len(parts)) + b"".join(struct.pack("<IIII", 16, *part) for part in parts)
+
+
+def _read_format(data: bytes) -> tuple[tuple[int, int, int], ...]:
+    parts = struct.unpack_from("<I", data)[0]
+    if parts not in (1, 2) or len(data) != 4 + 16 * parts:
+        return ()
+    return tuple(struct.unpack_from("<III", data, 8 + 16 * index) for index in range(parts))
