@@ -1,0 +1,75 @@
+"""A calibration made from formulas, at any size: a curved, coloured object under rotated, foreshortened projectors."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from controller.arrays import FloatImage, Mask
+from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
+
+PROJECTOR: Final = {"small": (210, 280), "medium": (526, 700), "paper": (1050, 1400)}
+CAMERA: Final = {"small": (520, 776), "medium": (1296, 1944), "paper": (2592, 3888)}
+"""(rows, columns)"""
+
+
+def synthetic_calibration(
+    size: str | None = None, *, projector: tuple[int, int] = (210, 280), camera: tuple[int, int] = (520, 776)
+) -> Calibration:
+    """Three projectors of one of the named sizes, or of the given (rows, columns)."""
+    if size is not None:
+        projector, camera = PROJECTOR[size], CAMERA[size]
+    y, x = np.mgrid[0 : camera[0], 0 : camera[1]].astype(np.float32)
+    u, v = x / camera[1] * 2 - 1, y / camera[0] * 2 - 1
+    mask: Mask = (u / 0.8) ** 2 + (v / 0.85) ** 2 < 1
+    albedo = _albedo(u, v)
+    projectors = tuple(_projector(n, projector, camera, u, v, albedo * mask[..., None]) for n in range(3))
+    black = (0.002 * albedo + 0.0005).astype(np.float32)
+    return Calibration(projectors, black, mask, np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]]))
+
+
+def synthetic_target(camera: tuple[int, int]) -> FloatImage:
+    """Reflectance in [0, 1] with smooth shading, sharp edges and fine detail, as seen from the camera."""
+    y, x = np.mgrid[0 : camera[0], 0 : camera[1]].astype(np.float32)
+    u, v = x / camera[1] * 2 - 1, y / camera[0] * 2 - 1
+    shade = 0.55 + 0.3 * np.sin(5 * u) * np.cos(4 * v) + 0.1 * np.sin(60 * u * v)
+    checks = 0.25 * ((np.floor(u * 9) + np.floor(v * 6)) % 2)
+    colour = np.stack([shade + checks * 0.4, shade * 0.9, 0.8 * shade + 0.15 * checks], -1)
+    return np.clip(colour * 0.7, 0.02, 1).astype(np.float32)
+
+
+def _albedo(u: FloatImage, v: FloatImage) -> FloatImage:
+    stripes = 0.3 * ((np.floor(u * 7.3) + np.floor(v * 5.1)) % 2)
+    waves = 0.15 * np.sin(31 * u) * np.sin(27 * v)
+    return np.stack([0.4 + stripes, 0.5 + waves, 0.45 + 0.5 * stripes - waves], -1).astype(np.float32)
+
+
+def _projector(
+    n: int, size: tuple[int, int], camera: tuple[int, int], u: FloatImage, v: FloatImage, albedo: FloatImage
+) -> ProjectorCalibration:
+    rows, columns = size
+    row, column = np.mgrid[0:rows, 0:columns].astype(np.float64)
+    p, q = (column + 0.5) / columns * 2 - 1, (row + 0.5) / rows * 2 - 1
+    foreshortening, angle = (0.0, 0.25, -0.25)[n], (0.0, 0.12, -0.1)[n]
+    a, b = p + 0.6 * foreshortening * (p * p - 1), q + 0.03 * np.sin(3 * p + n)
+    aspect = camera[1] / camera[0]
+    c, s = np.cos(angle), np.sin(angle)
+    x = camera[1] / 2 * (1 + 0.88 * (c * a - s * b / aspect)) + 0.13 * n
+    y = camera[0] / 2 * (1 + 0.88 * (s * a * aspect + c * b)) - 0.21 * n
+    centre = np.stack([x, y], -1)
+    # A metapixel is the pixel's own parallelogram, softened: covariance J J' times a width.
+    right, below = np.gradient(centre, axis=1), np.gradient(centre, axis=0)
+    jacobian = np.stack([right, below], -1)
+    covariance = 0.42**2 * jacobian @ np.swapaxes(jacobian, -1, -2) + 0.1 * np.eye(2)
+    packed = np.stack([covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]], -1)
+    inside = (x >= 0) & (y >= 0) & (x < camera[1]) & (y < camera[0])
+    at_x, at_y = np.clip(x.astype(int), 0, camera[1] - 1), np.clip(y.astype(int), 0, camera[0] - 1)
+    valid: Mask = inside & (albedo[at_y, at_x, 0] > 0)
+    falloff = (0.5 + 0.1 * n) * np.clip(1 - 0.5 * (u - (0.0, 0.5, -0.5)[n]) ** 2 - 0.3 * v**2, 0, None)
+    spill = (0.0, 0.05, 0.08)[n]
+    mixing = (1 - spill) * np.eye(3) + spill / 3
+    response = np.tile(np.linspace(0, 1, 256) ** 2.2, (3, 1))
+    metapixels = Metapixels(centre.astype(np.float32), packed.astype(np.float32), valid)
+    white = (albedo * falloff[..., None]).astype(np.float32)
+    return ProjectorCalibration(("left", "middle", "right")[n], metapixels, Radiometry(response, mixing), white)

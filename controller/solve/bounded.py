@@ -1,0 +1,230 @@
+"""Compensation images by a global, bounded, smooth least-squares solve (paper 2.2-2.4, eqs 2 and 3).
+
+Minimise  sum_u w_u |T p + K - C|^2  +  s sum over adjacent pixels of alpha^2 (p_i - p_j)^2   subject to 0 <= p <= 1
+by accelerated projected gradient. T is (nearly) non-negative, so the row sums |T|' w |T| 1 majorise the Hessian's data
+part and give every projector pixel its own step; momentum restarts where it points uphill (O'Donoghue and Candes 2015).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from controller.arrays import FloatImage, Mask
+from controller.errors import UsageError, WorkError
+from controller.solve.gradient import extrapolate, projected_step, weighted_residual
+from controller.solve.smoothness import squared_edges
+from controller.transport import LightTransport
+from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
+
+SMOOTHNESS: Final = 0.01
+"""Default strength of smoothness, relative to the mean diagonal of the data's majoriser."""
+TOLERANCE: Final = 1e-4
+MOST_ITERATIONS: Final = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """What a solve found.
+
+    ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
+    ``light`` (camera rows, columns, 3) float32: T p, what the frames add to the black image
+    ``objective``: weighted squared residual plus smoothness, in camera units squared
+    ``kkt``: rms of the last projected, scaled gradient step, in units of projector light; 0 at the optimum
+    ``converged``: the KKT residual fell below the tolerance before the cap on iterations
+    """
+
+    frames: tuple[FloatImage, ...]
+    light: FloatImage
+    objective: float
+    kkt: float
+    iterations: int
+    seconds: float
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Data of one solve on planes; smoothness is already scaled by its strength."""
+
+    transport: LightTransport
+    wanted: FloatImage
+    weights: FloatImage
+    across: FloatImage
+    down: FloatImage
+    majoriser: FloatImage
+
+
+def check_target(transport: LightTransport, target: FloatImage) -> None:
+    """Raise UsageError "image-wrong-size" or "target-not-finite" unless ``target`` can be a camera image here."""
+    if target.shape != (*transport.shape, 3):
+        raise UsageError(
+            "image-wrong-size",
+            what=f"The target is {' x '.join(map(str, target.shape))} instead of {transport.shape[0]} x "
+            f"{transport.shape[1]} x 3.",
+            remedy="Make the target as large as this stage's camera image.",
+        )
+    if not np.isfinite(target).all():
+        raise UsageError(
+            "target-not-finite",
+            what="The target has pixels that are not finite numbers.",
+            remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
+        )
+
+
+def solve_bounded(
+    transport: LightTransport,
+    target: FloatImage,
+    black: FloatImage,
+    *,
+    smoothness: float = SMOOTHNESS,
+    weights: FloatImage | None = None,
+    start: Sequence[FloatImage] | None = None,
+    tolerance: float = TOLERANCE,
+    most_iterations: int = MOST_ITERATIONS,
+    progress: Callable[[int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Solution:
+    """Find the projectors' images that make the camera see ``target``.
+
+    Parameters
+    ----------
+    target, black : (rows, columns, 3) linear camera units; the target is raised to ``black`` where it is darker
+    smoothness : >= 0, relative to the mean of the data's majorising diagonal
+    weights : (rows, columns) >= 0, how much each camera pixel counts; default 1 everywhere
+    start : frames to start from, for example those of a similar target
+    tolerance : stop when the rms scaled projected gradient step falls below it
+    progress : called with (iteration, kkt); ``cancelled`` : asked once an iteration
+
+    Raises
+    ------
+    UsageError  "image-wrong-size", "target-not-finite", "solve-arguments"
+    WorkError   "solve-cancelled"
+    """
+    began = time.perf_counter()
+    check_target(transport, target)
+    problem = _pose(transport, target, black, smoothness, weights)
+    if start is None:
+        x = _first_guess(problem)
+    else:
+        x = np.clip(frame_planes(start), 0, 1)
+        if x.shape != problem.majoriser.shape:
+            raise _wrong("the frames to start from are not of the projectors' sizes")
+    x[problem.majoriser == 0] = 0
+    x, kkt, iterations = _descend(problem, x, tolerance, most_iterations, progress, cancelled)
+    light = transport.forward_planes(x)
+    objective = weighted_residual(light, problem.wanted, problem.weights, np.empty_like(light)) + _roughness(problem, x)
+    frames = tuple(plane_frames(x, transport.sizes))
+    seconds = time.perf_counter() - began
+    return Solution(frames, plane_image(light), objective, kkt, iterations, seconds, kkt <= tolerance)
+
+
+def _wrong(what: str) -> UsageError:
+    return UsageError("solve-arguments", what=f"The solve can't start: {what}.", remedy="Correct it and solve again.")
+
+
+def _pose(
+    transport: LightTransport, target: FloatImage, black: FloatImage, smoothness: float, weights: FloatImage | None
+) -> _Problem:
+    if black.shape != target.shape or not np.isfinite(black).all():
+        raise _wrong("the black image is not finite or not of the target's size")
+    if not 0 <= smoothness < np.inf:
+        raise _wrong(f"a smoothness of {smoothness} is not a number of at least 0")
+    wanted = image_planes(np.maximum(target - black, 0))
+    counted = transport.object_mask.astype(np.float32)
+    if weights is not None:
+        if weights.shape != counted.shape or not np.isfinite(weights).all() or weights.min(initial=0) < 0:
+            raise _wrong("the weights are not finite numbers of at least 0, one a camera pixel")
+        counted *= weights
+    magnitude = transport.with_absolute_mixing()
+    diagonal = magnitude.adjoint_planes(magnitude.reach_planes() * counted)
+    across, down = squared_edges(transport, wanted)
+    active = diagonal > 0
+    scale = np.float32(smoothness * diagonal[active].mean(dtype=np.float64)) if active.any() else np.float32(0)
+    across *= scale
+    down *= scale
+    for n in range(len(transport.sizes)):
+        lit = active[:, transport.span(n)].reshape(3, *transport.sizes[n])
+        _tie(lit, *(_frame_view(transport, n, planes) for planes in (across, down, diagonal)))
+    return _Problem(transport, wanted, counted, across, down, diagonal)
+
+
+def _frame_view(transport: LightTransport, n: int, planes: FloatImage) -> FloatImage:
+    return planes[:, transport.span(n)].reshape(3, *transport.sizes[n])
+
+
+def _tie(active: Mask, across: FloatImage, down: FloatImage, diagonal: FloatImage) -> None:
+    """Cut the ties of dark pixels and add the rest, twice, to the majoriser; all (3, rows, columns)."""
+    across[:, :, :-1] *= active[:, :, :-1] & active[:, :, 1:]
+    down[:, :-1] *= active[:, :-1] & active[:, 1:]
+    diagonal += 2 * (across + down)
+    diagonal[:, :, 1:] += 2 * across[:, :, :-1]
+    diagonal[:, 1:] += 2 * down[:, :-1]
+
+
+def _first_guess(problem: _Problem) -> FloatImage:
+    """All projectors at the same share of their light: right wherever the target is smooth."""
+    reach = problem.transport.reach_planes()
+    share = np.divide(problem.wanted, reach, out=np.zeros_like(reach), where=reach > 0)
+    return np.clip(problem.transport.gaussian_mean_planes(np.minimum(share, 1)), 0, 1)
+
+
+def _descend(
+    problem: _Problem,
+    x: FloatImage,
+    tolerance: float,
+    most_iterations: int,
+    progress: Callable[[int, float], None] | None,
+    cancelled: Callable[[], bool] | None,
+) -> tuple[FloatImage, float, int]:
+    transport = problem.transport
+    y, new = x.copy(), np.empty_like(x)
+    light, gradient = np.empty_like(problem.wanted), np.empty_like(x)
+    total = max(float(problem.majoriser.sum(dtype=np.float64)), np.finfo(np.float64).tiny)
+    inertia, kkt, iteration = 1.0, np.inf, 0
+    for iteration in range(1, most_iterations + 1):
+        if cancelled is not None and cancelled():
+            raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again when wanted.")
+        transport.forward_planes(y, out=light)
+        weighted_residual(light, problem.wanted, problem.weights, light)
+        transport.adjoint_planes(light, out=gradient)
+        squared_step, uphill = _step(problem, y, x, gradient, new)
+        kkt = float(np.sqrt(squared_step / total))
+        following = (1 + np.sqrt(1 + 4 * inertia**2)) / 2
+        momentum = (inertia - 1) / following
+        inertia = following
+        if uphill > 0:
+            momentum, inertia = 0.0, 1.0
+        extrapolate(new, x, momentum, y)
+        x, new = new, x
+        if progress is not None:
+            progress(iteration, kkt)
+        if kkt <= tolerance:
+            break
+    return x, kkt, iteration
+
+
+def _step(
+    problem: _Problem, y: FloatImage, x: FloatImage, gradient: FloatImage, new: FloatImage
+) -> tuple[float, float]:
+    squared_step = uphill = 0.0
+    for n, (rows, columns) in enumerate(problem.transport.sizes):
+        start = int(problem.transport.patches.start[n])
+        a, b = projected_step(
+            y, x, gradient, problem.majoriser, problem.across, problem.down, start, rows, columns, new
+        )
+        squared_step, uphill = squared_step + a, uphill + b
+    return squared_step, uphill
+
+
+def _roughness(problem: _Problem, x: FloatImage) -> float:
+    total = 0.0
+    for n in range(len(problem.transport.sizes)):
+        frame, across, down = (_frame_view(problem.transport, n, v) for v in (x, problem.across, problem.down))
+        total += float((across[:, :, :-1] * np.diff(frame, axis=2) ** 2).sum(dtype=np.float64))
+        total += float((down[:, :-1] * np.diff(frame, axis=1) ** 2).sum(dtype=np.float64))
+    return total

@@ -1,0 +1,98 @@
+"""The compiled steps of the bounded solver, on planes (3, ...)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from controller.arrays import FloatImage
+from controller.compiled import compiled
+
+
+@compiled(parallel=True, fastmath=True)
+def weighted_residual(light: FloatImage, wanted: FloatImage, weights: FloatImage, out: FloatImage) -> float:
+    """Write weights (light - wanted) to ``out``; return the sum of weights (light - wanted)^2.
+
+    ``light``, ``wanted``, ``out`` (3, rows, columns), ``out`` may be ``light``; ``weights`` (rows, columns)
+    """
+    rows, columns = weights.shape
+    sums = np.zeros(rows, np.float64)
+    for y in prange(rows):
+        for c in range(3):
+            row = np.float32(0)
+            for x in range(columns):
+                e = light[c, y, x] - wanted[c, y, x]
+                row += weights[y, x] * e * e
+                out[c, y, x] = weights[y, x] * e
+            sums[y] += row
+    return float(sums.sum())
+
+
+@compiled(fastmath=True)
+def _pull(into: FloatImage, here: FloatImage, there: FloatImage, weight: FloatImage) -> None:
+    for i in range(into.size):
+        into[i] += weight[i] * (here[i] - there[i])
+
+
+@compiled(fastmath=True)
+def _move(
+    y: FloatImage, x: FloatImage, gradient: FloatImage, majoriser: FloatImage, new: FloatImage
+) -> tuple[float, float]:
+    kkt = uphill = np.float32(0)
+    for i in range(y.size):
+        d = majoriser[i]
+        to = y[i] - gradient[i] / max(d, np.float32(1e-30))
+        to = min(max(to, np.float32(0)), np.float32(1))
+        to = to if d > 0 else np.float32(0)
+        new[i] = to
+        kkt += d * (to - y[i]) * (to - y[i])
+        uphill += d * (y[i] - to) * (to - x[i])
+    return float(kkt), float(uphill)
+
+
+@compiled(parallel=True, fastmath=True)
+def projected_step(
+    y: FloatImage,
+    x: FloatImage,
+    gradient: FloatImage,
+    majoriser: FloatImage,
+    across: FloatImage,
+    down: FloatImage,
+    start: int,
+    rows: int,
+    columns: int,
+    new: FloatImage,
+) -> tuple[float, float]:
+    """Write one projected gradient step from ``y`` to ``new`` for the projector whose pixels begin at ``start``.
+
+    All arrays (3, pixels of all projectors), each projector row by row. ``gradient`` is that of the data; that of the
+    smoothness is added here. Returns two sums: majoriser x step^2, whose size measures the KKT residual, and
+    majoriser x (y - new) x (new - x), positive where the momentum points uphill.
+    """
+    sums = np.zeros((rows, 2), np.float64)
+    for v in prange(rows):
+        a = start + v * columns
+        e = a + columns
+        total = np.empty(columns, np.float32)
+        for c in range(3):
+            here, ties = y[c, a:e], across[c, a : e - 1]
+            total[:] = gradient[c, a:e]
+            _pull(total[:-1], here[:-1], here[1:], ties)
+            _pull(total[1:], here[1:], here[:-1], ties)
+            if v > 0:
+                _pull(total, here, y[c, a - columns : a], down[c, a - columns : a])
+            if v < rows - 1:
+                _pull(total, here, y[c, e : e + columns], down[c, a:e])
+            kkt, uphill = _move(here, x[c, a:e], total, majoriser[c, a:e], new[c, a:e])
+            sums[v, 0] += kkt
+            sums[v, 1] += uphill
+    return float(sums[:, 0].sum()), float(sums[:, 1].sum())
+
+
+@compiled(parallel=True, fastmath=True)
+def extrapolate(new: FloatImage, x: FloatImage, momentum: float, y: FloatImage) -> None:
+    """Write new + momentum (new - x) to ``y``; all (3, pixels)."""
+    beta = np.float32(momentum)
+    for i in prange(new.shape[1]):
+        for c in range(3):
+            y[c, i] = new[c, i] + beta * (new[c, i] - x[c, i])

@@ -1,0 +1,80 @@
+"""Smoothness between adjacent pixels of one projector (paper 2.4, eq. 3).
+
+Superimposed projectors leave many ways to make the same image; these equations choose the one without noise. Each asks
+two adjacent pixels to be equal, and is weighted down where the target or the object changes between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from controller.arrays import FloatImage
+from controller.transport import LightTransport
+from controller.transport.planes import plane_frames
+
+FAINTEST: Final = 1e-3
+"""Fraction of a projector's brightest observed pixel below which a pixel counts as in shadow."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeWeights:
+    """Weights alpha between a pixel and its right and lower neighbour.
+
+    ``across`` (rows, columns - 1, 3), ``down`` (rows - 1, columns, 3) float32, in [0, 1]
+    """
+
+    across: FloatImage
+    down: FloatImage
+
+
+def smoothness_weights(target: FloatImage, observed: FloatImage) -> EdgeWeights:
+    """Weights of the smoothness equations between adjacent pixels of one projector (paper 2.4, eq. 3).
+
+    Parameters
+    ----------
+    target, observed : (rows, columns, 3) float32, linear light, >= 0
+        target intensity at each projector pixel, and what that pixel contributes when fully on
+
+    Returns
+    -------
+    EdgeWeights; 0 beside a pixel that contributes nothing
+    """
+    faint = FAINTEST * observed.max(initial=0)
+    floor = np.float32(max(faint, np.finfo(np.float32).tiny))
+    tau = np.divide(target, np.maximum(observed, floor), dtype=np.float32)
+    # A pixel in shadow must not tie its neighbours; below any target's tau it is like no other pixel.
+    tau[observed <= faint] = np.nan
+    return EdgeWeights(across=_alike(tau[:, 1:], tau[:, :-1]), down=_alike(tau[1:], tau[:-1]))
+
+
+def _alike(a: FloatImage, b: FloatImage) -> FloatImage:
+    larger = np.maximum(a, b)
+    alpha = np.ones_like(larger)
+    np.divide(np.minimum(a, b), larger, out=alpha, where=larger > 0)
+    alpha[np.isnan(larger)] = 0
+    return alpha
+
+
+def squared_edges(transport: LightTransport, wanted: FloatImage) -> tuple[FloatImage, FloatImage]:
+    """alpha squared for all projectors, as the solver wants it.
+
+    ``wanted`` (3, camera rows, columns): the light to be made, without the black image. Returns two arrays
+    (3, pixels): from each pixel to its right neighbour, and to the one below; 0 at the last column and row.
+    """
+    count = transport.patches.first.size
+    across, down = np.zeros((3, count), np.float32), np.zeros((3, count), np.float32)
+    light = np.empty_like(wanted)
+    ones = np.ones((3, count), np.float32)
+    target = transport.gaussian_mean_planes(wanted)
+    for n, (rows, columns) in enumerate(transport.sizes):
+        span = transport.span(n)
+        transport.forward_planes(ones, projectors=(n, n + 1), out=light)
+        observed = transport.gaussian_mean_planes(light, projectors=(n, n + 1))
+        size = [(rows, columns)]
+        edges = smoothness_weights(plane_frames(target[:, span], size)[0], plane_frames(observed[:, span], size)[0])
+        across[:, span].reshape(3, rows, columns)[:, :, :-1] = np.moveaxis(edges.across**2, 2, 0)
+        down[:, span].reshape(3, rows, columns)[:, :-1] = np.moveaxis(edges.down**2, 2, 0)
+    return across, down
