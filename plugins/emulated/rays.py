@@ -182,8 +182,8 @@ def _in_shadow(projector: ProjectorTruth, scene: Any, points: Floats, distance: 
 
 def _key(truth: BenchTruth, thing: StageObject) -> str:
     digest = hashlib.sha256(f"{VERSION}\n".encode())
-    parts = (truth.camera.pose, truth.camera.lens, *truth.projectors)
-    for part in parts:
+    projectors = [part for p in truth.projectors for part in (p.pose, p.lens, p.focus, p.light)]
+    for part in (truth.camera.pose, truth.camera.lens, *projectors):
         digest.update(dump(part).encode())
     digest.update(f"{truth.subsamples} {thing.paint}".encode())
     for name in ("vertices", "faces", "normals", "corner_values", "texture", "parts"):

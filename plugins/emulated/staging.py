@@ -17,6 +17,7 @@ from plugins.emulated.truth import (
     BenchTruth,
     CameraTruth,
     Focus,
+    LampTruth,
     Lens,
     Light,
     Matrix,
@@ -50,6 +51,7 @@ PLACES: Final = (("left", -29.0, 6.0), ("right", 27.0, 3.0), ("above", 2.0, 27.0
 """Name, degrees to the right of the camera and above it, as seen from the object."""
 CAMERA_FILL: Final = 0.90
 PROJECTOR_FILL: Final = 0.88
+FAST_LAMP: Final = LampTruth(warm_up_s=2.0, stable_s=2.0, cool_down_s=1.0)
 LENS_SHIFT: Final = 1.05
 """The optical axis' height in the image, in image heights from the top: below the lower edge."""
 WHITE_LIGHT: Final = 2.5
@@ -178,6 +180,7 @@ def _projector(
             s_curve=_three(rng.uniform(0.08, 0.25, 3)),
             mixing=_mixing(rng),
         ),
+        lamp=FAST_LAMP,
     )
 
 

@@ -105,6 +105,15 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True)
+class LampTruth:
+    """Seconds from strike to full light, from strike to stable light, and from off to cool."""
+
+    warm_up_s: Annotated[float, Between(0.0, 3600.0)]
+    stable_s: Annotated[float, Between(0.0, 3600.0)]
+    cool_down_s: Annotated[float, Between(0.0, 3600.0)]
+
+
+@dataclass(frozen=True, slots=True)
 class ProjectorTruth:
     """A projector; ``port`` and ``profile`` are relative to the stage folder."""
 
@@ -116,6 +125,7 @@ class ProjectorTruth:
     lens: Lens
     focus: Focus
     light: Light
+    lamp: LampTruth
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from plugins.emulated.rays import Progress, samples_of
 from plugins.emulated.render import Renderer
 from plugins.emulated.sensor import SENSOR_WIDTH_MM, jpeg, mosaic
 from plugins.emulated.shot import ShotFiles, ShotSettings
-from plugins.emulated.truth import FOLDER, BenchTruth
+from plugins.emulated.truth import FOLDER, BenchTruth, ObjectTruth
 
 MOST_FRAMES_IN_A_SHOT = 6
 
@@ -42,7 +42,7 @@ class World:
     ) -> None:
         self._truth = truth
         self._lamps = tuple(lamps)
-        samples = samples_of(truth, object_of(stage, truth), stage / FOLDER, progress)
+        samples = samples_of(truth, object_of(stage, truth.object), stage / FOLDER, progress)
         self._renderer = Renderer(truth, samples)
         self._visible = VisibleFrames(stage / truth.frames, truth.latency_s)
         self._rng = np.random.default_rng([truth.seed, 2])
@@ -123,8 +123,8 @@ class World:
         )
 
 
-def object_of(stage: Path, truth: BenchTruth) -> StageObject:
+def object_of(stage: Path, kept: ObjectTruth) -> StageObject:
     """The object of a prepared stage. Raises DeviceError ``object-unreadable``."""
-    if truth.object.kind == "mesh":
-        return StageObject.read(stage / truth.object.file)
+    if kept.kind == "mesh":
+        return StageObject.read(stage / kept.file)
     return default_object()

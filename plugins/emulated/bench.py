@@ -1,0 +1,199 @@
+"""The emulated stage as a whole: prepares it, and serves all of its devices in one process."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from hal.deadline import Deadline
+from hal.errors import DeviceError
+from hal.registry import Driver, OpenContext
+from plugins.emulated.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.objects import load_object
+from plugins.emulated.ptp_camera import EmulatedPtpCamera
+from plugins.emulated.quick_profile import quick_profile
+from plugins.emulated.serial_projector import EmulatedSerialProjector
+from plugins.emulated.staging import FAST_LAMP, FAST_PROFILE, device_tables, random_truth, size_named
+from plugins.emulated.truth import FOLDER, ObjectTruth, read_truth, write_truth
+from plugins.emulated.world import World, object_of
+
+OBJECT_FILE: Final = f"{FOLDER}/object.npz"
+DEVICE_FAILED: Final = 3
+HOST: Final = "127.0.0.1"
+
+
+class EmulatedBench:
+    """``hal.interfaces.Bench``."""
+
+    def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
+        """Write ``bench.toml`` and ``bench/``; return the device tables of stage.toml (see ``hal.interfaces.Bench``).
+
+        Raises DeviceError ``size-unknown``, ``object-unreadable``, ``object-no-faces`` before anything is written, or
+        ``stage-not-written``.
+        """
+        size_named(size)
+        kept = ObjectTruth("vase-and-bust", "", seed)
+        thing = None
+        if object_file is not None:
+            thing = load_object(object_file)
+            kept = ObjectTruth("mesh", OBJECT_FILE, seed)
+        shape = thing if thing is not None else object_of(stage, kept)
+        truth = random_truth(size, seed, shape, kept, _free_ports())
+        profile = quick_profile(LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s), stable_s=FAST_LAMP.stable_s)
+        with _explained(stage):
+            for folder in (FOLDER, "run"):
+                (stage / folder).mkdir(parents=True, exist_ok=True)
+            if thing is not None:
+                thing.save(stage / OBJECT_FILE)
+            (stage / FAST_PROFILE).write_text(profile, encoding="utf-8")
+            write_truth(stage, truth)
+        return device_tables(truth)
+
+    def serve(self, stage: Path, *, json_lines: bool) -> int:
+        """Serve the stage's devices until SIGINT or SIGTERM; returns 0, or 3 when a device can't be served."""
+        out = _Lines(json_lines)
+        stopped = threading.Event()
+        with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
+            try:
+                _start(stage.resolve(), out, stack, stopped)
+            except DeviceError as error:
+                out.failed(error)
+                return DEVICE_FAILED
+            except _Interrupted:
+                return 0
+            out.ready()
+            while not stopped.wait(0.5):
+                pass
+        out.say({"stopped": True}, "All devices are off.")
+        return 0
+
+
+class _Interrupted(Exception):
+    """A signal came before everything was up."""
+
+
+class _Lines:
+    """Tells a person, or a machine, what is served."""
+
+    def __init__(self, json_lines: bool) -> None:
+        self._json = json_lines
+        self._told = -1
+
+    def say(self, record: Mapping[str, Any], sentence: str) -> None:
+        # A reader that went away must not take the bench with it.
+        with contextlib.suppress(BrokenPipeError):
+            sys.stdout.write((json.dumps(record) if self._json else sentence) + "\n")
+            sys.stdout.flush()
+
+    def progress(self, share: float) -> None:
+        if (percent := int(100 * share) // 10 * 10) > self._told:
+            self._told = percent
+            self.say({"progress": percent / 100, "what": "rays"}, f"Casting rays through the stage: {percent} %")
+
+    def served(self, device: str, kind: str, address: str) -> None:
+        self.say({"device": device, "kind": kind, "address": address}, f"{kind:<10} {device:<10} {address}")
+
+    def ready(self) -> None:
+        self.say({"ready": True}, "Ready. Ctrl-C ends.")
+
+    def failed(self, error: DeviceError) -> None:
+        if self._json:
+            self.say({"error": error.code, "what": error.what, "remedy": error.remedy}, "")
+        sys.stderr.write(f"{error.what}\n{error.remedy}\n")
+
+
+def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event) -> None:
+    """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
+    truth = read_truth(stage)
+    _require_free(truth.camera.command_port, truth.camera.event_port)
+    lamps = [EmulatedLamp(LampTiming(p.lamp.warm_up_s, p.lamp.cool_down_s)) for p in truth.projectors]
+
+    def progress(share: float) -> None:
+        if stopped.is_set():
+            raise _Interrupted
+        out.progress(share)
+
+    world = stack.enter_context(World(stage, truth, lamps, progress=progress))
+    world.warm()
+    for projector, lamp in zip(truth.projectors, lamps, strict=True):
+        wire = EmulatedSerialProjector(stage / projector.port, lamp)
+        stack.enter_context(wire)
+        out.served(projector.name, "projector", str(wire.port))
+    # The world spends the exposure time itself, since it must know what is visible meanwhile.
+    camera = EmulatedPtpCamera(
+        world.expose,
+        host=HOST,
+        command_port=truth.camera.command_port,
+        event_port=truth.camera.event_port,
+        time_scale=0.0,
+    )
+    stack.enter_context(camera)
+    out.served("camera", "camera", camera.address)
+    out.served("display", "display", str(stage / truth.frames))
+
+
+def _free_ports() -> tuple[int, int]:
+    """Two TCP ports that nobody listens on now."""
+    with socket.create_server((HOST, 0)) as first, socket.create_server((HOST, 0)) as second:
+        return int(first.getsockname()[1]), int(second.getsockname()[1])
+
+
+def _require_free(*ports: int) -> None:
+    for port in ports:
+        try:
+            socket.create_server((HOST, port)).close()
+        except OSError as error:
+            raise DeviceError(
+                "port-in-use",
+                what=f"The camera's TCP port {port} can't be served: {error.strerror}.",
+                remedy="End the program that uses it (another bench, perhaps), or prepare the stage anew.",
+            ) from error
+
+
+@contextlib.contextmanager
+def _explained(stage: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise DeviceError(
+            "stage-not-written",
+            what=f"The stage folder {stage} can't be written: {error.strerror}.",
+            remedy="Free space on its disk, or choose a folder that you may write to.",
+        ) from error
+
+
+@contextlib.contextmanager
+def _stop_on_signals(stopped: threading.Event) -> Iterator[None]:
+    """SIGINT and SIGTERM set ``stopped``; the handlers that were there come back afterwards."""
+
+    def stop(number: int, frame: object) -> None:
+        stopped.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> EmulatedBench:
+    return EmulatedBench()
+
+
+DRIVER: Final = Driver(
+    kind="bench",
+    name="emulated",
+    summary="A whole stage in one process: three projectors, a camera and an object, with their optics.",
+    open=_open,
+)
