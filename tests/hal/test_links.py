@@ -1,0 +1,197 @@
+"""Byte links over real sockets and real pseudo terminals."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hal.deadline import Cancelled, in_seconds
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
+from hal.links import TcpLink, host_and_port
+from hal.serial_link import SerialLink
+from hal.transcript import Transcript, Way
+
+
+class Peer:
+    """The other end of a TCP link."""
+
+    def __init__(self) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.transcript = Transcript()
+        port = self.listener.getsockname()[1]
+        self.link = TcpLink("127.0.0.1", port, deadline=in_seconds(2), transcript=self.transcript)
+        self.socket, _ = self.listener.accept()
+
+    def close(self) -> None:
+        self.link.close()
+        self.socket.close()
+        self.listener.close()
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    made = Peer()
+    yield made
+    made.close()
+
+
+def test_lines_are_cut_wherever_the_network_cut_them(peer: Peer) -> None:
+    def dribble() -> None:
+        for byte in b"one\rtwo\rrest":
+            peer.socket.sendall(bytes([byte]))
+
+    sender = threading.Thread(target=dribble)
+    sender.start()
+    deadline = in_seconds(2)
+    assert peer.link.read_until(b"\r", limit=10, deadline=deadline) == b"one\r"
+    assert peer.link.read_until(b"\r", limit=10, deadline=deadline) == b"two\r"
+    assert peer.link.read_exactly(4, deadline=deadline) == b"rest"
+    sender.join()
+
+
+def test_silence_ends_at_the_deadline_and_keeps_what_came(peer: Peer) -> None:
+    peer.socket.sendall(b"half")
+    started = time.monotonic()
+    with pytest.raises(DeviceTimeout):
+        peer.link.read_until(b"\r", limit=10, deadline=in_seconds(0.2))
+    assert 0.15 < time.monotonic() - started < 1.0
+    peer.socket.sendall(b" a line\r")
+    assert peer.link.read_until(b"\r", limit=20, deadline=in_seconds(2)) == b"half a line\r"
+
+
+def test_a_cancelled_read_ends_at_once(peer: Peer) -> None:
+    stop = threading.Event()
+    threading.Timer(0.1, stop.set).start()
+    started = time.monotonic()
+    with pytest.raises(Cancelled):
+        peer.link.read_exactly(1, deadline=in_seconds(10, stop))
+    assert time.monotonic() - started < 1.0
+
+
+def test_a_line_that_never_ends_is_refused(peer: Peer) -> None:
+    peer.socket.sendall(b"x" * 100)
+    with pytest.raises(ProtocolError, match="64 bytes"):
+        peer.link.read_until(b"\r", limit=64, deadline=in_seconds(2))
+
+
+def test_drain_takes_what_has_arrived_without_waiting(peer: Peer) -> None:
+    assert peer.link.drain() == b""
+    peer.socket.sendall(b"stale")
+    time.sleep(0.05)
+    assert peer.link.drain() == b"stale"
+    assert peer.link.drain() == b""
+
+
+def test_a_closed_connection_is_a_device_gone(peer: Peer) -> None:
+    peer.socket.close()
+    with pytest.raises(DeviceGone):
+        peer.link.read_exactly(1, deadline=in_seconds(2))
+    peer.link.close()
+    peer.link.close()
+    with pytest.raises(DeviceGone):
+        peer.link.write(b"x", deadline=in_seconds(2))
+
+
+def test_a_peer_that_reads_nothing_stops_a_long_write_at_the_deadline(peer: Peer) -> None:
+    with pytest.raises(DeviceTimeout):
+        peer.link.write(b"x" * 30_000_000, deadline=in_seconds(0.3))
+
+
+def test_every_byte_stands_in_the_transcript(peer: Peer) -> None:
+    peer.link.write(b"question\r", deadline=in_seconds(2))
+    peer.socket.sendall(b"answer\r")
+    peer.link.read_until(b"\r", limit=10, deadline=in_seconds(2))
+    sent = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Way.SENT)
+    received = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Way.RECEIVED)
+    assert (sent, received) == (b"question\r", b"answer\r")
+
+
+def test_nobody_listening_is_a_device_gone() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(DeviceGone, match=str(port)):
+        TcpLink("127.0.0.1", port, deadline=in_seconds(2))
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [("h:1", ("h", 1)), ("h", ("h", 4352)), ("[::1]:80", ("::1", 80)), ("[::1]", ("::1", 4352))],
+)
+def test_addresses_are_split(address: str, expected: tuple[str, int]) -> None:
+    assert host_and_port(address, 4352) == expected
+
+
+@pytest.mark.parametrize("address", ["", ":1", "h:", "h:0", "h:65536", "h:x", "h:-1"])
+def test_addresses_that_are_none_are_refused(address: str) -> None:
+    with pytest.raises(DeviceError, match="host:port"):
+        host_and_port(address, 4352)
+
+
+class Pty:
+    """A raw pseudo terminal, as a serial port with someone at the other end."""
+
+    def __init__(self) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.path = Path(os.ttyname(self.slave))
+
+    def hang_up(self) -> None:
+        os.close(self.slave)
+        os.close(self.master)
+        self.master = -1
+
+    def close(self) -> None:
+        if self.master >= 0:
+            self.hang_up()
+
+
+@pytest.fixture
+def pty() -> Iterator[Pty]:
+    made = Pty()
+    yield made
+    made.close()
+
+
+def test_a_serial_port_carries_every_byte_both_ways(pty: Pty) -> None:
+    link = SerialLink(pty.path, baud=9600, deadline=in_seconds(2))
+    every = bytes(range(256))
+    link.write(every, deadline=in_seconds(2))
+    assert os.read(pty.master, 1000) == every
+    os.write(pty.master, every)
+    assert link.read_exactly(256, deadline=in_seconds(2)) == every
+    link.close()
+
+
+def test_a_hang_up_is_a_device_gone_in_every_call(pty: Pty) -> None:
+    link = SerialLink(pty.path, baud=9600, deadline=in_seconds(2))
+    pty.hang_up()
+    with pytest.raises(DeviceGone):
+        link.read_exactly(1, deadline=in_seconds(2))
+    with pytest.raises(DeviceGone):
+        link.write(b"x", deadline=in_seconds(2))
+    with pytest.raises(DeviceGone):
+        link.drain()
+    link.close()
+    link.close()
+    with pytest.raises(DeviceGone):
+        link.read_exactly(1, deadline=in_seconds(2))
+
+
+def test_a_port_is_held_by_one_program_only(pty: Pty) -> None:
+    first = SerialLink(pty.path, baud=9600, deadline=in_seconds(2))
+    with pytest.raises(DeviceBusy, match="in use"):
+        SerialLink(pty.path, baud=9600, deadline=in_seconds(2))
+    first.close()
+    SerialLink(pty.path, baud=9600, deadline=in_seconds(2)).close()
+
+
+def test_a_port_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DeviceGone, match="tty-nowhere"):
+        SerialLink(tmp_path / "tty-nowhere", baud=9600, deadline=in_seconds(2))

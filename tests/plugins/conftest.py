@@ -1,0 +1,90 @@
+"""Emulated projectors with their drivers, on real ptys and sockets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.deadline import in_seconds
+from hal.registry import OpenContext
+from plugins.emulated.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
+from plugins.emulated.quick_profile import quick_profile
+from plugins.emulated.serial_projector import EmulatedSerialProjector
+from plugins.pjlink_projector import PjLinkProjector, open_pjlink_projector
+from plugins.serial_projector import SerialProjector, open_serial_projector
+
+LAMP = LampTiming(warm_up_s=0.25, cool_down_s=0.4)
+
+
+@dataclass(frozen=True)
+class SerialPair:
+    """A driver and the emulated projector at the other end of its line."""
+
+    driver: SerialProjector
+    emulator: EmulatedSerialProjector
+    stage: Path
+
+    def transcript(self) -> str:
+        return next((self.stage / "transcripts").glob("*.txt")).read_text()
+
+
+@dataclass(frozen=True)
+class PjLinkPair:
+    driver: PjLinkProjector
+    emulator: EmulatedPjLinkProjector
+    stage: Path
+
+
+OpenSerial = Callable[..., SerialPair]
+OpenPjLink = Callable[..., PjLinkPair]
+
+
+@pytest.fixture
+def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
+    """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator."""
+    opened: list[SerialPair] = []
+
+    def make(*, settings: dict[str, Any] | None = None, **kwargs: Any) -> SerialPair:
+        lamp = kwargs.pop("lamp", None) or EmulatedLamp(LAMP)
+        emulator = EmulatedSerialProjector(tmp_path / "run" / "tty-left", lamp, **kwargs)
+        emulator.start()
+        (tmp_path / "quick.toml").write_text(quick_profile(LAMP))
+        table = {"profile": "quick.toml", "port": "run/tty-left", **(settings or {})}
+        context = OpenContext(tmp_path, transcripts=tmp_path / "transcripts")
+        pair = SerialPair(open_serial_projector(table, context, in_seconds(5)), emulator, tmp_path)
+        opened.append(pair)
+        return pair
+
+    yield make
+    for pair in opened:
+        pair.driver.close()
+        pair.emulator.stop()
+
+
+@pytest.fixture
+def open_pjlink(tmp_path: Path) -> Iterator[OpenPjLink]:
+    """Start an emulated projector on TCP and open its driver; keyword arguments go to the emulator."""
+    opened: list[PjLinkPair] = []
+
+    def make(*, settings: dict[str, Any] | None = None, **kwargs: Any) -> PjLinkPair:
+        emulator = EmulatedPjLinkProjector(EmulatedLamp(LAMP), **kwargs)
+        emulator.start()
+        (tmp_path / "quick.toml").write_text(quick_profile(LAMP, base="pjlink"))
+        table = {"address": emulator.address, "profile": "quick.toml", **(settings or {})}
+        try:
+            driver = open_pjlink_projector(table, OpenContext(tmp_path), in_seconds(5))
+        except BaseException:
+            emulator.stop()
+            raise
+        opened.append(PjLinkPair(driver, emulator, tmp_path))
+        return opened[-1]
+
+    yield make
+    for pair in opened:
+        pair.driver.close()
+        pair.emulator.stop()

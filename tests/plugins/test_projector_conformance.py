@@ -1,0 +1,38 @@
+"""Both projector drivers against the shared conformance suite, over real bytes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from hal.conformance import ProjectorConformance
+from hal.interfaces import Projector
+from plugins.emulated.optoma import OptomaQuirks
+
+
+class TestSerialProjector(ProjectorConformance):
+    poll_s = 0.05
+
+    @pytest.fixture
+    def projector(self, open_serial: Any) -> Projector:
+        driver: Projector = open_serial().driver
+        return driver
+
+
+class TestSerialProjectorThatAcknowledgesQuestionsFirst(ProjectorConformance):
+    poll_s = 0.05
+
+    @pytest.fixture
+    def projector(self, open_serial: Any) -> Projector:
+        driver: Projector = open_serial(quirks=OptomaQuirks(ok=b"Ok", p_first=True)).driver
+        return driver
+
+
+class TestPjLinkProjector(ProjectorConformance):
+    poll_s = 0.05
+
+    @pytest.fixture
+    def projector(self, open_pjlink: Any) -> Projector:
+        driver: Projector = open_pjlink(password="secret", settings={"password": "secret"}).driver
+        return driver
