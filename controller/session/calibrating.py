@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,14 +17,23 @@ from controller.calibrate.pixels import fit_metapixels
 from controller.calibrate.radiometry import measure_radiometry
 from controller.calibrate.reconstruction import CameraPrior
 from controller.calibrate.regularize import regularize
-from controller.calibrate.values import Calibration, Correspondence, Metapixels, ProjectorCalibration, Radiometry
-from controller.capture.brackets import merge_bracket
+from controller.calibrate.values import (
+    Calibration,
+    Correspondence,
+    Geometry,
+    Metapixels,
+    Pinhole,
+    ProjectorCalibration,
+    Radiometry,
+)
+from controller.capture.brackets import merge_brackets
 from controller.capture.patterns import PatternPlan, plan_patterns
 from controller.errors import CalibrationError
 from controller.session.capturing import capture_steps, code_step
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
 from controller.session.shots import Developed, Taken, read_index
+from controller.storage import write_atomically
 
 LIT_SHARE = 0.004
 """A camera pixel counts as lit where a projector's white is above this share of the brightest white there is."""
@@ -73,7 +84,7 @@ def _pixels_step(projector: RigProjector) -> Step:
 
 def _merge(taken: Sequence[Taken]) -> FloatImage:
     """HDR radiance in full scales per second from photographs of one picture."""
-    return merge_bracket([t.read() for t in taken], [t.exposure_s for t in taken]).radiance
+    return merge_brackets([t.read().measured() for t in taken], [t.exposure_s for t in taken]).radiance
 
 
 def read_black(folder: Path) -> FloatImage:
@@ -88,7 +99,7 @@ def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) ->
     white = _merge(brackets)
     context.advance(0.5)
     captures = Developed(_unprefixed(taken, projector.name), {"black": black, "white": white})
-    radiometry = measure_radiometry(captures, plan)
+    radiometry, report = measure_radiometry(captures)
     path = context.folder / f"radiometry-{projector.name}.npz"
     matrix = brackets[0].read().camera_to_xyz
     save_arrays(
@@ -101,7 +112,9 @@ def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) ->
             "camera_to_xyz": _SRGB_TO_XYZ if matrix is None else matrix,
         },
     )
-    return [path]
+    figures = context.folder / f"radiometry-{projector.name}.json"
+    write_atomically(figures, json.dumps(asdict(report), indent=1, default=list).encode())
+    return [path, figures]
 
 
 _SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
@@ -125,7 +138,7 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
             remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
         )
     context.advance(0.4, "correspondences")
-    metapixels = regularize(fit_metapixels(captures, plan, correspondence))
+    metapixels, moved = regularize(fit_metapixels(captures, plan, correspondence))
     path = context.folder / f"pixels-{projector.name}.npz"
     save_arrays(
         path,
@@ -138,7 +151,11 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
             "valid": metapixels.valid,
         },
     )
-    return [path]
+    valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
+    figures = context.folder / f"pixels-{projector.name}.json"
+    content = {"fitted": int(valid), "pixels": int(metapixels.valid.size), "camera_pixels": int(seen), "moved": moved}
+    write_atomically(figures, json.dumps(content, indent=1).encode())
+    return [path, figures]
 
 
 def read_correspondence(folder: Path, projector: str) -> Correspondence:
@@ -160,10 +177,48 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
     geometry = found.geometry
     arrays, figures = context.folder / "geometry.npz", context.folder / "geometry.json"
     save_arrays(arrays, {"points_m": geometry.points_m, "normals": geometry.normals})
-    from controller.session.geometry_files import write_poses
-
-    write_poses(figures, found, [projector.name for projector in rig.projectors])
+    poses = {
+        "camera": _pinhole(geometry.camera),
+        "projectors": {p.name: _pinhole(q) for p, q in zip(rig.projectors, geometry.projectors, strict=True)},
+        "reprojection_rms_px": geometry.reprojection_rms_px,
+        "scale_known": geometry.scale_known,
+        "noise_px": found.noise_px,
+        "shape_rel_sigma": found.shape_rel_sigma,
+        "inlier_share": found.inlier_share,
+    }
+    write_atomically(figures, json.dumps(poses, indent=1).encode())
     return [arrays, figures]
+
+
+def _pinhole(pinhole: Pinhole) -> dict[str, object]:
+    return {
+        "matrix": pinhole.matrix.tolist(),
+        "distortion": pinhole.distortion.tolist(),
+        "rotation": pinhole.rotation.tolist(),
+        "translation_m": pinhole.translation_m.tolist(),
+        "size_px": list(pinhole.size_px),
+    }
+
+
+def read_geometry(folder: Path) -> Geometry:
+    """The geometry that a finished run left in ``folder``."""
+    arrays = load_arrays(folder / "geometry.npz")
+    poses = json.loads((folder / "geometry.json").read_text())
+
+    def pinhole(row: dict[str, Any]) -> Pinhole:
+        keys = ("matrix", "distortion", "rotation", "translation_m")
+        matrix, distortion, rotation, translation_m = (np.array(row[key], np.float64) for key in keys)
+        width, height = row["size_px"]
+        return Pinhole(matrix, distortion, rotation, translation_m, (int(width), int(height)))
+
+    return Geometry(
+        camera=pinhole(poses["camera"]),
+        projectors=tuple(pinhole(row) for row in poses["projectors"].values()),
+        points_m=arrays["points_m"],
+        normals=arrays["normals"],
+        reprojection_rms_px=float(poses["reprojection_rms_px"]),
+        scale_known=bool(poses["scale_known"]),
+    )
 
 
 def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
@@ -184,11 +239,5 @@ def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:
     """Camera pixels that some projector lights noticeably in every channel."""
     brightest = max(float(np.percentile(part.white, 99.9)) for part in parts)
     masks = [part.white.min(axis=2) > LIT_SHARE * brightest for part in parts]
-    return np.logical_or.reduce(masks)
-
-
-def write_json(path: Path, content: object) -> None:
-    """Figures of a step, atomically."""
-    from controller.storage import write_atomically
-
-    write_atomically(path, json.dumps(content, indent=1, allow_nan=False).encode())
+    lit: Mask = np.logical_or.reduce(masks)
+    return lit

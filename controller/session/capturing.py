@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-
 
 from controller.arrays import ByteImage, Float64, load_arrays
 from controller.capture.acquire import Shot
-from controller.capture.brackets import nearest_exposure, suggest_exposure
+from controller.capture.brackets import choose_brackets, choose_exposure
 from controller.capture.patterns import Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
 from controller.capture.raw import read_photograph
 from controller.errors import CalibrationError
@@ -20,10 +22,10 @@ from controller.storage import write_atomically
 
 FIRST_EXPOSURE_S = 1 / 30
 EXPOSURE_TRIES = 8
-WHITE_BRACKET = (1 / 8, 1.0, 8.0)
-"""Exposures of the HDR white image, relative to the one at which white is well exposed."""
+WHITE_EXPOSURES = 3
+"""At most as many photographs for one HDR white image."""
 BLACK_BRACKET = (8.0, 32.0)
-"""Exposures of the HDR black image, likewise."""
+"""Exposures of the HDR black image, relative to the one at which white is well exposed."""
 SHOT_SECONDS = 0.4
 """What a photograph costs on the reference machine beside its exposure; weighs the steps for the time left."""
 
@@ -59,11 +61,11 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
         steps.append(
             Step(
                 f"light-{projector.name}",
-                lambda context, p=projector, q=plan: _photograph_light(rig, p, q, context, longest_exposure_s),  # type: ignore[misc]
+                partial(_photograph_light, rig, projector, plan),
                 inputs=inputs,
                 after=("exposure",),
                 title=f"Photographing the light of {projector.name}",
-                weight=SHOT_SECONDS * (len(WHITE_BRACKET) + 3 + len(plan.of_kind(PatternKind.RAMP))),
+                weight=SHOT_SECONDS * (WHITE_EXPOSURES + 3 + len(plan.of_kind(PatternKind.RAMP))),
             )
         )
     return steps
@@ -83,41 +85,54 @@ def code_step(rig: Rig, projector: RigProjector) -> Step:
     )
 
 
-def exposures_of(folder: Path) -> dict[str, float]:
-    """What the exposure step found: seconds by projector name."""
-    return {str(name): float(value) for name, value in json.loads((folder / "exposure.json").read_text()).items()}
+@dataclass(frozen=True, slots=True)
+class Exposures:
+    """``base_s`` at which a projector's white is well exposed; ``white_s`` the bracket of its HDR white image."""
+
+    base_s: float
+    white_s: tuple[float, ...]
+
+
+def exposures_of(folder: Path) -> dict[str, Exposures]:
+    """What the exposure step found, by projector name."""
+    rows = json.loads((folder / "exposure.json").read_text())
+    return {name: Exposures(float(row["base_s"]), tuple(map(float, row["white_s"]))) for name, row in rows.items()}
 
 
 def bracket(base_s: float, factors: Sequence[float], available_s: Sequence[float], longest_s: float) -> list[float]:
-    """Distinct exposures of the camera nearest to ``base_s`` times each factor, none above ``longest_s``."""
-    chosen = {nearest_exposure(min(base_s * factor, longest_s), available_s) for factor in factors}
-    return sorted(chosen)
+    """Distinct exposures of the camera, each the nearest to ``base_s`` times a factor, none above ``longest_s``."""
+    usable = [value for value in available_s if value <= longest_s] or [min(available_s)]
+    return sorted({min(usable, key=lambda value: abs(math.log(value / (base_s * factor)))) for factor in factors})
 
 
 def _find_exposures(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
     found = {}
     for number, projector in enumerate(rig.projectors):
         context.advance(number / len(rig.projectors), projector.name)
-        found[projector.name] = _find_exposure(rig, projector, context, longest_s)
+        exposures = _find_exposure(rig, projector, context, longest_s)
+        found[projector.name] = {"base_s": exposures.base_s, "white_s": exposures.white_s}
     path = context.folder / "exposure.json"
     write_atomically(path, json.dumps(found, indent=1).encode())
     return [path]
 
 
-def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> float:
+def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> Exposures:
     """Photograph white until it is well exposed. These photographs are tries: they are not journalled."""
     white = device_frame(_named(plan_patterns(projector.size_px), "white"), projector.size_px)
-    available = tuple(value for value in rig.acquirer.exposures_s() if value <= longest_s)
-    exposure_s = nearest_exposure(FIRST_EXPOSURE_S, available)
+    available = [value for value in rig.acquirer.exposures_s() if value <= longest_s]
+    exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_s)[0]
     for number in range(EXPOSURE_TRIES):
         context.check()
         shot = Shot(f"try-{projector.name}-{number}", rig.on_outputs({projector.name: white}), exposure_s)
         file, confirmed_s = rig.acquirer.take(shot, context.folder / "captures", deadline=context.deadline)
-        better_s = suggest_exposure(read_photograph(file.path), confirmed_s, available)
+        image = read_photograph(file.path).measured()
         file.path.unlink()
-        if better_s == exposure_s:
-            return exposure_s
-        exposure_s = better_s
+        choice = choose_exposure(image, confirmed_s, available)
+        if choice.settled:
+            brackets = choose_brackets(image, confirmed_s, available, most=WHITE_EXPOSURES)
+            if brackets.settled:
+                return Exposures(choice.exposure_s, brackets.exposures_s)
+        exposure_s = choice.exposure_s
     raise CalibrationError(
         "exposure-not-found",
         what=f"No exposure was found at which the white of projector {projector.name} is well exposed.",
@@ -126,23 +141,20 @@ def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_
 
 
 def _photograph_black(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
-    base_s = max(exposures_of(context.folder).values())
+    base_s = max(found.base_s for found in exposures_of(context.folder).values())
     exposures = bracket(base_s, BLACK_BRACKET, rig.acquirer.exposures_s(), longest_s)
     plan = [Planned(f"black-{number}", dict, exposure_s) for number, exposure_s in enumerate(exposures)]
     return take_all(rig, context, plan, index="black")
 
 
-def _photograph_light(
-    rig: Rig, projector: RigProjector, plan: PatternPlan, context: Context, longest_s: float
-) -> Sequence[Path]:
-    base_s = exposures_of(context.folder)[projector.name]
-    exposures = bracket(base_s, WHITE_BRACKET, rig.acquirer.exposures_s(), longest_s)
+def _photograph_light(rig: Rig, projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+    exposures = exposures_of(context.folder)[projector.name]
     planned = [
         _planned(projector, _named(plan, "white"), exposure_s, None, suffix=f"-{number}")
-        for number, exposure_s in enumerate(exposures)
+        for number, exposure_s in enumerate(exposures.white_s)
     ]
     shown = [_named(plan, colour) for colour in ("red", "green", "blue")] + list(plan.of_kind(PatternKind.RAMP))
-    planned += [_planned(projector, pattern, base_s, None) for pattern in shown]
+    planned += [_planned(projector, pattern, exposures.base_s, None) for pattern in shown]
     return take_all(rig, context, planned, index=f"light-{projector.name}")
 
 
@@ -150,7 +162,7 @@ def _photograph_codes(
     rig: Rig, projector: RigProjector, plan: PatternPlan, coded: Sequence[Pattern], context: Context
 ) -> Sequence[Path]:
     response = load_arrays(context.folder / f"radiometry-{projector.name}.npz")["response"]
-    base_s = exposures_of(context.folder)[projector.name]
+    base_s = exposures_of(context.folder)[projector.name].base_s
     planned = [_planned(projector, pattern, base_s, response) for pattern in coded]
     return take_all(rig, context, planned, index=f"codes-{projector.name}")
 
@@ -173,4 +185,3 @@ def _sizes(rig: Rig) -> str:
 
 
 __all__ = ["bracket", "capture_steps", "code_step", "exposures_of", "plans_of"]
-

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from controller.errors import WorkError
 from controller.session.journal_schema import JournalError, explained, opened
 from controller.session.machine import Change
 from controller.session.progress import Level
@@ -91,15 +92,15 @@ class Journal:
     def run(self, name: str) -> Iterator[int]:
         """Record a start and its outcome: "done", or the error's code (a killed run keeps none). Yields its number."""
         self._run = self._write("INSERT INTO runs (name, pid, began_at_s) VALUES (?, ?, ?)", name, os.getpid(), _now())
-        outcome = "done"
         try:
             yield self._run
         except BaseException as error:
-            outcome = getattr(error, "code", None) or type(error).__name__
+            try:
+                self._end(getattr(error, "code", None) or type(error).__name__)
+            except WorkError as second:  # must not hide what went wrong first
+                error.add_note(f"It could not be journalled: {second}")
             raise
-        finally:
-            self._write("UPDATE runs SET ended_at_s = ?, outcome = ? WHERE id = ?", _now(), str(outcome), self._run)
-            self._run = None
+        self._end("done")
 
     def outcomes(self) -> list[tuple[str, str | None]]:
         """Name and outcome of every start, oldest first; outcome None for one that was killed or still goes on."""
@@ -188,6 +189,10 @@ class Journal:
         return [JournalEvent(*row) for row in self._read("SELECT at_s, level, code, text FROM events ORDER BY id")]
 
     # -- inside
+
+    def _end(self, outcome: str) -> None:
+        run, self._run = self._run, None
+        self._write("UPDATE runs SET ended_at_s = ?, outcome = ? WHERE id = ?", _now(), outcome, run)
 
     def _relative(self, path: Path) -> str:
         return os.path.relpath(path, self.folder)
