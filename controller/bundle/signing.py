@@ -43,9 +43,14 @@ def generate_key(path: Path) -> bytes:
     key = SigningKey.generate()
     public = bytes(key.verify_key)
     write_atomically(path, f"{_SIGNING_PREFIX}{bytes(key).hex()}\n".encode(), mode=0o600)
-    write_atomically(path.with_name(path.name + ".pub"), f"{_PUBLIC_PREFIX}{public.hex()}\n".encode())
+    write_public_key(path.with_name(path.name + ".pub"), public)
     sync_folder(path.parent)
     return public
+
+
+def write_public_key(path: Path, public: bytes) -> None:
+    """Write the 32 bytes of a public key as a key file."""
+    write_atomically(path, f"{_PUBLIC_PREFIX}{public.hex()}\n".encode())
 
 
 def load_signing_key(path: Path) -> SigningKey:

@@ -235,7 +235,7 @@ class Player:
         self._prepare_s = min(max(time.monotonic() - began_s, 0.9 * self._prepare_s), tick_s)
         sleep_until(due_s)
         if time.monotonic() > due_s + tick_s:
-            self._late += 1
+            self._late += self._playlist is not None and coming.told is None
             coming.tick = self._grid.after(time.monotonic()) - 1
         self._coming = None
         self._presented(coming, self._output.flip())

@@ -1,0 +1,249 @@
+"""Bundles that are damaged, forged or built to hurt are refused, quickly and with little memory."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xxhash
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nacl.signing import SigningKey
+
+from controller.bundle.format import parse_index
+from controller.bundle.reader import Bundle
+from controller.errors import BundleError
+
+Table = dict[str, Any]
+
+
+def index_place(data: bytes) -> tuple[int, int]:
+    offset, length = struct.unpack_from("<QQ", data, 16)
+    return int(offset), int(length)
+
+
+def refused(path: Path, data: bytes, **how: Any) -> BundleError:
+    path.write_bytes(data)
+    with pytest.raises(BundleError) as caught, Bundle.open(path, **how) as bundle:
+        bundle.verify()
+    return caught.value
+
+
+def sealed(path: Path, index: bytes, blobs: bytes = bytes(4096)) -> Path:
+    """An unsigned bundle with this index, hashes right: what someone with a text editor and time can make."""
+    start = 4096 + len(blobs)
+    head = struct.pack(
+        "<8sIIQQQ32s56x", b"VELBUNDL", 1, 0, start, len(index), start + len(index) + 128, hashlib.sha256(index).digest()
+    )
+    path.write_bytes(head.ljust(4096, b"\0") + blobs + index + bytes(128))
+    return path
+
+
+def blob_of(data: bytes, offset: int = 4096) -> list[Any]:
+    return [offset, len(data), f"{xxhash.xxh3_64_intdigest(data):016x}", hashlib.sha256(data).hexdigest()]
+
+
+def small_index(blob: list[Any], **changes: Any) -> Table:
+    output = {"name": "P1", "width_px": 4, "height_px": 3, "stripe_rows": 3}
+    appearance = {"name": "a", "stripes": {"P1": [blob]}, "thumbnail": None, "metadata": {}}
+    index = {"stage": "s", "calibration": "c", "created_unix_s": 0, "revision": 0}
+    return {**index, "outputs": [output], "appearances": [appearance], **changes}
+
+
+def test_every_flipped_byte_of_header_index_and_signature_is_refused(
+    tmp_path: Path, signed: Path, unsigned: Path, key: SigningKey
+) -> None:
+    for file, how in ((signed, {"trusted": [bytes(key.verify_key)]}), (unsigned, {"allow_unsigned": True})):
+        data = file.read_bytes()
+        start, _ = index_place(data)
+        for place in [*range(128), *range(start, len(data))]:
+            changed = bytearray(data)
+            changed[place] ^= 1 << place % 8
+            refused(tmp_path / "changed.vel", bytes(changed), **how)
+
+
+def test_flipped_payload_bytes_are_refused_padding_included(tmp_path: Path, unsigned: Path) -> None:
+    data = unsigned.read_bytes()
+    start, _ = index_place(data)
+    for place in np.random.default_rng(1).integers(128, start, 400):
+        changed = bytearray(data)
+        changed[place] ^= 1 << int(place) % 8
+        assert refused(tmp_path / "changed.vel", bytes(changed), allow_unsigned=True).code == "bundle-damaged"
+
+
+def test_a_stripe_that_changed_since_it_was_installed_is_not_played(unsigned: Path) -> None:
+    data = bytearray(unsigned.read_bytes())
+    data[4096 + 9] ^= 16
+    unsigned.write_bytes(data)
+    with Bundle.open(unsigned, allow_unsigned=True) as bundle, pytest.raises(BundleError, match="checksum"):
+        bundle.decode("noise", "left")
+
+
+def test_every_truncation_is_refused(tmp_path: Path, unsigned: Path) -> None:
+    data = unsigned.read_bytes()
+    for length in [*range(0, 200), *range(200, len(data), 997), *range(len(data) - 200, len(data))]:
+        refused(tmp_path / "short.vel", data[:length], allow_unsigned=True)
+    refused(tmp_path / "long.vel", data + b"\0", allow_unsigned=True)
+
+
+def test_only_our_signature_passes(signed: Path, unsigned: Path, key: SigningKey, tmp_path: Path) -> None:
+    ours, other = bytes(key.verify_key), bytes(SigningKey(bytes(32)).verify_key)
+    assert refused(signed, signed.read_bytes(), trusted=[other]).code == "bundle-untrusted"
+    assert refused(signed, signed.read_bytes()).code == "bundle-untrusted"
+    assert refused(unsigned, unsigned.read_bytes(), trusted=[ours]).code == "bundle-unsigned"
+    forged = signed.read_bytes()[:-128] + other_block(signed, other)
+    assert refused(tmp_path / "forged.vel", forged, trusted=[other]).code == "bundle-signature-wrong"
+    assert refused(tmp_path / "forged.vel", forged, allow_unsigned=True).code == "bundle-signature-wrong"
+    Bundle.open(signed, trusted=[other, ours]).close()
+
+
+def other_block(signed: Path, public: bytes) -> bytes:
+    block = signed.read_bytes()[-128:]
+    return block[:8] + public + block[40:]
+
+
+def test_a_newer_format_is_told_from_a_damaged_one(tmp_path: Path, unsigned: Path) -> None:
+    data = bytearray(unsigned.read_bytes())
+    data[8] = 2
+    assert refused(tmp_path / "new.vel", bytes(data), allow_unsigned=True).code == "bundle-version"
+    assert refused(tmp_path / "zip.vel", b"PK\3\4" + bytes(500), allow_unsigned=True).code == "bundle-foreign"
+
+
+PIXELS = zstandard.ZstdCompressor().compress(bytes(36))
+BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(50_000_000))
+SIZELESS = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(36))
+GOOD = blob_of(PIXELS)
+
+
+def output(**changes: Any) -> Table:
+    return {"outputs": [{"name": "P1", "width_px": 4, "height_px": 3, "stripe_rows": 3, **changes}]}
+
+
+HOSTILE: dict[str, Callable[[], bytes]] = {
+    "an output of 4 Gpx": lambda: as_json(small_index(GOOD, **output(width_px=65536, height_px=65536))),
+    "an output of 256 Mpx": lambda: as_json(small_index(GOOD, **output(width_px=16384, height_px=16384))),
+    "2 million stripes": lambda: as_json(small_index(GOOD, **output(height_px=16384, stripe_rows=1))),
+    "no rows in a stripe": lambda: as_json(small_index(GOOD, **output(stripe_rows=0))),
+    "a negative size": lambda: as_json(small_index(GOOD, **output(width_px=-4))),
+    "a size that is true": lambda: as_json(small_index(GOOD, **output(width_px=True))),
+    "a fractional size": lambda: as_json(small_index(GOOD, **output(width_px=4.0))),
+    "a name that climbs": lambda: as_json(small_index(GOOD, **output(name="../P1"))),
+    "two outputs of one name": lambda: as_json(small_index(GOOD, outputs=output()["outputs"] * 2)),
+    "no outputs": lambda: as_json(small_index(GOOD, outputs=[])),
+    "a stripe behind the end": lambda: as_json(small_index([2**62, 9, GOOD[2], GOOD[3]])),
+    "a stripe in the header": lambda: as_json(small_index([0, 9, GOOD[2], GOOD[3]])),
+    "a stripe over the index": lambda: as_json(small_index([4096, 5000, GOOD[2], GOOD[3]])),
+    "a stripe off its place": lambda: as_json(small_index([4097, 9, GOOD[2], GOOD[3]])),
+    "a checksum of other length": lambda: as_json(small_index([4096, 9, GOOD[2] + "0", GOOD[3]])),
+    "an unknown key": lambda: as_json(small_index(GOOD, extra=1)),
+    "a key twice": lambda: as_json(small_index(GOOD)).replace(b'"stage"', b'"stage":"x","stage"'),
+    "a number without end": lambda: as_json(small_index(GOOD)).replace(b'"revision": 0', b'"revision": ' + b"9" * 9999),
+    "deep nesting": lambda: b"[" * 1_000_000 + b"]" * 1_000_000,
+    "many small lists": lambda: b"[" + b"[]," * 690_000 + b"[]]",
+    "not UTF-8": lambda: b'"\xff\xfe"',
+    "not JSON": lambda: b"{'a': 1}",
+    "a lone surrogate": lambda: as_json(small_index(GOOD)).replace(b'"stage": "s"', b'"stage": "\\ud800"'),
+}
+
+
+def as_json(index: Table) -> bytes:
+    return json.dumps(index).encode()
+
+
+def test_the_small_index_itself_is_sound(tmp_path: Path) -> None:
+    path = sealed(tmp_path / "good.vel", as_json(small_index(GOOD)), PIXELS)
+    with Bundle.open(path, allow_unsigned=True) as bundle:
+        bundle.verify()
+        assert not bundle.decode("a", "P1").any()
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_indexes_are_refused_fast_and_in_little_memory(tmp_path: Path, name: str) -> None:
+    path = sealed(tmp_path / "hostile.vel", HOSTILE[name](), PIXELS)
+    tracemalloc.start()
+    try:
+        with pytest.raises(BundleError):
+            Bundle.open(path, allow_unsigned=True)
+        assert tracemalloc.get_traced_memory()[1] < 64 * 2**20
+    finally:
+        tracemalloc.stop()
+    assert min(seconds_to_refuse(path) for _ in range(3)) < 0.1
+
+
+def seconds_to_refuse(path: Path) -> float:
+    began = time.process_time()
+    with pytest.raises(BundleError):
+        Bundle.open(path, allow_unsigned=True)
+    return time.process_time() - began
+
+
+@pytest.mark.parametrize("payload", [BOMB, SIZELESS, b"not a frame", PIXELS[:-3], zstandard.compress(bytes(35))])
+def test_stripes_that_do_not_hold_their_pixels_are_refused_in_little_memory(tmp_path: Path, payload: bytes) -> None:
+    size = {"width_px": 50, "height_px": 40, "stripe_rows": 40} if payload is BOMB else {}
+    path = sealed(tmp_path / "bomb.vel", as_json(small_index(blob_of(payload), **output(**size))), payload)
+    tracemalloc.start()
+    try:
+        with Bundle.open(path, allow_unsigned=True) as bundle, pytest.raises(BundleError):
+            bundle.decode("a", "P1")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200))
+def test_no_bytes_make_the_index_parser_fail_in_another_way(data: bytes) -> None:
+    with pytest.raises(BundleError):
+        parse_index(data, data_end=10_000)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=8,
+)
+PLACES = [
+    ["stage"],
+    ["created_unix_s"],
+    ["outputs"],
+    ["outputs", 0],
+    ["outputs", 0, "name"],
+    ["outputs", 0, "width_px"],
+    ["outputs", 0, "stripe_rows"],
+    ["appearances"],
+    ["appearances", 0],
+    ["appearances", 0, "thumbnail"],
+    ["appearances", 0, "stripes"],
+    ["appearances", 0, "stripes", "P1"],
+    ["appearances", 0, "stripes", "P1", 0],
+    ["appearances", 0, "stripes", "P1", 0, 0],
+    ["appearances", 0, "stripes", "P1", 0, 1],
+    ["appearances", 0, "stripes", "P1", 0, 2],
+]
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.sampled_from(PLACES), JSON)
+def test_any_value_at_any_place_is_either_in_bounds_or_refused(place: list[str | int], value: Any) -> None:
+    index: Any = small_index(GOOD)
+    inner = index
+    for step in place[:-1]:
+        inner = inner[step]
+    inner[place[-1]] = value
+    try:
+        parsed = parse_index(json.dumps(index).encode(), data_end=8192)
+    except BundleError:
+        return
+    for appearance in parsed.appearances:
+        for blobs in appearance.stripes.values():
+            assert all(blob.offset >= 4096 and blob.offset + blob.length <= 8192 for blob in blobs)
+    assert all(o.width_px * o.height_px <= 2**24 for o in parsed.outputs)

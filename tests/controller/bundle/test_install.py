@@ -1,0 +1,128 @@
+"""Installation leaves the old bundle or the new one, whole, and never an unsound one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nacl.signing import SigningKey
+
+from controller.bundle.install import current, install, rollback
+from controller.bundle.reader import Bundle
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.errors import BundleError
+
+
+class PowerCut(BaseException):
+    """Not an Exception: nothing may catch it and go on."""
+
+
+def made(path: Path, value: int, revision: int = 0, key: SigningKey | None = None) -> Path:
+    frames = {"P1": np.full((6, 5, 3), value, np.uint8)}
+    write_bundle(
+        path,
+        stage="s",
+        calibration="c",
+        created_unix_s=0,
+        outputs=[("P1", 5, 6)],
+        appearances=[NewAppearance("a", frames)],
+        revision=revision,
+        key=key,
+    )
+    return path
+
+
+def plays(folder: Path) -> int:
+    """The pixel value that the installed bundle would show."""
+    file = current(folder)
+    assert file is not None
+    with Bundle.open(file, allow_unsigned=True) as bundle:
+        bundle.verify()
+        return int(bundle.decode("a", "P1")[0, 0, 0])
+
+
+def test_the_newest_plays_and_the_one_before_comes_back(tmp_path: Path) -> None:
+    folder = tmp_path / "bundles"
+    for value in (1, 2, 3):
+        install(made(tmp_path / "b.vel", value), folder, allow_unsigned=True)
+    assert plays(folder) == 3
+    assert len(list(folder.glob("*.vel"))) == 2, "only the current and the previous one are kept"
+    rollback(folder)
+    assert plays(folder) == 2
+    rollback(folder)
+    assert plays(folder) == 3
+
+
+def test_installing_the_current_bundle_again_keeps_the_previous_one(tmp_path: Path) -> None:
+    folder = tmp_path / "bundles"
+    for value in (1, 2, 2):
+        install(made(tmp_path / "b.vel", value), folder, allow_unsigned=True)
+    rollback(folder)
+    assert plays(folder) == 1
+
+
+def test_without_an_earlier_bundle_there_is_nothing_to_go_back_to(tmp_path: Path) -> None:
+    install(made(tmp_path / "b.vel", 1), tmp_path / "bundles", allow_unsigned=True)
+    with pytest.raises(BundleError) as caught:
+        rollback(tmp_path / "bundles")
+    assert caught.value.code == "bundle-no-previous"
+    assert plays(tmp_path / "bundles") == 1
+
+
+def test_unsound_foreign_and_older_bundles_change_nothing(tmp_path: Path) -> None:
+    folder, key = tmp_path / "bundles", SigningKey(bytes(32))
+    trusted = [bytes(key.verify_key)]
+    install(made(tmp_path / "b.vel", 1, 7, key), folder, trusted=trusted)
+    broken = bytearray(made(tmp_path / "broken.vel", 2, 8, key).read_bytes())
+    broken[4100] ^= 1
+    (tmp_path / "broken.vel").write_bytes(broken)
+    for path, code in (
+        (tmp_path / "broken.vel", "bundle-damaged"),
+        (made(tmp_path / "unsigned.vel", 3, 9), "bundle-unsigned"),
+        (made(tmp_path / "older.vel", 4, 6, key), "bundle-older"),
+        (tmp_path / "absent.vel", "bundle-unreadable"),
+    ):
+        with pytest.raises(BundleError) as caught:
+            install(path, folder, trusted=trusted)
+        assert caught.value.code == code
+        assert plays(folder) == 1
+        assert len(list(folder.glob("*.vel"))) == 1
+
+
+def test_a_power_cut_before_any_durable_step_leaves_the_old_or_the_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cuts = 0
+    for moment in range(50):
+        folder = tmp_path / f"bundles-{moment}"
+        install(made(tmp_path / "old.vel", 1), folder, allow_unsigned=True)
+        new = made(tmp_path / "new.vel", 2)
+        with monkeypatch.context() as patch:
+            countdown = iter(range(moment))
+            for owner, name in ((os, "fsync"), (Path, "replace"), (Path, "symlink_to"), (Path, "unlink")):
+                patch.setattr(owner, name, cutting(getattr(owner, name), countdown))
+            try:
+                install(new, folder, allow_unsigned=True)
+            except PowerCut:
+                cuts += 1
+        assert plays(folder) in (1, 2)
+        install(new, folder, allow_unsigned=True)
+        assert plays(folder) == 2
+        rollback(folder)
+        assert plays(folder) == 1
+        if cuts <= moment:
+            break
+    assert 8 < cuts < 50
+
+
+def cutting(real: Any, countdown: Iterator[int]) -> Any:
+    def step(*arguments: Any, **options: Any) -> Any:
+        if next(countdown, None) is None:
+            raise PowerCut
+        return real(*arguments, **options)
+
+    return step
