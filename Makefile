@@ -3,7 +3,7 @@
 # Both do their own set-up.
 
 SIZE ?= small
-OUT ?= demo
+OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(notdir $(basename $(OBJECT))))
 SEED ?= 1
 OBJECT ?=
 NAME ?=

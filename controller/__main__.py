@@ -39,7 +39,57 @@ def states(
     console.show_result(diagram() if mermaid else "\n".join(lines), as_json=False)
 
 
-COMMANDS: Final[tuple[Callable[..., None], ...]] = (states,)
+def demo(
+    size: Annotated[str, typer.Option(help="small, medium or paper.")] = "small",
+    object: Annotated[  # noqa: A002 - the option's name is fixed
+        Path | None, typer.Option(help="A mesh to put on the stage, .obj or .ply; else a vase and a bust.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Where the stage and the report go.")] = Path("demo"),
+    seed: Annotated[int, typer.Option(help="Which of the random stages.", min=0)] = 1,
+    prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Write OUT/stage and stop there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Do the whole job on an emulated stage, from cold lamps to a report."""
+    work(
+        "controller.demo.job:demo", as_json=as_json,
+        size=size, object_file=object, out=out, seed=seed, prepare_only=prepare_only,
+    )  # fmt: skip
+
+
+def emulate(stage: StageFolder, as_json: Json = False) -> int:
+    """Serve the emulated devices of a stage, and print the address of each, until Ctrl-C."""
+    from controller.demo.stage import bench_of
+
+    return bench_of(stage).serve(stage, json_lines=as_json)
+
+
+def calibrate(stage: StageFolder, as_json: Json = False) -> None:
+    """Photograph patterns and calibrate the stage; goes on with an unfinished calibration."""
+    work("controller.services:calibrate", as_json=as_json, stage=stage)
+
+
+def appearance(
+    stage: StageFolder,
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Names from stage.toml; all of them if none is given.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Solve appearances on the last calibration and publish them in a signed bundle."""
+    work("controller.services:make_appearances", as_json=as_json, stage=stage, names=tuple(names or ()))
+
+
+def play(
+    stage: StageFolder,
+    name: Annotated[str, typer.Argument(help="The appearance to show.")],
+    seconds: Annotated[float, typer.Option(help="How long; without it, until Ctrl-C.", min=0)] = 0.0,
+    as_json: Json = False,
+) -> None:
+    """Light the projectors and show an appearance of the installed bundle."""
+    work("controller.services:play", as_json=as_json, stage=stage, name=name, seconds=seconds or None)
+
+
+COMMANDS: Final[tuple[Callable[..., Any], ...]] = (demo, calibrate, appearance, play, emulate, states)
 """Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
 
 

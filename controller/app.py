@@ -1,0 +1,231 @@
+"""The composition root: stage.toml -> devices -> services. Nothing else builds objects."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from controller.bundle.signing import write_public_key
+from controller.calibrate.reconstruction import CameraPrior
+from controller.capture.acquire import Acquirer
+from controller.config import Stage, check_driver_settings, load_stage
+from controller.config.models import CameraTable, OpenTable
+from controller.play.launch import PlayerProcess, PlayerSettings, start_player
+from controller.session.journal import Journal
+from controller.session.lamps import LampFile
+from controller.session.machine import Event, Machine
+from controller.session.power import light, power_down, steady
+from controller.session.progress import Level, Reporter
+from controller.session.rig import Rig, RigProjector
+from controller.session.runner import Context, Runner, Step
+from controller.session.safety import LampGuard
+from controller.storage import exclusive, runtime_folder
+from hal.deadline import Deadline, in_seconds
+from hal.interfaces import Camera, Display, Projector
+from hal.registry import Driver, Drivers, OpenContext, load_drivers
+
+OPEN_S = 20.0
+"""Longest that opening one device may take."""
+LONGEST_RUN_S = 12 * 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A stage whose every table has been checked; nothing is opened or switched on yet."""
+
+    stage: Stage
+    drivers: Drivers
+    projectors: tuple[tuple[Driver, dict[str, Any]], ...]
+    camera: tuple[Driver, dict[str, Any]]
+    display: tuple[Driver, dict[str, Any]]
+
+    @property
+    def prior(self) -> CameraPrior:
+        table: CameraTable = self.stage.tables.camera
+        return CameraPrior(
+            focal_length_px=table.focal_length_px,
+            focal_length_rel_sigma=table.focal_length_rel_sigma,
+            distance_m=table.distance_m,
+            distance_rel_sigma=table.distance_rel_sigma,
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The projectors' names in stage order."""
+        return tuple(table.name for table in self.stage.tables.projectors)
+
+
+def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
+    """Read stage.toml and check every key, the drivers' own among them, before anything is opened.
+
+    Raises UsageError (see ``controller.config.load_stage``) and PluginError("driver-unknown").
+    """
+    stage = load_stage(folder)
+    drivers = drivers or load_drivers()
+    tables = stage.tables
+
+    def checked(kind: str, table: OpenTable, name: str) -> tuple[Driver, dict[str, Any]]:
+        driver = drivers.get(kind, name)
+        return driver, check_driver_settings(table, driver)
+
+    return Checked(
+        stage=stage,
+        drivers=drivers,
+        projectors=tuple(checked("projector", table, table.driver) for table in tables.projectors),
+        camera=checked("camera", tables.camera, tables.camera.driver),
+        display=checked("display", tables.display, tables.display.driver),
+    )
+
+
+@contextlib.contextmanager
+def opened(checked: Checked, *, deadline: Deadline) -> Iterator[Rig]:
+    """Open every device of the stage and start the player; close them, and end the player, on leaving.
+
+    Lamps are left as they are: switching them is ``lit``'s.
+    """
+    stage = checked.stage
+    context = OpenContext(stage=stage.folder, runtime=runtime_folder(stage.folder))
+    with contextlib.ExitStack() as stack:
+        guards = []
+        ledger = LampFile(stage.folder / LampFile.NAME)
+        at_least = stage.tables.safety.at_least()
+        for table, (driver, settings) in zip(stage.tables.projectors, checked.projectors, strict=True):
+            projector = cast("Projector", driver.open(settings, context, deadline.within(OPEN_S)))
+            guard = LampGuard(table.name, projector, ledger, at_least=at_least)
+            stack.callback(guard.close)
+            guards.append(guard)
+        driver, settings = checked.camera
+        camera = cast("Camera", driver.open(settings, context, deadline.within(OPEN_S)))
+        stack.callback(camera.close)
+        if checked.stage.tables.display.driver == "player":
+            stack.enter_context(_player(stage, context))
+        driver, settings = checked.display
+        display = cast("Display", driver.open(settings, context, deadline.within(OPEN_S)))
+        stack.callback(display.close)
+        yield _rig(stage, guards, camera, display)
+
+
+def _player(stage: Stage, context: OpenContext) -> PlayerProcess:
+    """The player of this stage; a context manager that ends it."""
+    table = stage.tables.display
+    frames = None if table.frames is None else stage.path(table.frames)
+    if frames is not None:
+        frames.parent.mkdir(parents=True, exist_ok=True)
+    assert context.runtime is not None
+    settings = PlayerSettings(
+        outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
+        frames=frames,
+        trusted=_key_files(stage.tables.bundle.trusted_keys, context.runtime),
+        allow_unsigned=stage.tables.bundle.allow_unsigned,
+    )
+    return start_player(context.runtime, settings)
+
+
+def _key_files(keys: Sequence[str], folder: Path) -> list[Path]:
+    """Public key files for the player, which reads no stage.toml."""
+    paths = [folder / f"trusted-{number}.pub" for number in range(len(keys))]
+    for path, key in zip(paths, keys, strict=True):
+        write_public_key(path, bytes.fromhex(key))
+    return paths
+
+
+def _rig(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: Display) -> Rig:
+    sizes = {output.name: (output.width_px, output.height_px) for output in stage.tables.display.outputs}
+    projectors = tuple(
+        RigProjector(table.name, table.output, sizes[table.output], guard)
+        for table, guard in zip(stage.tables.projectors, guards, strict=True)
+    )
+    acquirer = Acquirer(
+        display,
+        camera,
+        iso=stage.tables.camera.iso,
+        aperture_f=stage.tables.camera.aperture_f,
+        settle_s=stage.tables.capture.settle_s,
+    )
+    return Rig(stage.folder, projectors, camera, display, acquirer)
+
+
+@contextlib.contextmanager
+def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) -> Iterator[None]:
+    """Whatever happens inside, the lamps are off or cooling afterwards.
+
+    Raises nothing of its own: a projector that can't be switched off is told to the technician.
+    """
+    try:
+        yield
+    finally:
+        if machine.allows(Event.STOP):
+            machine.handle(Event.STOP, "the lamps are switched off")
+        failures = power_down(rig.guards, within_s=power_down_s)
+        for failure in failures:
+            reporter.say(f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
+        if not failures and machine.allows(Event.COOLED):
+            machine.handle(Event.COOLED, "every lamp is off or cooling by itself")
+
+
+def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
+    """Strike the lamps and wait for steady light. Never skipped: hardware is probed, not restored."""
+
+    def strike(context: Context) -> Sequence[Path]:
+        light(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance)
+        return ()
+
+    def settle(context: Context) -> Sequence[Path]:
+        steady(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance)
+        return ()
+
+    return [
+        Step("strike", strike, title="Switching the projectors on", weight=4, enter=Event.START,
+             leave=Event.LAMPS_LIT, always=True),
+        Step("steady", settle, title="Waiting for steady light", weight=3, leave=Event.LAMPS_STABLE, always=True),
+    ]  # fmt: skip
+
+
+def marker(name: str, title: str, *, enter: Event | None = None, leave: Event | None = None) -> Step:
+    """A step that only moves the state machine; never skipped, so that a resumed run is in the right state too."""
+    return Step(name, lambda _: (), title=title, weight=0.01, enter=enter, leave=leave, always=True)
+
+
+MakeSteps = Callable[[Rig], Sequence[Step]]
+
+
+def run_on_stage(
+    checked: Checked, make_steps: MakeSteps, *, name: str, run: Path, reporter: Reporter, cancel: threading.Event
+) -> None:
+    """Open the stage, run the steps in ``run`` with the lamps on, and leave the lamps safe.
+
+    Raises what the steps raise; UsageError("already-running") if another program works on the stage.
+    """
+    stage = checked.stage
+    deadline = in_seconds(LONGEST_RUN_S, cancel)
+    safety = stage.tables.safety
+    with (
+        exclusive(stage.folder / "run" / "lock", what_is_running="Velatura"),
+        Journal(run) as journal,
+        opened(checked, deadline=deadline) as rig,
+    ):
+        machine = Machine(journal.record_change)
+        steps = [*power_steps(rig, power_up_s=safety.power_up_s), *make_steps(rig)]
+        with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
+            Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
+
+
+def unfinished_run(stage: Path, name: str) -> Path:
+    """The newest run folder of ``name`` whose work was begun and not finished, or a new one."""
+    runs = stage / "runs"
+    for folder in sorted(runs.glob(f"*-{name}"), reverse=True):
+        if (folder / Journal.FILE).exists():
+            with Journal(folder) as journal:
+                outcomes = journal.outcomes()
+            if not outcomes or outcomes[-1][1] != "done":
+                return folder
+            break
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    folder = runs / f"{stamp}-{name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
