@@ -103,18 +103,27 @@ class Table:
         return value
 
     def _line(self, key: str) -> int | None:
-        """The line where ``key`` stands, else the one where its table begins, else None."""
-        header: tuple[str, ...] = ()
-        begins = None
-        for number, line in enumerate(self._text.splitlines(), start=1):
-            if match := _HEADER.fullmatch(line):
-                header = tuple(part.strip().strip("\"'") for part in match[1].split("."))
-                if header == (*self._path, key):
-                    return number
-                begins = number if header == self._path else begins
-            elif header == self._path and (match := _KEY.match(line)) and key in match.groups():
+        """The line where ``key`` stands, else the one where its table (or the key of its inline table) begins."""
+        for path in (self._path, self._path[:-1]):
+            if (line := _find(self._text, path, key)) is not None:
+                return line
+            key = path[-1] if path else key
+        return None
+
+
+def _find(text: str, path: tuple[str, ...], key: str) -> int | None:
+    """The line of ``key`` in the table ``path``, else that of the table's header."""
+    header: tuple[str, ...] = ()
+    begins = None
+    for number, line in enumerate(text.splitlines(), start=1):
+        if match := _HEADER.fullmatch(line):
+            header = tuple(part.strip().strip("\"'") for part in match[1].split("."))
+            if header == (*path, key):
                 return number
-        return begins
+            begins = number if header == path else begins
+        elif header == path and (match := _KEY.match(line)) and key in match.groups():
+            return number
+    return begins
 
 
 def _wrong(file: str, line: int | None, why: str) -> ProtocolError:
