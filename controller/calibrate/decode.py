@@ -26,6 +26,9 @@ WORST_NOISE_PX = 0.35
 WEAK_BIT = 0.25
 CELL_SLACK_PX = 1.5
 LEAST_CONSISTENT = 0.6
+LEAST_STEADY = 0.75
+BRIGHT_SHARE = 0.1
+NOISE_WINDOW = (7, 7)
 FEWEST_PIXELS = 100
 
 
@@ -67,7 +70,8 @@ def decode(captures: Captures, plan: PatternPlan, *, refine: bool = True) -> Cor
         modulation = np.sqrt(axes[0].amplitude * axes[1].amplitude) / (0.5 * white)
         lit = _lit(axes, amplitude, modulation)
     consistent = axes[0].consistent & axes[1].consistent
-    _check_order(lit, consistent)
+    bright = _bright(white, axes)
+    _check_order(lit | bright, lit & consistent, axes)
     position = np.stack([axis.position_px for axis in axes], axis=2)
     valid = lit & consistent & _inside(position, plan.size_px, 0.0)
     valid &= _inside(position, plan.size_px, frame_margin_px(modulation[valid]))
@@ -112,26 +116,59 @@ def _decode_gray(
     return cell, weak
 
 
+def _noise(axes: tuple[_Axis, ...]) -> FloatImage:
+    """Standard deviation of one photograph's value around each camera pixel."""
+    both = np.nan_to_num(axes[0].noise_squared + axes[1].noise_squared) / 2
+    return np.asarray(np.sqrt(np.maximum(cv2.boxFilter(both, -1, NOISE_WINDOW), 0)), np.float32)
+
+
 def _lit(axes: tuple[_Axis, ...], amplitude: FloatImage, modulation: FloatImage) -> Mask:
     """Where the sinusoids stand out of the noise and of stray light. NaN anywhere is not lit."""
-    noise = np.sqrt(cv2.boxFilter(np.nan_to_num(axes[0].noise_squared + axes[1].noise_squared) / 2, -1, (7, 7)))
-    noise_px = noise / (np.sqrt(2) * amplitude) * (PERIOD_PX / (2 * np.pi))
-    finite = amplitude[np.isfinite(amplitude)]
-    floor = DARKEST_SHARE * np.percentile(finite[:: max(1, finite.size // 100_000)], 99) if finite.size else 0.0
-    lit = (amplitude > floor) & (noise_px < WORST_NOISE_PX)
+    noise_px = _noise(axes) / (np.sqrt(2) * amplitude) * (PERIOD_PX / (2 * np.pi))
+    lit = (amplitude > DARKEST_SHARE * _brightest(amplitude)) & (noise_px < WORST_NOISE_PX)
     return np.asarray(lit & (modulation > LEAST_MODULATION) & (modulation < MOST_MODULATION))
 
 
-def _check_order(lit: Mask, consistent: Mask) -> None:
-    pixels = int(np.count_nonzero(lit))
-    agreeing = np.count_nonzero(lit & consistent)
-    if pixels >= FEWEST_PIXELS and agreeing < LEAST_CONSISTENT * pixels:
+def _bright(white: FloatImage, axes: tuple[_Axis, ...]) -> Mask:
+    """Where this projector plainly casts light, whether or not the phases make sense.
+
+    Phases in the wrong order look like noise as strong as the pattern; real noise vanishes in a neighbourhood's mean.
+    """
+    around = cv2.boxFilter(np.nan_to_num(white), -1, NOISE_WINDOW)
+    return np.asarray((around > BRIGHT_SHARE * _brightest(white)) & (around > _noise(axes)) & np.isfinite(white))
+
+
+def _brightest(image: FloatImage) -> float:
+    finite = image[np.isfinite(image)]
+    return float(np.percentile(finite[:: max(1, finite.size // 100_000)], 99)) if finite.size else 0.0
+
+
+def _check_order(seen: Mask, agreeing: Mask, axes: tuple[_Axis, ...]) -> None:
+    """Refuse captures that contradict each other: code against phase, or a code that jumps at every other cell."""
+    pixels = int(np.count_nonzero(seen))
+    if pixels < FEWEST_PIXELS:
+        return
+    share = np.count_nonzero(agreeing) / pixels
+    steady = min(_steady_share(axis.position_px, agreeing) for axis in axes)
+    if share < LEAST_CONSISTENT or steady < LEAST_STEADY:
         raise CalibrationError(
             "captures-inconsistent",
-            what=f"Gray code and phase agree at only {100 * agreeing / pixels:.0f} % of the lit camera pixels.",
+            what=f"Gray code and phase agree at {100 * share:.0f} % of the lit camera pixels, and {100 * steady:.0f} % "
+            "of the steps from cell to cell go to the next one.",
             remedy="A photograph shows another pattern than it should, or something moved: check the delay between "
             "display and camera and that nothing moves, and take the photographs again.",
         )
+
+
+def _steady_share(position_px: FloatImage, agreeing: Mask) -> float:
+    """Of adjacent camera pixels in different cells, the share in adjacent cells."""
+    crossings = jumps = 0
+    cell = np.floor(np.where(agreeing, position_px, np.nan) / np.float32(CELL_PX))
+    for axis in range(2):
+        step = np.abs(np.diff(cell, axis=axis))
+        crossings += int(np.count_nonzero(step > 0))
+        jumps += int(np.count_nonzero(step > 1))
+    return 1 - jumps / crossings if crossings else 1.0
 
 
 def frame_margin_px(modulation: FloatImage) -> float:

@@ -159,6 +159,7 @@ def response_curve(levels: np.ndarray[tuple[int, ...], np.dtype[np.int64]], ligh
     middle = (known > 0.02) & (known < 0.98)
     gamma = float(np.clip(np.median(np.log(known[middle]) / np.log(at[middle])), 0.3, 4)) if middle.any() else 1.0
     curve = PchipInterpolator(at**gamma, known)((np.arange(256) / 255) ** gamma)
+    curve[0], curve[-1] = 0.0, 1.0
     return np.asarray(np.maximum.accumulate(np.clip(curve, 0, 1)), np.float64)
 
 

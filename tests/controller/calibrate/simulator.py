@@ -6,7 +6,10 @@ of each camera pixel, blurred by the camera and averaged. No Gaussians per pixel
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -26,6 +29,8 @@ class Scene:
     projector_px: tuple[int, int] = (112, 88)
     scale: float = 2.4
     bend: float = 3.0
+    step_px: float = 0.0
+    """Projector px by which the right 40 % of the camera's image look farther right: a depth edge."""
     projector_blur_px: float = 0.3
     camera_blur_px: float = 0.6
     lit_share_of_pixel: int = 8
@@ -48,7 +53,8 @@ class Scene:
         r2 = np.sum((q / 60) ** 2, axis=-1, keepdims=True)
         w = 1 + 0.002 * q[..., :1]
         bulge = self.bend * np.stack([np.sin(q[..., 1] / 25), np.cos(q[..., 0] / 30)], axis=-1)
-        return np.asarray(q * (1 + 0.05 * r2) / w + bulge + (np.array(self.projector_px) - 1) / 2)
+        step = np.where(camera[..., :1] > 0.6 * self.camera_px[0], self.step_px, 0.0) * np.array([1.0, 0.0])
+        return np.asarray(q * (1 + 0.05 * r2) / w + bulge + step + (np.array(self.projector_px) - 1) / 2)
 
     def jacobian(self, camera: Float64) -> Float64:
         """(..., 2, 2) d projector / d camera."""
@@ -141,3 +147,18 @@ class Stage:
         plan = self.plan()
         response = self.scene.response()
         return {p.name: self.photograph(device_frame(p, plan.size_px, response)) for p in plan}
+
+
+@functools.cache
+def photographed(scene: Scene) -> Mapping[str, FloatImage]:
+    """``Stage(scene).captures()``, made once for all tests; do not write into it."""
+    captures = Stage(scene).captures()
+    for image in captures.values():
+        image.setflags(write=False)
+    return MappingProxyType(captures)
+
+
+def positions(scene: Scene) -> Float64:
+    """(rows, columns, 2): the projector position each camera pixel truly looks at."""
+    x, y = np.meshgrid(np.arange(scene.camera_px[0], dtype=float), np.arange(scene.camera_px[1], dtype=float))
+    return scene.projector_of(np.stack([x, y], axis=-1))
