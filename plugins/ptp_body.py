@@ -23,15 +23,18 @@ _EVERY_STORE: Final = 0xFFFF_FFFF
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How patient the driver is, in seconds. ``answer_s``: for an ordinary answer; ``busy_s``: with a busy camera;
-    ``margin_s``: for a picture, beyond twice its exposure; ``grace_s``: for an event, before asking for what it would
-    have told; ``reconnect_s``: for a camera to come back during a picture; ``keep_alive_s``: between two signs of life.
+    """How patient the driver is, in seconds.
+
+    ``answer_s``: for an ordinary answer; ``busy_s``: with a busy camera; ``margin_s``: for a picture, beyond twice its
+    exposure; ``grace_s``: for an event, before asking for what it would have told; ``come_back_s``: for a lost camera
+    to answer again, ``reconnect_s``: the same during a picture; ``keep_alive_s``: between two signs of life.
     """
 
     answer_s: float = 15.0
     busy_s: float = 20.0
     margin_s: float = 15.0
     grace_s: float = 1.0
+    come_back_s: float = 2.0
     reconnect_s: float = 30.0
     keep_alive_s: float = 5.0
 

@@ -27,7 +27,6 @@ Result = TypeVar("Result")
 _SESSION: Final = 1
 _ATTEMPTS: Final = 4
 _CLOSE_S: Final = 0.7
-_QUICK_RECONNECT_S: Final = 2.0
 
 
 class PtpCamera:
@@ -89,8 +88,8 @@ class PtpCamera:
         attempt = 0
         while True:
             attempt += 1
+            body = self._ready(deadline, self._timing.reconnect_s if shot.fired else self._timing.come_back_s)
             try:
-                body = self._ready(deadline, self._timing.reconnect_s if shot.fired else _QUICK_RECONNECT_S)
                 if shot.fired:
                     shot.resume()
                 else:
@@ -116,12 +115,13 @@ class PtpCamera:
 
     def _with_body(self, work: Callable[[Body], Result], deadline: Deadline) -> Result:
         """Do ``work``; if that breaks the connection, once more on a new one. Only for what may be done twice."""
+        body = self._ready(deadline, self._timing.come_back_s)
         try:
-            return work(self._ready(deadline, _QUICK_RECONNECT_S))
+            return work(body)
         except (DeviceGone, DeviceTimeout, ProtocolError):
-            if self._closed or deadline.passed or not self._link_broken():
+            if deadline.passed or not self._link_broken():
                 raise
-            return work(self._ready(deadline, _QUICK_RECONNECT_S))
+        return work(self._ready(deadline, self._timing.come_back_s))
 
     def _exposure_s(self, body: Body, deadline: Deadline) -> float:
         return self._settings.exposure_s if self._settings is not None else body.exposure_s(deadline=deadline)
@@ -171,7 +171,7 @@ class PtpCamera:
         while True:
             try:
                 return self._reopen(deadline, after_break=True)
-            except (DeviceGone, DeviceBusy):
+            except (DeviceGone, DeviceBusy, DeviceTimeout, ProtocolError):
                 # A camera that restarts refuses connections at first, or still holds the lost one.
                 if give_up.passed:
                     raise

@@ -75,9 +75,10 @@ class EmulatedPtpCamera:
         faults: CameraFaults | None = None,
     ) -> None:
         self.faults = faults or CameraFaults()
+        self.names = names or NAMES[flavour]
         self._body = _BODIES[flavour](
             expose,
-            names=names or NAMES[flavour],
+            names=self.names,
             time_scale=time_scale,
             card_bytes=card_bytes,
             faults=self.faults,
