@@ -153,8 +153,18 @@ def cost_of(problem: Problem, state: State) -> float:
     return 0.5 * (data + float(own @ own))
 
 
-def adjust(problem: Problem, state: State, *, iterations: int = 40, tick: Callable[[], None] | None = None) -> Adjusted:
-    """Levenberg-Marquardt with the Schur complement over the points; ``tick`` is called once an iteration."""
+def adjust(
+    problem: Problem,
+    state: State,
+    *,
+    iterations: int = 40,
+    tolerance: float = 1e-8,
+    tick: Callable[[], None] | None = None,
+) -> Adjusted:
+    """Levenberg-Marquardt with the Schur complement over the points.
+
+    ``tolerance``: stops when an iteration lowers the cost by a smaller share; ``tick`` is called once an iteration.
+    """
     state = normalised(state)
     cost, damping = cost_of(problem, state), 1e-3
     for _ in range(iterations):
@@ -169,7 +179,7 @@ def adjust(problem: Problem, state: State, *, iterations: int = 40, tick: Callab
                 state, cost, damping = proposal, proposed_cost, max(damping * 0.2, 1e-9)
                 break
             damping *= 6.0
-        if before - cost < 1e-8 * before + 1e-9:
+        if before - cost < tolerance * before + 1e-9:
             break
     normal = _normal_equations(problem, state)
     depth = np.where(normal.depth > 0, normal.depth, np.inf)

@@ -198,7 +198,7 @@ def _best_stage(
             what="The projectors' light does not overlap enough on the object to join them into one stage.",
             remedy="Turn the projectors so that each one's light overlaps another's.",
         )
-    solved = [ba.adjust(small, start, tick=tick) for start in starts]
+    solved = [ba.adjust(small, start, tolerance=1e-5, tick=tick) for start in starts]
     solved = [s for s in solved if np.mean(s.state.inverse_depth > 0) > 0.95] or solved
     solved.sort(key=lambda s: s.cost)
     best = solved[0]

@@ -82,7 +82,7 @@ def solve_pair(problem: ba.Problem, index: int, size_px: tuple[int, int], tick: 
     small = replace(restricted(problem, chosen, [index]), noise_px=max(noise, 0.02))
     solved = []
     for start in starts:
-        adjusted = ba.adjust(small, _from_start(small, start), tick=tick)
+        adjusted = ba.adjust(small, _from_start(small, start), tolerance=1e-5, tick=tick)
         ahead = float(np.mean(adjusted.state.inverse_depth > 0))
         if ahead > 0.95:
             solved.append((adjusted.state, adjusted.cost))

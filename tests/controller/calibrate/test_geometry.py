@@ -39,7 +39,7 @@ def looking_at(centre: Array, target: Array, roll: float) -> Array:
     z = (target - centre) / np.linalg.norm(target - centre)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
-    return turn(2, roll) @ np.stack([x, np.cross(z, x), z])
+    return np.asarray(turn(2, roll) @ np.stack([x, np.cross(z, x), z]), dtype=np.float64)
 
 
 def make_stage(
