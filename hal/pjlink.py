@@ -13,7 +13,7 @@ from enum import Enum
 from typing import Final, Literal
 
 from hal.errors import ProtocolError
-from hal.transcript import escaped
+from hal.escapes import escaped
 from hal.values import Power
 
 PORT: Final = 4352

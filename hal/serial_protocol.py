@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from hal.errors import ProtocolError
+from hal.escapes import escaped
 from hal.profiles import Query, SerialTable
-from hal.transcript import escaped
 from hal.values import Power
 
 MOST_HOURS = 99_999

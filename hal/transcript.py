@@ -7,8 +7,7 @@ The file is ASCII. Its first line is ``velatura transcript 1``; then one line an
     7.250000 | reconnected
 
 that is: seconds since the transcript began, a space, the direction (``>`` sent to the device, ``<`` received from it,
-``|`` a remark), a space, the bytes. Bytes 0x20 to 0x7e stand for themselves except the backslash; ``\r``, ``\n``,
-``\t``, ``\\`` are as in C, every other byte is ``\xNN``. How bytes are grouped into lines has no meaning.
+``|`` a remark), a space, the bytes in the notation of ``hal.escapes``. How bytes are grouped into lines has no meaning.
 """
 
 from __future__ import annotations
@@ -25,12 +24,10 @@ from typing import Final
 
 from hal.deadline import Deadline
 from hal.errors import DeviceTimeout, ProtocolError
+from hal.escapes import escaped, unescaped
 
 HEADER: Final = "velatura transcript 1"
 _LINE: Final = re.compile(r"(?P<at>\d{1,12}\.\d{1,9}) (?P<way>[<>|]) (?P<data>[ -~]*)", re.ASCII)
-_ESCAPE: Final = re.compile(rb"\\(?:x([0-9a-f]{2})|([rnt\\]))")
-_SHORT: Final = {0x0D: "\\r", 0x0A: "\\n", 0x09: "\\t", 0x5C: "\\\\"}
-_LONG: Final = {b"r": b"\r", b"n": b"\n", b"t": b"\t", b"\\": b"\\"}
 
 
 class Way(Enum):
@@ -102,19 +99,6 @@ class Transcript:
 def line_of(entry: Entry) -> str:
     """One entry as a line of the file, without the newline."""
     return f"{entry.at_s:.6f} {entry.way.value} {escaped(entry.data)}"
-
-
-def escaped(data: bytes) -> str:
-    """Bytes as printable ASCII, in the transcript's notation."""
-    return "".join(_SHORT.get(byte) or (chr(byte) if 0x20 <= byte <= 0x7E else f"\\x{byte:02x}") for byte in data)
-
-
-def unescaped(text: str) -> bytes:
-    """The bytes that ``escaped`` wrote; ProtocolError for any other text."""
-    data = text.encode("ascii", "backslashreplace")
-    if not text.isascii() or b"\\" in _ESCAPE.sub(b"", data):
-        raise _not_a_transcript(f"the bytes {text!r} are not escaped as they should be")
-    return _ESCAPE.sub(lambda m: bytes.fromhex(m[1].decode()) if m[1] else _LONG[m[2]], data)
 
 
 def parse_transcript(text: str) -> tuple[Entry, ...]:

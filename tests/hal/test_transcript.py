@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from hal.deadline import in_seconds
 from hal.errors import DeviceTimeout, ProtocolError
-from hal.transcript import HEADER, Entry, ReplayLink, Transcript, Way, escaped, line_of, parse_transcript, unescaped
+from hal.escapes import escaped, unescaped
+from hal.transcript import HEADER, Entry, ReplayLink, Transcript, Way, line_of, parse_transcript
 
 
 @given(st.binary(max_size=200))
