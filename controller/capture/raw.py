@@ -17,6 +17,9 @@ from controller.errors import UsageError, WorkError
 SATURATED_SHARE = 0.985
 """Of full scale: sensors bend shortly before they clip."""
 JPEG_SATURATED = 254
+SINGULAR = 1e-6
+SRGB_TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
+"""D65, with the digits that LibRaw uses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +78,10 @@ def _read_raw(path: Path) -> Photograph:
             mosaic = raw.raw_image_visible.copy()
             colours = _colour_of_sites(raw, path)
             black, white = _levels(raw)
-            matrix = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
+            camera_to_xyz = _camera_to_xyz(raw)
     except (rawpy.LibRawError, OSError) as error:
         raise _unreadable(path, error) from error
-    return develop(mosaic, colours, black, white, camera_to_xyz=_inverse(matrix))
+    return develop(mosaic, colours, black, white, camera_to_xyz=camera_to_xyz)
 
 
 def _colour_of_sites(raw: Any, path: Path) -> npt.NDArray[np.int64]:
@@ -106,10 +109,16 @@ def _levels(raw: Any) -> tuple[Float64, Float64]:
     return black, white
 
 
-def _inverse(xyz_to_camera: Float64) -> Float64 | None:
-    if xyz_to_camera.shape != (3, 3) or abs(np.linalg.det(xyz_to_camera)) < 1e-6:
-        return None
-    return np.asarray(np.linalg.inv(xyz_to_camera), np.float64)
+def _camera_to_xyz(raw: Any) -> Float64 | None:
+    """From LibRaw's XYZ-to-camera matrix where it knows the camera, else from what a DNG says of itself.
+
+    LibRaw keeps a DNG's matrix only as balanced camera RGB to sRGB, with the daylight balance beside it.
+    """
+    known = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
+    if abs(np.linalg.det(known)) > SINGULAR:
+        return np.asarray(np.linalg.inv(known), np.float64)
+    to_srgb = np.asarray(raw.color_matrix, np.float64)[:, :3] * np.asarray(raw.daylight_whitebalance[:3], np.float64)
+    return SRGB_TO_XYZ @ to_srgb if abs(np.linalg.det(to_srgb)) > SINGULAR else None
 
 
 def develop(

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from controller.arrays import FloatImage
+from controller.capture.brackets import CameraNoise, choose_brackets, choose_exposure, merge_brackets
+from controller.errors import UsageError
+
+EXPOSURES = tuple(2.0**stop for stop in np.arange(-12, 3, 1 / 3))
+NOISE = CameraNoise(shot=1 / 5000, read=8 / 5000)
+
+
+def expose(radiance: FloatImage, exposure_s: float, seed: int = 0) -> FloatImage:
+    signal = radiance * exposure_s
+    random = np.random.default_rng(seed)
+    value = signal + np.sqrt(NOISE.shot * signal + NOISE.read**2) * random.standard_normal(signal.shape)
+    value = np.round(value * 4095) / 4095
+    return np.where(value < 0.985, value, np.nan).astype(np.float32)
+
+
+def scene(decades: float = 3.0) -> FloatImage:
+    return np.broadcast_to(np.geomspace(1, 10**decades, 200)[None, :, None], (150, 200, 3)).astype(np.float32)
+
+
+def test_a_merged_bracket_is_unbiased_over_its_whole_range_and_knows_its_noise() -> None:
+    truth = scene()
+    times = (1 / 1200, 1 / 150, 1 / 19)
+    merged = merge_brackets([expose(truth, t, n) for n, t in enumerate(times)], times, noise=NOISE)
+    assert np.isfinite(merged.radiance).all()
+    mean = merged.radiance.mean(axis=(0, 2))
+    np.testing.assert_allclose(mean, truth[0, :, 0], rtol=0.02)
+    pull = (merged.radiance - truth) / merged.sigma
+    assert 0.9 < pull.std() < 1.1
+    alone = expose(truth, times[0]) / times[0]
+    assert np.std((merged.radiance / truth)[:, :50]) < 0.2 * np.std((alone / truth)[:, :50])
+
+
+def test_saturated_in_every_exposure_is_not_measured() -> None:
+    truth = scene()
+    merged = merge_brackets([expose(truth, 0.01), expose(truth, 0.1)], (0.01, 0.1), noise=NOISE)
+    lost = truth * 0.01 > 1.1
+    assert np.all(np.isnan(merged.radiance[lost]))
+    assert np.isfinite(merged.radiance[truth * 0.01 < 0.9]).all()
+
+
+def test_a_bracket_that_does_not_fit_together_is_refused() -> None:
+    image = scene()
+    for images, times in (([image], (0.1, 0.2)), ([], ()), ([image, image[:5]], (0.1, 0.2)), ([image], (0.0,))):
+        with pytest.raises(UsageError) as caught:
+            merge_brackets(images, times)
+        assert caught.value.code == "bracket-mismatch"
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.3, 300), st.floats(-10, 1))
+def test_the_exposure_for_patterns_is_found_from_any_first_photograph(brightest: float, first_stop: float) -> None:
+    radiance = brightest * np.random.default_rng(1).uniform(0.2, 1.0, (40, 60, 3)).astype(np.float32)
+    exposure_s = 2.0**first_stop
+    for _ in range(8):
+        choice = choose_exposure(expose(radiance, exposure_s), exposure_s, EXPOSURES)
+        exposure_s = choice.exposure_s
+        if choice.settled:
+            break
+    assert choice.settled
+    level = np.nanpercentile((radiance * exposure_s).max(axis=2), 99.5)
+    assert 0.55 < level < 0.83
+
+
+def test_dark_and_blinding_scenes_settle_at_the_cameras_limits() -> None:
+    dark = np.zeros((20, 20, 3), np.float32)
+    assert choose_exposure(dark, EXPOSURES[-1], EXPOSURES).settled
+    assert choose_exposure(dark, EXPOSURES[-1], EXPOSURES).exposure_s == EXPOSURES[-1]
+    blind = np.full((20, 20, 3), np.nan, np.float32)
+    assert not choose_exposure(blind, 1.0, EXPOSURES).settled
+    assert choose_exposure(blind, EXPOSURES[0], EXPOSURES).settled
+
+
+@pytest.mark.parametrize("decades", [0.3, 1.0, 2.0, 2.8])
+def test_brackets_measure_the_brightest_and_the_darkest(decades: float) -> None:
+    radiance = scene(decades)
+    lit = np.ones(radiance.shape[:2], np.bool_)
+    exposure_s, settled = 0.5, False
+    while not settled:
+        choice = choose_brackets(expose(radiance, exposure_s), exposure_s, EXPOSURES, lit=lit)
+        settled = choice.settled
+        if not settled:
+            assert len(choice.exposures_s) == 1
+            exposure_s = choice.exposures_s[0]
+    assert list(choice.exposures_s) == sorted(set(choice.exposures_s))
+    assert set(choice.exposures_s) <= set(EXPOSURES)
+    assert len(choice.exposures_s) <= 4
+    assert radiance.max() * choice.exposures_s[0] < 0.95
+    assert radiance.min() * choice.exposures_s[-1] > 0.1
+    steps = np.array(choice.exposures_s[1:]) / np.array(choice.exposures_s[:-1])
+    assert np.all(steps <= 8.01)
+
+
+def test_a_camera_without_exposures_is_explained() -> None:
+    with pytest.raises(UsageError) as caught:
+        choose_exposure(scene(), 1.0, ())
+    assert caught.value.code == "no-exposures"
