@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import random
+import re
 import string
 import tomllib
 from collections.abc import Mapping
@@ -170,6 +172,42 @@ def test_a_folder_without_a_stage_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no .*stage\.toml") as error:
         load_stage(tmp_path)
     assert error.value.code == "stage-missing"
+
+
+PIECES = ["", "=", "[", "]", "{", "}", '"', "'", "\n", ".", "-1", "1e999", "9" * 400, "[[", "true", "nan", "é", "\x00"]
+PIECES += ["1979-05-27", "x = 1\n", "[camera]\n", "[[projectors]]\n", "[]", "{}", '"""', '"text"', "0", "[1, {a = 2}]"]
+
+
+def damaged(chance: random.Random) -> str:
+    """The stage with some of its characters, or one whole value, replaced."""
+    text = STAGE
+    if chance.random() < 0.5:
+        value = chance.choice(list(re.finditer(r"(?<== ).*", text)))
+        return text[: value.start()] + chance.choice(PIECES) + text[value.end() :]
+    for _ in range(chance.randint(1, 3)):
+        at = chance.randrange(len(text))
+        text = text[:at] + chance.choice(PIECES) + text[at + chance.choice([0, 1, 1, 8]) :]
+    return text
+
+
+def test_a_damaged_stage_never_gets_more_than_a_sentence(tmp_path: Path) -> None:
+    chance = random.Random(5)
+    codes = set()
+    for _ in range(1500):
+        told = told_about(tmp_path, damaged(chance))
+        if told is not None:
+            assert re.search(r"stage\.toml(, line \d+|, at its end)", told.what), told.what
+            assert told.remedy
+            codes.add(told.code)
+    assert codes == {*("stage-syntax", "stage-key-unknown", "stage-key-missing", "stage-key-type", "stage-key-value")}
+
+
+def told_about(tmp_path: Path, text: str) -> UsageError | None:
+    try:
+        load(tmp_path, text)
+    except UsageError as error:
+        return error
+    return None
 
 
 def a_driver(**settings: str) -> Driver:

@@ -18,9 +18,13 @@ from controller.session.lamps import LampFile
 TOY = Path(__file__).with_name("toy_pipeline.py")
 
 
-def start(folder: Path) -> subprocess.Popen[str]:
+SLOW_S = "0.2"
+"""A pause that leaves even a busy machine the time to press Ctrl-C in the middle of the work."""
+
+
+def start(folder: Path, pause_s: str = "0.01") -> subprocess.Popen[str]:
     folder.mkdir(exist_ok=True)
-    process = subprocess.Popen([sys.executable, TOY, folder], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, TOY, folder, pause_s], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline().startswith("begun")
     return process
@@ -74,7 +78,7 @@ def test_a_finished_run_does_nothing_again(tmp_path: Path) -> None:
 def test_ctrl_c_cools_the_lamp_even_when_pressed_again_and_the_run_goes_on_later(
     tmp_path: Path, uninterrupted: dict[str, bytes], number: signal.Signals
 ) -> None:
-    process = start(tmp_path)
+    process = start(tmp_path, SLOW_S)
     while not (tmp_path / "worked.log").exists():
         time.sleep(0.005)
     assert (tmp_path / "lamp").read_text() == "lit"
@@ -95,7 +99,7 @@ def test_ctrl_c_cools_the_lamp_even_when_pressed_again_and_the_run_goes_on_later
 
 
 def test_a_killed_run_leaves_the_lamp_on_record_as_lit(tmp_path: Path) -> None:
-    process = start(tmp_path)
+    process = start(tmp_path, SLOW_S)
     while not (tmp_path / "worked.log").exists():
         time.sleep(0.005)
     process.kill()

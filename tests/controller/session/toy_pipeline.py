@@ -1,6 +1,6 @@
 """A run of several steps in a process of its own, for tests that kill it or press Ctrl-C.
 
-Usage: toy_pipeline.py FOLDER. Every piece of work leaves a line in FOLDER/worked.log before it begins.
+Usage: toy_pipeline.py FOLDER [PAUSE_S]. Every piece of work leaves a line in FOLDER/worked.log before it begins.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
 
 SHOTS = 12
-PAUSE_S = 0.01
+PAUSE_S = float(sys.argv[2]) if len(sys.argv) > 2 else 0.01
 
 
 class LampInAFile:
