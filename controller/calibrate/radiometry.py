@@ -174,7 +174,7 @@ def _rising(values: Float64) -> Float64:
         groups.append((mean, size))
     pooled = np.concatenate([np.full(size, mean) for mean, size in groups])
     pooled[0], pooled[-1] = 0.0, 1.0
-    return np.asarray(pooled)
+    return np.round(pooled, 12)
 
 
 @dataclass(frozen=True, slots=True)

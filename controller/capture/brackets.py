@@ -14,6 +14,8 @@ TARGET = 0.75
 """Of full scale, for the brightest lit pixels of a pattern: bright enough, and room for the lamp's flicker."""
 BRIGHT_PERCENTILE = 99.5
 LIT_SHARE = 0.05
+TOO_DARK = 0.1
+"""Below it a percentile says more of the noise than of the light."""
 BRACKET_CEILING = 0.8
 BRACKET_DARK = 0.2
 BRACKET_STEP = 8.0
@@ -120,7 +122,7 @@ def choose_exposure(
     brightest = _brightest(image, lit)
     if brightest is None:
         return ExposureChoice(_at_most(exposures, exposure_s / 8), exposure_s <= exposures[0])
-    if brightest < 0.02:
+    if brightest < TOO_DARK:
         longer = _at_most(exposures, exposure_s * min(16.0, 0.5 / max(brightest, 1e-3)))
         return ExposureChoice(longer, longer <= exposure_s)
     return ExposureChoice(_at_most(exposures, exposure_s * target * 1.07 / brightest), True)
