@@ -25,10 +25,11 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644) -> None:
 
 def stream_atomically(path: Path, write: Callable[[BinaryIO], object], *, mode: int = 0o644) -> None:
     """As ``write_atomically``, for content that ``write`` produces into an open binary file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    temporary = Path(name)
+    temporary: Path | None = None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        temporary = Path(name)
         with os.fdopen(handle, "wb") as file:
             write(file)
             file.flush()
@@ -38,7 +39,8 @@ def stream_atomically(path: Path, write: Callable[[BinaryIO], object], *, mode: 
     except OSError as error:
         raise _explained(error, path) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
     sync_folder(path.parent)
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.registry import Driver, OpenContext
-from hal.values import DeviceIdentity, OutputInfo, Presented
+from hal.values import DeviceIdentity, OutputInfo, PlaybackStatus, Presented
 
 _PROTOCOL: Final = 1
 _SLICE_S: Final = 0.1
@@ -137,6 +137,24 @@ class PlayerDisplay:
         """What the player shows and how evenly: the keys of "status" in docs/player-protocol.md."""
         return self._ask({"op": "status"}, deadline)
 
+    def playing(self, *, deadline: Deadline) -> PlaybackStatus:
+        """What is shown now, and how evenly; see ``hal.interfaces.BundleDisplay.playing``."""
+        answer = self.status(deadline=deadline)
+        try:
+            return PlaybackStatus(
+                swaps=int(answer["swaps"]),
+                presented_at_s=float(answer["presented_at"]),
+                running=bool(answer["sequence_running"]),
+                late=int(answer["late"]),
+                appearance=answer["appearance"],
+                bundle=answer["bundle"],
+                interval_p50_s=answer["interval_p50_s"],
+                interval_p99_s=answer["interval_p99_s"],
+                rss_bytes=int(answer["rss_bytes"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise _broken("its status lacks something") from error
+
     def load_bundle(self, path: Path, *, deadline: Deadline) -> str:
         """Let the player use another bundle from now on; returns the bundle's identity (hex)."""
         return str(self._ask({"op": "load-bundle", "path": str(path.resolve())}, deadline)["bundle"])
@@ -163,10 +181,9 @@ class PlayerDisplay:
     def _connect(self, deadline: Deadline) -> None:
         if self._channel is not None:
             return
-        deadline.check("player-silent", what="There was no time left to reach the player.", remedy="Try again.")
         channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            channel.connect(str(self._path))
+            _call(channel, self._path, deadline)
         except OSError as error:
             channel.close()
             raise DeviceGone(
@@ -174,6 +191,9 @@ class PlayerDisplay:
                 what=f"No player answers at {self._path}.",
                 remedy="Start it with 'velatura play' or through its systemd unit; then ask again.",
             ) from error
+        except BaseException:
+            channel.close()
+            raise
         self._channel = channel
         try:
             self._greet(deadline)
@@ -226,13 +246,14 @@ class PlayerDisplay:
 
     def _send(self, line: bytes, deadline: Deadline) -> None:
         assert self._channel is not None
-        deadline.check("player-silent", what="There was no time left to ask the player.", remedy="Try again.")
+        silent = _silent()
+        deadline.check(silent.code, what=silent.what, remedy=silent.remedy)
         self._channel.settimeout(max(0.001, deadline.left_s()))
         try:
             self._channel.sendall(line)
         except TimeoutError as error:
             self.close()  # half a line may be under way
-            raise _silent() from error
+            raise silent from error
 
     def _answer(self, deadline: Deadline) -> dict[str, Any]:
         assert self._channel is not None
@@ -257,6 +278,20 @@ class PlayerDisplay:
         if not isinstance(answer, dict):
             raise _broken("an answer of it is not a JSON object")
         return answer
+
+
+def _call(channel: socket.socket, path: Path, deadline: Deadline) -> None:
+    """Connect; where too many others wait for the player, wait with them."""
+    channel.setblocking(False)
+    while True:
+        silent = _silent()
+        deadline.check(silent.code, what=silent.what, remedy=silent.remedy)
+        try:
+            channel.connect(str(path))
+        except BlockingIOError:
+            deadline.sleep(_SLICE_S)
+        else:
+            return
 
 
 def _presented(answer: Mapping[str, Any]) -> Presented:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import mmap
+import os
+import stat
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -51,7 +54,10 @@ class Bundle:
         not be opened, and those of ``format.parse_header``, ``format.parse_index`` and ``signing.check_signature``.
         """
         try:
-            with path.open("rb") as file:
+            # Not blocking: opening a pipe would otherwise wait for its other end, and the player with it.
+            with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+                if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                    raise OSError(errno.EINVAL, "it is not a file")
                 data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except OSError as error:
             raise BundleError(

@@ -16,6 +16,7 @@ from controller.play.protocol import MAX_LINE_BYTES, RequestWrong, error_line
 from controller.storage import exclusive
 
 MAX_CLIENTS: Final = 16
+_BACKLOG: Final = 64
 _MAX_PATH_BYTES: Final = 107
 _MAX_UNSENT_BYTES: Final = 1024 * 1024
 _RECEIVE_BYTES: Final = 64 * 1024
@@ -29,6 +30,7 @@ class Client:
         self.received = bytearray()
         self.unsent = bytearray()
         self.closing = False
+        self.drained_bytes = 0
 
     def fileno(self) -> int:
         return self.connection.fileno()
@@ -92,7 +94,7 @@ class Server:
             ) from error
         finally:
             os.umask(before)
-        self._listener.listen(MAX_CLIENTS)
+        self._listener.listen(_BACKLOG)
 
     def wake(self) -> None:
         """End a ``poll`` that is waiting, now. A full pipe means that it is ending already."""
@@ -127,15 +129,16 @@ class Server:
         with contextlib.suppress(OSError):
             connection, _ = self._listener.accept()
             connection.setblocking(False)
-            client = Client(connection)
-            self._clients.append(client)
-            if len(self._clients) > MAX_CLIENTS:
-                full = UsageError(
-                    "player-busy",
-                    what=f"The player serves {MAX_CLIENTS} connections already.",
-                    remedy="Close one of them first.",
-                )
-                self._end(client, error_line(None, full))
+            if len(self._clients) < MAX_CLIENTS:
+                self._clients.append(Client(connection))
+                return
+            full = UsageError(
+                "player-busy",
+                what=f"The player serves {MAX_CLIENTS} connections already.",
+                remedy="Close one of them first.",
+            )
+            with connection:
+                connection.send(error_line(None, full))
 
     def _receive(self, client: Client) -> list[bytes]:
         try:
@@ -148,6 +151,10 @@ class Server:
             self._drop(client)
             return []
         if client.closing:
+            # Closing with bytes unread would reset the connection before our last line is read.
+            client.drained_bytes += len(data)
+            if client.drained_bytes > _MAX_UNSENT_BYTES:
+                self._drop(client)
             return []
         client.received += data
         *lines, rest = client.received.split(b"\n")
@@ -171,8 +178,11 @@ class Server:
         except OSError:
             self._drop(client)
             return
-        if len(client.unsent) > _MAX_UNSENT_BYTES or (client.closing and not client.unsent):
+        if len(client.unsent) > _MAX_UNSENT_BYTES:
             self._drop(client)
+        elif client.closing and not client.unsent:
+            with contextlib.suppress(OSError):
+                client.connection.shutdown(socket.SHUT_WR)
 
     def _drop(self, client: Client) -> None:
         if client in self._clients:

@@ -60,15 +60,20 @@ def small_index(blob: list[Any], **changes: Any) -> Table:
 
 
 def test_every_flipped_byte_of_header_index_and_signature_is_refused(
-    tmp_path: Path, signed: Path, unsigned: Path, key: SigningKey
+    signed: Path, unsigned: Path, key: SigningKey
 ) -> None:
-    for file, how in ((signed, {"trusted": [bytes(key.verify_key)]}), (unsigned, {"allow_unsigned": True})):
+    for file, trusted in ((signed, [bytes(key.verify_key)]), (unsigned, [])):
         data = file.read_bytes()
         start, _ = index_place(data)
-        for place in [*range(128), *range(start, len(data))]:
-            changed = bytearray(data)
-            changed[place] ^= 1 << place % 8
-            refused(tmp_path / "changed.vel", bytes(changed), **how)
+        with file.open("r+b", buffering=0) as changed:
+            for place in [*range(128), *range(start, len(data))]:
+                changed.seek(place)
+                changed.write(bytes([data[place] ^ 1 << place % 8]))
+                with pytest.raises(BundleError):
+                    Bundle.open(file, trusted=trusted, allow_unsigned=not trusted)
+                changed.seek(place)
+                changed.write(data[place : place + 1])
+        assert file.read_bytes() == data
 
 
 def test_flipped_payload_bytes_are_refused_padding_included(tmp_path: Path, unsigned: Path) -> None:
