@@ -13,13 +13,15 @@ from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, Devic
 from hal.ptp import Answer, Operation
 from hal.ptp_datasets import DeviceInfo
 from hal.registry import Driver, OpenContext
+from hal.transcript import Transcript
 from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.ptp_body import Body, Channel, Picture, Shot, Timing
 from plugins.ptp_canon import EosBody
 from plugins.ptp_files import PendingFile, commit_all, kind_of
 from plugins.ptp_generic import GenericBody
 from plugins.ptp_link import PtpLink, refused
-from plugins.ptpip import PtpIpAddress, PtpIpLink
+from plugins.ptpip import PtpIpLink
+from plugins.ptpip_wire import PtpIpAddress
 
 Connect = Callable[[Deadline], PtpLink]
 Result = TypeVar("Result")
@@ -40,6 +42,7 @@ class PtpCamera:
     serial : the camera must say this serial number; "" takes the first that answers and stays with it
     to_card : let a Canon EOS store on its card instead of sending straight to this computer
     keep_on_card : leave pictures on the card after they are safe here
+    transcript : closed with the camera; what passes over a link is recorded by whoever opens it
     """
 
     def __init__(
@@ -50,9 +53,11 @@ class PtpCamera:
         to_card: bool = False,
         keep_on_card: bool = False,
         timing: Timing | None = None,
+        transcript: Transcript | None = None,
         deadline: Deadline,
     ) -> None:
         self._connect = connect
+        self._transcript = transcript
         self._serial = serial
         self._to_card = to_card
         self._keep = keep_on_card
@@ -105,13 +110,14 @@ class PtpCamera:
         self._closed = True
         deadline = in_seconds(_CLOSE_S)
         body, channel, self._body, self._channel = self._body, self._channel, None, None
-        if channel is None:
-            return
-        with contextlib.suppress(DeviceError):
-            if body is not None and not channel.link.broken:
-                body.leave(deadline=deadline)
-                channel.once(Operation.CLOSE_SESSION, deadline=deadline)
-        channel.link.close()
+        if channel is not None:
+            with contextlib.suppress(DeviceError):
+                if body is not None and not channel.link.broken:
+                    body.leave(deadline=deadline)
+                    channel.once(Operation.CLOSE_SESSION, deadline=deadline)
+            channel.link.close()
+        if self._transcript is not None:
+            self._transcript.close()
 
     def _with_body(self, work: Callable[[Body], Result], deadline: Deadline) -> Result:
         """Do ``work``; if that breaks the connection, once more on a new one. Only for what may be done twice."""
@@ -235,13 +241,21 @@ class PtpCamera:
 
 
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
-    """Open the camera of a ``[camera]`` table; ``context`` is not needed for a camera on the network."""
+    """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
     address = PtpIpAddress.parse(str(settings["address"]))
+    to_card = _choice(settings, "target", "computer", "card") == "card"
+    keep_on_card = _flag(settings, "keep_on_card")
+    transcript = None
+    if context.transcripts is not None:
+        context.transcripts.mkdir(parents=True, exist_ok=True)
+        name = f"ptpip-{address.host.replace(':', '_')}-{address.command_port}.txt"
+        transcript = Transcript(context.transcripts / name, keep=1000)
     return PtpCamera(
-        lambda until: PtpIpLink.connect(address, deadline=until),
+        lambda until: PtpIpLink.connect(address, transcript=transcript, deadline=until),
         serial=str(settings.get("serial", "")),
-        to_card=_choice(settings, "target", "computer", "card") == "card",
-        keep_on_card=_flag(settings, "keep_on_card"),
+        to_card=to_card,
+        keep_on_card=keep_on_card,
+        transcript=transcript,
         deadline=deadline,
     )
 

@@ -12,22 +12,18 @@ from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceRefused, DeviceTimeout
 from hal.ptp import Operation
 from hal.ptp_eos import (
-    MANUAL_EXPOSURE,
     Destination,
     EosProperty,
     ImageFormat,
-    ObjectAdded,
-    PropertyChanged,
-    ValuesChanged,
     aperture_of,
     exposure_of,
     iso_of,
     pack_setting,
-    parse_image_format,
     parse_records,
 )
 from hal.values import CameraCapabilities, ExposureSettings
 from plugins.ptp_body import Channel, Picture, Shot, nearest, no_such_file, still_waiting
+from plugins.ptp_canon_state import EosState
 from plugins.ptp_files import PendingFile, kind_of
 from plugins.ptp_link import Reply, camera_busy, refused
 
@@ -53,21 +49,12 @@ class EosBody:
         self._channel = channel
         self._to_card = to_card
         self._keep = keep_on_card
-        self._values: dict[int, bytes] = {}
-        self._allowed: dict[int, tuple[int, ...]] = {}
-        self._formats: tuple[ImageFormat, ...] = ()
-        self._fresh: list[ObjectAdded] = []
+        self._state = EosState()
         self._alive_at_s = time.monotonic()
 
     @property
     def capabilities(self) -> CameraCapabilities:
-        return CameraCapabilities(
-            exposures_s=tuple(sorted(self._exposures())),
-            isos=tuple(sorted(self._isos())),
-            apertures_f=tuple(sorted(self._apertures())),
-            raw=self._pick_format(raw=True) is not None,
-            jpeg=self._pick_format(raw=False) is not None,
-        )
+        return self._state.capabilities
 
     def prepare(self, *, after_break: bool, deadline: Deadline) -> None:
         for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
@@ -80,10 +67,10 @@ class EosBody:
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
         self._drain(deadline)
-        image_format = self._pick_format(raw=settings.raw)
+        image_format = self._state.pick_format(raw=settings.raw)
         if image_format is None:
             raise no_such_file(settings.raw)
-        exposures, isos, apertures = self._exposures(), self._isos(), self._apertures()
+        exposures, isos, apertures = self._state.exposures(), self._state.isos(), self._state.apertures()
         exposure_s = nearest(exposures, settings.exposure_s, setting="exposure time in seconds")
         iso = round(nearest(isos, settings.iso, setting="ISO speed")) if isos else settings.iso
         aperture_f = settings.aperture_f
@@ -99,7 +86,7 @@ class EosBody:
 
     def exposure_s(self, *, deadline: Deadline) -> float:
         self._drain(deadline)
-        return exposure_of(self._number(EosProperty.SHUTTER)) or 30.0
+        return exposure_of(self._state.number(EosProperty.SHUTTER)) or 30.0
 
     def release(self, shot: Shot, *, deadline: Deadline) -> None:
         self._aim_at_target(deadline)
@@ -127,14 +114,14 @@ class EosBody:
     def collect(self, shot: Shot, *, deadline: Deadline) -> list[Picture]:
         """Poll for the records of the new files; on a card also look at the list, should a record be lost."""
         timing = self._channel.timing
-        expected = len(self._current_format() or (None,))
+        expected = len(self._state.current_format() or (None,))
         listing_due_s = 0.0 if shot.recovering else 2 * shot.exposure_s + timing.grace_s
         pause_s = 0.002
         while True:
-            for new in self._fresh:
+            for new in self._state.fresh:
                 if kind_of(new.format, new.filename) is not None and new.handle not in shot.known:
                     shot.found[new.handle] = Picture(new.handle, new.format, new.size, new.filename, new.waiting)
-            self._fresh.clear()
+            self._state.fresh.clear()
             if len(shot.found) < expected and shot.age_s() >= listing_due_s:
                 self._look_again(shot, deadline)
                 listing_due_s = shot.age_s() + timing.grace_s
@@ -197,26 +184,18 @@ class EosBody:
         for _ in range(_MOST_DRAINS):
             reply = self._channel.ask(Operation.EOS_GET_EVENT, doing="say what has changed", deadline=deadline)
             records = parse_records(reply.data)
-            for record in records:
-                match record:
-                    case PropertyChanged(code, data):
-                        self._values[code] = data
-                    case ValuesChanged(code, values, formats):
-                        self._allowed[code] = values
-                        self._formats = formats if code == EosProperty.IMAGE_FORMAT else self._formats
-                    case ObjectAdded():
-                        self._fresh.append(record)
+            self._state.take(records)
             if not records:
                 return
 
     def _aim_at_target(self, deadline: Deadline) -> None:
         """Let pictures go to this computer, or to the card; looked at each time, for bodies change it by themselves."""
         self._drain(deadline)
-        if EosProperty.CAPTURE_DESTINATION not in self._values:
+        if not self._state.knows(EosProperty.CAPTURE_DESTINATION):
             self._to_card = True
             return
-        cards = [one for one in self._allowed.get(EosProperty.CAPTURE_DESTINATION, ()) if one != Destination.HOST]
-        now = self._number(EosProperty.CAPTURE_DESTINATION)
+        cards = [one for one in self._state.allowed(EosProperty.CAPTURE_DESTINATION) if one != Destination.HOST]
+        now = self._state.number(EosProperty.CAPTURE_DESTINATION)
         wanted: int = Destination.HOST
         if self._to_card:
             wanted = now if now != Destination.HOST or not cards else cards[0]
@@ -232,10 +211,10 @@ class EosBody:
     def _forget_old_pictures(self, deadline: Deadline) -> None:
         """What waits from before this shot belongs to an earlier one, and must not be taken for this one."""
         self._drain(deadline)
-        for old in self._fresh:
+        for old in self._state.fresh:
             if old.waiting:
                 self._channel.once(Operation.EOS_TRANSFER_COMPLETE, old.handle, deadline=deadline)
-        self._fresh.clear()
+        self._state.fresh.clear()
 
     def _look_again(self, shot: Shot, deadline: Deadline) -> None:
         """A record may have been lost: list the card, or have the body report everything anew."""
@@ -257,9 +236,9 @@ class EosBody:
     def _set(self, code: EosProperty, value: int | ImageFormat, deadline: Deadline) -> int:
         """Set a property and wait until the body says so (C189); return what it says."""
         wanted = pack_setting(code, value)[8:]
-        if self._values.get(code, b"")[: len(wanted)] == wanted:
-            return self._number(code)
-        self._values.pop(code, None)
+        if self._state.is_set(code, wanted):
+            return self._state.number(code)
+        self._state.forget(code)
         self._channel.ask(
             Operation.EOS_SET_PROPERTY,
             data=pack_setting(code, value),
@@ -268,13 +247,13 @@ class EosBody:
             deadline=deadline,
         )
         self._await_value(code, deadline.within(self._channel.timing.answer_s))
-        return self._number(code)
+        return self._state.number(code)
 
     def _await_value(self, code: EosProperty, until: Deadline) -> None:
         pause_s = 0.001
-        while code not in self._values:
+        while True:
             self._drain(until)
-            if code in self._values:
+            if self._state.knows(code):
                 return
             if until.passed:
                 # What is set is unknown now; a new connection begins with a full report.
@@ -286,44 +265,6 @@ class EosBody:
                 )
             until.sleep(pause_s)
             pause_s = min(0.05, 2 * pause_s)
-
-    def _number(self, code: EosProperty) -> int:
-        return int.from_bytes(self._values.get(code, b"")[:4], "little")
-
-    def _codes(self, code: EosProperty) -> tuple[int, ...]:
-        manual = EosProperty.EXPOSURE_MODE not in self._values or (
-            self._number(EosProperty.EXPOSURE_MODE) == MANUAL_EXPOSURE
-        )
-        return self._allowed.get(code, ()) if manual else ()
-
-    def _exposures(self) -> dict[float, int]:
-        codes = self._codes(EosProperty.SHUTTER)
-        return {seconds: code for code in codes if (seconds := exposure_of(code)) is not None}
-
-    def _isos(self) -> dict[int, int]:
-        return {iso: code for code in self._codes(EosProperty.ISO) if (iso := iso_of(code)) is not None}
-
-    def _apertures(self) -> dict[float, int]:
-        codes = self._codes(EosProperty.APERTURE)
-        return {number: code for code in codes if (number := aperture_of(code)) is not None}
-
-    def _current_format(self) -> ImageFormat | None:
-        data = self._values.get(EosProperty.IMAGE_FORMAT)
-        return None if data is None else parse_image_format(data)
-
-    def _pick_format(self, *, raw: bool) -> ImageFormat | None:
-        """The best format of a kind: full-size RAW, alone where the body has it; else one full-size fine JPEG."""
-        known = self._formats
-        if not known and (current := self._current_format()):
-            known = (current,)
-        able = [one for one in known if any(part.raw == raw for part in one)]
-        return min(able, default=None, key=lambda one: _rank(one, raw))
-
-
-def _rank(image_format: ImageFormat, raw: bool) -> tuple[int, int, int]:
-    """Smaller is better: whole picture size, then few files, then little compression."""
-    part = next(part for part in image_format if part.raw == raw)
-    return part.size, len(image_format), -part.compression
 
 
 def _not_released(code: int) -> DeviceRefused:

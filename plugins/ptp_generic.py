@@ -171,9 +171,11 @@ class GenericBody:
         return nearest(self._allowed(code), wanted, setting=setting)
 
     def _confirm(self, code: Property, value: float, deadline: Deadline) -> float:
-        """Set and read back: what counts is what the camera says afterwards."""
+        """Set, unless it is so already, and read back: what counts is what the camera says afterwards."""
         description = self._settings[code]
-        self._set(description, round(value / _STEPS[code]), deadline)
+        wanted = round(value / _STEPS[code])
+        if self._read(description, deadline) != wanted:
+            self._set(description, wanted, deadline)
         return round(self._read(description, deadline) * _STEPS[code], 6)
 
     def _describe(self, code: int, deadline: Deadline) -> PropertyDescription:

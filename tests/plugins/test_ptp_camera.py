@@ -30,7 +30,8 @@ from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.shot import ShotFiles, ShotSettings
 from plugins.ptp_body import Timing
 from plugins.ptp_camera import DRIVER, PtpCamera, open_camera
-from plugins.ptpip import PtpIpAddress, PtpIpLink
+from plugins.ptpip import PtpIpLink
+from plugins.ptpip_wire import PtpIpAddress
 
 FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old")
 QUICK = Timing(answer_s=1.0, busy_s=1.5, margin_s=0.6, grace_s=0.1, come_back_s=0.3, reconnect_s=3.0, keep_alive_s=0.05)
