@@ -81,6 +81,7 @@ class PlayerDisplay:
         self._outputs: tuple[OutputInfo, ...] = ()
         self._received = b""
         self._ticket = 0
+        self._closed = False
 
     # --- hal.interfaces.Display ---------------------------------------------------------------------------------
 
@@ -109,13 +110,8 @@ class PlayerDisplay:
 
     def close(self) -> None:
         """Let go of the player; it goes on showing what it shows."""
-        channel, self._channel = self._channel, None
-        inbox, self._inbox = self._inbox, None
-        self._received = b""
-        if channel is not None:
-            channel.close()
-        if inbox is not None:
-            inbox.close()
+        self._closed = True
+        self._hang_up()
 
     # --- beyond the interface -----------------------------------------------------------------------------------
 
@@ -178,7 +174,18 @@ class PlayerDisplay:
                     remedy="Make frames of the size that stage.toml gives for this output.",
                 )
 
+    def _hang_up(self) -> None:
+        channel, self._channel = self._channel, None
+        inbox, self._inbox = self._inbox, None
+        self._received = b""
+        if channel is not None:
+            channel.close()
+        if inbox is not None:
+            inbox.close()
+
     def _connect(self, deadline: Deadline) -> None:
+        if self._closed:
+            raise DeviceGone("display-closed", what="The display was closed.", remedy="Open it again to use it.")
         if self._channel is not None:
             return
         channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -198,7 +205,7 @@ class PlayerDisplay:
         try:
             self._greet(deadline)
         except BaseException:
-            self.close()
+            self._hang_up()
             raise
 
     def _greet(self, deadline: Deadline) -> None:
@@ -232,7 +239,7 @@ class PlayerDisplay:
             while (answer := self._answer(deadline)).get("id") != self._ticket:
                 pass
         except (OSError, ProtocolError) as error:
-            self.close()
+            self._hang_up()
             if isinstance(error, DeviceError):
                 raise
             raise DeviceGone("player-gone", what="The player ended meanwhile.", remedy=_RESTARTED) from error
@@ -240,7 +247,7 @@ class PlayerDisplay:
             return answer
         told = answer.get("error")
         if not isinstance(told, dict) or not all(isinstance(told.get(k), str) for k in ("code", "what", "remedy")):
-            self.close()
+            self._hang_up()
             raise _broken("an error of it does not say what and why")
         raise DeviceRefused(told["code"], what=told["what"], remedy=told["remedy"])
 
@@ -252,7 +259,7 @@ class PlayerDisplay:
         try:
             self._channel.sendall(line)
         except TimeoutError as error:
-            self.close()  # half a line may be under way
+            self._hang_up()  # half a line may be under way
             raise silent from error
 
     def _answer(self, deadline: Deadline) -> dict[str, Any]:
