@@ -96,3 +96,23 @@ def extrapolate(new: FloatImage, x: FloatImage, momentum: float, y: FloatImage) 
     for i in prange(new.shape[1]):
         for c in range(3):
             y[c, i] = new[c, i] + beta * (new[c, i] - x[c, i])
+
+
+@compiled(parallel=True, fastmath=True)
+def scale_base(
+    mixed: FloatImage,
+    means: FloatImage,
+    coverage: FloatImage,
+    unmix: FloatImage,
+    start: int,
+    end: int,
+    out: FloatImage,
+) -> None:
+    """Write clip(unmix (mixed (.) means (.) coverage)) for the pixels of one projector; all planes (3, pixels)."""
+    for i in prange(start, end):
+        a = mixed[0, i] * means[0, i] * coverage[0, i]
+        b = mixed[1, i] * means[1, i] * coverage[1, i]
+        c = mixed[2, i] * means[2, i] * coverage[2, i]
+        for k in range(3):
+            value = unmix[k, 0] * a + unmix[k, 1] * b + unmix[k, 2] * c
+            out[k, i] = min(max(value, np.float32(0)), np.float32(1))

@@ -1,0 +1,186 @@
+"""New appearances at interactive speed: base times scale (paper 3, eqs 4-6), and the full solve started from it.
+
+C_t = C_b x C_s for every camera pixel; the base's frames P_b are solved once; each projector pixel's P_s is the mean of
+C_s over its metapixel; then P_t = P_b x P_s. Light is counted above the black image K, and the product is taken in the
+camera's colours, M p, so that projectors of different primaries are scaled alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+
+from controller.arrays import FloatImage
+from controller.calibrate.values import Calibration
+from controller.solve.bounded import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
+from controller.solve.gradient import scale_base
+from controller.transport import LightTransport
+from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
+
+BaseKind = Literal["minimum", "white"]
+Mode = Literal["auto", "scale", "full"]
+
+FAINTEST_BASE: Final = 1e-2
+"""Base light below this fraction of its mean divides nothing: the pixel is left out of its metapixels' means."""
+HEADROOM: Final = 0.5
+"""A white base uses this part of the reachable light, so that scales above 1 are possible."""
+FINE_DETAIL: Final = 0.02
+"""Share of a target's light above one projector's frequency limit from which a full solve is advised."""
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """A solved base image, ready to be scaled.
+
+    ``image`` (rows, columns, 3): C_b with the black image; ``solution``: its frames P_b
+    ``inverse`` (3, rows, columns): 1 / base light, 0 where the base is (nearly) zero
+    ``coverage`` (3, pixels): 1 / share of each metapixel that has base light, 0 where none has
+    ``mixed`` (3, pixels): M p_b
+    """
+
+    image: FloatImage
+    solution: Solution
+    inverse: FloatImage
+    coverage: FloatImage
+    mixed: FloatImage
+
+
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """Frames (rows, columns, 3) linear in [0, 1], one a projector; ``mode`` is how they were made."""
+
+    frames: tuple[FloatImage, ...]
+    mode: Literal["scale", "full"]
+    fine_detail: float
+    solution: Solution | None
+
+
+def base_image(calibration: Calibration, kind: BaseKind = "white") -> FloatImage:
+    """The base image C_b as radiance, (rows, columns, 3); the black image alone outside the object.
+
+    ``"minimum"``: the darkest white image among the projectors that light a pixel, which drops specular highlights and
+    keeps the object's own pattern (paper 3.1, 5). ``"white"``: even light over the object, so that its pattern is
+    cancelled in the base, at full resolution, and the scale has only the target's detail.
+    """
+    whites = np.stack([p.white for p in calibration.projectors])
+    mask = calibration.object_mask & (whites.max(axis=(0, 3)) > 0)
+    if kind == "minimum":
+        faint = 1e-3 * whites.max(axis=(1, 2, 3), keepdims=True)
+        light = np.where(whites.max(axis=3, keepdims=True) > faint, whites, np.inf).min(axis=0)
+        light[~np.isfinite(light)] = 0
+        light[~mask] = 0
+        return np.asarray(light + calibration.black, np.float32)
+    reach = (whites.sum(axis=0) + calibration.black)[mask].min(axis=1)
+    level = HEADROOM * float(np.quantile(reach, 0.05)) if reach.size else 0.0
+    return np.where(mask[..., None], np.maximum(calibration.black, np.float32(level)), calibration.black)
+
+
+def solve_base(
+    transport: LightTransport,
+    image: FloatImage,
+    black: FloatImage,
+    *,
+    smoothness: float = SMOOTHNESS,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Base:
+    """Solve the frames of a base ``image`` (``base_image``) and prepare to scale them; errors as ``solve_bounded``."""
+    solution = solve_bounded(
+        transport, image, black, smoothness=smoothness, tolerance=tolerance, progress=progress, cancelled=cancelled
+    )
+    return prepare_base(transport, image, black, solution)
+
+
+def prepare_base(transport: LightTransport, image: FloatImage, black: FloatImage, solution: Solution) -> Base:
+    """A Base from frames that were solved before for ``image``."""
+    light = image_planes(np.maximum(image - black, 0))
+    mask = transport.object_mask
+    faint = FAINTEST_BASE * light[:, mask].mean() if mask.any() else 0.0
+    present = mask & (light > max(faint, np.finfo(np.float32).tiny))
+    inverse = np.divide(1, light, out=np.zeros_like(light), where=present)
+    share = transport.gaussian_mean_planes(present.astype(np.float32))
+    coverage = np.divide(1, share, out=np.zeros_like(share), where=share > 0)
+    mixed = np.empty_like(share)
+    p = frame_planes(solution.frames)
+    for n, M in enumerate(transport.mixing):
+        mixed[:, transport.span(n)] = M @ p[:, transport.span(n)]
+    return Base(image, solution, inverse, coverage, mixed)
+
+
+def scale_frames(transport: LightTransport, base: Base, target: FloatImage, black: FloatImage) -> list[FloatImage]:
+    """P_t = P_b x P_s (paper eqs 4-6): frames (rows, columns, 3) in [0, 1] for a target radiance (rows, columns, 3).
+
+    Exact where C_t / C_b has no detail finer than one projector's pixels (paper 3.3).
+    Raises UsageError("image-wrong-size", "target-not-finite").
+    """
+    check_target(transport, target)
+    scale = image_planes(np.maximum(target - black, 0))
+    scale *= base.inverse
+    means = transport.gaussian_mean_planes(scale)
+    out = np.empty_like(means)
+    for n, M in enumerate(transport.mixing):
+        start, end = transport.span(n).start, transport.span(n).stop
+        unmix = np.linalg.inv(M.astype(np.float64)).astype(np.float32)
+        scale_base(base.mixed, means, base.coverage, unmix, start, end, out)
+    return plane_frames(out, transport.sizes)
+
+
+def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black: FloatImage) -> float:
+    """Share of the target's light (rms) that the scale image would need above one projector's frequency limit F.
+
+    F is half a cycle a projector pixel, whose pitch in the camera is the root of camera pixels by projector pixels.
+    """
+    pitch = max((_pitch(transport, n) for n in range(len(transport.sizes))), default=1.0)
+    light = np.maximum(target - black, 0)
+    inverse = plane_image(base.inverse)
+    scale = light * inverse
+    # A Gaussian that halves the amplitude at F: exp(-2 (pi sigma F)^2) = 1/2 with F = 1 / (2 pitch).
+    sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi
+    present = (inverse > 0).astype(np.float32)
+    blurred, weight = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (scale, present))
+    low = np.divide(blurred, weight, out=np.zeros_like(blurred), where=weight > 0)
+    fine = np.divide(scale - low, inverse, out=np.zeros_like(scale), where=inverse > 0)
+    whole = float((light[transport.object_mask].astype(np.float64) ** 2).sum())
+    return float(np.sqrt((fine[transport.object_mask].astype(np.float64) ** 2).sum() / whole)) if whole > 0 else 0.0
+
+
+def _pitch(transport: LightTransport, n: int) -> float:
+    pixels = int((transport.per_weight[transport.span(n)] > 0).sum())
+    return float(np.sqrt(transport.lit[n].sum() / pixels)) if pixels else 0.0
+
+
+def make_appearance(
+    transport: LightTransport,
+    base: Base,
+    target: FloatImage,
+    black: FloatImage,
+    *,
+    mode: Mode = "auto",
+    smoothness: float = SMOOTHNESS,
+    weights: FloatImage | None = None,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Appearance:
+    """Frames for a target radiance: by base and scale, by a full solve started from it, or by what the target needs."""
+    frames: Sequence[FloatImage] = scale_frames(transport, base, target, black)
+    detail = fine_detail(transport, base, target, black)
+    if mode == "scale" or (mode == "auto" and detail < FINE_DETAIL):
+        return Appearance(tuple(frames), "scale", detail, None)
+    solution = solve_bounded(
+        transport,
+        target,
+        black,
+        smoothness=smoothness,
+        weights=weights,
+        start=frames,
+        tolerance=tolerance,
+        progress=progress,
+        cancelled=cancelled,
+    )
+    return Appearance(solution.frames, "full", detail, solution)

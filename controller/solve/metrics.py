@@ -1,0 +1,113 @@
+"""How near a photographed result is to its target: colour difference, error, sharpness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from skimage.color import deltaE_ciede2000
+
+from controller.arrays import Float64, FloatImage, Mask
+from controller.errors import UsageError
+
+BAND_PIXELS: Final = 1 << 18
+"""Pixels compared at a time, so that memory stays bounded at any size."""
+STRONG: Final = 0.9
+"""Canny's high threshold is this quantile of the target's gradient; the low one is ``WEAK`` of it."""
+WEAK: Final = 0.4
+EDGE_SIGMA_PX: Final = 1.4
+GRADIENT_SCALE: Final = 2000.0
+"""Gradients as 16-bit integers: a step from black to white stays in range, and a thousandth of it is seen."""
+FAINTEST_EDGE: Final = 40.0
+"""No threshold below this: two hundredths of the way from black to white, as a step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Figures over the pixels of a mask; ``error_map`` (rows, columns) float32 CIEDE2000, 0 outside the mask."""
+
+    delta_e00_median: float
+    delta_e00_p95: float
+    rmse: float
+    sharpness_lambda: float
+    error_map: FloatImage
+
+
+def lab_of(rgb: FloatImage, camera_to_xyz: Float64, white: float) -> Float64:
+    """CIE L*a*b* of linear camera values (..., 3); camera RGB (white, white, white) is L* = 100 and neutral."""
+    reference = camera_to_xyz @ np.full(3, white)
+    t = np.maximum(rgb.astype(np.float64) @ camera_to_xyz.T / reference, 0)
+    delta = 6 / 29
+    f = np.where(t > delta**3, np.cbrt(t), t / (3 * delta**2) + 4 / 29)
+    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], -1)
+
+
+def colour_difference(
+    achieved: FloatImage, target: FloatImage, camera_to_xyz: Float64, white: float, mask: Mask
+) -> FloatImage:
+    """CIEDE2000 at each pixel of ``mask``, 0 elsewhere; images (rows, columns, 3) in linear camera units.
+
+    ``white`` is the camera value of a perfect white at the target's exposure.
+    """
+    difference = np.zeros(mask.shape, np.float32)
+    ys, xs = np.nonzero(mask)
+    for first in range(0, ys.size, BAND_PIXELS):
+        at = ys[first : first + BAND_PIXELS], xs[first : first + BAND_PIXELS]
+        a, b = (lab_of(image[at], camera_to_xyz, white) for image in (achieved, target))
+        difference[at] = deltaE_ciede2000(b, a)  # type: ignore[no-untyped-call]
+    return difference
+
+
+def compare(achieved: FloatImage, target: FloatImage, camera_to_xyz: Float64, white: float, mask: Mask) -> Comparison:
+    """All figures of one appearance. ``rmse`` is relative to ``white``.
+
+    Raises UsageError("nothing-to-compare") when the mask is empty or the images are not finite or of different sizes.
+    """
+    if achieved.shape != target.shape or target.shape[:2] != mask.shape or not mask.any() or not white > 0:
+        raise _incomparable("they differ in size, or no pixel is to be compared")
+    if not (np.isfinite(achieved[mask]).all() and np.isfinite(target[mask]).all()):
+        raise _incomparable("some pixels are not finite")
+    difference = colour_difference(achieved, target, camera_to_xyz, white, mask)
+    inside = difference[mask]
+    error = (achieved[mask].astype(np.float64) - target[mask]) / white
+    return Comparison(
+        delta_e00_median=float(np.median(inside)),
+        delta_e00_p95=float(np.percentile(inside, 95)),
+        rmse=float(np.sqrt((error**2).mean())),
+        sharpness_lambda=sharpness(achieved, target, white, mask),
+        error_map=difference,
+    )
+
+
+def sharpness(achieved: FloatImage, target: FloatImage, white: float, mask: Mask) -> float:
+    """Local sharpness lambda: edges in common over the larger number of edges (paper 6, eq. 9); 1 without edges.
+
+    Both edge images are cut at the target's own threshold, so a flat result does not find edges in its noise.
+    """
+    gradients = [_gradient(image, white) for image in (achieved, target)]
+    strength = np.hypot(*(part.astype(np.float32) for part in gradients[1]))[mask]
+    threshold = max(float(np.quantile(strength, STRONG)) if strength.size else 0.0, FAINTEST_EDGE)
+    ours, theirs = (
+        (cv2.Canny(dx, dy, WEAK * threshold, threshold, L2gradient=True) > 0) & mask for dx, dy in gradients
+    )
+    most = max(int(ours.sum()), int(theirs.sum()))
+    return float((ours & theirs).sum() / most) if most else 1.0
+
+
+def _gradient(image: FloatImage, white: float) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]]:
+    """Gradient of a picture's brightness after a display's gamma, so that edges in the dark count as they are seen."""
+    grey = np.clip(image.mean(axis=2) / white, 0, 1) ** np.float32(1 / 2.2)
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
+    dx, dy = (cv2.Sobel(smooth, cv2.CV_32F, 1 - i, i) * GRADIENT_SCALE for i in range(2))
+    return np.round(dx).astype(np.int16), np.round(dy).astype(np.int16)
+
+
+def _incomparable(why: str) -> UsageError:
+    return UsageError(
+        "nothing-to-compare",
+        what=f"The result can't be compared with its target: {why}.",
+        remedy="Compare camera images of one stage, on pixels of the object.",
+    )

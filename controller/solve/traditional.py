@@ -1,0 +1,63 @@
+"""Compensation as it was done before: one projector, a division at each pixel (Nayar 2003, Grossberg 2004).
+
+It is what superimposed projectors are compared with (paper 6); it knows no neighbours, other projectors or bounds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from controller.arrays import FloatImage
+from controller.calibrate.values import Calibration
+from controller.errors import UsageError
+
+
+def traditional_compensation(calibration: Calibration, target: FloatImage, n: int) -> list[FloatImage]:
+    """Frames that make ``target`` with projector ``n`` alone; the other projectors are black.
+
+    p = M^-1 ((C_t - K) / W_n), read bilinearly at the camera pixel each metapixel's centre falls on, clipped to [0, 1].
+    ``target`` (rows, columns, 3): linear radiance, finite.
+
+    Raises UsageError("projector-unknown", "image-wrong-size", "target-not-finite").
+    """
+    if not 0 <= n < len(calibration.projectors):
+        raise UsageError(
+            "projector-unknown",
+            what=f"There is no projector number {n + 1}.",
+            remedy=f"Choose one from 1 to {len(calibration.projectors)}.",
+        )
+    if target.shape != calibration.black.shape:
+        raise UsageError(
+            "image-wrong-size",
+            what=f"The target is {target.shape} instead of {calibration.black.shape}.",
+            remedy="Make the target as large as this stage's camera image.",
+        )
+    if not np.isfinite(target).all():
+        raise UsageError(
+            "target-not-finite",
+            what="The target has pixels that are not finite numbers.",
+            remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
+        )
+    frames = [np.zeros((*p.metapixels.valid.shape, 3), np.float32) for p in calibration.projectors]
+    projector = calibration.projectors[n]
+    metapixels = projector.metapixels
+    usable = metapixels.valid & np.isfinite(metapixels.centre_px).all(axis=-1)
+    centre = metapixels.centre_px[usable].astype(np.float64)
+    wanted = np.maximum(target - calibration.black, 0)
+    light = _sampled(wanted, centre)
+    white = _sampled(projector.white, centre)
+    # Where the projector brings no light nothing can be divided; as bright as possible is as near as it gets.
+    ratio = np.divide(
+        light, white, out=(light > 0).astype(np.float64), where=white > 1e-6 * projector.white.max(initial=0)
+    )
+    unmixed = ratio @ np.linalg.inv(projector.radiometry.mixing).T
+    frames[n][usable] = np.clip(unmixed, 0, 1)
+    return frames
+
+
+def _sampled(
+    image: FloatImage, centre: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    at = (centre[:, 1], centre[:, 0])
+    return np.stack([map_coordinates(image[..., c], at, np.float64, order=1, mode="nearest") for c in range(3)], -1)

@@ -1,0 +1,73 @@
+"""Figures of a result: colour difference against a published pair, error, sharpness."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skimage.color import rgb2lab
+
+from controller.errors import UsageError
+from controller.solve.metrics import colour_difference, compare, lab_of, sharpness
+
+SRGB = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+
+
+def linear_picture(seed: int = 0) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    y, x = np.mgrid[0:50, 0:60]
+    checks = ((x // 10 + y // 10) % 2)[..., None] * np.array([0.5, 0.4, 0.3])
+    return np.asarray(0.1 + checks + 0.01 * np.random.default_rng(seed).random((50, 60, 3)), np.float32)
+
+
+def test_lab_agrees_with_an_independent_conversion_and_with_any_exposure() -> None:
+    linear = np.random.default_rng(0).random((5, 6, 3)).astype(np.float32)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(lab_of(linear * 0.3, SRGB, 0.3), rgb2lab(encoded), atol=0.05)
+
+
+def test_a_published_pair_has_its_published_difference() -> None:
+    # Sharma, Wu and Dalal 2005, table 1, pair 17: dE00 = 27.1492.
+    pair = np.array([[50.0, 2.5, 0.0], [73.0, 25.0, -18.0]])
+    f = np.stack(
+        [
+            (pair[:, 0] + 16) / 116 + pair[:, 1] / 500,
+            (pair[:, 0] + 16) / 116,
+            (pair[:, 0] + 16) / 116 - pair[:, 2] / 200,
+        ],
+        1,
+    )
+    xyz = np.where(f > 6 / 29, f**3, 3 * (6 / 29) ** 2 * (f - 4 / 29))
+    a, b = (row.astype(np.float32).reshape(1, 1, 3) for row in xyz)
+    difference = colour_difference(a, b, np.eye(3), 1.0, np.ones((1, 1), np.bool_))
+    assert difference[0, 0] == pytest.approx(27.1492, abs=1e-3)
+
+
+def test_a_perfect_result_has_no_error_and_all_its_edges() -> None:
+    picture = linear_picture()
+    result = compare(picture, picture, SRGB, 1.0, np.ones((50, 60), np.bool_))
+    assert (result.delta_e00_median, result.delta_e00_p95, result.rmse) == (0, 0, 0)
+    assert result.sharpness_lambda == 1
+
+
+def test_only_the_mask_counts() -> None:
+    picture, wrong = linear_picture(), linear_picture()
+    mask = np.ones((50, 60), np.bool_)
+    mask[:20] = False
+    wrong[:20] = 5
+    result = compare(wrong, picture, SRGB, 1.0, mask)
+    assert result.rmse == 0
+    assert not result.error_map.any()
+
+
+def test_blur_lowers_the_sharpness_and_a_flat_result_has_none() -> None:
+    picture, mask = linear_picture(), np.ones((50, 60), np.bool_)
+    assert sharpness(np.full_like(picture, 0.3), picture, 1.0, mask) < 0.05
+    assert sharpness(np.roll(picture, 3, 1), picture, 1.0, mask) < 0.7
+
+
+def test_an_empty_mask_is_refused() -> None:
+    picture = linear_picture()
+    with pytest.raises(UsageError) as refused:
+        compare(picture, picture, SRGB, 1.0, np.zeros((50, 60), np.bool_))
+    assert refused.value.code == "nothing-to-compare"
