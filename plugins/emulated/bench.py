@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import signal
 import socket
 import sys
@@ -120,7 +121,8 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
             raise _Interrupted
         out.progress(share)
 
-    world = stack.enter_context(World(stage, truth, lamps, progress=progress))
+    with _explained(stage):
+        world = stack.enter_context(World(stage, truth, lamps, progress=progress))
     world.warm()
     for projector, lamp in zip(truth.projectors, lamps, strict=True):
         wire = EmulatedSerialProjector(stage / projector.port, lamp)
@@ -152,7 +154,7 @@ def _require_free(*ports: int) -> None:
         except OSError as error:
             raise DeviceError(
                 "port-in-use",
-                what=f"The camera's TCP port {port} can't be served: {error.strerror}.",
+                what=f"The camera's TCP port {port} can't be served: {os.strerror(error.errno or 0)}.",
                 remedy="End the program that uses it (another bench, perhaps), or prepare the stage anew.",
             ) from error
 

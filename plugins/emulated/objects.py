@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,6 +79,7 @@ class StageObject:
         return cls(**(values | {"paint": str(values["paint"])}))
 
 
+@functools.cache
 def default_object() -> StageObject:
     """The vase and the bust side by side as one mesh."""
     (vase_points, vase_faces), (bust_points, bust_faces) = vase(), bust()
@@ -104,7 +106,7 @@ def load_object(path: Path) -> StageObject:
     if faces.ndim != 2 or len(faces) == 0:
         raise DeviceError(
             "object-no-faces",
-            what=f"{path} holds {len(vertices)} points and no faces, so there is no surface to light.",
+            what=f"{path} holds no faces, so there is no surface to light.",
             remedy="Export the object as a triangle mesh (.obj or .ply), not as a point cloud.",
         )
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
@@ -159,20 +161,21 @@ def _assembled(
 
 
 def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
-    """Unit normals (F, 3, 3): the area-weighted mean of the faces that meet at a point, or flat at sharp creases."""
+    """Unit normals (F, 3, 3): the mean of the faces that meet at a point by their angles, or flat at sharp creases."""
     corners = vertices[faces]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     # Files split vertices along texture seams; the surface is smooth there all the same.
     _, place = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
     place = place.reshape(-1)
     total = np.zeros((int(place.max()) + 1, 3))
     for corner in range(3):
+        sides = [_unit(corners[:, (corner + step) % 3] - corners[:, corner]) for step in (1, 2)]
+        angle = np.arccos(np.clip(np.sum(sides[0] * sides[1], axis=1), -1.0, 1.0))
         for axis in range(3):
-            total[:, axis] += np.bincount(place[faces[:, corner]], weights=area[:, axis], minlength=len(total))
+            total[:, axis] += np.bincount(place[faces[:, corner]], weights=angle * flat[:, axis], minlength=len(total))
     smooth = _unit(total)[place][faces]
-    flat = np.broadcast_to(_unit(area)[:, None], smooth.shape)
-    creased = np.einsum("fkc,fkc->fk", smooth, flat) < SHARPEST_CREASE
-    return np.where(creased[..., None], flat, smooth).astype(np.float32)
+    creased = np.einsum("fkc,fc->fk", smooth, flat) < SHARPEST_CREASE
+    return np.where(creased[..., None], flat[:, None], smooth).astype(np.float32)
 
 
 def _unit(vectors: Floats) -> Floats:

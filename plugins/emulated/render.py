@@ -6,6 +6,7 @@ the focal surface. Both separate into x and y, so a pixel's light at a point is 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -47,6 +48,7 @@ def emitted(light: Light, frame: ByteImage) -> FloatImage:
     return channels @ np.asarray(light.mixing, dtype=np.float32).T
 
 
+@functools.lru_cache(maxsize=4)
 def pixel_profiles(fill_factor: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
     """Cross-sections of a blurred pixel: weights (256, SUBPIXELS, 2 * LARGEST_RADIUS + 1), and radius (256,).
 
@@ -63,7 +65,7 @@ def pixel_profiles(fill_factor: float) -> tuple[npt.NDArray[np.float32], npt.NDA
     radius = np.minimum(np.ceil(REACH_SIGMAS * sigma + 0.5 * side - 0.5), LARGEST_RADIUS).astype(np.int32)
     near = np.where(np.abs(far) <= radius[:, None, None], whole, 0.0)
     # What the cut takes from the tails goes back to the rest, so that an even image is not darker where blurred.
-    near *= (whole.sum(axis=2) / near.sum(axis=2))[..., None]
+    near *= (whole.sum(axis=2) / np.maximum(near.sum(axis=2), 1e-30))[..., None]
     return np.ascontiguousarray(near[..., LARGEST_RADIUS:-LARGEST_RADIUS], dtype=np.float32), radius
 
 

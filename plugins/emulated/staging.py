@@ -72,7 +72,7 @@ def size_named(name: str) -> Size:
 def random_truth(size: str, seed: int, thing: StageObject, kept: ObjectTruth, ports: tuple[int, int]) -> BenchTruth:
     """A plausible stage round ``thing``; the same arguments give the same stage."""
     sizes, rng = size_named(size), np.random.default_rng(seed)
-    points = thing.vertices[:: max(1, len(thing.vertices) // 20000)].astype(np.float64)
+    points = thing.vertices[:: max(1, len(thing.vertices) // 6000)].astype(np.float64)
     camera = _camera(sizes, rng, points, ports)
     projectors = tuple(_projector(index, *place, sizes, rng, points) for index, place in enumerate(PLACES))
     return BenchTruth(
@@ -213,7 +213,7 @@ def _aimed(
     wanted = np.array([middle[0] * (width - 1), middle[1] * (height - 1)])
     target = np.zeros(3)
     lens = dataclasses.replace(lens, focal_px=1.8 * width)
-    for _ in range(40):
+    for _ in range(16):
         pose = Pose(position, _looking(np.asarray(position), target, roll))
         at, local = project(pose, lens, points)
         low, high = at.min(axis=0), at.max(axis=0)

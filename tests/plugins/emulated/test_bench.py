@@ -1,0 +1,192 @@
+"""The bench as a process: what it prepares, what it serves, how it ends; and what its camera sees."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rawpy
+
+from hal.errors import DeviceError
+from plugins.emulated.bench import EmulatedBench
+from plugins.emulated.shot import ShotSettings
+from plugins.emulated.truth import BenchTruth, read_truth, write_truth
+from plugins.emulated.world import World
+
+SERVE = """
+import sys
+from pathlib import Path
+from plugins.emulated.bench import EmulatedBench
+sys.exit(EmulatedBench().serve(Path(sys.argv[1]), json_lines=True))
+"""
+WHITE = ShotSettings(exposure_s=1 / 15, iso=100, aperture_f=8.0, raw=True, jpeg=False)
+
+
+@pytest.fixture
+def prepared(tmp_path: Path, shrink: Callable[[BenchTruth], BenchTruth]) -> Path:
+    EmulatedBench().prepare(tmp_path / "stage", size="small", object_file=None, seed=11)
+    write_truth(tmp_path / "stage", shrink(read_truth(tmp_path / "stage")))
+    return tmp_path / "stage"
+
+
+def served(stage: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", SERVE, str(stage)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[3],
+    )
+
+
+def until_ready(process: subprocess.Popen[str]) -> Iterator[dict[str, object]]:
+    assert process.stdout is not None
+    for line in process.stdout:
+        record = json.loads(line)
+        if record.get("ready"):
+            return
+        yield record
+
+
+def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(prepared: Path) -> None:
+    camera = read_truth(prepared).camera
+    with served(prepared) as process:
+        try:
+            records = list(until_ready(process))
+            addresses = {str(record["device"]): str(record["address"]) for record in records if "device" in record}
+            assert addresses["camera"] == f"ptpip:127.0.0.1:{camera.command_port}:{camera.event_port}"
+            ttys = [Path(addresses[name]) for name in ("left", "right", "above")]
+            assert all(tty.is_symlink() and tty.resolve().is_char_device() for tty in ttys)
+            socket.create_connection(("127.0.0.1", camera.command_port), timeout=5).close()
+            assert any("progress" in record for record in records)
+        finally:
+            process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=20) == 0
+    assert not any(tty.is_symlink() for tty in ttys)
+
+
+def test_a_port_in_use_is_told_in_a_sentence_before_anything_is_served(prepared: Path) -> None:
+    with socket.create_server(("127.0.0.1", read_truth(prepared).camera.command_port)):
+        process = served(prepared)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 3
+    assert json.loads(out.splitlines()[-1])["error"] == "port-in-use"
+    assert len(err.strip().splitlines()) == 2
+    assert not (prepared / "run" / "tty-left").exists()
+
+
+def test_a_mesh_without_faces_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "cloud.obj").write_text("v 0 0 0\nv 1 1 1\n")
+    with pytest.raises(DeviceError) as refused:
+        EmulatedBench().prepare(tmp_path / "stage", size="small", object_file=tmp_path / "cloud.obj", seed=1)
+    assert refused.value.code == "object-no-faces"
+    assert not (tmp_path / "stage").exists()
+
+
+def test_an_unknown_size_is_refused_with_those_there_are(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match="small, medium, paper"):
+        EmulatedBench().prepare(tmp_path / "stage", size="huge", object_file=None, seed=1)
+    assert not (tmp_path / "stage").exists()
+
+
+def test_the_controllers_tables_hold_nothing_of_the_truth(tmp_path: Path) -> None:
+    tables = EmulatedBench().prepare(tmp_path / "stage", size="small", object_file=None, seed=5)
+    truth = read_truth(tmp_path / "stage")
+    text = json.dumps(tables)
+    for secret in (truth.camera.lens.focal_px, truth.projectors[0].lens.focal_px, truth.projectors[0].light.gamma[0]):
+        assert f"{secret:.4f}"[:7] not in text
+    assert set(tables) == {"projectors", "camera", "display"}
+
+
+class Lamp:
+    def __init__(self) -> None:
+        self.level = 1.0
+
+    def light_level(self) -> float:
+        return self.level
+
+
+@pytest.fixture
+def lamps() -> list[Lamp]:
+    return [Lamp(), Lamp(), Lamp()]
+
+
+@pytest.fixture
+def world(prepared: Path, lamps: list[Lamp]) -> Iterator[World]:
+    with World(prepared, dataclasses.replace(read_truth(prepared), time_scale=0.5), lamps) as made:
+        yield made
+
+
+def show(stage: Path, value: int, at_s: float, sequence: int) -> None:
+    """A whole memory output with one grey on every projector."""
+    truth = read_truth(stage)
+    frames, entries, pixels = len(truth.projectors), b"", b""
+    for projector in truth.projectors:
+        width, height = projector.lens.size_px
+        offset = 4096 + len(pixels)
+        entries += np.array([(projector.output.encode(), width, height, offset, 0)], ENTRY).tobytes()
+        pixels += bytes([value]) * (width * height * 3)
+        pixels += bytes(-len(pixels) % 4096)
+    size = 4096 + len(pixels)
+    head = np.array([(b"VELFRAME", 1, frames, sequence, at_s, size, b"")], HEADER).tobytes()
+    temporary = stage / "run" / "new"
+    temporary.write_bytes((head + entries).ljust(4096, b"\0") + pixels)
+    temporary.replace(stage / truth.frames)
+
+
+ENTRY = np.dtype([("name", "S40"), ("w", "<u4"), ("h", "<u4"), ("at", "<u8"), ("zero", "<u8")])
+HEADER = np.dtype(
+    [("magic", "S8"), ("v", "<u4"), ("n", "<u4"), ("seq", "<u8"), ("at", "<f8"), ("size", "<u8"), ("pad", "V24")]
+)
+
+
+def signal_of(world: World, tmp_path: Path, settings: ShotSettings = WHITE) -> float:
+    data = world.expose(settings).raw
+    assert data is not None
+    (tmp_path / "shot.dng").write_bytes(data)
+    with rawpy.imread(str(tmp_path / "shot.dng")) as raw:
+        return float(np.percentile(raw.raw_image_visible, 90)) - 128.0
+
+
+def test_the_camera_sees_what_is_shown_and_only_while_lamps_burn(
+    world: World, lamps: list[Lamp], prepared: Path, tmp_path: Path
+) -> None:
+    nothing_shown = signal_of(world, tmp_path)
+    show(prepared, 255, time.monotonic() - 1.0, 2)
+    white = signal_of(world, tmp_path)
+    for lamp in lamps:
+        lamp.level = 0.0
+    dark = signal_of(world, tmp_path)
+    assert white > 1500
+    assert nothing_shown < 30
+    assert dark < 30
+
+
+def test_white_is_well_exposed_at_a_fifteenth_of_a_second(world: World, prepared: Path, tmp_path: Path) -> None:
+    show(prepared, 255, time.monotonic() - 1.0, 2)
+    files = world.expose(WHITE)
+    assert files.raw is not None
+    assert files.jpeg is None
+    (tmp_path / "white.dng").write_bytes(files.raw)
+    with rawpy.imread(str(tmp_path / "white.dng")) as raw:
+        assert 2500 < np.percentile(raw.raw_image_visible, 99.5) < 4090
+
+
+def test_a_frame_that_appears_in_the_middle_of_an_exposure_counts_for_its_share(
+    world: World, prepared: Path, tmp_path: Path
+) -> None:
+    show(prepared, 255, time.monotonic() - 1.0, 2)
+    quarter = dataclasses.replace(WHITE, exposure_s=0.8, aperture_f=32.0)
+    whole = signal_of(world, tmp_path, quarter)
+    show(prepared, 0, time.monotonic() + 0.1, 4)
+    part = signal_of(world, tmp_path, quarter)
+    assert part / whole == pytest.approx((0.1 + 2 / 60) / 0.4, abs=0.06)
