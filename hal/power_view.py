@@ -63,19 +63,28 @@ class PowerView:
         """The power state, given a fresh ``answer``."""
         changed = self._last is not None and self._last is not answer
         self._last = answer
-        phase = self._phase_at(now_s)
         if answer is Power.ON:
-            if changed and phase is None:
-                self._enter(Power.WARMING, now_s, told=False)
-            return Power.WARMING if self._phase_at(now_s) is Power.WARMING else Power.ON
+            return self._burns(changed, now_s)
         if answer is Power.OFF:
-            if changed and phase is None:
-                self._enter(Power.COOLING, now_s, told=False)
-            phase = self._phase_at(now_s)
-            if phase is Power.COOLING or (phase is Power.WARMING and self._told and not self.failed):
-                return phase
-            return Power.FAULT if self.failed else Power.OFF
+            return self._dark(changed, now_s)
         return answer
+
+    def _burns(self, changed: bool, now_s: float) -> Power:
+        phase = self._phase_at(now_s)
+        if phase is Power.COOLING:
+            # It burns again, or still: when it goes out, its cooling begins anew.
+            self._phase = None
+        elif changed and phase is None:
+            self._enter(Power.WARMING, now_s, told=False)
+        return Power.WARMING if self._phase is Power.WARMING else Power.ON
+
+    def _dark(self, changed: bool, now_s: float) -> Power:
+        if changed and self._phase_at(now_s) is not Power.COOLING:
+            self._enter(Power.COOLING, now_s, told=False)
+        phase = self._phase_at(now_s)
+        if phase is Power.COOLING or (phase is Power.WARMING and self._told and not self.failed):
+            return phase
+        return Power.FAULT if self.failed else Power.OFF
 
     def _enter(self, phase: Power, now_s: float, *, told: bool) -> None:
         self._phase, self._since_s, self._told = phase, now_s, told

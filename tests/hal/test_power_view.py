@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.power_view import PowerView
@@ -49,6 +49,22 @@ def test_a_fresh_on_is_never_hidden_by_an_old_off() -> None:
     assert view.answered(Power.ON, 2.0) is Power.ON
 
 
+def test_a_lamp_seen_lit_during_an_old_cooling_time_cools_anew() -> None:
+    view = PowerView(RULES)
+    view.switched_off(0.0)
+    view.answered(Power.ON, 119.0)
+    view.answered(Power.OFF, 119.5)
+    assert view.answered(Power.OFF, 121.0) is Power.COOLING
+
+
+def test_a_lamp_that_goes_out_while_it_warms_counts_as_hot() -> None:
+    view = PowerView(RULES)
+    view.noticed_power(Power.WARMING, 0.0)
+    view.answered(Power.ON, 1.0)
+    assert view.answered(Power.OFF, 59.0) is Power.COOLING
+    assert view.answered(Power.OFF, 61.0) is Power.COOLING
+
+
 def test_a_reported_failure_is_a_fault_until_the_next_accepted_start() -> None:
     view = PowerView(RULES)
     view.switched_on(0.0)
@@ -73,6 +89,7 @@ def test_a_projector_that_tells_its_phase_itself_is_believed() -> None:
         assert view.answered(power, 0.0) is power
 
 
+@settings(max_examples=500)
 @given(
     st.lists(
         st.tuples(st.sampled_from(["on", "off", "warming", "cooling", "standby", "ask1", "ask0"]), st.floats(0, 300))
