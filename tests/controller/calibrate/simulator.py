@@ -25,8 +25,8 @@ SUPERSAMPLED = 4
 class Scene:
     """Everything about the simulated stage; the defaults are in focus with noise."""
 
-    camera_px: tuple[int, int] = (264, 200)
-    projector_px: tuple[int, int] = (112, 88)
+    camera_px: tuple[int, int] = (208, 160)
+    projector_px: tuple[int, int] = (88, 68)
     scale: float = 2.4
     bend: float = 3.0
     step_px: float = 0.0
