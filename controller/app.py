@@ -26,6 +26,7 @@ from controller.session.runner import Context, Runner, Step
 from controller.session.safety import LampGuard
 from controller.storage import exclusive, runtime_folder
 from hal.deadline import Deadline, in_seconds
+from hal.errors import PluginError
 from hal.interfaces import Camera, Display, Projector
 from hal.registry import Driver, Drivers, OpenContext, load_drivers
 
@@ -70,7 +71,10 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
     tables = stage.tables
 
     def checked(kind: str, table: OpenTable, name: str) -> tuple[Driver, dict[str, Any]]:
-        driver = drivers.get(kind, name)
+        try:
+            driver = drivers.get(kind, name)
+        except PluginError as error:
+            raise table.place.wrong_value("driver", name, f"is not a {kind} driver", error.remedy) from error
         return driver, check_driver_settings(table, driver)
 
     return Checked(
@@ -135,7 +139,13 @@ def _key_files(keys: Sequence[str], folder: Path) -> list[Path]:
 
 
 def _rig(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: Display) -> Rig:
-    sizes = {output.name: (output.width_px, output.height_px) for output in stage.tables.display.outputs}
+    sizes = {
+        output.name: (output.width_px, output.height_px) for output in display.outputs(deadline=in_seconds(OPEN_S))
+    }
+    for table in stage.tables.projectors:
+        if table.output not in sizes:
+            raise table.place.wrong_value("output", table.output, "is not an output of the display",
+                                          f"one of {', '.join(sizes)}")  # fmt: skip
     projectors = tuple(
         RigProjector(table.name, table.output, sizes[table.output], guard)
         for table, guard in zip(stage.tables.projectors, guards, strict=True)
@@ -159,11 +169,12 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
     try:
         yield
     finally:
-        if machine.allows(Event.STOP):
-            machine.handle(Event.STOP, "the lamps are switched off")
+        # Before the machine is told: a listener that fails (a full disk under the journal) must not keep lamps lit.
         failures = power_down(rig.guards, within_s=power_down_s)
         for failure in failures:
             reporter.say(f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
+        if machine.allows(Event.STOP):
+            machine.handle(Event.STOP, "the lamps are switched off")
         if not failures and machine.allows(Event.COOLED):
             machine.handle(Event.COOLED, "every lamp is off or cooling by itself")
 

@@ -6,7 +6,7 @@ Every blocking call takes a ``Deadline`` and fails with an error of ``hal.errors
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,6 +20,7 @@ from hal.values import (
     DeviceIdentity,
     ExposureSettings,
     OutputInfo,
+    PlaybackStatus,
     Presented,
     ProjectorCapabilities,
     ProjectorStatus,
@@ -100,6 +101,25 @@ class Display(Device, Protocol):
 
     def play(self, appearance: str, *, deadline: Deadline) -> Presented:
         """Show an appearance of the installed bundle by name. Raises DeviceRefused if it has none of that name."""
+
+
+@runtime_checkable
+class BundleDisplay(Display, Protocol):
+    """A display that plays bundles by itself, at its own pace: the player."""
+
+    def load_bundle(self, path: Path, *, deadline: Deadline) -> str:
+        """Use another bundle from now on; return its identity (hex). Raises DeviceRefused for one it does not trust."""
+
+    def play_sequence(
+        self, items: Sequence[tuple[str, float]], *, deadline: Deadline, repeat: int = 0, rate_hz: float | None = None
+    ) -> Presented:
+        """Show appearances in turn, (name, seconds) each, ``repeat`` times (0: for ever); return at the first."""
+
+    def stop(self, *, deadline: Deadline) -> Presented:
+        """Show black."""
+
+    def playing(self, *, deadline: Deadline) -> PlaybackStatus:
+        """What is shown now, and how evenly."""
 
 
 @runtime_checkable

@@ -115,3 +115,23 @@ class Presented:
 
     sequence: int
     at_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlaybackStatus:
+    """How a display plays its bundle.
+
+    ``swaps`` since its start, the last ``presented_at_s`` (monotonic clock); ``running`` whether a sequence has more
+    items; ``late`` items presented more than a tick after their time in this sequence; intervals between presentations
+    of this or the last sequence, None before any.
+    """
+
+    swaps: int
+    presented_at_s: float
+    running: bool
+    late: int
+    appearance: str | None
+    bundle: str | None
+    interval_p50_s: float | None
+    interval_p99_s: float | None
+    rss_bytes: int

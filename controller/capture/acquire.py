@@ -50,22 +50,32 @@ class Acquirer:
         return self._camera.capabilities.exposures_s
 
     def take(self, shot: Shot, folder: Path, *, deadline: Deadline) -> tuple[CapturedFile, float]:
-        """Take one shot into ``folder``; return the RAW file (JPEG where there is no RAW) and the confirmed exposure.
+        """Show and photograph one shot into ``folder``; return as ``photograph``."""
+        # The camera is set first: that takes a while, in which the frames would only wait.
+        self._set(shot.exposure_s, deadline)
+        shown = self._display.show(shot.frames, deadline=deadline.within(10.0))
+        return self.photograph(shot.name, shot.exposure_s, folder, shown_at_s=shown.at_s, deadline=deadline)
+
+    def photograph(
+        self, name: str, exposure_s: float, folder: Path, *, shown_at_s: float, deadline: Deadline
+    ) -> tuple[CapturedFile, float]:
+        """Photograph what has been shown since ``shown_at_s`` (monotonic clock).
+
+        Returns the RAW file (JPEG where there is no RAW) and the confirmed exposure in seconds.
 
         Raises
         ------
         WorkError("camera-no-file")  the camera sent nothing
         and every error of the display and the camera
         """
-        confirmed = self._set(shot.exposure_s, deadline)
-        shown = self._display.show(shot.frames, deadline=deadline.within(10.0))
-        deadline.sleep(max(0.0, shown.at_s + self._settle_s - time.monotonic()))
+        confirmed = self._set(exposure_s, deadline)
+        deadline.sleep(max(0.0, shown_at_s + self._settle_s - time.monotonic()))
         bound = deadline.within(2 * confirmed.exposure_s + TRANSFER_MARGIN_S)
-        files = self._camera.capture(folder / shot.name, deadline=bound)
+        files = self._camera.capture(folder / name, deadline=bound)
         if not files:
             raise WorkError(
                 "camera-no-file",
-                what=f"The camera took picture {shot.name} and sent no file.",
+                what=f"The camera took picture {name} and sent no file.",
                 remedy="Check its memory card and its image quality setting (RAW), then go on with the same command.",
             )
         raw = [file for file in files if file.kind is FileKind.RAW]

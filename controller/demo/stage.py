@@ -7,9 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
 from controller.bundle.signing import generate_key
 from controller.config import write_stage
 from controller.errors import UsageError
+from controller.solve.targets import linear_to_srgb, shipped_photograph
 from controller.storage import sha256_of, write_atomically
 from hal.deadline import in_seconds
 from hal.interfaces import Bench
@@ -77,12 +81,10 @@ def _write(stage: Path, *, size: str, object_file: Path | None, seed: int) -> Ma
 
 
 def _write_photograph(path: Path) -> None:
-    import cv2
-    from skimage import data
-
-    ok, encoded = cv2.imencode(".png", cv2.cvtColor(data.astronaut(), cv2.COLOR_RGB2BGR))
+    encoded = np.rint(255 * linear_to_srgb(shipped_photograph("astronaut"))).astype(np.uint8)
+    ok, data = cv2.imencode(".png", encoded[..., ::-1])
     assert ok
-    write_atomically(path, encoded.tobytes())
+    write_atomically(path, data.tobytes())
 
 
 def _object_digest(object_file: Path | None) -> str:

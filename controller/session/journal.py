@@ -170,6 +170,10 @@ class Journal:
         )
         return artefact
 
+    def shot_count(self) -> int:
+        """How many photographs the journal knows."""
+        return int(self._read("SELECT COUNT(*) FROM shots")[0][0])
+
     # -- events
 
     def record(self, code: str, text: str, level: Level = Level.INFO) -> None:

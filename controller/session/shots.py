@@ -70,9 +70,27 @@ def _take(rig: Rig, context: Context, planned: Planned, folder: Path) -> Taken:
         return Taken(planned.name, known.path, confirmed_exposure(known.path))
     shot = Shot(planned.name, frames, planned.exposure_s)
     file, exposure_s = rig.acquirer.take(shot, folder, deadline=context.deadline)
-    write_atomically(_note_of(file.path), json.dumps({"exposure_s": exposure_s}).encode())
-    artefact = context.journal.record_shot(planned.name, settings, file.path)
-    return Taken(planned.name, artefact.path, exposure_s)
+    return _journalled(context, planned.name, settings, file.path, exposure_s)
+
+
+def take_photograph(
+    rig: Rig, context: Context, name: str, exposure_s: float, *, shown_at_s: float, of: Mapping[str, str]
+) -> Taken:
+    """Photograph what is shown since ``shown_at_s``; ``of`` says what that is, for the journal."""
+    settings = {"exposure_s": repr(exposure_s), **of}
+    known = context.journal.shot(name, settings)
+    if known is not None:
+        return Taken(name, known.path, confirmed_exposure(known.path))
+    file, confirmed_s = rig.acquirer.photograph(
+        name, exposure_s, context.folder / "captures", shown_at_s=shown_at_s, deadline=context.deadline
+    )
+    return _journalled(context, name, settings, file.path, confirmed_s)
+
+
+def _journalled(context: Context, name: str, settings: Mapping[str, str], path: Path, exposure_s: float) -> Taken:
+    write_atomically(_note_of(path), json.dumps({"exposure_s": exposure_s}).encode())
+    artefact = context.journal.record_shot(name, settings, path)
+    return Taken(name, artefact.path, exposure_s)
 
 
 def _note_of(photograph: Path) -> Path:

@@ -1,0 +1,116 @@
+"""`velatura demo`: the steps of the whole job, on the demo's stage."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from controller.app import Checked, check_stage, marker, run_on_stage, unfinished_run
+from controller.arrays import save_arrays
+from controller.demo.bench_process import BenchProcess
+from controller.demo.report import write_demo_report
+from controller.demo.stage import KEY, prepare
+from controller.services import calibrating
+from controller.session.machine import Event
+from controller.session.progress import Reporter
+from controller.session.publishing import photograph_hdr, photograph_step, playback_step, publish_step
+from controller.session.rig import Rig
+from controller.session.runner import Context, Step
+from controller.session.solving import Calibrated, SolveOptions, device_frames, read_solved, solve_steps
+from controller.session.wishes import wishes_of
+from controller.solve.traditional import traditional_compensation
+
+PLAYBACK_S = 4.0
+
+
+def demo(
+    *,
+    size: str,
+    object_file: Path | None,
+    out: Path,
+    seed: int,
+    prepare_only: bool,
+    reporter: Reporter,
+    cancel: threading.Event,
+) -> Mapping[str, Any]:
+    """Do the whole job in ``out``, going on with an unfinished demo; return where stage and report lie.
+
+    Raises what ``demo.stage.prepare``, the configuration, the devices and the steps raise; the lamps are safe by then.
+    """
+    stage = prepare(out.resolve(), size=size, object_file=object_file, seed=seed)
+    checked = check_stage(stage)
+    if prepare_only:
+        return {"stage": str(stage)}
+    run = unfinished_run(stage, "demo")
+    reporter.say("Starting the bench: an emulated stage in a process of its own.")
+    with BenchProcess(stage, cancel=cancel):
+        run_on_stage(
+            checked,
+            partial(demo_steps, checked=checked, run=run),
+            name="demo", run=run, reporter=reporter, cancel=cancel,
+        )  # fmt: skip
+    html, machine = write_demo_report(out.resolve(), run, checked)
+    return {"report": str(html), "figures": str(machine), "stage": str(stage)}
+
+
+def demo_steps(rig: Rig, *, checked: Checked, run: Path) -> Sequence[Step]:
+    """Calibrate, solve, publish, photograph, compare with one projector, swap."""
+    stage = checked.stage
+    calibrated = Calibrated(run, checked.names)
+    wishes = wishes_of(stage, calibrated)
+    names = [wish.name for wish in wishes]
+    options = SolveOptions(stage.tables.solve.exposure_share, stage.tables.solve.smoothness)
+    after = [name for projector in checked.names for name in (f"radiometry-{projector}", f"pixels-{projector}")]
+    key = stage.folder / KEY
+    longest_s = stage.tables.capture.longest_exposure_s
+    return [
+        *calibrating(rig, checked),
+        marker("solving", "Solving", enter=Event.SOLVE),
+        *solve_steps(calibrated, wishes, options, [*after, "geometry"]),
+        marker("solved", "Solved", leave=Event.SOLVED),
+        marker("publishing", "Publishing", enter=Event.PUBLISH),
+        publish_step(rig, names, stage=stage.tables.stage.name, calibration=run.name, key=key),
+        marker("published", "Published", leave=Event.PUBLISHED),
+        marker("playing", "Playing", enter=Event.PLAY),
+        photograph_step(rig, names, longest_exposure_s=longest_s),
+        _traditional_step(rig, calibrated, names, longest_s),
+        playback_step(rig, names, seconds=PLAYBACK_S),
+        marker("played", "Played", leave=Event.PAUSE),
+    ]
+
+
+def _traditional_step(rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float) -> Step:
+    """What the targets look like when one projector makes them by division at each pixel, to compare with."""
+    return Step(
+        "traditional",
+        partial(_traditional, rig, calibrated, tuple(names), longest_s),
+        after=tuple(f"appearance-{name}" for name in names),
+        title="Photographing the traditional way for comparison",
+        weight=1.2 * len(names),
+    )
+
+
+def _traditional(
+    rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float, context: Context
+) -> Sequence[Path]:
+    paths = []
+    lit = calibrated.transport.lit
+    best = int(lit.reshape(len(lit), -1).sum(axis=1).argmax())
+    for number, name in enumerate(names):
+        context.advance(number / len(names), name)
+        solved = read_solved(context.folder, name, calibrated.projectors)
+        frames = device_frames(
+            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.target, best)
+        )
+        shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
+        picture = photograph_hdr(
+            rig, context, f"traditional-{name}", solved.exposure, longest_s,
+            shown_at_s=shown.at_s, of={"appearance": name, "projector": str(best)},
+        )  # fmt: skip
+        path = context.folder / f"traditional-{name}.npz"
+        save_arrays(path, {"photograph": picture})
+        paths.append(path)
+    return paths

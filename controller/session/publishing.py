@@ -1,0 +1,165 @@
+"""The steps from solved frames to a signed, installed bundle, and from there to photographs of what plays."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.arrays import FloatImage, save_arrays
+from controller.bundle.install import install
+from controller.bundle.signing import load_public_key, load_signing_key
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.capture.brackets import merge_brackets
+from controller.errors import UsageError
+from controller.session.capturing import bracket
+from controller.session.rig import Rig
+from controller.session.runner import Context, Step
+from controller.session.shots import take_photograph
+from controller.session.solving import read_solved
+from controller.storage import sha256_of, write_atomically
+from hal.deadline import Deadline
+from hal.interfaces import BundleDisplay
+
+PHOTO_BRACKET = (0.7, 5.0)
+"""Exposures of an appearance's photograph, relative to the one at which its target's white fills the scale."""
+PLAYBACK_RATE_HZ = 60.0
+
+
+def bundle_display(rig: Rig) -> BundleDisplay:
+    """The rig's display as one that plays bundles. Raises UsageError("display-plays-no-bundles")."""
+    if not isinstance(rig.display, BundleDisplay):
+        raise UsageError(
+            "display-plays-no-bundles",
+            what="This stage's display driver shows pictures but plays no bundles.",
+            remedy='Use the driver "player" under [display] in stage.toml.',
+        )
+    return rig.display
+
+
+def publish_step(rig: Rig, names: Sequence[str], *, stage: str, calibration: str, key: Path | None) -> Step:
+    """Write, sign and install the bundle of these appearances; its artefact is the installed file's name."""
+    return Step(
+        "publish",
+        partial(_publish, rig, tuple(names), stage, calibration, key),
+        inputs={"names": " ".join(names), "key": "" if key is None else sha256_of(key)},
+        after=tuple(f"appearance-{name}" for name in names),
+        title="Publishing the signed bundle",
+        weight=1,
+    )
+
+
+def _publish(
+    rig: Rig, names: Sequence[str], stage: str, calibration: str, key: Path | None, context: Context
+) -> Sequence[Path]:
+    projectors = [projector.name for projector in rig.projectors]
+    output_of = {projector.name: projector.output for projector in rig.projectors}
+
+    def appearance(name: str) -> NewAppearance:
+        solved = read_solved(context.folder, name, projectors)
+        frames = {output_of[projector]: frame for projector, frame in solved.frames.items()}
+        return NewAppearance(name, frames, metadata={"mode": solved.figures["mode"], "exposure": solved.exposure})
+
+    built = context.folder / "bundle.vel"
+    trusted = () if key is None else (load_public_key(key.with_name(key.name + ".pub")),)
+    write_bundle(
+        built,
+        stage=stage,
+        calibration=calibration,
+        created_unix_s=int(time.time()),
+        outputs=[(projector.output, *projector.size_px) for projector in rig.projectors],
+        appearances=(appearance(name) for name in names),
+        key=None if key is None else load_signing_key(key),
+    )
+    installed = install(built, rig.stage / "bundles", trusted=trusted, allow_unsigned=key is None)
+    raw = sum(3 * p.size_px[0] * p.size_px[1] for p in rig.projectors) * len(names)
+    size = built.stat().st_size
+    figures = {"bytes": size, "ratio": raw / size, "file": installed.name}
+    path = context.folder / "bundle.json"
+    write_atomically(path, json.dumps(figures, indent=1).encode())
+    return [path, built]
+
+
+def photograph_step(rig: Rig, names: Sequence[str], *, longest_exposure_s: float) -> Step:
+    """Play each appearance of the installed bundle and photograph it in HDR."""
+    return Step(
+        "photograph",
+        partial(_photograph, rig, tuple(names), longest_exposure_s),
+        after=("publish",),
+        title="Photographing what plays",
+        weight=1.0 * len(names),
+    )
+
+
+def _photograph(rig: Rig, names: Sequence[str], longest_s: float, context: Context) -> Sequence[Path]:
+    display = bundle_display(rig)
+    bundle = display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
+    projectors = [projector.name for projector in rig.projectors]
+    paths = []
+    for number, name in enumerate(names):
+        context.advance(number / len(names), name)
+        exposure = read_solved(context.folder, name, projectors).exposure
+        shown = display.play(name, deadline=context.deadline.within(20))
+        of = {"bundle": bundle, "appearance": name}
+        picture = photograph_hdr(rig, context, f"played-{name}", exposure, longest_s, shown_at_s=shown.at_s, of=of)
+        path = context.folder / f"photograph-{name}.npz"
+        save_arrays(path, {"photograph": picture})
+        paths.append(path)
+    return paths
+
+
+def photograph_hdr(
+    rig: Rig, context: Context, name: str, white: float, longest_s: float, *, shown_at_s: float, of: Mapping[str, str]
+) -> FloatImage:
+    """Photograph what is shown now in HDR: (rows, columns, 3) float32, full scales per second.
+
+    ``white`` is the radiance of the target's white; ``of`` names what is shown, for the journal.
+    """
+    images, exposures = [], []
+    for number, exposure_s in enumerate(bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)):
+        taken = take_photograph(rig, context, f"{name}-{number}", exposure_s, shown_at_s=shown_at_s, of=of)
+        images.append(taken.read().measured())
+        exposures.append(taken.exposure_s)
+    merged = merge_brackets(images, exposures).radiance
+    return np.asarray(np.nan_to_num(merged), np.float32)
+
+
+def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:
+    """Swap the appearances as fast as a display does, and measure how evenly they come."""
+    return Step(
+        "playback",
+        partial(_playback, rig, tuple(names), seconds),
+        title="Swapping appearances 60 times a second",
+        weight=seconds + 0.5,
+        always=True,
+    )
+
+
+def _playback(rig: Rig, names: Sequence[str], seconds: float, context: Context) -> Sequence[Path]:
+    display = bundle_display(rig)
+    deadline: Deadline = context.deadline.within(seconds + 60)
+    display.load_bundle(rig.stage / "bundles" / "current", deadline=deadline)
+    items = [(name, 1 / PLAYBACK_RATE_HZ) for name in names]
+    rounds = max(1, round(seconds * PLAYBACK_RATE_HZ / len(names)))
+    before = display.playing(deadline=deadline)
+    began = display.play_sequence(items, repeat=rounds, rate_hz=PLAYBACK_RATE_HZ, deadline=deadline)
+    while (now := display.playing(deadline=deadline)).running:
+        context.advance(min(0.99, (now.swaps - before.swaps) / (rounds * len(names))))
+        deadline.sleep(0.2)
+    display.stop(deadline=deadline)
+    swaps = now.swaps - before.swaps
+    figures = {
+        "swaps": swaps,
+        "swaps_per_s": (swaps - 1) / max(now.presented_at_s - began.at_s, 1e-9),
+        "interval_p50_ms": None if now.interval_p50_s is None else 1000 * now.interval_p50_s,
+        "interval_p99_ms": None if now.interval_p99_s is None else 1000 * now.interval_p99_s,
+        "late": now.late,
+        "rss_bytes": now.rss_bytes,
+    }
+    path = context.folder / "playback.json"
+    write_atomically(path, json.dumps(figures, indent=1).encode())
+    return [path]

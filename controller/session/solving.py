@@ -1,0 +1,253 @@
+"""The steps from a calibration to frames: transport, its grade, the base, and every appearance."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.arrays import ByteImage, FloatImage, Mask, load_arrays, save_arrays
+from controller.calibrate.values import Calibration
+from controller.calibrate.verify import verify
+from controller.capture.patterns import Pattern, PatternKind, frame, plan_patterns
+from controller.errors import WorkError
+from controller.session.calibrating import read_calibration
+from controller.session.runner import Context, Step
+from controller.session.shots import read_index
+from controller.solve.appearance import Base, Mode, base_image, make_appearance, prepare_base, solve_base
+from controller.solve.bounded import Solution
+from controller.solve.dither import to_device
+from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
+from controller.solve.targets import Target
+from controller.storage import write_atomically
+from controller.transport import LightTransport
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """An appearance to be made: ``target`` gives its picture, reflectance-like, and where it says something.
+
+    ``inputs`` are the hashes of what the target is made from; ``mode`` as in ``solve.appearance``.
+    """
+
+    name: str
+    title: str
+    target: Callable[[], Target]
+    inputs: dict[str, str]
+    mode: Mode = "auto"
+
+
+@dataclass(frozen=True, slots=True)
+class SolveOptions:
+    """``share`` of the object's pixels that each target's exposure makes reachable; ``smoothness`` of eq. 3."""
+
+    share: float
+    smoothness: float
+
+    def inputs(self) -> dict[str, str]:
+        return {"share": repr(self.share), "smoothness": repr(self.smoothness)}
+
+
+class Calibrated:
+    """The calibration of a run and its transport, read when they are first needed and kept while steps need them."""
+
+    def __init__(self, folder: Path, projectors: Sequence[str]) -> None:
+        self.folder = folder
+        self.projectors = tuple(projectors)
+        self._calibration: Calibration | None = None
+        self._transport: LightTransport | None = None
+        self._base: Base | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        if self._calibration is None:
+            self._calibration = read_calibration(self.folder, self.projectors)
+        return self._calibration
+
+    @property
+    def transport(self) -> LightTransport:
+        if self._transport is None:
+            self._transport = LightTransport.build(self.calibration)
+        return self._transport
+
+    @property
+    def base(self) -> Base:
+        """The solved base image. Read from ``base.npz``, which the step ``base`` wrote."""
+        if self._base is None:
+            arrays = load_arrays(self.folder / "base.npz")
+            figures = json.loads((self.folder / "base.json").read_text())
+            solution = Solution(
+                frames=tuple(arrays[f"frame-{name}"] for name in self.projectors), light=arrays["light"], **figures
+            )
+            self._base = prepare_base(self.transport, arrays["image"], self.calibration.black, solution)
+        return self._base
+
+    def keep_base(self, base: Base) -> None:
+        self._base = base
+
+
+def solve_steps(
+    calibrated: Calibrated, wishes: Sequence[Wish], options: SolveOptions, after: Sequence[str]
+) -> list[Step]:
+    """Grade the calibration, solve the base, then each wish. ``after``: the steps whose artefacts are read."""
+    steps = [
+        Step("verify", partial(_verify, calibrated), after=tuple(after), title="Grading the calibration", weight=2),
+        Step(
+            "base",
+            partial(_solve_base, calibrated, options),
+            inputs=options.inputs(),
+            after=tuple(after),
+            title="Solving the base image",
+            weight=5,
+        ),
+    ]
+    for wish in wishes:
+        steps.append(
+            Step(
+                f"appearance-{wish.name}",
+                partial(_solve_appearance, calibrated, wish, options),
+                inputs={**options.inputs(), **wish.inputs, "mode": wish.mode},
+                after=(*after, "base"),
+                title=f"Solving {wish.title}",
+                weight=4,
+            )
+        )
+    return steps
+
+
+def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
+    """Predict each projector's random pattern and compare with its photograph."""
+    calibration, transport = calibrated.calibration, calibrated.transport
+    figures = {}
+    maps = {}
+    for n, part in enumerate(calibration.projectors):
+        context.advance(n / len(calibration.projectors), part.name)
+        rows, columns = part.metapixels.valid.shape
+        pattern = random_pattern((columns, rows))
+        predicted = transport.project_one(n, frame(pattern, (columns, rows))) + calibration.black
+        taken = read_index(context.folder, f"codes-{part.name}")[f"{part.name}-{pattern.name}"]
+        found = verify(predicted, taken.per_second(), calibration.black, transport.lit[n])
+        figures[part.name] = {
+            "relative_rms": found.relative_rms,
+            "without_gain_rms": found.without_gain_rms,
+            "gain": found.gain,
+            "grade": found.grade.value,
+        }
+        maps[part.name] = found.error_map
+    arrays, path = context.folder / "verification.npz", context.folder / "verification.json"
+    save_arrays(arrays, maps)
+    write_atomically(path, json.dumps(figures, indent=1).encode())
+    return [path, arrays]
+
+
+def random_pattern(size_px: tuple[int, int]) -> Pattern:
+    """The pattern on which a calibration is graded."""
+    return plan_patterns(size_px).of_kind(PatternKind.RANDOM)[0]
+
+
+def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context) -> Sequence[Path]:
+    black = calibrated.calibration.black
+    image = base_image(calibrated.calibration)
+    base = solve_base(
+        calibrated.transport, image, black, smoothness=options.smoothness, progress=_watched(context)
+    )  # fmt: skip
+    calibrated.keep_base(base)
+    solution = base.solution
+    arrays, path = context.folder / "base.npz", context.folder / "base.json"
+    frames = {f"frame-{name}": values for name, values in zip(calibrated.projectors, solution.frames, strict=True)}
+    save_arrays(arrays, {"image": image, "light": solution.light, **frames})
+    figures = {key: getattr(solution, key) for key in ("objective", "kkt", "iterations", "seconds", "converged")}
+    write_atomically(path, json.dumps(figures, indent=1).encode())
+    return [arrays, path]
+
+
+def _watched(context: Context) -> Callable[[int, float], None]:
+    """Tells the run how far a solve is, whose end is not known; a stop takes hold in it."""
+
+    def progress(iteration: int, kkt: float) -> None:
+        context.advance(1 - 1 / (1 + iteration / 60), f"iteration {iteration}")
+
+    return progress
+
+
+def _solve_appearance(calibrated: Calibrated, wish: Wish, options: SolveOptions, context: Context) -> Sequence[Path]:
+    began_s = time.perf_counter()
+    calibration, transport = calibrated.calibration, calibrated.transport
+    black, reach = calibration.black, transport.reach()
+    asked = wish.target()
+    picture = asked.image
+    exposure = choose_exposure(transport, picture, black, share=options.share, reach=reach)
+    wanted = np.float32(exposure) * picture
+    target = target_radiance(picture, black, exposure)
+    possible = feasibility(transport, wanted, black, reach=reach)
+    solve_began_s = time.perf_counter()
+    made = make_appearance(
+        transport,
+        calibrated.base,
+        target,
+        black,
+        mode=wish.mode,
+        smoothness=options.smoothness,
+        progress=_watched(context),
+    )
+    seconds = time.perf_counter() - solve_began_s
+    device = device_frames(calibration, made.frames)
+    arrays = context.folder / f"appearance-{wish.name}.npz"
+    linear = {f"linear-{name}": values for name, values in zip(calibrated.projectors, made.frames, strict=True)}
+    save_arrays(arrays, {**device, **linear, "target": wanted, "reachable": possible.reachable & asked.mask})
+    figures = {
+        "name": wish.name,
+        "title": wish.title,
+        "mode": made.mode,
+        "exposure": exposure,
+        "seconds": seconds,
+        "seconds_with_target": time.perf_counter() - began_s,
+        "reachable_share": possible.share,
+        "fine_detail": made.fine_detail,
+        "iterations": 0 if made.solution is None else made.solution.iterations,
+        "kkt": None if made.solution is None else made.solution.kkt,
+    }
+    path = context.folder / f"appearance-{wish.name}.json"
+    write_atomically(path, json.dumps(figures, indent=1).encode())
+    return [arrays, path]
+
+
+def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dict[str, ByteImage]:
+    """8-bit frames by projector name, dithered, each projector at another place of the dither's tile."""
+    return {
+        part.name: to_device(values, part.radiometry, phase=(17 * n, 29 * n))
+        for n, (part, values) in enumerate(zip(calibration.projectors, frames, strict=True))
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """What an appearance step left: device frames by projector, the target radiance, and where it is reachable."""
+
+    frames: dict[str, ByteImage]
+    target: FloatImage
+    reachable: Mask
+    exposure: float
+    figures: dict[str, object]
+
+
+def read_solved(folder: Path, name: str, projectors: Sequence[str]) -> Solved:
+    """Raises WorkError("appearance-not-solved") if there is none of that name."""
+    arrays, figures = folder / f"appearance-{name}.npz", folder / f"appearance-{name}.json"
+    if not (arrays.exists() and figures.exists()):
+        raise WorkError(
+            "appearance-not-solved",
+            what=f"The appearance {name} has not been solved in {folder.name}.",
+            remedy="Run `velatura appearance` on the stage first.",
+        )
+    loaded, content = load_arrays(arrays), json.loads(figures.read_text())
+    frames = {projector: loaded[projector] for projector in projectors}
+    return Solved(frames, loaded["target"], loaded["reachable"], float(content["exposure"]), content)
+
+
+__all__ = ["Calibrated", "SolveOptions", "Solved", "Wish", "device_frames", "read_solved", "solve_steps"]

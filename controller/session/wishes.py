@@ -1,0 +1,111 @@
+"""From the [[appearances]] of stage.toml to target pictures on the calibrated object."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controller.arrays import FloatImage
+from controller.config import Stage
+from controller.config.models import AppearanceTable
+from controller.errors import UsageError
+from controller.session.calibrating import read_geometry
+from controller.session.solving import Calibrated, Wish
+from controller.solve import targets
+from controller.solve.targets import Target
+from controller.storage import sha256_of
+
+TITLES: Mapping[str, str] = {
+    "photograph": "A photograph, wrapped on the object",
+    "pattern": "Its own pattern cancelled, another put on",
+    "checkerboard": "A checkerboard",
+    "gloss": "A gloss",
+    "recolour": "Recoloured",
+    "picture": "A picture as seen from the camera",
+}
+"""Every kind of appearance, as a person calls it."""
+
+NEEDS_FILE = ("photograph", "picture")
+
+
+def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -> list[Wish]:
+    """The appearances of stage.toml with these names, or all of them, checked before anything is solved.
+
+    Raises UsageError with code "appearance-unknown", "stage-key-value" or "stage-key-unknown" (with the line), and
+    "target-missing" for a file that is not there.
+    """
+    tables = {table.name: table for table in stage.tables.appearances}
+    unknown = [name for name in names if name not in tables]
+    if unknown or not tables:
+        raise UsageError(
+            "appearance-unknown",
+            what=f"stage.toml has no appearance {unknown[0]!r}." if unknown else "stage.toml has no [[appearances]].",
+            remedy=f"It has {', '.join(tables)}." if tables else 'Add one: name and kind, for example kind = "gloss".',
+        )
+    return [_wish(stage, tables[name], calibrated) for name in (names or tables)]
+
+
+def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
+    if table.kind not in TITLES:
+        raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
+    settings = table.settings(_allowed(table.kind))
+    file = None if table.file is None else stage.path(table.file)
+    if table.kind in NEEDS_FILE and file is None:
+        raise table.place.missing("file", "a picture file, relative to the stage's folder", written=settings)
+    if file is not None and not file.is_file():
+        raise UsageError(
+            "target-missing",
+            what=f"The picture {file} of appearance {table.name} is not there.",
+            remedy="Put it there, or correct `file` in stage.toml.",
+        )
+    options = {key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()}
+    inputs = {"kind": table.kind, "settings": repr(sorted(options.items()))}
+    if file is not None:
+        inputs["file"] = sha256_of(file)
+
+    def target() -> Target:
+        return _make(table.kind, file, options, calibrated)
+
+    return Wish(table.name, TITLES[table.kind], target, inputs)
+
+
+_MAKERS: Mapping[str, Callable[..., Target]] = {
+    "pattern": targets.replace_pattern,
+    "checkerboard": targets.checkerboard,
+    "gloss": targets.gloss,
+    "photograph": targets.wrap_photograph,
+}
+
+
+def _allowed(kind: str) -> dict[str, str]:
+    """The settings of a kind: the keyword arguments of what makes it."""
+    if kind not in _MAKERS:
+        return {"tint": "three numbers from 0 to 1"} if kind == "recolour" else {}
+    parameters = inspect.signature(_MAKERS[kind]).parameters.values()
+    return {p.name: f"as {p.name} of {kind}" for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
+
+
+def _make(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: Calibrated) -> Target:
+    mask = calibrated.transport.object_mask
+    if kind == "picture":
+        assert file is not None
+        rows, columns = mask.shape
+        return targets.load_target(file, (columns, rows))
+    if kind == "recolour":
+        return targets.recolour(_as_it_is(calibrated), mask, **options)
+    geometry = read_geometry(calibrated.folder)
+    if kind == "photograph":
+        assert file is not None
+        return targets.wrap_photograph(targets.read_picture(file)[..., :3], geometry, mask, **options)
+    return _MAKERS[kind](geometry, mask, **options)
+
+
+def _as_it_is(calibrated: Calibrated) -> FloatImage:
+    """The object under white light, its brightest parts at 1."""
+    light = calibrated.transport.reach()
+    brightest = np.percentile(light[calibrated.transport.object_mask], 99)
+    return np.asarray(np.clip(light / brightest, 0, 1), np.float32)
