@@ -19,6 +19,7 @@ import zstandard
 
 from controller.bundle import format as fmt
 from controller.bundle.format import damaged
+from controller.bundle.index import parse_index
 from controller.bundle.signing import BLOCK_BYTES, check_signature
 from controller.errors import BundleError
 
@@ -42,7 +43,7 @@ class Bundle:
         if hashlib.sha256(index_bytes).digest() != header.index_sha256:
             raise damaged("its index does not have the hash that its header says")
         self.signed_by = check_signature(start, index_bytes, block, trusted=trusted, allow_unsigned=allow_unsigned)
-        self.index = fmt.parse_index(index_bytes, data_end=header.index_offset)
+        self.index = parse_index(index_bytes, data_end=header.index_offset)
         self.identity = header.index_sha256.hex()
         self._data_end = header.index_offset
 
@@ -51,7 +52,7 @@ class Bundle:
         """Map a bundle and check header, index and signature (not yet the pixels: see ``verify``).
 
         ``trusted``: public keys, 32 bytes each. Raises BundleError, with code "bundle-unreadable" for a file that can
-        not be opened, and those of ``format.parse_header``, ``format.parse_index`` and ``signing.check_signature``.
+        not be opened, and those of ``format.parse_header``, ``index.parse_index`` and ``signing.check_signature``.
         """
         try:
             # Not blocking: opening a pipe would otherwise wait for its other end, and the player with it.

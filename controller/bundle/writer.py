@@ -15,6 +15,7 @@ import zstandard
 from nacl.signing import SigningKey
 
 from controller.bundle import format as fmt
+from controller.bundle.index import encode_index, parse_index
 from controller.bundle.signing import BLOCK_BYTES, UNSIGNED_BLOCK, sign
 from controller.errors import BundleError
 from controller.storage import stream_atomically
@@ -72,9 +73,9 @@ def write_bundle(
 
 def _finish(file: BinaryIO, index: fmt.Index, key: SigningKey | None) -> None:
     end = _align(file)
-    data = fmt.encode_index(index)
+    data = encode_index(index)
     try:
-        fmt.parse_index(data, data_end=end)
+        parse_index(data, data_end=end)
     except BundleError as error:
         raise BundleError(
             "bundle-not-writable",

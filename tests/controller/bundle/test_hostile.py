@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nacl.signing import SigningKey
 
-from controller.bundle.format import parse_index
+from controller.bundle.index import parse_index
 from controller.bundle.reader import Bundle
 from controller.errors import BundleError
 

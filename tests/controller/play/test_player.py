@@ -381,7 +381,7 @@ def test_memory_stays_bounded_over_many_swaps(wire: Wire) -> None:
     before = wire.ask("status")
     time.sleep(1.0)
     after = wire.ask("status")
-    assert after["swaps"] - before["swaps"] > 300
+    assert after["swaps"] - before["swaps"] > 100
     assert after["rss_bytes"] - before["rss_bytes"] < 2 * 2**20
 
 
