@@ -71,6 +71,7 @@ class PtpIpLink:
         still_time(deadline)
         if self._broken:
             raise camera_lost("it was closed")
+        self._pump()
         self._transaction = (self._transaction + 1) % 0xFFFF_FFFF
         number = self._transaction
         try:

@@ -191,7 +191,11 @@ class EmulatedBody:
             self.stopped.wait(min(left_s, 1.0))
         if self.stopped.is_set():
             return
-        files = self._expose(exposed.settings)
+        try:
+            files = self._expose(exposed.settings)
+        except BaseException:
+            self.exposing = False  # the picture is lost, but the camera goes on
+            raise
         with self.lock:
             self._picture = self._picture % 9999 + 1
             taken = time.strftime("%Y%m%dT%H%M%S")

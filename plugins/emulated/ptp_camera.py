@@ -44,7 +44,7 @@ NAMES: Final = {
     "eos-new": CameraNames("Canon Inc.", "Canon EOS 1300D", "0320010001", "3-1.1.0"),
     "eos-old": CameraNames("Canon Inc.", "Canon EOS 400D DIGITAL", "0320010002", "3-1.1.1"),
 }
-_TAKEOVER_S: Final = 1.0
+_TAKEOVER_S: Final = 0.5
 
 
 class EmulatedPtpCamera:

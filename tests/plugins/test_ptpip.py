@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import struct
 import threading
@@ -54,6 +55,8 @@ class Scripted:
     def close(self) -> None:
         for one in (self._listener, self.command, self.events):
             if one is not None:
+                with contextlib.suppress(OSError):
+                    one.shutdown(socket.SHUT_RDWR)
                 one.close()
         self._thread.join(2)
 
@@ -172,6 +175,7 @@ def test_more_data_than_was_asked_for_is_refused_before_it_is_stored(camera: Scr
 
 def test_pings_are_answered_on_both_connections(camera: Scripted, link: PtpIpLink) -> None:
     assert camera.events is not None
+    camera.events.settimeout(2)
     camera.events.sendall(packet(13))
     camera.answers += [packet(13), response()]
     thread = threading.Thread(target=lambda: link.transact(0x1001, deadline=in_seconds(2)))
@@ -208,21 +212,21 @@ def test_noise_on_the_event_connection_breaks_the_link(camera: Scripted, link: P
     assert camera.events is not None
     camera.events.sendall(noise)
     with pytest.raises(ProtocolError):
-        for _ in range(100):
-            link.events()
-            time.sleep(0.005)
+        until(link.events)
     assert link.broken
 
 
 @pytest.mark.parametrize(
     ("reason", "error", "code"),
-    [(1, DeviceRefused, "camera-refused-pairing"), (2, DeviceBusy, "camera-in-use"), (3, DeviceRefused, "camera-refused-pairing")],
-)  # fmt: skip
+    [
+        (1, DeviceRefused, "camera-refused-pairing"),
+        (2, DeviceBusy, "camera-in-use"),
+        (3, DeviceRefused, "camera-refused-pairing"),
+    ],
+)
 def test_a_fail_packet_says_why_in_words(make: Make, reason: int, error: type[Exception], code: str) -> None:
-    for options in (
-        {"welcome": packet(5, struct.pack("<I", reason))},
-        {"event_welcome": packet(5, struct.pack("<I", reason))},
-    ):
+    refusal = packet(5, struct.pack("<I", reason))
+    for options in ({"welcome": refusal}, {"event_welcome": refusal}):
         with pytest.raises(error) as caught:
             PtpIpLink.connect(make(**options).address, deadline=in_seconds(2))
         assert getattr(caught.value, "code", None) == code
