@@ -18,6 +18,7 @@ from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.objects import load_object
+from plugins.emulated.ptp_body import CameraNames
 from plugins.emulated.ptp_camera import EmulatedPtpCamera
 from plugins.emulated.quick_profile import quick_profile
 from plugins.emulated.serial_projector import EmulatedSerialProjector
@@ -134,6 +135,7 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
         host=HOST,
         command_port=truth.camera.command_port,
         event_port=truth.camera.event_port,
+        names=CameraNames(serial=truth.camera.serial_number),
         time_scale=0.0,
     )
     stack.enter_context(camera)

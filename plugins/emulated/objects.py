@@ -90,7 +90,7 @@ def default_object() -> StageObject:
 
 
 def load_object(path: Path) -> StageObject:
-    """Read a mesh (.obj, .ply and whatever trimesh reads), upright along +y, and fit it to the stage.
+    """Read a mesh (.obj, .ply and whatever trimesh reads), upright along +y and facing +z, and fit it to the stage.
 
     Its texture or vertex colours (taken as sRGB) become its albedo; without either it is painted procedurally.
     Raises DeviceError ``object-unreadable`` or ``object-no-faces``.
