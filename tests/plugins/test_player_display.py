@@ -58,8 +58,22 @@ def display(player: PlayerProcess, tmp_path: Path) -> Iterator[PlayerDisplay]:
     device.close()
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where a player serves that no test ends."""
+    path = tmp_path_factory.mktemp("player")
+    with start_player(path, PlayerSettings(OUTPUTS, path / "out.frame")):
+        yield path
+
+
 class TestPlayerDisplay(DisplayConformance):
-    """The shared suite."""
+    """The shared suite, every test on the same player."""
+
+    @pytest.fixture
+    def display(self, shared: Path) -> Iterator[PlayerDisplay]:
+        device = opened(shared)
+        yield device
+        device.close()
 
 
 def shown(folder: Path) -> dict[str, npt.NDArray[np.uint8]]:

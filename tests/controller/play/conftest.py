@@ -22,10 +22,8 @@ def outputs() -> list[tuple[str, int, int]]:
     return OUTPUTS
 
 
-@pytest.fixture
-def bundle(tmp_path: Path) -> Path:
+def write_noise(path: Path) -> Path:
     """An unsigned bundle with the appearances "0" to "5": noise of that seed."""
-    path = tmp_path / "b.vel"
     write_bundle(
         path,
         stage="s",
@@ -35,6 +33,11 @@ def bundle(tmp_path: Path) -> Path:
         appearances=[NewAppearance(str(seed), noise(OUTPUTS, seed)) for seed in range(6)],
     )
     return path
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    return write_noise(tmp_path / "b.vel")
 
 
 @pytest.fixture
@@ -49,8 +52,18 @@ def start(tmp_path: Path) -> Iterator[START]:
         yield started
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where a player serves that the tests of a file share: none of them may end it."""
+    path = tmp_path_factory.mktemp("player")
+    settings = PlayerSettings(OUTPUTS, path / "out.frame", bundle=write_noise(path / "b.vel"), allow_unsigned=True)
+    with start_player(path, settings):
+        yield path
+
+
 @pytest.fixture
-def wire(start: START, bundle: Path) -> Iterator[Wire]:
-    """A connection to a player that has the bundle."""
-    with Wire(start(bundle=bundle, allow_unsigned=True).socket) as connection:
+def wire(folder: Path) -> Iterator[Wire]:
+    """A connection to the shared player, which shows black and has the bundle."""
+    with Wire(folder / "player.sock") as connection:
+        connection.ask("stop")
         yield connection

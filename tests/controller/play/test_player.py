@@ -34,20 +34,20 @@ def dark(pictures: Pictures) -> bool:
     return not any(picture.any() for picture in pictures.values())
 
 
-def test_it_says_who_it_is_and_begins_black(wire: Wire, outputs: Outputs, tmp_path: Path) -> None:
+def test_it_says_who_it_is_and_begins_black(wire: Wire, outputs: Outputs, folder: Path) -> None:
     hello = wire.ask("hello")
     assert hello["ok"] is True
     assert hello["protocol"] == 1
     assert [(o["name"], o["width_px"], o["height_px"]) for o in hello["outputs"]] == outputs
-    assert dark(Frames(tmp_path / "out.frame").read())
-    for path in (tmp_path / "player.sock", Path(hello["inbox"]), tmp_path / "out.frame"):
+    assert dark(Frames(folder / "out.frame").read())
+    for path in (folder / "player.sock", Path(hello["inbox"]), folder / "out.frame"):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
 def test_a_pattern_appears_byte_for_byte_and_the_answer_comes_after_it(
-    wire: Wire, outputs: Outputs, tmp_path: Path
+    wire: Wire, outputs: Outputs, folder: Path
 ) -> None:
-    shown, inbox = Frames(tmp_path / "out.frame"), Frames(Path(wire.ask("hello")["inbox"]))
+    shown, inbox = Frames(folder / "out.frame"), Frames(Path(wire.ask("hello")["inbox"]))
     last = 0.0
     for seed in range(100, 105):
         pattern = noise(outputs, seed)
@@ -60,8 +60,8 @@ def test_a_pattern_appears_byte_for_byte_and_the_answer_comes_after_it(
     assert wire.ask("status")["showing"] == "pattern"
 
 
-def test_an_appearance_appears_byte_for_byte(wire: Wire, outputs: Outputs, tmp_path: Path) -> None:
-    shown = Frames(tmp_path / "out.frame")
+def test_an_appearance_appears_byte_for_byte(wire: Wire, outputs: Outputs, folder: Path) -> None:
+    shown = Frames(folder / "out.frame")
     for seed in (3, 0, 5, 3):
         assert wire.ask("play", appearance=str(seed))["ok"]
         assert same(shown.read(), noise(outputs, seed))
@@ -77,8 +77,8 @@ def test_pictures_come_on_the_grid_of_the_rate(start: Start, tmp_path: Path) -> 
     assert np.median(np.minimum(phase, 1 - phase)) < 0.2
 
 
-def test_swaps_never_mix_two_appearances(wire: Wire, outputs: Outputs, tmp_path: Path) -> None:
-    shown = Frames(tmp_path / "out.frame")
+def test_swaps_never_mix_two_appearances(wire: Wire, outputs: Outputs, folder: Path) -> None:
+    shown = Frames(folder / "out.frame")
     expected = [noise(outputs, seed) for seed in range(6)]
     first = wire.ask("sequence", items=[[str(seed), 0.002] for seed in range(6)], rate_hz=500)
     seen = set()
@@ -96,7 +96,7 @@ def test_swaps_never_mix_two_appearances(wire: Wire, outputs: Outputs, tmp_path:
     assert 0 < status["interval_p50_s"] <= status["interval_p99_s"]
 
 
-def test_a_sequence_ends_with_its_last_item_after_its_repeats(wire: Wire, outputs: Outputs, tmp_path: Path) -> None:
+def test_a_sequence_ends_with_its_last_item_after_its_repeats(wire: Wire, outputs: Outputs, folder: Path) -> None:
     first = wire.ask("sequence", items=[["1", 0.02], ["2", 0.05], ["1", 0.02], ["4", 0.02]], repeat=2)
     ends = time.monotonic() + 10
     while wire.ask("status")["sequence_running"] and time.monotonic() < ends:
@@ -104,7 +104,7 @@ def test_a_sequence_ends_with_its_last_item_after_its_repeats(wire: Wire, output
     status = wire.ask("status")
     assert status["sequence"] - first["sequence"] == 7
     assert status["presented_at"] - first["presented_at"] > 0.15
-    assert same(Frames(tmp_path / "out.frame").read(), noise(outputs, 4))
+    assert same(Frames(folder / "out.frame").read(), noise(outputs, 4))
 
 
 def test_what_is_not_yet_presented_is_superseded_and_said_so(start: Start, bundle: Path) -> None:
@@ -161,7 +161,7 @@ def test_malformed_requests_are_answered_and_hurt_nobody(wire: Wire) -> None:
 @pytest.mark.parametrize(
     ("operation", "values", "code"),
     [
-        ("show", {"sequence": 2}, "inbox-sequence"),
+        ("show", {"sequence": 2**40}, "inbox-sequence"),
         ("play", {"appearance": "none of them"}, "bundle-no-appearance"),
         ("sequence", {"items": [["1", 1], ["9", 1]]}, "bundle-no-appearance"),
         ("load-bundle", {"path": "/nowhere/b.vel"}, "bundle-unreadable"),
@@ -170,23 +170,24 @@ def test_malformed_requests_are_answered_and_hurt_nobody(wire: Wire) -> None:
     ],
 )
 def test_what_can_not_be_done_is_refused_and_the_picture_stays(
-    wire: Wire, outputs: Outputs, tmp_path: Path, operation: str, values: dict[str, object], code: str
+    wire: Wire, outputs: Outputs, folder: Path, operation: str, values: dict[str, object], code: str
 ) -> None:
     wire.ask("play", appearance="1")
     assert wire.ask(operation, **values)["error"]["code"] == code
-    assert same(Frames(tmp_path / "out.frame").read(), noise(outputs, 1))
+    assert same(Frames(folder / "out.frame").read(), noise(outputs, 1))
 
 
-def test_frames_that_are_still_being_written_are_not_shown(wire: Wire, outputs: Outputs, tmp_path: Path) -> None:
+def test_frames_that_are_still_being_written_are_not_shown(wire: Wire, outputs: Outputs, folder: Path) -> None:
     inbox = Frames(Path(wire.ask("hello")["inbox"]))
     sequence = inbox.write(noise(outputs, 50))
     inbox._words[2] += 1
     assert wire.ask("show", sequence=sequence)["error"]["code"] == "frames-changing"
-    assert dark(Frames(tmp_path / "out.frame").read())
+    inbox.write(noise(outputs, 50))
+    assert dark(Frames(folder / "out.frame").read())
 
 
-def test_an_endless_line_ends_its_connection_and_no_other(wire: Wire, tmp_path: Path) -> None:
-    with Wire(tmp_path / "player.sock") as talker:
+def test_an_endless_line_ends_its_connection_and_no_other(wire: Wire, folder: Path) -> None:
+    with Wire(folder / "player.sock") as talker:
         talker.send(b"x" * 300_000)
         assert talker.receive()["error"]["code"] == "request-wrong"
         assert talker.ended()
@@ -194,11 +195,11 @@ def test_an_endless_line_ends_its_connection_and_no_other(wire: Wire, tmp_path: 
     assert wire.ask("hello")["ok"]
 
 
-def test_clients_that_vanish_or_do_not_listen_or_are_too_many_do_no_harm(wire: Wire, tmp_path: Path) -> None:
+def test_clients_that_vanish_or_do_not_listen_or_are_too_many_do_no_harm(wire: Wire, folder: Path) -> None:
     for _ in range(30):
-        with Wire(tmp_path / "player.sock") as other:
+        with Wire(folder / "player.sock") as other:
             other.send(b'{"op": "play", "appearance": "2"}\n{"op": "sta')
-    with Wire(tmp_path / "player.sock") as deaf:
+    with Wire(folder / "player.sock") as deaf:
         deaf.channel.settimeout(0.2)
         try:
             for _ in range(200):
@@ -206,12 +207,20 @@ def test_clients_that_vanish_or_do_not_listen_or_are_too_many_do_no_harm(wire: W
         except OSError:
             pass  # the player gave it up
         assert wire.ask("status")["ok"]
-    many = [Wire(tmp_path / "player.sock") for _ in range(20)]
+    many = [Wire(folder / "player.sock") for _ in range(20)]
     assert wire.ask("hello")["ok"]
     assert many[-1].receive()["error"]["code"] == "player-busy"
     for other in many:
         other.__exit__()
     assert wire.ask("stop")["ok"]
+
+
+def exit_code(player: PlayerProcess) -> int:
+    """With what a player ended by itself."""
+    ends = time.monotonic() + 10
+    while player.alive and time.monotonic() < ends:
+        time.sleep(0.01)
+    return player.terminate()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -220,19 +229,19 @@ def test_a_signal_leaves_black_and_no_socket(start: Start, bundle: Path, tmp_pat
     with Wire(player.socket) as wire:
         wire.ask("sequence", items=[["1", 0.05], ["2", 0.05]])
         os.kill(player.pid, number)
-        ends = time.monotonic() + 5
-        while player.alive and time.monotonic() < ends:
-            time.sleep(0.01)
-    assert player.terminate() == 0
+    assert exit_code(player) == 0
     assert dark(Frames(tmp_path / "out.frame").read())
     assert not player.socket.exists()
     assert player.log.read_text() == ""
 
 
-def test_quit_is_answered_and_ends_it(wire: Wire, tmp_path: Path) -> None:
-    wire.ask("play", appearance="1")
-    assert wire.ask("quit")["ok"]
-    assert wire.ended()
+def test_quit_is_answered_and_ends_it(start: Start, bundle: Path, tmp_path: Path) -> None:
+    player = start(bundle=bundle, allow_unsigned=True)
+    with Wire(player.socket) as wire:
+        wire.ask("play", appearance="1")
+        assert wire.ask("quit")["ok"]
+        assert wire.ended()
+    assert exit_code(player) == 0
     assert dark(Frames(tmp_path / "out.frame").read())
 
 
@@ -265,14 +274,14 @@ def run_player(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
 
 
-def test_a_second_player_does_not_start_and_the_first_goes_on(wire: Wire, tmp_path: Path) -> None:
+def test_a_second_player_does_not_start_and_the_first_goes_on(wire: Wire, folder: Path) -> None:
     frames = ["--outputs", "P1:8x8", "--frames"]
-    second = run_player(tmp_path, *frames, str(tmp_path / "other.frame"))
+    second = run_player(folder, *frames, str(folder / "other.frame"))
     assert second.returncode == 2
     assert "already running" in second.stderr
-    (tmp_path / "deeper").mkdir()
+    (folder / "deeper").mkdir()
     third = run_player(
-        tmp_path / "deeper", "--outputs", "P1:40x30,P2:41x31,Prój3:39x29", "--frames", str(tmp_path / "out.frame")
+        folder / "deeper", "--outputs", "P1:40x30,P2:41x31,Prój3:39x29", "--frames", str(folder / "out.frame")
     )
     assert third.returncode == 2
     assert "Another player writes" in third.stderr
