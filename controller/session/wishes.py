@@ -16,6 +16,7 @@ from controller.errors import UsageError
 from controller.session.calibrating import read_geometry
 from controller.session.solving import Calibrated, Wish
 from controller.solve import targets
+from controller.solve.pieces import on_each
 from controller.solve.targets import Target
 from controller.storage import sha256_of
 
@@ -100,8 +101,9 @@ def _make(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: 
     geometry = read_geometry(calibrated.folder)
     if kind == "photograph":
         assert file is not None
-        return targets.wrap_photograph(targets.read_picture(file)[..., :3], geometry, mask, **options)
-    return _MAKERS[kind](geometry, mask, **options)
+        photograph = targets.read_picture(file)[..., :3]
+        return on_each(mask, lambda piece: targets.wrap_photograph(photograph, geometry, piece, **options))
+    return on_each(mask, lambda piece: _MAKERS[kind](geometry, piece, **options))
 
 
 def _as_it_is(calibrated: Calibrated) -> FloatImage:
