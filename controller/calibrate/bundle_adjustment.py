@@ -14,11 +14,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from controller.arrays import Float64, Mask
+from controller.calibrate.normal_equations import CAMERA as CAMERA_PARAMETERS
+from controller.calibrate.normal_equations import PROJECTOR as PROJECTOR_PARAMETERS
+from controller.calibrate.normal_equations import accumulate, reduced, solve_positive
 
-CAMERA_PARAMETERS = 4
-PROJECTOR_PARAMETERS = 9
+__all__ = ["CAMERA_PARAMETERS", "PROJECTOR_PARAMETERS", "Adjusted", "Problem", "State", "adjust"]
+
 _NEAREST = 1e-4  # of a projector's view axis, in baselines: anything nearer counts as behind the projector
 _GAUGE_SIGMA = 1e-3
+_CAUCHY = 2.4
+_BEHIND_PX = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +79,24 @@ class Adjusted:
     depth_sensitivity: Float64
 
 
+def undistorted(camera: Float64, px: Float64) -> Float64:
+    """(points, 2) x, y at depth 1 of camera pixels."""
+    distorted = (px - camera[1:3]) / np.exp(camera[0])
+    xy = distorted
+    for _ in range(8):
+        xy = distorted / (1.0 + camera[3] * np.sum(xy * xy, axis=1, keepdims=True))
+    return np.asarray(xy)
+
+
 def camera_rays(camera: Float64, px: Float64) -> tuple[Float64, Float64]:
     """Undistorted x, y at depth 1 of (points, 2) camera pixels, and their derivatives (points, 2, 4) by the camera."""
     f, k1 = float(np.exp(camera[0])), float(camera[3])
     distorted = (px - camera[1:3]) / f
-    xy = distorted.copy()
-    for _ in range(8):
-        xy = distorted / (1.0 + k1 * np.sum(xy * xy, axis=1, keepdims=True))
+    xy = undistorted(camera, px)
     r2 = np.sum(xy * xy, axis=1)
-    forward = (1.0 + k1 * r2)[:, None, None] * np.eye(2) + 2.0 * k1 * xy[:, :, None] * xy[:, None, :]
-    backward = np.linalg.inv(forward)
+    # the inverse of (1 + k1 r2) I + 2 k1 xy xy', by Sherman and Morrison
+    along = 2.0 * k1 / (1.0 + 3.0 * k1 * r2)
+    backward = (np.eye(2) - along[:, None, None] * xy[:, :, None] * xy[:, None, :]) / (1.0 + k1 * r2)[:, None, None]
     by_camera = np.empty((len(px), 2, 4))
     by_camera[:, :, 0] = -np.einsum("pij,pj->pi", backward, distorted)
     by_camera[:, :, 1:3] = -backward / f
@@ -93,14 +106,14 @@ def camera_rays(camera: Float64, px: Float64) -> tuple[Float64, Float64]:
 
 def residuals(problem: Problem, state: State) -> Float64:
     """(points, N, 2) projected less measured projector pixels, 0 where not seen, very large behind a projector."""
-    xy, _ = camera_rays(state.camera, problem.camera_px)
+    xy = undistorted(state.camera, problem.camera_px)
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     q = np.einsum("nij,pj->pni", state.rotations, rays) - state.inverse_depth[:, None, None] * _turned_centres(state)
     behind = q[..., 2] < _NEAREST
     depth = np.where(behind, 1.0, q[..., 2])
     focal = np.exp(state.intrinsics[:, 0])[:, None]
     out = focal * q[..., :2] / depth[..., None] + state.intrinsics[:, 1:] - problem.projector_px
-    out[behind] = 1e6
+    out[behind] = _BEHIND_PX
     out[~problem.seen] = 0.0
     return np.asarray(out)
 
@@ -124,10 +137,13 @@ def linearise(problem: Problem, state: State) -> Linearised:
     by_projector[..., 0, 1] = by_projector[..., 1, 2] = use
     # d(exp(delta) q)/d(delta) = -[q]x, so a row g of by_q becomes q x g
     by_projector[..., 3:6] = np.cross(q[:, :, None, :], by_q)
-    by_projector[..., 6:9] = -rho[:, None, None, None] * (by_q @ state.rotations)
-    by_camera = np.einsum("pnik,nkj,pjc->pnic", by_q, state.rotations[:, :, :2], xy_by_camera, optimize=True)
+    by_projector[..., 6:9] = -rho[:, None, None, None] * np.einsum("pnik,nkj->pnij", by_q, state.rotations)
+    by_xy = np.einsum("pnik,nkj->pnij", by_q, state.rotations[:, :, :2])
+    by_camera = np.einsum("pnij,pjc->pnic", by_xy, xy_by_camera)
     by_depth = -np.einsum("pnik,nk->pni", by_q, turned)
-    return Linearised(residuals(problem, state), by_camera, by_projector, by_depth)
+    residual = np.where(use[..., None], focal[:, None] * x + state.intrinsics[:, 1:] - problem.projector_px, 0.0)
+    residual[problem.seen & ~use] = _BEHIND_PX
+    return Linearised(residual, by_camera, by_projector, by_depth)
 
 
 def stepped(state: State, parameters: Float64, inverse_depth: Float64) -> State:
@@ -184,9 +200,9 @@ def adjust(
     normal = _normal_equations(problem, state)
     depth = np.where(normal.depth > 0, normal.depth, np.inf)
     sensitivity = -normal.cross / depth[:, None]
-    reduced = normal.parameters + sensitivity.T @ normal.cross
+    information = reduced(normal.parameters, normal.cross, normal.depth)
     scale = 1.0 / np.sqrt(np.diag(normal.parameters))
-    covariance = np.linalg.pinv(reduced * np.outer(scale, scale), rcond=1e-14, hermitian=True)
+    covariance = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-14, hermitian=True)
     return Adjusted(state, cost, covariance * np.outer(scale, scale), sensitivity)
 
 
@@ -194,9 +210,6 @@ def normalised(state: State) -> State:
     """The same stage with baselines of rms length 1, which the data cannot tell from any other scale."""
     scale = float(np.sqrt(np.mean(np.sum(state.centres**2, axis=1))))
     return replace(state, centres=state.centres / scale, inverse_depth=state.inverse_depth * scale)
-
-
-_CAUCHY = 2.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,31 +246,18 @@ def _prior_terms(problem: Problem, state: State) -> tuple[Float64, Float64]:
 
 def _normal_equations(problem: Problem, state: State) -> _Normal:
     linear = linearise(problem, state)
-    count, projectors = problem.seen.shape
     squared = np.sum(linear.residual_px**2, axis=2) / (problem.noise_px * _CAUCHY) ** 2
-    root = np.sqrt(problem.seen / (1.0 + squared)) / problem.noise_px
+    weight = problem.seen / (1.0 + squared) / problem.noise_px**2
+    parameters, cross, depth, gradient, depth_gradient = accumulate(
+        linear.by_camera, linear.by_projector, linear.by_depth, linear.residual_px, weight
+    )
     prior, jacobian = _prior_terms(problem, state)
-    parameters, gradient = jacobian.T @ jacobian, jacobian.T @ prior
-    cross = np.zeros((count, len(gradient)))
-    r = linear.residual_px * root[..., None]
-    by_depth = linear.by_depth * root[..., None]
-    for n in range(projectors):
-        start = CAMERA_PARAMETERS + PROJECTOR_PARAMETERS * n
-        columns = np.r_[0:CAMERA_PARAMETERS, start : start + PROJECTOR_PARAMETERS]
-        rows = np.concatenate([linear.by_camera[:, n], linear.by_projector[:, n]], axis=2) * root[:, n, None, None]
-        flat = rows.reshape(-1, rows.shape[2])
-        parameters[np.ix_(columns, columns)] += flat.T @ flat
-        gradient[columns] += flat.T @ r[:, n].ravel()
-        cross[:, columns] += np.einsum("pik,pi->pk", rows, by_depth[:, n])
-    return _Normal(parameters, cross, np.sum(by_depth**2, axis=(1, 2)), gradient, np.sum(by_depth * r, axis=(1, 2)))
+    return _Normal(parameters + jacobian.T @ jacobian, cross, depth, gradient + jacobian.T @ prior, depth_gradient)
 
 
 def _solve(normal: _Normal, damping: float) -> tuple[Float64, Float64]:
     depth = normal.depth * (1.0 + damping) + 1e-12
     damped = normal.parameters + damping * np.diag(np.diag(normal.parameters))
-    reduced = damped - normal.cross.T @ (normal.cross / depth[:, None])
-    right = normal.cross.T @ (normal.depth_gradient / depth) - normal.gradient
-    # pixels and radians differ by orders of magnitude: solve with a unit diagonal
-    scale = 1.0 / np.sqrt(np.diag(damped))
-    step = scale * np.linalg.solve(reduced * np.outer(scale, scale) + 1e-14 * np.eye(len(scale)), scale * right)
-    return step, -(normal.depth_gradient + normal.cross @ step) / depth
+    right = np.sum(normal.cross * (normal.depth_gradient / depth)[:, None], axis=0) - normal.gradient
+    step = solve_positive(reduced(damped, normal.cross, depth), right)
+    return step, -(normal.depth_gradient + np.sum(normal.cross * step, axis=1)) / depth

@@ -73,7 +73,7 @@ def solve_pair(problem: ba.Problem, index: int, size_px: tuple[int, int], tick: 
     noise = 1.4826 * float(np.median(epipolar.epipolar_distance_px(matrix, camera_px[fits], observed[fits])))
     inliers = np.zeros(len(problem.seen), dtype=np.bool_)
     inliers[seen[fits]] = True
-    rays, _ = ba.camera_rays(problem.camera_prior, camera_px[fits])
+    rays = ba.undistorted(problem.camera_prior, camera_px[fits])
     camera_matrix = np.array(
         [[focal, 0, problem.camera_prior[1]], [0, focal, problem.camera_prior[2]], [0, 0, 1.0]], dtype=np.float64
     )
@@ -121,7 +121,7 @@ def restricted(problem: ba.Problem, points: npt.NDArray[np.intp] | Mask, project
 
 def triangulated(problem: ba.Problem, state: ba.State) -> Float64:
     """(points,) inverse depths from all projectors that see each point; NaN where none does."""
-    xy, _ = ba.camera_rays(state.camera, problem.camera_px)
+    xy = ba.undistorted(state.camera, problem.camera_px)
     total, weight = np.zeros(len(xy)), np.zeros(len(xy))
     for n in range(problem.seen.shape[1]):
         rays = (problem.projector_px[:, n] - state.intrinsics[n, 1:]) / np.exp(state.intrinsics[n, 0])
