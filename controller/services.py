@@ -4,30 +4,39 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from controller.app import Checked, check_stage, marker, run_on_stage, unfinished_run
+from controller.app import LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage, unfinished_run
+from controller.bundle.install import current
+from controller.errors import UsageError
 from controller.session.calibrating import calibration_steps
+from controller.session.journal import Journal
 from controller.session.machine import Event
 from controller.session.progress import Reporter
+from controller.session.publishing import bundle_display, publish_step
 from controller.session.rig import Rig
-from controller.session.runner import Step
+from controller.session.runner import Context, Runner, Step
+from controller.session.solving import Calibrated, SolveOptions, solve_steps
+from controller.session.wishes import wishes_of
+from controller.storage import exclusive
+from hal.deadline import in_seconds
+
+KEY_FILE = "keys/stage.key"
+"""The stage's signing key, where there is one."""
 
 
 def calibrate(*, stage: Path, reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
     """Calibrate the stage, going on with an unfinished calibration; returns where the results lie."""
     checked = check_stage(stage)
     run = unfinished_run(checked.stage.folder, "calibrate")
-    run_on_stage(
-        checked,
-        lambda rig: calibrating(rig, checked),
-        name="calibrate", run=run, reporter=reporter, cancel=cancel,
-    )  # fmt: skip
+    run_on_stage(checked, partial(calibrating, checked=checked), name="calibrate", run=run,
+                 reporter=reporter, cancel=cancel)  # fmt: skip
     return {"run": str(run)}
 
 
-def calibrating(rig: Rig, checked: Checked) -> Sequence[Step]:
+def calibrating(rig: Rig, *, checked: Checked) -> Sequence[Step]:
     """The calibration's steps between their state markers."""
     longest_s = checked.stage.tables.capture.longest_exposure_s
     return [
@@ -35,3 +44,103 @@ def calibrating(rig: Rig, checked: Checked) -> Sequence[Step]:
         *calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
         marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
     ]
+
+
+def make_appearances(
+    *, stage: Path, names: Sequence[str], reporter: Reporter, cancel: threading.Event
+) -> Mapping[str, Any]:
+    """Solve appearances of stage.toml on the last calibration, and install them as the stage's bundle.
+
+    No device is touched: the projectors may be off, or playing.
+    Raises UsageError with code "not-calibrated", and what ``wishes_of`` and the steps raise.
+    """
+    checked = check_stage(stage)
+    folder = checked.stage.folder
+    run = finished_calibration(folder)
+    calibrated = Calibrated(run, checked.names)
+    wishes = wishes_of(checked.stage, calibrated, names)
+    table = checked.stage.tables.solve
+    options = SolveOptions(table.exposure_share, table.smoothness, table.mode)
+    outputs = output_sizes(checked)
+    with exclusive(folder / "run" / "lock", what_is_running="Velatura"), Journal(run) as journal:
+        steps = [
+            *solve_steps(calibrated, wishes, options, after=()),
+            publish_step(folder, outputs, [wish.name for wish in wishes], stage=checked.stage.tables.stage.name,
+                         calibration=run.name, key=signing_key(checked)),
+        ]  # fmt: skip
+        Runner(steps, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
+    return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(wish.name for wish in wishes)}
+
+
+def signing_key(checked: Checked) -> Path | None:
+    """The stage's own key. Without one, bundles stay unsigned, which stage.toml must allow in so many words."""
+    key = checked.stage.path(KEY_FILE)
+    if key.exists():
+        return key
+    if checked.stage.tables.bundle.allow_unsigned:
+        return None
+    raise UsageError(
+        "no-signing-key",
+        what=f"The stage has no signing key in {KEY_FILE}.",
+        remedy="Make one with `velatura keys STAGE`, which also tells which line to add to stage.toml.",
+    )
+
+
+def finished_calibration(stage: Path) -> Path:
+    """The newest run folder whose calibration is complete. Raises UsageError("not-calibrated")."""
+    for folder in sorted((stage / "runs").glob("*"), reverse=True):
+        if not (folder / Journal.FILE).exists():
+            continue
+        with Journal(folder) as journal:
+            if "calibrated" in journal.steps():
+                return folder
+    raise UsageError(
+        "not-calibrated",
+        what="This stage has no finished calibration.",
+        remedy="Run `velatura calibrate` on it first.",
+    )
+
+
+def output_sizes(checked: Checked) -> dict[str, tuple[str, tuple[int, int]]]:
+    """Output name and (width, height) by projector, from stage.toml. Raises UsageError("stage-key-missing")."""
+    display = checked.stage.tables.display
+    sizes = {output.name: (output.width_px, output.height_px) for output in display.outputs}
+    if not sizes:
+        raise display.place.missing("outputs", "a list of [[display.outputs]] tables with name, width_px and height_px")
+    return {table.name: (table.output, sizes[table.output]) for table in checked.stage.tables.projectors}
+
+
+def play(
+    *, stage: Path, name: str, seconds: float | None, reporter: Reporter, cancel: threading.Event
+) -> Mapping[str, Any]:
+    """Light the projectors and show an appearance of the installed bundle, for ``seconds`` or until stopped.
+
+    Raises UsageError("nothing-installed"), DeviceRefused for a name that the bundle does not have.
+    """
+    checked = check_stage(stage)
+    folder = checked.stage.folder
+    if current(folder / "bundles") is None:
+        raise UsageError(
+            "nothing-installed",
+            what="No bundle is installed on this stage.",
+            remedy="Run `velatura appearance` on it first.",
+        )
+    run = unfinished_run(folder, "play")
+    run_on_stage(checked, partial(_playing, name=name, seconds=seconds), name="play", run=run,
+                 reporter=reporter, cancel=cancel)  # fmt: skip
+    return {"played": name}
+
+
+def _playing(rig: Rig, *, name: str, seconds: float | None) -> Sequence[Step]:
+    def show(context: Context) -> Sequence[Path]:
+        display = bundle_display(rig)
+        display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
+        display.play(name, deadline=context.deadline.within(20))
+        until = in_seconds(LONGEST_RUN_S if seconds is None else seconds)
+        while not until.passed:
+            context.advance(0.0 if seconds is None else 1 - until.left_s() / max(seconds, 1e-9), name)
+            context.deadline.sleep(min(0.5, until.left_s()))
+        display.stop(deadline=context.deadline.within(20))
+        return ()
+
+    return [Step("play", show, title=f"Playing {name}", enter=Event.PLAY, leave=Event.PAUSE, always=True)]

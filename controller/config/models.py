@@ -131,8 +131,10 @@ class SolveTable(Table):
     smoothness: float = Field(
         default=0.002, ge=0, le=100, description="the weight of equal neighbours in a compensation image, 0 to 100"
     )
-    mode: Literal["full", "scaled"] = Field(
-        default="full", description='"full" (a solve for every appearance) or "scaled" (base image x scale image)'
+    mode: Literal["auto", "full", "scale"] = Field(
+        default="auto",
+        description='"full" (a solve for every appearance), "scale" (base image x scale image), or "auto" (full where '
+        "the target has finer detail than scaling can show)",
     )
 
 

@@ -12,8 +12,8 @@ from controller.app import Checked, check_stage, marker, run_on_stage, unfinishe
 from controller.arrays import save_arrays
 from controller.demo.bench_process import BenchProcess
 from controller.demo.report import write_demo_report
-from controller.demo.stage import KEY, prepare
-from controller.services import calibrating
+from controller.demo.stage import prepare
+from controller.services import calibrating, output_sizes, signing_key
 from controller.session.machine import Event
 from controller.session.progress import Reporter
 from controller.session.publishing import photograph_hdr, photograph_step, playback_step, publish_step
@@ -62,17 +62,24 @@ def demo_steps(rig: Rig, *, checked: Checked, run: Path) -> Sequence[Step]:
     calibrated = Calibrated(run, checked.names)
     wishes = wishes_of(stage, calibrated)
     names = [wish.name for wish in wishes]
-    options = SolveOptions(stage.tables.solve.exposure_share, stage.tables.solve.smoothness)
+    table = stage.tables.solve
+    options = SolveOptions(table.exposure_share, table.smoothness, table.mode)
     after = [name for projector in checked.names for name in (f"radiometry-{projector}", f"pixels-{projector}")]
-    key = stage.folder / KEY
     longest_s = stage.tables.capture.longest_exposure_s
     return [
-        *calibrating(rig, checked),
+        *calibrating(rig, checked=checked),
         marker("solving", "Solving", enter=Event.SOLVE),
         *solve_steps(calibrated, wishes, options, [*after, "geometry"]),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
-        publish_step(rig, names, stage=stage.tables.stage.name, calibration=run.name, key=key),
+        publish_step(
+            stage.folder,
+            output_sizes(checked),
+            names,
+            stage=stage.tables.stage.name,
+            calibration=run.name,
+            key=signing_key(checked),
+        ),
         marker("published", "Published", leave=Event.PUBLISHED),
         marker("playing", "Playing", enter=Event.PLAY),
         photograph_step(rig, names, longest_exposure_s=longest_s),

@@ -13,6 +13,7 @@ import numpy as np
 from controller.bundle.signing import generate_key
 from controller.config import write_stage
 from controller.errors import UsageError
+from controller.services import KEY_FILE
 from controller.solve.targets import linear_to_srgb, shipped_photograph
 from controller.storage import sha256_of, write_atomically
 from hal.deadline import in_seconds
@@ -21,7 +22,6 @@ from hal.registry import Drivers, OpenContext, load_drivers
 
 MARK = "demo.json"
 PHOTOGRAPH = "photograph.png"
-KEY = "keys/demo.key"
 
 APPEARANCES: tuple[dict[str, Any], ...] = (
     {"name": "photograph", "kind": "photograph", "file": PHOTOGRAPH},
@@ -71,7 +71,7 @@ def _write(stage: Path, *, size: str, object_file: Path | None, seed: int) -> Ma
     devices = bench_of(stage).prepare(stage, size=size, object_file=object_file, seed=seed)
     stage.mkdir(parents=True, exist_ok=True)
     _write_photograph(stage / PHOTOGRAPH)
-    public = generate_key(stage / KEY)
+    public = generate_key(stage / KEY_FILE)
     return {
         "stage": {"name": f"demo {size}"},
         **devices,

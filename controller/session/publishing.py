@@ -41,11 +41,20 @@ def bundle_display(rig: Rig) -> BundleDisplay:
     return rig.display
 
 
-def publish_step(rig: Rig, names: Sequence[str], *, stage: str, calibration: str, key: Path | None) -> Step:
-    """Write, sign and install the bundle of these appearances; its artefact is the installed file's name."""
+Outputs = Mapping[str, tuple[str, tuple[int, int]]]
+"""Output name and (width, height) by projector name."""
+
+
+def publish_step(
+    stage_folder: Path, outputs: Outputs, names: Sequence[str], *, stage: str, calibration: str, key: Path | None
+) -> Step:
+    """Write, sign and install the bundle of these appearances; its artefacts are the bundle and its figures.
+
+    ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle.
+    """
     return Step(
         "publish",
-        partial(_publish, rig, tuple(names), stage, calibration, key),
+        partial(_publish, stage_folder, dict(outputs), tuple(names), (stage, calibration), key),
         inputs={"names": " ".join(names), "key": "" if key is None else sha256_of(key)},
         after=tuple(f"appearance-{name}" for name in names),
         title="Publishing the signed bundle",
@@ -54,29 +63,31 @@ def publish_step(rig: Rig, names: Sequence[str], *, stage: str, calibration: str
 
 
 def _publish(
-    rig: Rig, names: Sequence[str], stage: str, calibration: str, key: Path | None, context: Context
+    folder: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    identity: tuple[str, str],
+    key: Path | None,
+    context: Context,
 ) -> Sequence[Path]:
-    projectors = [projector.name for projector in rig.projectors]
-    output_of = {projector.name: projector.output for projector in rig.projectors}
-
     def appearance(name: str) -> NewAppearance:
-        solved = read_solved(context.folder, name, projectors)
-        frames = {output_of[projector]: frame for projector, frame in solved.frames.items()}
+        solved = read_solved(context.folder, name, tuple(outputs))
+        frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
         return NewAppearance(name, frames, metadata={"mode": solved.figures["mode"], "exposure": solved.exposure})
 
     built = context.folder / "bundle.vel"
     trusted = () if key is None else (load_public_key(key.with_name(key.name + ".pub")),)
     write_bundle(
         built,
-        stage=stage,
-        calibration=calibration,
+        stage=identity[0],
+        calibration=identity[1],
         created_unix_s=int(time.time()),
-        outputs=[(projector.output, *projector.size_px) for projector in rig.projectors],
+        outputs=[(output, *size) for output, size in outputs.values()],
         appearances=(appearance(name) for name in names),
         key=None if key is None else load_signing_key(key),
     )
-    installed = install(built, rig.stage / "bundles", trusted=trusted, allow_unsigned=key is None)
-    raw = sum(3 * p.size_px[0] * p.size_px[1] for p in rig.projectors) * len(names)
+    installed = install(built, folder / "bundles", trusted=trusted, allow_unsigned=key is None)
+    raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
     size = built.stat().st_size
     figures = {"bytes": size, "ratio": raw / size, "file": installed.name}
     path = context.folder / "bundle.json"

@@ -32,14 +32,13 @@ from controller.transport import LightTransport
 class Wish:
     """An appearance to be made: ``target`` gives its picture, reflectance-like, and where it says something.
 
-    ``inputs`` are the hashes of what the target is made from; ``mode`` as in ``solve.appearance``.
+    ``inputs`` are the hashes of what the target is made from.
     """
 
     name: str
     title: str
     target: Callable[[], Target]
     inputs: dict[str, str]
-    mode: Mode = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +47,10 @@ class SolveOptions:
 
     share: float
     smoothness: float
+    mode: Mode = "auto"
 
     def inputs(self) -> dict[str, str]:
-        return {"share": repr(self.share), "smoothness": repr(self.smoothness)}
+        return {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode}
 
 
 class Calibrated:
@@ -111,7 +111,7 @@ def solve_steps(
             Step(
                 f"appearance-{wish.name}",
                 partial(_solve_appearance, calibrated, wish, options),
-                inputs={**options.inputs(), **wish.inputs, "mode": wish.mode},
+                inputs={**options.inputs(), **wish.inputs},
                 after=(*after, "base"),
                 title=f"Solving {wish.title}",
                 weight=4,
@@ -191,7 +191,7 @@ def _solve_appearance(calibrated: Calibrated, wish: Wish, options: SolveOptions,
         calibrated.base,
         target,
         black,
-        mode=wish.mode,
+        mode=options.mode,
         smoothness=options.smoothness,
         progress=_watched(context),
     )
