@@ -214,6 +214,17 @@ def test_little_depth_still_converges_to_the_right_shape(seed: int) -> None:
     assert shape_error_m(stage, solve(stage)) < 4e-4
 
 
+@pytest.mark.parametrize("seed", [1, 4, 5])
+def test_a_nearly_flat_scene_is_right_or_refused_but_never_quietly_wrong(seed: int) -> None:
+    stage = make_stage(seed, projectors=2, relief_m=0.016, noise_px=0.15)
+    try:
+        found = solve(stage)
+    except CalibrationError as refused:
+        assert refused.code in ("scene-flat", "geometry-uncertain", "geometry-ambiguous", "camera-prior-contradicted")
+    else:
+        assert shape_error_m(stage, found) < 5e-4
+
+
 def test_a_fifth_of_wrong_correspondences_does_no_harm() -> None:
     stage = make_stage(5, outliers=0.2, noise_px=0.1)
     found = solve(stage)
