@@ -22,6 +22,7 @@ from controller.session.shots import read_index
 from controller.solve.appearance import Base, Mode, base_image, make_appearance, prepare_base, solve_base
 from controller.solve.bounded import Solution
 from controller.solve.dither import to_device
+from controller.solve.drive import Drive
 from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
 from controller.solve.targets import Target
 from controller.storage import write_atomically
@@ -62,6 +63,7 @@ class Calibrated:
         self._calibration: Calibration | None = None
         self._transport: LightTransport | None = None
         self._base: Base | None = None
+        self._drive: Drive | None = None
 
     @property
     def calibration(self) -> Calibration:
@@ -86,6 +88,12 @@ class Calibrated:
             )
             self._base = prepare_base(self.transport, arrays["image"], self.calibration.black, solution)
         return self._base
+
+    @property
+    def drive(self) -> Drive:
+        if self._drive is None:
+            self._drive = Drive(self.transport)
+        return self._drive
 
     def keep_base(self, base: Base) -> None:
         self._base = base
@@ -178,13 +186,13 @@ def _watched(context: Context) -> Callable[[int, float], None]:
 def _solve_appearance(calibrated: Calibrated, wish: Wish, options: SolveOptions, context: Context) -> Sequence[Path]:
     began_s = time.perf_counter()
     calibration, transport = calibrated.calibration, calibrated.transport
-    black, reach = calibration.black, transport.reach()
+    black, drive = calibration.black, calibrated.drive
     asked = wish.target()
     picture = asked.image
-    exposure = choose_exposure(transport, picture, black, share=options.share, reach=reach)
+    exposure = choose_exposure(transport, picture, black, share=options.share, drive=drive)
     wanted = np.float32(exposure) * picture
     target = target_radiance(picture, black, exposure)
-    possible = feasibility(transport, wanted, black, reach=reach)
+    possible = feasibility(transport, wanted, black, drive=drive)
     solve_began_s = time.perf_counter()
     made = make_appearance(
         transport,

@@ -9,15 +9,17 @@ import numpy as np
 from controller.arrays import FloatImage, Mask
 from controller.errors import UsageError, WorkError
 from controller.solve.bounded import check_target
+from controller.solve.drive import Drive
 from controller.transport import LightTransport
 
 
 @dataclass(frozen=True, slots=True)
 class Feasibility:
-    """How a target radiance lies in the reachable range K to K + T 1.
+    """How a target radiance lies in what the projectors can make.
 
-    ``too_bright``, ``too_dark`` (rows, columns, 3) float32, >= 0: what is missing or too much, in camera units
-    ``reachable`` (rows, columns) bool: on the object and within the range in all channels
+    ``too_bright``, ``too_dark`` (rows, columns, 3) float32, >= 0: by how much the channels of the projectors would have
+    to be driven above white, or below black; 1 is all of a channel's light
+    ``reachable`` (rows, columns) bool: on the object, and neither too bright, too dark nor too saturated
     ``share``: the part of the object's pixels that is reachable
     """
 
@@ -32,22 +34,19 @@ def feasibility(
     target: FloatImage,
     black: FloatImage,
     *,
-    margin: float = 1e-3,
-    reach: FloatImage | None = None,
+    margin: float = 2e-3,
+    drive: Drive | None = None,
 ) -> Feasibility:
     """Compare ``target`` (rows, columns, 3), linear radiance, with what the projectors can make.
 
-    ``margin`` of the brightest reachable light is forgiven; ``reach`` is ``transport.reach()`` where already known.
+    ``margin``: so much drive beyond [0, 1] is forgiven; ``drive`` of this transport, where already known.
     """
     check_target(transport, target)
-    reach = transport.reach() if reach is None else reach
-    slack = margin * float(reach.max(initial=0))
-    bright = np.maximum(target - black - reach, 0)
-    dark = np.maximum(black - target, 0)
-    mask = transport.object_mask
-    bright[~mask] = 0
-    dark[~mask] = 0
-    reachable = mask & (bright.max(axis=2) <= slack) & (dark.max(axis=2) <= slack)
+    drive = Drive(transport) if drive is None else drive
+    needed = drive.of(target - black)
+    bright, dark = np.maximum(needed - 1, 0), np.maximum(-needed, 0)
+    mask = drive.mask
+    reachable: Mask = mask & (bright.max(axis=2) <= margin) & (dark.max(axis=2) <= margin)
     share = float(reachable[mask].mean()) if mask.any() else 0.0
     return Feasibility(bright, dark, reachable, share)
 
@@ -58,12 +57,12 @@ def choose_exposure(
     black: FloatImage,
     *,
     share: float = 0.95,
-    reach: FloatImage | None = None,
+    drive: Drive | None = None,
 ) -> float:
     """The largest exposure at which ``share`` of the object's pixels can be made as bright as exposure x target.
 
-    ``target`` (rows, columns, 3): reflectance-like, 0 to 1. All three channels of a pixel must be within K + T 1;
-    pixels that should be darker than the black image K do not bear on the exposure, they stay at K.
+    ``target`` (rows, columns, 3): reflectance-like, 0 to 1. No channel of a pixel may need more than all its light;
+    pixels too dark or too saturated for the stage do not bear on the exposure: another one would not help them.
 
     Raises UsageError("share-out-of-range"), WorkError("no-light") when there is no light or the target is black.
     """
@@ -74,11 +73,11 @@ def choose_exposure(
             what=f"A share of {share} reachable pixels was asked for.",
             remedy="Ask for a share above 0 and up to 1, for example 0.95.",
         )
-    reach = transport.reach() if reach is None else reach
-    mask = transport.object_mask
-    wanted = target[mask].astype(np.float64)
-    range_end = reach[mask].astype(np.float64) + black[mask]
-    largest = np.divide(range_end, wanted, out=np.full_like(wanted, np.inf), where=wanted > 0).min(axis=1)
+    drive = Drive(transport) if drive is None else drive
+    mask = drive.mask
+    per_exposure, at_none = drive.of(target)[mask].astype(np.float64), drive.of(-black)[mask].astype(np.float64)
+    room = np.full_like(per_exposure, np.inf)
+    largest = np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 0).min(axis=1)
     largest.sort()
     # The pixel that bounds the exposure: at most (1 - share) of all pixels may need less.
     bound = int(np.floor((1 - share) * largest.size))

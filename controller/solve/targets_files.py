@@ -49,7 +49,7 @@ def load_target(path: Path, size: tuple[int, int]) -> Target:
 
 
 def read_picture(path: Path) -> FloatImage:
-    """(rows, columns, 3 or 4) float32 linear light of an EXR, PNG or JPEG file; else UsageError("target-unreadable")."""
+    """(rows, columns, 3 or 4) float32 linear light of an EXR, PNG or JPEG; UsageError("target-unreadable") if not."""
     return _read_exr(path) if path.suffix.lower() == ".exr" else _read_encoded(path)
 
 
