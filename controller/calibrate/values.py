@@ -105,9 +105,11 @@ class Calibration:
     ``black`` (rows, columns, 3) float32: all projectors at black, ambient light included (K)
     ``object_mask`` (rows, columns): camera pixels on the object that at least one projector lights
     ``camera_to_xyz`` (3, 3): linear camera RGB to CIE XYZ (D65), from the camera's own colour matrix
+    ``camera_blur_px``: standard deviation in camera pixels of the camera's own blur, red, green and blue; 0: not known
     """
 
     projectors: tuple[ProjectorCalibration, ...]
     black: FloatImage
     object_mask: Mask
     camera_to_xyz: npt.NDArray[np.float64]
+    camera_blur_px: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,13 @@ JPEG_SATURATED = 254
 SINGULAR = 1e-6
 SRGB_TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 """D65, with the digits that LibRaw uses."""
+
+
+OPTICS_BLUR_PX = 0.5
+"""Standard deviation of a sharp lens with its sensor's pixel, in camera pixels."""
+CAMERA_BLUR_PX = tuple(math.hypot(OPTICS_BLUR_PX, math.sqrt(variance)) for variance in (1 / 2, 1 / 4, 1 / 2))
+"""Red, green and blue, with the bilinear interpolation of this module: its variance along an axis, averaged over the
+sites of the colour pattern, is 1/2 for red and blue and 1/4 for green."""
 
 
 @dataclass(frozen=True, slots=True)

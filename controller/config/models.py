@@ -129,7 +129,7 @@ class SolveTable(Table):
         default=0.9, gt=0, le=1, description="the share of the reachable light that targets may use, above 0, at most 1"
     )
     smoothness: float = Field(
-        default=0.002, ge=0, le=100, description="the weight of equal neighbours in a compensation image, 0 to 100"
+        default=0.001, ge=0, le=100, description="the weight of equal neighbours in a compensation image, 0 to 100"
     )
     mode: Literal["auto", "full", "scale"] = Field(
         default="auto",

@@ -28,6 +28,7 @@ from controller.calibrate.values import (
 )
 from controller.capture.brackets import merge_brackets
 from controller.capture.patterns import PatternPlan, plan_patterns
+from controller.capture.raw import CAMERA_BLUR_PX
 from controller.errors import CalibrationError
 from controller.session.capturing import capture_steps, code_step
 from controller.session.rig import Rig, RigProjector
@@ -232,7 +233,9 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
         parts.append(ProjectorCalibration(name, metapixels, radiometry, np.nan_to_num(light["white"])))
     black = np.nan_to_num(light["black"])
     camera_to_xyz: Float64 = light["camera_to_xyz"]
-    return Calibration(tuple(parts), black, object_mask(parts), camera_to_xyz)
+    red, green, blue = CAMERA_BLUR_PX
+    camera_blur_px = (red, green, blue)
+    return Calibration(tuple(parts), black, object_mask(parts), camera_to_xyz, camera_blur_px)
 
 
 def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:

@@ -133,6 +133,7 @@ def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_
             if brackets.settled:
                 return Exposures(choice.exposure_s, brackets.exposures_s)
         exposure_s = choice.exposure_s
+    rig.check_light(deadline=context.deadline)  # a dead lamp is not a matter of exposure
     raise CalibrationError(
         "exposure-not-found",
         what=f"No exposure was found at which the white of projector {projector.name} is well exposed.",

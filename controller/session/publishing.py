@@ -19,7 +19,7 @@ from controller.errors import UsageError
 from controller.session.capturing import bracket
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
-from controller.session.shots import take_photograph
+from controller.session.shots import keep_if_lit, take_photograph
 from controller.session.solving import read_solved
 from controller.storage import sha256_of, write_atomically
 from hal.deadline import Deadline
@@ -130,12 +130,12 @@ def photograph_hdr(
 
     ``white`` is the radiance of the target's white; ``of`` names what is shown, for the journal.
     """
-    images, exposures = [], []
-    for number, exposure_s in enumerate(bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)):
-        taken = take_photograph(rig, context, f"{name}-{number}", exposure_s, shown_at_s=shown_at_s, of=of)
-        images.append(taken.read().measured())
-        exposures.append(taken.exposure_s)
-    merged = merge_brackets(images, exposures).radiance
+    taken = [
+        take_photograph(rig, context, f"{name}-{number}", exposure_s, shown_at_s=shown_at_s, of=of)
+        for number, exposure_s in enumerate(bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s))
+    ]
+    keep_if_lit(rig, context, taken)
+    merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
     return np.asarray(np.nan_to_num(merged), np.float32)
 
 

@@ -10,8 +10,12 @@ import numpy as np
 
 from controller.arrays import ByteImage
 from controller.capture.acquire import Acquirer
-from controller.session.safety import LampGuard
+from controller.session.power import ANSWER_S
+from controller.session.safety import LampGuard, faulty
+from hal.deadline import Deadline
+from hal.errors import DeviceRefused
 from hal.interfaces import Camera, Display
+from hal.values import Power
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +45,22 @@ class Rig:
     @property
     def guards(self) -> tuple[LampGuard, ...]:
         return tuple(projector.guard for projector in self.projectors)
+
+    def check_light(self, *, deadline: Deadline) -> None:
+        """Look at every projector: a photograph counts only if each lamp is on and steady.
+
+        Raises DeviceRefused("projector-fault" or "lamp-went-off"), and what the drivers raise.
+        """
+        for guard in self.guards:
+            status = guard.status(deadline=deadline.within(ANSWER_S))
+            if status.power is Power.FAULT:
+                raise faulty(guard.name, status)
+            if status.power is not Power.ON or guard.stable_left_s() > 0:
+                raise DeviceRefused(
+                    "lamp-went-off",
+                    what=f"The lamp of projector {guard.name} went off during the work.",
+                    remedy="See whether somebody switched it off, or it overheated; then start again.",
+                )
 
     def on_outputs(self, frames: Mapping[str, ByteImage]) -> dict[str, ByteImage]:
         """Frames by output from frames by projector; every projector that is not named shows black."""

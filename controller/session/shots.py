@@ -16,6 +16,8 @@ from controller.capture.raw import Photograph, read_photograph
 from controller.session.rig import Rig
 from controller.session.runner import Context
 from controller.storage import write_atomically
+from hal.deadline import Cancelled
+from hal.errors import DeviceError
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +31,15 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """A photograph on disk, with the exposure that the camera confirmed."""
+    """A photograph on disk, with the exposure that the camera confirmed.
+
+    ``fresh``: it was taken just now, not by an earlier run.
+    """
 
     name: str
     path: Path
     exposure_s: float
+    fresh: bool = False
 
     def read(self) -> Photograph:
         return read_photograph(self.path)
@@ -54,12 +60,31 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, index: str)
     for number, planned in enumerate(plan):
         context.advance(number / len(plan), planned.name)
         taken.append(_take(rig, context, planned, folder))
+    keep_if_lit(rig, context, taken)
     path = context.folder / f"{index}.json"
     rows = [
         {"name": t.name, "path": str(t.path.relative_to(context.folder)), "exposure_s": t.exposure_s} for t in taken
     ]
     write_atomically(path, json.dumps(rows, indent=1).encode())
     return [path, *(t.path for t in taken)]
+
+
+def keep_if_lit(rig: Rig, context: Context, taken: Sequence[Taken]) -> None:
+    """Look at the lamps after photographs were taken; if one is not well, forget them: some may lack its light.
+
+    Raises as ``Rig.check_light``. A run that goes on takes the forgotten ones again.
+    """
+    fresh = [one.path for one in taken if one.fresh]
+    if not fresh:
+        return
+    try:
+        rig.check_light(deadline=context.deadline)
+    except Cancelled:
+        raise
+    except DeviceError:
+        for path in fresh:
+            path.unlink(missing_ok=True)
+        raise
 
 
 def _take(rig: Rig, context: Context, planned: Planned, folder: Path) -> Taken:
@@ -90,7 +115,7 @@ def take_photograph(
 def _journalled(context: Context, name: str, settings: Mapping[str, str], path: Path, exposure_s: float) -> Taken:
     write_atomically(_note_of(path), json.dumps({"exposure_s": exposure_s}).encode())
     artefact = context.journal.record_shot(name, settings, path)
-    return Taken(name, artefact.path, exposure_s)
+    return Taken(name, artefact.path, exposure_s, fresh=True)
 
 
 def _note_of(photograph: Path) -> Path:

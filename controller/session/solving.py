@@ -25,6 +25,7 @@ from controller.solve.dither import to_device
 from controller.solve.drive import Drive
 from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
 from controller.solve.targets import Target
+from controller.solve.weights import appearance_weights
 from controller.storage import write_atomically
 from controller.transport import LightTransport
 
@@ -201,6 +202,7 @@ def _solve_appearance(calibrated: Calibrated, wish: Wish, options: SolveOptions,
         black,
         mode=options.mode,
         smoothness=options.smoothness,
+        weights=appearance_weights(target, possible.reachable, exposure),
         progress=_watched(context),
     )
     seconds = time.perf_counter() - solve_began_s

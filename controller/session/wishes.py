@@ -102,8 +102,10 @@ def _make(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: 
     if kind == "photograph":
         assert file is not None
         photograph = targets.read_picture(file)[..., :3]
-        return on_each(mask, lambda piece: targets.wrap_photograph(photograph, geometry, piece, **options))
-    return on_each(mask, lambda piece: _MAKERS[kind](geometry, piece, **options))
+        made = on_each(mask, lambda piece: targets.wrap_photograph(photograph, geometry, piece, **options))
+    else:
+        made = on_each(mask, lambda piece: _MAKERS[kind](geometry, piece, **options))
+    return targets.through_camera(made)
 
 
 def _as_it_is(calibrated: Calibrated) -> FloatImage:

@@ -21,7 +21,7 @@ from controller.solve.smoothness import squared_edges
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
 
-SMOOTHNESS: Final = 0.005
+SMOOTHNESS: Final = 0.001
 """Default strength of smoothness, relative to the mean diagonal of the data's majoriser. On a disturbed synthetic stage
 the edges kept (eq. 9) peak between 0.003 and 0.01; colour noise falls up to 0.03, at the cost of detail."""
 TOLERANCE: Final = 3e-5
@@ -59,17 +59,6 @@ class _Problem:
     across: FloatImage
     down: FloatImage
     majoriser: FloatImage
-
-
-def perceptual_weights(target: FloatImage, white: float) -> FloatImage:
-    """Weights (rows, columns) of mean 1 that count errors as the eye does, by the squared slope of L*.
-
-    L* grows with the cube root of light, so its squared slope falls as light^(-4/3); ``white`` is the target's white,
-    and light below 2 % of it counts as that. Measured: CIEDE2000 falls by about 1 % against even weights.
-    """
-    light = target.mean(axis=2) / np.float32(white) + np.float32(0.02)
-    weights = light ** np.float32(-4 / 3)
-    return np.asarray(weights / weights.mean(dtype=np.float64), np.float32)
 
 
 def check_target(transport: LightTransport, target: FloatImage) -> None:

@@ -7,7 +7,7 @@ can become is decided by the solver's exposure.
 from controller.solve.relight import gloss, recolour, smooth_normals
 from controller.solve.targets_files import PHOTOGRAPHS, load_target, read_picture, shipped_photograph
 from controller.solve.targets_patterns import WHITE_GREY, Colour, checkerboard, replace_pattern
-from controller.solve.targets_values import Target, linear_to_srgb, srgb_to_linear
+from controller.solve.targets_values import Target, linear_to_srgb, srgb_to_linear, through_camera
 from controller.solve.wrap import Mapping, ObjectSpace, object_space, painted, wrap_photograph
 
 __all__ = [
@@ -29,5 +29,6 @@ __all__ = [
     "shipped_photograph",
     "smooth_normals",
     "srgb_to_linear",
+    "through_camera",
     "wrap_photograph",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -42,3 +43,20 @@ def _as_unit(values: npt.NDArray[Any]) -> FloatImage:
     if np.issubdtype(values.dtype, np.integer):
         return values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
     return values.astype(np.float32)
+
+
+CAMERA_FILTER_PX = 0.7
+"""What the camera's optics and the interpolation of its colours blur at least (``capture.raw.CAMERA_BLUR_PX``)."""
+
+
+def through_camera(target: Target, *, sigma_px: float = CAMERA_FILTER_PX) -> Target:
+    """A computed picture as the camera would see it, so that it asks for no edge that no photograph can show.
+
+    The blur (a Gaussian of ``sigma_px``) is over the mask alone: nothing bleeds in from outside, or out.
+    """
+    weight = cv2.GaussianBlur(target.mask.astype(np.float32), (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT)
+    blurred = cv2.GaussianBlur(
+        np.where(target.mask[..., None], target.image, 0), (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT
+    )
+    image = np.where(target.mask[..., None], blurred / np.maximum(weight, 1e-6)[..., None], 0)
+    return Target(np.asarray(image, np.float32), target.mask)

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from controller.arrays import Float64, FloatImage, Mask
 from controller.calibrate.values import Geometry
-from controller.errors import WorkError
+from controller.errors import UsageError, WorkError
 from controller.solve.targets_values import Target
 
 Mapping: TypeAlias = Literal["cylinder", "plane"]
@@ -107,14 +107,24 @@ def wrap_photograph(
     mapping: Mapping = "cylinder",
     up: tuple[float, float, float] = UPRIGHT,
     shading: float = 0.0,
+    ink: float = 0.03,
+    paper: float = 0.9,
 ) -> Target:
-    """A photograph wrapped on the object: as large as it must be to cover what the camera sees of it, unstretched.
+    """A photograph printed and wrapped on the object: as large as it must be to cover what the camera sees of it.
 
     Parameters
     ----------
     photo_linear : (rows, columns, 3) float32, linear, in [0, 1]
     shading : 0 flat, as printed on the object; up to 1: darkened where the surface turns away from the camera
+    ink, paper : what the print's black and white reflect, 0 <= ink < paper <= 1. A print of density 1.5 has 0.03; no
+        projector makes the black of a screen on a pale object in another projector's stray light
     """
+    if not 0 <= ink < paper <= 1:
+        raise UsageError(
+            "print-range-invalid",
+            what=f"A print can't reflect from {ink} to {paper}.",
+            remedy="Give 0 <= ink < paper <= 1, for example 0.03 and 0.9.",
+        )
     space = object_space(geometry, mask, mapping=mapping, up=up)
     low, high = (np.percentile([space.across_m[space.mask], space.up_m[space.mask]], q, axis=1) for q in (0.5, 99.5))
     height, width = photo_linear.shape[:2]
@@ -131,7 +141,7 @@ def wrap_photograph(
     def pattern(across: FloatImage, above: FloatImage) -> FloatImage:
         x = (across - np.float32(middle[0])) / np.float32(metres) + np.float32((width - 1) / 2)
         y = (np.float32(middle[1]) - above) / np.float32(metres) + np.float32((height - 1) / 2)
-        return _sampled(photo_linear, x, y)
+        return np.float32(ink) + np.float32(paper - ink) * _sampled(photo_linear, x, y)
 
     return painted(space, pattern, gain=facing(geometry, mask, shading))
 

@@ -4,10 +4,14 @@ For projector n with frame p_n, T_n p_n = W_n (.) G_n (p_n M_n'). W_n is the pro
 mixing, and G_n holds, for each camera pixel, the shares of its light that come from each projector pixel: metapixel
 Gaussians, normalised to sum 1 over the projector pixels. So T_n 1 reproduces W_n, which a plain Gaussian model counts
 twice where neighbours overlap, and edges of the object's colour stay as sharp as the camera sees them.
+
+Where the camera's own blur H is known, it stands in the shares: G_n p = H (a_n (.) g_n p) / H (a_n (.) g_n 1), with g_n
+the shares on the object and a_n the white image before the blur (docs/decisions/0006).
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +24,12 @@ from controller.arrays import FloatImage, Mask
 from controller.calibrate.values import Calibration, Metapixels
 from controller.errors import UsageError
 from controller.storage import stream_atomically
+from controller.transport.blur import blur_planes, gaussian_taps, sharpened, without_blur
 from controller.transport.patches import Patches, build_patches
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
-from controller.transport.products import adjoint_planes, forward_planes, gaussian_sums
+from controller.transport.products import adjoint_planes, forward_planes, gaussian_sums, multiply_add
 
-VERSION: Final = 1
+VERSION: Final = 2
 FAINTEST: Final = 1e-6
 """A camera pixel counts as lit by a projector above this fraction of the projector's brightest white."""
 
@@ -35,6 +40,8 @@ class LightTransport:
 
     ``patches``: Gaussian weights of every metapixel, before normalisation
     ``gain`` (projectors, 3, rows, columns) float32: white over sum of weights, 0 where a camera pixel is not counted
+    ``after`` (projectors, 3, rows, columns) float32: factor after the camera's blur; without blur (projectors, 3, 0, 0)
+    ``taps`` (3, 2 r + 1) float32: the camera's blur along an axis; a single 1 where it is not modelled
     ``mixing`` (projectors, 3, 3) float32: camera channel by projector channel
     ``lit`` (projectors, rows, columns) bool: camera pixels on the object with shares of that projector
     ``per_weight`` (pixels,) float32: 1 / sum of a metapixel's weights over its lit camera pixels, or 0
@@ -46,6 +53,8 @@ class LightTransport:
     mixing: FloatImage
     lit: Mask
     per_weight: FloatImage
+    after: FloatImage
+    taps: FloatImage
     sizes: tuple[tuple[int, int], ...]
 
     @classmethod
@@ -60,8 +69,13 @@ class LightTransport:
         _check(calibration)
         projectors = calibration.projectors
         shape = calibration.object_mask.shape
-        patches = build_patches(tuple(p.metapixels for p in projectors), (shape[0], shape[1]))
+        blur_px = calibration.camera_blur_px
+        on_object = tuple(without_blur(p.metapixels, blur_px) for p in projectors)
+        patches = build_patches(on_object, (shape[0], shape[1]))
+        taps = gaussian_taps(blur_px)
+        blurred = taps.shape[1] > 1
         gain = np.ones((len(projectors), 3, *shape), np.float32)
+        after = np.zeros((len(projectors), 3, *(shape if blurred else (0, 0))), np.float32)
         lit = np.zeros((len(projectors), *shape), np.bool_)
         ones = np.ones((3, patches.first.size), np.float32)
         plain = np.broadcast_to(np.eye(3, dtype=np.float32), (len(projectors), 3, 3)).copy()
@@ -71,15 +85,22 @@ class LightTransport:
             white = projector.white
             lit[n] = calibration.object_mask & (total[0] > 0) & (white.max(axis=2) > FAINTEST * white.max(initial=0))
             inverse = np.divide(1, total[0], out=np.zeros(shape, np.float32), where=lit[n])
-            for channel in range(3):
-                np.multiply(white[..., channel], inverse, out=gain[n, channel])
+            planes = image_planes(white)
+            colour = sharpened(planes, taps) if blurred else planes
+            np.multiply(colour, inverse, out=gain[n])
+            if blurred:
+                _match_white(planes, np.where(lit[n], colour, 0), taps, lit[n], after[n])
         total[:] = 1
         weights = np.zeros_like(ones)
         gaussian_sums(patches, lit, total, ones[0], (0, len(projectors)), weights)
         per_weight = np.divide(1, weights[0], out=np.zeros_like(weights[0]), where=weights[0] > 0)
         mixing = np.stack([p.radiometry.mixing for p in projectors]).astype(np.float32)
         sizes = tuple((p.metapixels.valid.shape[0], p.metapixels.valid.shape[1]) for p in projectors)
-        return cls(patches, gain, mixing, lit, per_weight, sizes)
+        return cls(patches, gain, mixing, lit, per_weight, after, taps, sizes)
+
+    @property
+    def _blurred(self) -> bool:
+        return int(self.taps.shape[1]) > 1
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -134,13 +155,29 @@ class LightTransport:
     ) -> FloatImage:
         """T p on planes: (3, pixels) to (3, rows, columns), for a range of projectors or for all."""
         out = np.empty((3, *self.shape), np.float32) if out is None else out
-        forward_planes(self.patches, self.gain, self.mixing, p, projectors or (0, len(self.sizes)), out)
+        projectors = projectors or (0, len(self.sizes))
+        if not self._blurred:
+            forward_planes(self.patches, self.gain, self.mixing, p, projectors, out)
+            return out
+        out[:] = 0
+        light, scratch = np.empty_like(out), np.empty_like(out)
+        for n in range(*projectors):
+            forward_planes(self.patches, self.gain, self.mixing, p, (n, n + 1), light)
+            blur_planes(light, self.taps, scratch, light)
+            multiply_add(out, self.after[n], light)
         return out
 
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         """T' r on planes: (3, rows, columns) to (3, pixels)."""
         out = np.empty((3, self.patches.first.size), np.float32) if out is None else out
-        adjoint_planes(self.patches, self.gain, self.mixing, r, (0, len(self.sizes)), out)
+        if not self._blurred:
+            adjoint_planes(self.patches, self.gain, self.mixing, r, (0, len(self.sizes)), out)
+            return out
+        part, scratch = np.empty_like(r), np.empty_like(r)
+        for n in range(len(self.sizes)):
+            np.multiply(self.after[n], r, out=part)
+            blur_planes(part, self.taps, scratch, part)
+            adjoint_planes(self.patches, self.gain, self.mixing, part, (n, n + 1), out)
         return out
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
@@ -155,7 +192,7 @@ class LightTransport:
 
     def with_absolute_mixing(self) -> LightTransport:
         """T with every entry's magnitude: mixing may be slightly negative, a majoriser must not be."""
-        return LightTransport(self.patches, self.gain, np.abs(self.mixing), self.lit, self.per_weight, self.sizes)
+        return dataclasses.replace(self, mixing=np.abs(self.mixing))
 
     def save(self, folder: Path) -> None:
         """Write one .npy file an array; ``load`` maps them instead of reading them."""
@@ -175,7 +212,7 @@ class LightTransport:
             if header[0, 0] != VERSION:
                 raise ValueError(f"version {header[0, 0]} instead of {VERSION}")
             patches = Patches(*(_load(folder / f"{name}.npy") for name in Patches._fields))
-            gain, mixing, lit, per_weight = (_load(folder / f"{name}.npy") for name in _ARRAYS)
+            gain, mixing, lit, per_weight, after, taps = (_load(folder / f"{name}.npy") for name in _ARRAYS)
         except (OSError, ValueError, IndexError) as error:
             raise UsageError(
                 "transport-unreadable",
@@ -183,7 +220,7 @@ class LightTransport:
                 remedy="Remove the folder and solve again; it is rebuilt from the calibration.",
             ) from error
         sizes = tuple((int(rows), int(columns)) for rows, columns in header[1:])
-        return cls(patches, gain, mixing, lit, per_weight, sizes)
+        return cls(patches, gain, mixing, lit, per_weight, after, taps, sizes)
 
     def _checked(self, image: FloatImage) -> FloatImage:
         if image.shape != (*self.shape, 3):
@@ -195,7 +232,14 @@ class LightTransport:
             raise _wrong_size(f"frame of projector {n + 1}", frame.shape, (*self.sizes[n], 3))
 
 
-_ARRAYS: Final = ("gain", "mixing", "lit", "per_weight")
+_ARRAYS: Final = ("gain", "mixing", "lit", "per_weight", "after", "taps")
+
+
+def _match_white(white: FloatImage, colour: FloatImage, taps: FloatImage, lit: Mask, after: FloatImage) -> None:
+    """Write the factor that makes the blurred ``colour`` (3, rows, columns) the ``white`` image again, where lit."""
+    scratch, blurred = np.empty_like(white), np.empty_like(white)
+    blur_planes(colour, taps, scratch, blurred)
+    np.divide(white, blurred, out=after, where=lit & (blurred > 0))
 
 
 def _save(path: Path, array: npt.NDArray[Any]) -> None:

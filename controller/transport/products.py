@@ -211,3 +211,11 @@ def gaussian_sums(
                 at = (patches.row[v] - top) * stride + patches.column[v] - left
                 a, b, c = _collect(patches, v, at, stride, red, green, blue, sums)
                 out[0, v], out[1, v], out[2, v] = a * factor[v], b * factor[v], c * factor[v]
+
+
+@compiled(parallel=True, fastmath=True)
+def multiply_add(into: FloatImage, a: FloatImage, b: FloatImage) -> None:
+    """Add ``a`` times ``b`` to ``into``, all (3, rows, columns)."""
+    rows = into.shape[1]
+    for line in prange(3 * rows):
+        _multiply_add(into[line // rows, line % rows], a[line // rows, line % rows], b[line // rows, line % rows])

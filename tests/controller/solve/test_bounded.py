@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from controller.calibrate.values import Calibration, Metapixels
 from controller.errors import UsageError, WorkError
-from controller.solve.bounded import Solution, perceptual_weights, solve_bounded
+from controller.solve.bounded import Solution, solve_bounded
 from controller.solve.smoothness import smoothness_weights
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes
@@ -242,11 +242,3 @@ def test_smoothness_lets_go_where_the_target_has_an_edge_or_a_shadow() -> None:
     np.testing.assert_allclose(edges.across[1:, 2], 0.2, rtol=1e-5)
     assert not edges.across[0].any()
     assert not edges.down[0].any()
-
-
-def test_perceptual_weights_count_the_dark_more() -> None:
-    target = np.stack([np.full((2, 3), v, np.float32) for v in (0.1, 0.1, 0.1)], -1)
-    target[0] = 0.9
-    weights = perceptual_weights(target, 1.0)
-    assert weights[1, 0] > 5 * weights[0, 0]
-    assert weights.mean() == pytest.approx(1, rel=1e-5)

@@ -21,7 +21,8 @@ def two_discs() -> Mask:
 
 def test_two_objects_are_two_pieces_the_larger_first() -> None:
     left, right = pieces(two_discs())
-    assert left[30, 25] and right[30, 75]
+    assert left[30, 25]
+    assert right[30, 75]
     assert left.sum() > right.sum()
 
 

@@ -104,7 +104,7 @@ def test_a_photograph_on_a_wall_is_the_photograph() -> None:
     geometry, mask = wall()
     rng = np.random.default_rng(1)
     photo = cv2.GaussianBlur(rng.random((ROWS, COLUMNS, 3)).astype(np.float32), (0, 0), 3).astype(np.float32)
-    target = targets.wrap_photograph(photo, geometry, mask)
+    target = targets.wrap_photograph(photo, geometry, mask, ink=0, paper=1)
     # 99 % of the wall's extent take the whole photograph, so it is 1 % smaller than pixel for pixel
     inner = (slice(40, -40), slice(60, -60))
     assert np.abs(target.image[inner] - photo[inner]).mean() < 0.02
@@ -116,7 +116,7 @@ def test_fine_detail_is_averaged_and_does_not_alias() -> None:
     geometry, mask = wall()
     photo = np.zeros((2400, 3600, 3), dtype=np.float32)
     photo[::2, 1::2] = photo[1::2, ::2] = 1.0
-    target = targets.wrap_photograph(photo, geometry, mask)
+    target = targets.wrap_photograph(photo, geometry, mask, ink=0, paper=1)
     np.testing.assert_allclose(target.image[20:-20, 20:-20], 0.5, atol=0.05)
     checks = targets.checkerboard(geometry, mask, square_m=0.01, colours=((1, 1, 1), (0, 0, 0)))
     assert checks.image.mean() == pytest.approx(0.5, abs=0.02)
@@ -125,8 +125,8 @@ def test_fine_detail_is_averaged_and_does_not_alias() -> None:
 def test_shading_darkens_what_turns_away_and_only_that() -> None:
     geometry, mask = quadric(0.15, upright=True)
     white = np.ones((50, 50, 3), dtype=np.float32)
-    flat = targets.wrap_photograph(white, geometry, mask)
-    shaded = targets.wrap_photograph(white, geometry, mask, shading=0.5)
+    flat = targets.wrap_photograph(white, geometry, mask, paper=1)
+    shaded = targets.wrap_photograph(white, geometry, mask, paper=1, shading=0.5)
     assert np.all(flat.image[mask] == pytest.approx(1.0, abs=1e-5))
     assert shaded.image[80, 120, 0] == pytest.approx(1.0, abs=1e-3)
     assert 0.5 <= shaded.image[80][mask[80]].min() < 0.65
@@ -287,3 +287,28 @@ def test_photographs_come_with_the_installation(name: str) -> None:
     assert photo.ndim == 3
     assert photo.dtype == np.float32
     assert 0.0 <= photo.min() < photo.max() <= 1.0
+
+
+def test_what_goes_through_the_camera_keeps_flat_parts_and_softens_edges_inside_the_mask_only() -> None:
+    mask = np.zeros((30, 40), np.bool_)
+    mask[5:25, 5:35] = True
+    image = np.zeros((30, 40, 3), np.float32)
+    image[5:25, 5:20] = 0.2
+    image[5:25, 20:35] = 0.8
+    seen = targets.through_camera(targets.Target(image, mask))
+    np.testing.assert_allclose(seen.image[6:24, 6:15], 0.2, atol=1e-4)
+    np.testing.assert_allclose(seen.image[5:25, 5], 0.2, atol=1e-4)
+    assert (seen.image[~mask] == 0).all()
+    assert 0.3 < seen.image[15, 19, 0] < 0.5 < seen.image[15, 20, 0] < 0.7
+
+
+def test_a_print_reflects_from_its_ink_to_its_paper() -> None:
+    geometry, mask = wall()
+    photo = np.zeros((20, 30, 3), dtype=np.float32)
+    photo[:, 15:] = 1
+    printed = targets.wrap_photograph(photo, geometry, mask, ink=0.04, paper=0.85).image[mask]
+    assert printed.min() == pytest.approx(0.04, abs=1e-4)
+    assert printed.max() == pytest.approx(0.85, abs=1e-4)
+    with pytest.raises(UsageError) as refused:
+        targets.wrap_photograph(photo, geometry, mask, ink=0.9, paper=0.2)
+    assert refused.value.code == "print-range-invalid"
