@@ -20,7 +20,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from controller import console
-from controller.errors import VelaturaError
+from controller.errors import UsageError, VelaturaError
 
 DONE, FAILED, WRONG_USE, DEVICE_FAILED, STOPPED = 0, 1, 2, 3, 130
 
@@ -45,7 +45,7 @@ def demo(
         Path | None, typer.Option(help="A mesh to put on the stage, .obj or .ply; else a vase and a bust.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Where the stage and the report go.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(help="Which of the random stages.", min=0)] = 1,
+    seed: Annotated[int, typer.Option(help="Which of the random stages.", min=0, max=2**32 - 1)] = 1,
     prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Write OUT/stage and stop there.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -56,10 +56,25 @@ def demo(
     )  # fmt: skip
 
 
-def emulate(stage: StageFolder, as_json: Json = False) -> int:
+def emulate(
+    stage: StageFolder,
+    until_input_ends: Annotated[
+        bool, typer.Option("--until-input-ends", help="End, too, when standard input is closed.")
+    ] = False,
+    as_json: Json = False,
+) -> int:
     """Serve the emulated devices of a stage, and print the address of each, until Ctrl-C."""
+    from controller.demo.bench_process import terminated_when_input_ends
     from controller.demo.stage import bench_of
 
+    if not stage.is_dir():
+        raise UsageError(
+            "stage-missing",
+            what=f"There is no folder {stage}.",
+            remedy="Give the stage's folder; `velatura demo --prepare-only` makes one.",
+        )
+    if until_input_ends:
+        terminated_when_input_ends()
     return bench_of(stage).serve(stage, json_lines=as_json)
 
 
@@ -164,7 +179,7 @@ def _shown(error: BaseException, *, as_json: bool) -> int:
         return error.exit_code if isinstance(error, VelaturaError) else DEVICE_FAILED
     if isinstance(error, typer.TyperException):
         return _wrong_use(error, as_json=as_json)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         name = error.filename or "the stage's folder"
         console.show_error(
             "no-space", f"There was no space left to write {name}.", "Free some space and start again.", as_json=as_json

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +15,8 @@ from controller.calibrate.reconstruction import CameraPrior
 from controller.capture.acquire import Acquirer
 from controller.config import Stage, check_driver_settings, load_stage
 from controller.config.models import CameraTable, OpenTable
-from controller.play.launch import PlayerProcess, PlayerSettings, start_player
+from controller.errors import UsageError
+from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover, start_player
 from controller.session.journal import Journal
 from controller.session.lamps import LampFile
 from controller.session.machine import Event, Machine
@@ -24,15 +25,17 @@ from controller.session.progress import Level, Reporter
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Runner, Step
 from controller.session.safety import LampGuard
-from controller.storage import exclusive, runtime_folder
+from controller.storage import clear_unfinished_writes, exclusive, runtime_folder
 from hal.deadline import Deadline, in_seconds
-from hal.errors import PluginError
+from hal.errors import DeviceError, PluginError
 from hal.interfaces import Camera, Display, Projector
 from hal.registry import Driver, Drivers, OpenContext, load_drivers
 
 OPEN_S = 20.0
 """Longest that opening one device may take."""
 LONGEST_RUN_S = 12 * 3600.0
+LOCK = "run/lock"
+"""Held by whoever works on the stage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +77,8 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
         try:
             driver = drivers.get(kind, name)
         except PluginError as error:
-            raise table.place.wrong_value("driver", name, f"is not a {kind} driver", error.remedy) from error
+            names = ", ".join(driver.name for driver in drivers.list if driver.kind == kind) or "none is installed"
+            raise table.place.wrong_value("driver", name, f"is not a {kind} driver", f"one of {names}") from error
         return driver, check_driver_settings(table, driver)
 
     return Checked(
@@ -99,19 +103,32 @@ def opened(checked: Checked, *, deadline: Deadline) -> Iterator[Rig]:
         ledger = LampFile(stage.folder / LampFile.NAME)
         at_least = stage.tables.safety.at_least()
         for table, (driver, settings) in zip(stage.tables.projectors, checked.projectors, strict=True):
-            projector = cast("Projector", driver.open(settings, context, deadline.within(OPEN_S)))
+            projector = cast("Projector", _device(table, driver, settings, context, deadline))
             guard = LampGuard(table.name, projector, ledger, at_least=at_least)
             stack.callback(guard.close)
             guards.append(guard)
         driver, settings = checked.camera
-        camera = cast("Camera", driver.open(settings, context, deadline.within(OPEN_S)))
+        camera = cast("Camera", _device(stage.tables.camera, driver, settings, context, deadline))
         stack.callback(camera.close)
         if checked.stage.tables.display.driver == "player":
             stack.enter_context(_player(stage, context))
         driver, settings = checked.display
-        display = cast("Display", driver.open(settings, context, deadline.within(OPEN_S)))
+        display = cast("Display", _device(stage.tables.display, driver, settings, context, deadline))
         stack.callback(display.close)
         yield _rig(stage, guards, camera, display)
+
+
+def _device(
+    table: OpenTable, driver: Driver, settings: Mapping[str, Any], context: OpenContext, deadline: Deadline
+) -> object:
+    """Open a device; what the driver finds wrong in its settings is a mistake in stage.toml, told with its line."""
+    try:
+        return driver.open(settings, context, deadline.within(OPEN_S))
+    except PluginError as error:
+        place = table.place
+        named = (key for key, value in settings.items() if f"'{key}'" in error.what or f"'{value}'" in error.what)
+        line = place.line(next(named, None))
+        raise UsageError(error.code, what=f"{place.file}, line {line}: {error.what}", remedy=error.remedy) from error
 
 
 def _player(stage: Stage, context: OpenContext) -> PlayerProcess:
@@ -127,6 +144,8 @@ def _player(stage: Stage, context: OpenContext) -> PlayerProcess:
         trusted=_key_files(stage.tables.bundle.trusted_keys, context.runtime),
         allow_unsigned=stage.tables.bundle.allow_unsigned,
     )
+    # A run that was killed leaves its player, which plays on by design; it still has our socket.
+    end_leftover(context.runtime)
     return start_player(context.runtime, settings)
 
 
@@ -164,11 +183,13 @@ def _rig(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: Dis
 def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) -> Iterator[None]:
     """Whatever happens inside, the lamps are off or cooling afterwards.
 
-    Raises nothing of its own: a projector that can't be switched off is told to the technician.
+    A projector that can't be switched off is told to the technician. For that, DeviceError("lamp-still-lit") is raised,
+    unless the work itself failed: then its own error is.
     """
     try:
         yield
     finally:
+        reporter.say("Switching the projectors off.")
         # Before the machine is told: a listener that fails (a full disk under the journal) must not keep lamps lit.
         failures = power_down(rig.guards, within_s=power_down_s)
         for failure in failures:
@@ -177,6 +198,13 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
             machine.handle(Event.STOP, "the lamps are switched off")
         if not failures and machine.allows(Event.COOLED):
             machine.handle(Event.COOLED, "every lamp is off or cooling by itself")
+    if failures:
+        names = ", ".join(failure.projector for failure in failures)
+        raise DeviceError(
+            "lamp-still-lit",
+            what=f"The work is done, but {names} could not be switched off.",
+            remedy="Switch off by the remote control, and leave the mains on until the fans stand still.",
+        )
 
 
 def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
@@ -202,32 +230,46 @@ def marker(name: str, title: str, *, enter: Event | None = None, leave: Event | 
     return Step(name, lambda _: (), title=title, weight=0.01, enter=enter, leave=leave, always=True)
 
 
-MakeSteps = Callable[[Rig], Sequence[Step]]
+MakeSteps = Callable[[Rig, Path], Sequence[Step]]
+"""The steps of a run on the opened stage; the path is the run's folder."""
 
 
 def run_on_stage(
-    checked: Checked, make_steps: MakeSteps, *, name: str, run: Path, reporter: Reporter, cancel: threading.Event
-) -> None:
-    """Open the stage, run the steps in ``run`` with the lamps on, and leave the lamps safe.
+    checked: Checked,
+    make_steps: MakeSteps,
+    *,
+    name: str,
+    reporter: Reporter,
+    cancel: threading.Event,
+    around: contextlib.AbstractContextManager[object] | None = None,
+) -> Path:
+    """Open the stage, run the steps of a new or unfinished run with the lamps on, and leave the lamps safe.
 
+    ``around`` is entered before the devices are opened and left when they are closed. Returns the run's folder.
     Raises what the steps raise; UsageError("already-running") if another program works on the stage.
     """
     stage = checked.stage
     deadline = in_seconds(LONGEST_RUN_S, cancel)
     safety = stage.tables.safety
     with (
-        exclusive(stage.folder / "run" / "lock", what_is_running="Velatura"),
-        Journal(run) as journal,
+        exclusive(stage.folder / LOCK, what_is_running="Velatura"),
+        around or contextlib.nullcontext(),
         opened(checked, deadline=deadline) as rig,
+        Journal(unfinished_run(stage.folder, name)) as journal,
     ):
+        clear_unfinished_writes(journal.folder)
         machine = Machine(journal.record_change)
-        steps = [*power_steps(rig, power_up_s=safety.power_up_s), *make_steps(rig)]
+        steps = [*power_steps(rig, power_up_s=safety.power_up_s), *make_steps(rig, journal.folder)]
         with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
             Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
+        return journal.folder
 
 
 def unfinished_run(stage: Path, name: str) -> Path:
-    """The newest run folder of ``name`` whose work was begun and not finished, or a new one."""
+    """The newest run folder of ``name`` whose work was begun and not finished, or a new one, not yet made.
+
+    For the holder of the stage's lock.
+    """
     runs = stage / "runs"
     for folder in sorted(runs.glob(f"*-{name}"), reverse=True):
         if (folder / Journal.FILE).exists():
@@ -237,6 +279,4 @@ def unfinished_run(stage: Path, name: str) -> Path:
                 return folder
             break
     stamp = time.strftime("%Y%m%d-%H%M%S")
-    folder = runs / f"{stamp}-{name}"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    return runs / f"{stamp}-{name}"

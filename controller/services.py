@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from controller.app import LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage, unfinished_run
+from controller.app import LOCK, LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage
 from controller.bundle.install import current
 from controller.errors import UsageError
 from controller.session.calibrating import calibration_steps
@@ -30,9 +29,9 @@ KEY_FILE = "keys/stage.key"
 def calibrate(*, stage: Path, reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
     """Calibrate the stage, going on with an unfinished calibration; returns where the results lie."""
     checked = check_stage(stage)
-    run = unfinished_run(checked.stage.folder, "calibrate")
-    run_on_stage(checked, partial(calibrating, checked=checked), name="calibrate", run=run,
-                 reporter=reporter, cancel=cancel)  # fmt: skip
+    run = run_on_stage(
+        checked, lambda rig, _: calibrating(rig, checked=checked), name="calibrate", reporter=reporter, cancel=cancel
+    )
     return {"run": str(run)}
 
 
@@ -56,19 +55,19 @@ def make_appearances(
     """
     checked = check_stage(stage)
     folder = checked.stage.folder
-    run = finished_calibration(folder)
-    calibrated = Calibrated(run, checked.names)
-    wishes = wishes_of(checked.stage, calibrated, names)
-    table = checked.stage.tables.solve
-    options = SolveOptions(table.exposure_share, table.smoothness, table.mode)
-    outputs = output_sizes(checked)
-    with exclusive(folder / "run" / "lock", what_is_running="Velatura"), Journal(run) as journal:
+    with exclusive(folder / LOCK, what_is_running="Velatura"):
+        run = finished_calibration(folder)
+        calibrated = Calibrated(run, checked.names)
+        wishes = wishes_of(checked.stage, calibrated, names)
+        table = checked.stage.tables.solve
+        options = SolveOptions(table.exposure_share, table.smoothness, table.mode)
         steps = [
             *solve_steps(calibrated, wishes, options, after=()),
-            publish_step(folder, outputs, [wish.name for wish in wishes], stage=checked.stage.tables.stage.name,
-                         calibration=run.name, key=signing_key(checked)),
+            publish_step(folder, output_sizes(checked), [wish.name for wish in wishes],
+                         stage=checked.stage.tables.stage.name, calibration=run.name, key=signing_key(checked)),
         ]  # fmt: skip
-        Runner(steps, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
+        with Journal(run) as journal:
+            Runner(steps, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(wish.name for wish in wishes)}
 
 
@@ -125,9 +124,9 @@ def play(
             what="No bundle is installed on this stage.",
             remedy="Run `velatura appearance` on it first.",
         )
-    run = unfinished_run(folder, "play")
-    run_on_stage(checked, partial(_playing, name=name, seconds=seconds), name="play", run=run,
-                 reporter=reporter, cancel=cancel)  # fmt: skip
+    run_on_stage(
+        checked, lambda rig, _: _playing(rig, name=name, seconds=seconds), name="play", reporter=reporter, cancel=cancel
+    )
     return {"played": name}
 
 

@@ -44,6 +44,12 @@ def stream_atomically(path: Path, write: Callable[[BinaryIO], object], *, mode: 
     sync_folder(path.parent)
 
 
+def clear_unfinished_writes(folder: Path) -> None:
+    """Remove the temporary files that a killed process left below ``folder``; nobody may be writing there."""
+    for temporary in folder.rglob(".*.part"):
+        temporary.unlink(missing_ok=True)
+
+
 def sync_folder(folder: Path) -> None:
     """Make the names in ``folder`` durable."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -56,7 +62,8 @@ def sync_folder(folder: Path) -> None:
 def _explained(error: OSError, path: Path) -> WorkError:
     import errno
 
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    # EFBIG: a limit on the size of files, of the user's or the disk's format (FAT: 4 GiB).
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return WorkError(
             "no-space",
             what=f"There was no space left to write {path.name}.",

@@ -10,11 +10,15 @@ from pathlib import Path
 from controller.arrays import ByteImage
 from controller.errors import WorkError
 from hal.deadline import Deadline
+from hal.errors import DeviceError
 from hal.interfaces import Camera, Display
 from hal.values import CapturedFile, ExposureSettings, FileKind
 
 TRANSFER_MARGIN_S = 20.0
 """Longest that a camera may take beyond the exposure itself: mirror, write-out and transfer."""
+
+DISK_CODES = ("no-space", "cannot-write")
+"""What a camera's driver raises when this computer's disk fails."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +70,19 @@ class Acquirer:
         Raises
         ------
         WorkError("camera-no-file")  the camera sent nothing
+        WorkError("no-space", "cannot-write")  the picture could not be stored
         and every error of the display and the camera
         """
         confirmed = self._set(exposure_s, deadline)
         deadline.sleep(max(0.0, shown_at_s + self._settle_s - time.monotonic()))
         bound = deadline.within(2 * confirmed.exposure_s + TRANSFER_MARGIN_S)
-        files = self._camera.capture(folder / name, deadline=bound)
+        try:
+            files = self._camera.capture(folder / name, deadline=bound)
+        except DeviceError as error:
+            if error.code not in DISK_CODES:
+                raise
+            # The camera did its part: this is no failing device.
+            raise WorkError(error.code, what=error.what, remedy=error.remedy) from error
         if not files:
             raise WorkError(
                 "camera-no-file",

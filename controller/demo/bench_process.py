@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -16,48 +18,87 @@ from hal.deadline import Cancelled
 from hal.errors import DeviceError
 
 END_S = 10.0
+STARTS = 3
+TOLD = 400
 
 
 class BenchProcess:
-    """``velatura emulate STAGE --json`` in the background. A context manager; leaving it ends the bench.
+    """``velatura emulate STAGE`` in the background. A context manager: starts on entering, ends on leaving.
 
     It is a process group of its own, so that Ctrl-C reaches the demo alone: the emulated lamps must still be there to
-    be cooled.
+    be cooled. When the demo is killed, it ends by itself, because its standard input closes.
     """
 
     def __init__(
-        self, stage: Path, *, cancel: threading.Event, advance: Callable[[float, str], None] = lambda *_: None
+        self, stage: Path, *, cancel: threading.Event, tell: Callable[[str], None] = lambda sentence: None
     ) -> None:
         self.addresses: dict[str, str] = {}
-        command = [sys.executable, "-m", "controller", "emulate", str(stage), "--json"]
+        self._stage = stage
+        self._cancel = cancel
+        self._tell = tell
+
+    def __enter__(self) -> Self:
+        """Return once its devices are there. Raises what it tells, WorkError("bench-not-started") and Cancelled."""
+        self._tell("Starting the bench: an emulated stage in a process of its own.")
+        for left in reversed(range(STARTS)):
+            try:
+                self._start()
+            except DeviceError as error:
+                # The bench of a demo that was killed a moment ago may be on its way out still.
+                if error.code != "port-in-use" or not left:
+                    raise
+            else:
+                break
+        return self
+
+    def _start(self) -> None:
+        command = [sys.executable, "-m", "controller", "emulate", str(self._stage), "--json", "--until-input-ends"]
+        # A file, because nobody reads a pipe while the demo works, and a full one would stop the bench.
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by end()
         self._process = subprocess.Popen(  # noqa: S603 - our own program
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
             start_new_session=True,
         )  # fmt: skip
+        watcher = threading.Thread(target=self._end_when_cancelled, daemon=True)
+        self._ready = threading.Event()
+        watcher.start()
         try:
-            self._wait_until_ready(cancel, advance)
+            self._wait_until_ready()
         except BaseException:
             self.end()
             raise
+        finally:
+            self._ready.set()
+            watcher.join()
 
-    def _wait_until_ready(self, cancel: threading.Event, advance: Callable[[float, str], None]) -> None:
+    def _end_when_cancelled(self) -> None:
+        """While rays are cast the bench may say nothing for a long time; a stop must not wait for its next line."""
+        while not self._ready.wait(0.1):
+            if self._cancel.is_set():
+                self._process.terminate()
+                return
+
+    def _wait_until_ready(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            if cancel.is_set():
-                raise Cancelled
             record: dict[str, Any] = json.loads(line) if line.strip() else {}
             if "progress" in record:
-                advance(float(record["progress"]), "casting rays")
+                self._tell(f"Casting rays through the stage: {record['progress']:.0%}")
             elif "device" in record:
                 self.addresses[record["device"]] = record["address"]
             elif "error" in record:
-                raise DeviceError(record["error"], what=record["what"], remedy=record["remedy"])
+                told = record["error"]
+                raise DeviceError(told["code"], what=told["what"], remedy=told["remedy"])
             elif record.get("ready"):
                 return
-        _, told = self._process.communicate()
+        if self._cancel.is_set():
+            raise Cancelled
+        self._process.wait()
+        self._errors.seek(0)
+        last_words = self._errors.read().decode(errors="replace").split()
         raise WorkError(
             "bench-not-started",
-            what=f"The bench ended before its devices were there: {' '.join(told.split())[-400:]}",
+            what=f"The bench ended before its devices were there: {' '.join(last_words)[-TOLD:]}",
             remedy="Start `velatura emulate` on the stage by hand to see more.",
         )
 
@@ -70,9 +111,18 @@ class BenchProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
         self._process.communicate()
-
-    def __enter__(self) -> Self:
-        return self
+        self._errors.close()
 
     def __exit__(self, *_: object) -> None:
         self.end()
+
+
+def terminated_when_input_ends() -> None:
+    """From now on SIGTERM comes when standard input closes: so a child learns that its parent was killed."""
+
+    def watch() -> None:
+        while sys.stdin.buffer.read(4096):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="input", daemon=True).start()

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from controller.app import Checked, check_stage, marker, run_on_stage, unfinished_run
+from controller.app import Checked, check_stage, marker, run_on_stage
 from controller.arrays import save_arrays
 from controller.demo.bench_process import BenchProcess
 from controller.demo.report import write_demo_report
@@ -44,19 +44,16 @@ def demo(
     checked = check_stage(stage)
     if prepare_only:
         return {"stage": str(stage)}
-    run = unfinished_run(stage, "demo")
-    reporter.say("Starting the bench: an emulated stage in a process of its own.")
-    with BenchProcess(stage, cancel=cancel):
-        run_on_stage(
-            checked,
-            partial(demo_steps, checked=checked, run=run),
-            name="demo", run=run, reporter=reporter, cancel=cancel,
-        )  # fmt: skip
+    bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
+    run = run_on_stage(
+        checked, partial(demo_steps, checked=checked), name="demo", reporter=reporter, cancel=cancel, around=bench
+    )
+    reporter.say("Writing the report.")
     html, machine = write_demo_report(out.resolve(), run, checked)
     return {"report": str(html), "figures": str(machine), "stage": str(stage)}
 
 
-def demo_steps(rig: Rig, *, checked: Checked, run: Path) -> Sequence[Step]:
+def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     """Calibrate, solve, publish, photograph, compare with one projector, swap."""
     stage = checked.stage
     calibrated = Calibrated(run, checked.names)

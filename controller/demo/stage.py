@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,16 +14,20 @@ import numpy as np
 
 from controller.bundle.signing import generate_key
 from controller.config import write_stage
-from controller.errors import UsageError
+from controller.errors import UsageError, WorkError
 from controller.services import KEY_FILE
 from controller.solve.targets import linear_to_srgb, shipped_photograph
-from controller.storage import sha256_of, write_atomically
+from controller.storage import sha256_of, sync_folder, write_atomically
 from hal.deadline import in_seconds
+from hal.errors import DeviceError
 from hal.interfaces import Bench
 from hal.registry import Drivers, OpenContext, load_drivers
 
 MARK = "demo.json"
+BUILDING = ".stage.part"
 PHOTOGRAPH = "photograph.png"
+POWER_DOWN_S = 10.0
+"""Emulated lamps go off at once; a bench that died must not hold up the end of the demo."""
 
 APPEARANCES: tuple[dict[str, Any], ...] = (
     {"name": "photograph", "kind": "photograph", "file": PHOTOGRAPH},
@@ -46,38 +52,64 @@ def prepare(out: Path, *, size: str, object_file: Path | None, seed: int) -> Pat
     """
     stage = out / "stage"
     wishes = {"size": size, "seed": seed, "object": _object_digest(object_file)}
-    mark = stage / MARK
-    if mark.exists():
-        if json.loads(mark.read_text()) != wishes:
+    if (mark := stage / MARK).exists():
+        if _read_mark(mark) != wishes:
             raise UsageError(
                 "demo-folder-taken",
                 what=f"{out} holds a demo of another size, object or seed.",
                 remedy="Choose another folder with --out, or remove this one.",
             )
         return stage
-    if stage.exists() and any(stage.iterdir()):
+    if stage.is_dir() and any(stage.iterdir()):
         raise UsageError(
             "demo-folder-taken",
             what=f"{stage} is not empty and was not made by the demo.",
             remedy="Choose another folder with --out.",
         )
-    tables = _write(stage, size=size, object_file=object_file, seed=seed)
-    write_stage(stage / "stage.toml", tables)
-    write_atomically(mark, json.dumps(wishes).encode())
+    _build(out, stage, wishes, object_file)
     return stage
 
 
+def _build(out: Path, stage: Path, wishes: Mapping[str, Any], object_file: Path | None) -> None:
+    """Write the stage under another name and rename it: a demo that ends here leaves all of it or nothing."""
+    building, there = out / BUILDING, out.exists()
+    shutil.rmtree(building, ignore_errors=True)
+    try:
+        tables = _write(building, size=wishes["size"], object_file=object_file, seed=wishes["seed"])
+        write_stage(building / "stage.toml", tables)
+        write_atomically(building / MARK, json.dumps(wishes).encode())
+        building.rename(stage)
+        sync_folder(out)
+    except BaseException:
+        shutil.rmtree(building, ignore_errors=True)
+        if not there:
+            with contextlib.suppress(OSError):
+                out.rmdir()
+        raise
+
+
 def _write(stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
-    devices = bench_of(stage).prepare(stage, size=size, object_file=object_file, seed=seed)
-    stage.mkdir(parents=True, exist_ok=True)
+    try:
+        devices = bench_of(stage).prepare(stage, size=size, object_file=object_file, seed=seed)
+    except DeviceError as error:
+        kind = UsageError if error.code.startswith(("size-", "object-")) else WorkError
+        raise kind(error.code, what=error.what, remedy=error.remedy) from error
     _write_photograph(stage / PHOTOGRAPH)
     public = generate_key(stage / KEY_FILE)
     return {
         "stage": {"name": f"demo {size}"},
         **devices,
+        "safety": {"power_down_s": POWER_DOWN_S},
         "bundle": {"trusted_keys": [public.hex()]},
         "appearances": list(APPEARANCES),
     }
+
+
+def _read_mark(mark: Path) -> object:
+    try:
+        return json.loads(mark.read_bytes())
+    except (OSError, ValueError):
+        return None
 
 
 def _write_photograph(path: Path) -> None:
@@ -96,4 +128,11 @@ def _object_digest(object_file: Path | None) -> str:
             what=f"There is no file {object_file}.",
             remedy="Give OBJECT the path of a mesh, .obj or .ply.",
         )
-    return sha256_of(object_file)
+    try:
+        return sha256_of(object_file)
+    except OSError as error:
+        raise UsageError(
+            "object-unreadable",
+            what=f"{object_file} can't be read: {error.strerror}.",
+            remedy="Check the file's permissions.",
+        ) from error

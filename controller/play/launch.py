@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -127,6 +130,30 @@ class PlayerProcess:
 
     def __exit__(self, *_: object) -> None:
         self.terminate()
+
+
+def end_leftover(runtime: Path, timeout_s: float = _END_S) -> bool:
+    """End the player that still serves ``runtime`` because its starter was killed; whether there was one.
+
+    For the holder of the stage's lock only: to anybody else that player may be of use. One that hangs is killed.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
+        channel.settimeout(1.0)
+        try:
+            channel.connect(str(runtime / SOCKET_NAME))
+            pid, _, _ = struct.unpack("3i", channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            process = os.pidfd_open(pid)
+        except OSError:
+            return False
+    try:
+        for number, patience_s in ((signal.SIGTERM, timeout_s), (signal.SIGKILL, 1.0)):
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(process, number)
+            if select.select([process], [], [], patience_s)[0]:
+                break
+    finally:
+        os.close(process)
+    return True
 
 
 def start_player(runtime: Path, settings: PlayerSettings, *, timeout_s: float = _READY_S) -> PlayerProcess:

@@ -107,8 +107,9 @@ class _Lines:
 
     def failed(self, error: DeviceError) -> None:
         if self._json:
-            self.say({"error": error.code, "what": error.what, "remedy": error.remedy}, "")
-        sys.stderr.write(f"{error.what}\n{error.remedy}\n")
+            self.say({"error": {"code": error.code, "what": error.what, "remedy": error.remedy}}, "")
+        else:
+            sys.stderr.write(f"velatura: {error.what}\n{error.remedy}\n")
 
 
 def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event) -> None:

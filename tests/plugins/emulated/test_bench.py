@@ -79,8 +79,10 @@ def test_a_port_in_use_is_told_in_a_sentence_before_anything_is_served(prepared:
         process = served(prepared)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 3
-    assert json.loads(out.splitlines()[-1])["error"] == "port-in-use"
-    assert len(err.strip().splitlines()) == 2
+    error = json.loads(out.splitlines()[-1])["error"]
+    assert error.keys() == {"code", "what", "remedy"}
+    assert error["code"] == "port-in-use"
+    assert err == ""
     assert not (prepared / "run" / "tty-left").exists()
 
 
