@@ -184,8 +184,8 @@ def _row(one: Judged, before: Any, calibration: Calibration, crop: Crop) -> Row:
 def _goals(judged: Sequence[Judged], figures: Mapping[str, Any]) -> tuple[Goal, ...]:
     worst = max(one.ours.delta_e00_median for one in judged)
     least = min(one.times_better for one in judged)
-    swaps = figures["playback"]["swaps_per_s"]
-    grades = ", ".join(f"{name} {row['grade']}" for name, row in figures["verification"].items())
+    swaps, bundle = figures["playback"]["swaps_per_s"], figures["bundle"]
+    grades = "grade " + max(row["grade"] for row in figures["verification"].values())
     predicted = max(row["relative_rms"] for row in figures["verification"].values())
     return (
         Goal("Worst median colour difference", f"{worst:.2f}", f"at most {GOAL_DELTA_E:g}", worst <= GOAL_DELTA_E),
@@ -195,9 +195,11 @@ def _goals(judged: Sequence[Judged], figures: Mapping[str, Any]) -> tuple[Goal, 
         ),
         # A swap that comes one tick late in some seconds of playing is no missed goal.
         Goal("Swaps", f"{swaps:.1f} a second", f"{GOAL_SWAPS_PER_S:g}", swaps >= 0.995 * GOAL_SWAPS_PER_S),
-        Goal("Grade of the calibration", grades, f"predicted to {100 * predicted:.1f} %", None),
-        Goal("Geometry", f"{figures['geometry']['reprojection_rms_px']:.3f} px", "", None),
-        Goal("Bundle", f"{figures['bundle']['bytes'] / 1e6:.2f} MB, {figures['bundle']['ratio']:.1f} x smaller"),
+        Goal("Calibration", grades, note=f"random patterns predicted to {100 * predicted:.1f} %"),
+        Goal(
+            "Geometry", f"{figures['geometry']['reprojection_rms_px']:.3f} px", note="rms of reprojection, projector px"
+        ),
+        Goal("Bundle", f"{bundle['bytes'] / 1e6:.2f} MB", note=f"{bundle['ratio']:.1f} x smaller, signed"),
     )  # fmt: skip
 
 

@@ -34,12 +34,13 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A figure with what was asked for; ``holds`` None where nothing was asked."""
+    """A figure with what was asked for; ``holds`` None where nothing was asked. ``note`` stands in small below it."""
 
     name: str
     value: str
     goal: str = ""
     holds: bool | None = None
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
