@@ -47,7 +47,7 @@ def test_what_all_projectors_make_together_is_within_reach_and_a_little_more_is_
     """Through T itself: the same colour on all projectors is driven by just that colour, crosstalk and all."""
     calibration = stage()
     transport = LightTransport.build(calibration)
-    frames = [np.broadcast_to(np.float32(colour), (*size, 3)).copy() for size in transport.sizes]
+    frames = [np.broadcast_to(np.array(colour, np.float32), (*size, 3)).copy() for size in transport.sizes]
     light = transport.forward(frames)
     mask = transport.object_mask
     found = feasibility(transport, light + calibration.black, calibration.black)
@@ -55,14 +55,14 @@ def test_what_all_projectors_make_together_is_within_reach_and_a_little_more_is_
     full = transport.forward([np.ones_like(frame) for frame in frames])
     beyond = feasibility(transport, light + 1.01 * full + calibration.black, calibration.black)
     np.testing.assert_allclose(
-        beyond.too_bright[mask], np.float32(colour) + 0.01 + np.zeros((mask.sum(), 3)), atol=1e-3
+        beyond.too_bright[mask], np.array(colour) + 0.01 + np.zeros((int(mask.sum()), 3)), atol=1e-3
     )
 
 
 def test_a_colour_purer_than_the_projectors_primaries_is_out_of_reach(stage: Stage) -> None:
     calibration = stage()
     transport = LightTransport.build(calibration)
-    red = transport.reach() * np.float32([0.5, 0, 0])
+    red = transport.reach() * np.array([0.5, 0, 0], np.float32)
     found = feasibility(transport, red + calibration.black, calibration.black)
     assert not found.reachable.any()
     assert (found.too_dark[transport.object_mask].max(axis=1) > 0).all()

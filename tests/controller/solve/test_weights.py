@@ -8,7 +8,7 @@ from controller.solve.weights import appearance_weights
 
 
 def test_the_dark_counts_more_and_what_is_beyond_reach_counts_less() -> None:
-    target = np.ones((2, 3, 3), np.float32) * np.float32([[[0.8], [0.05], [0.8]]])
+    target = np.ones((2, 3, 3), np.float32) * np.array([[[0.8], [0.05], [0.8]]], np.float32)
     reachable = np.ones((2, 3), np.bool_)
     reachable[:, 2] = False
     weights = appearance_weights(target, reachable, 1.0)

@@ -84,7 +84,7 @@ def test_at_painted_edges_the_prediction_is_better_by_far() -> None:
     rows, columns, pitch = 80, 100, 2.6
     size = (28, 36)
     row, column = np.mgrid[0:rows, 0:columns]
-    paint = np.where((column + row) // 9 % 2, 0.8, 0.25)[..., None] * np.float32([1, 0.9, 0.8])
+    paint = np.where((column + row) // 9 % 2, 0.8, 0.25)[..., None] * np.array([1, 0.9, 0.8])
     centre = np.stack(np.meshgrid(np.arange(size[1]) * pitch + 3, np.arange(size[0]) * pitch + 3), -1)
     own = 0.45 * pitch
     # What cancels the paint changes just where the paint does: the case that matters.
@@ -97,7 +97,7 @@ def test_at_painted_edges_the_prediction_is_better_by_far() -> None:
     shares = weights / weights.sum(-1, keepdims=True)
     photograph = blurred((paint * (shares @ frame.reshape(-1, 3))).astype(np.float32))
     total = own**2 + np.mean(np.square(BLUR_PX))
-    covariance = np.broadcast_to(np.float32([total, 0, total]), (*size, 3)).copy()
+    covariance = np.broadcast_to(np.array([total, 0, total], np.float32), (*size, 3)).copy()
     metapixels = Metapixels(centre.astype(np.float32), covariance, np.ones(size, np.bool_))
     radiometry = Radiometry(np.tile(np.linspace(0, 1, 256), (3, 1)), np.eye(3))
     projector = ProjectorCalibration("wall", metapixels, radiometry, blurred(paint.astype(np.float32)))
