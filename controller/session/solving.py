@@ -67,6 +67,15 @@ class Calibrated:
         self._drive: Drive | None = None
 
     @property
+    def camera_px(self) -> tuple[int, int] | None:
+        """(width, height) of the camera's picture; None before the geometry is known."""
+        figures = self.folder / "geometry.json"
+        if not figures.exists():
+            return None
+        width, height = json.loads(figures.read_text())["camera"]["size_px"]
+        return int(width), int(height)
+
+    @property
     def calibration(self) -> Calibration:
         if self._calibration is None:
             self._calibration = read_calibration(self.folder, self.projectors)

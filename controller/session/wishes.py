@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
 from controller.arrays import FloatImage
 from controller.config import Stage
+from controller.config.arguments import allowed, checked_arguments
 from controller.config.models import AppearanceTable
 from controller.errors import UsageError
 from controller.session.calibrating import read_geometry
@@ -53,23 +54,22 @@ def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -
 def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
     if table.kind not in TITLES:
         raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
-    settings = table.settings(_allowed(table.kind))
+    wanted = _options(table.kind)
+    required = ("tint",) if table.kind == "recolour" else ()
+    settings = table.settings({key: allowed(kind) for key, kind in wanted.items()}, required)
+    options = checked_arguments(table.place, settings, wanted)
     file = None if table.file is None else stage.path(table.file)
     if table.kind in NEEDS_FILE and file is None:
         raise table.place.missing("file", "a picture file, relative to the stage's folder", written=settings)
-    if file is not None and not file.is_file():
-        raise UsageError(
-            "target-missing",
-            what=f"The picture {file} of appearance {table.name} is not there.",
-            remedy="Put it there, or correct `file` in stage.toml.",
-        )
-    options = {key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()}
+    if file is not None:
+        _check_picture(table, file, calibrated.camera_px)
     inputs = {"kind": table.kind, "settings": repr(sorted(options.items()))}
     if file is not None:
         inputs["file"] = sha256_of(file)
 
     def target() -> Target:
-        return _make(table.kind, file, options, calibrated)
+        arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
+        return _make(table.kind, file, arguments, calibrated)
 
     return Wish(table.name, TITLES[table.kind], target, inputs)
 
@@ -82,12 +82,34 @@ _MAKERS: Mapping[str, Callable[..., Target]] = {
 }
 
 
-def _allowed(kind: str) -> dict[str, str]:
-    """The settings of a kind: the keyword arguments of what makes it."""
+def _options(kind: str) -> dict[str, Any]:
+    """The settings of a kind with their types: the keyword arguments of what makes it."""
+    if kind == "recolour":
+        return {"tint": targets.Colour}
     if kind not in _MAKERS:
-        return {"tint": "three numbers from 0 to 1"} if kind == "recolour" else {}
+        return {}
+    types = get_type_hints(_MAKERS[kind])
     parameters = inspect.signature(_MAKERS[kind]).parameters.values()
-    return {p.name: f"as {p.name} of {kind}" for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
+    names = (p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY)
+    return {_RENAMED.get(name, name): types[name] for name in names}
+
+
+_RENAMED: Mapping[str, str] = {"kind": "figure"}
+"""Arguments of makers that go by another name in stage.toml, where ``kind`` says which maker it is."""
+_ARGUMENTS: Mapping[str, str] = {written: name for name, written in _RENAMED.items()}
+
+
+def _check_picture(table: AppearanceTable, file: Path, camera_px: tuple[int, int] | None) -> None:
+    """Read a picture now, so that a wrong one is known before an hour of solving."""
+    if not file.is_file():
+        raise UsageError(
+            "target-missing",
+            what=f"The picture {file} of appearance {table.name} is not there.",
+            remedy="Put it there, or correct `file` in stage.toml.",
+        )
+    picture = targets.read_picture(file)
+    size = camera_px if table.kind == "picture" else None
+    targets.check_picture(file, picture, (picture.shape[1], picture.shape[0]) if size is None else size)
 
 
 def _make(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: Calibrated) -> Target:

@@ -5,7 +5,7 @@ can become is decided by the solver's exposure.
 """
 
 from controller.solve.relight import gloss, recolour, smooth_normals
-from controller.solve.targets_files import PHOTOGRAPHS, load_target, read_picture, shipped_photograph
+from controller.solve.targets_files import PHOTOGRAPHS, check_picture, load_target, read_picture, shipped_photograph
 from controller.solve.targets_patterns import WHITE_GREY, Colour, checkerboard, replace_pattern
 from controller.solve.targets_values import Target, linear_to_srgb, srgb_to_linear, through_camera
 from controller.solve.wrap import Mapping, ObjectSpace, object_space, painted, wrap_photograph
@@ -17,6 +17,7 @@ __all__ = [
     "Mapping",
     "ObjectSpace",
     "Target",
+    "check_picture",
     "checkerboard",
     "gloss",
     "linear_to_srgb",

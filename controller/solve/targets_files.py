@@ -30,6 +30,15 @@ def load_target(path: Path, size: tuple[int, int]) -> Target:
     """
     picture = read_picture(path)
     height, width = picture.shape[:2]
+    check_picture(path, picture, size)
+    mask = picture[..., 3] > 0.5 if picture.shape[2] == 4 else np.ones((height, width), dtype=np.bool_)
+    image = np.where(mask[..., None], np.maximum(picture[..., :3], 0), 0).astype(np.float32)
+    return Target(image, mask)
+
+
+def check_picture(path: Path, picture: FloatImage, size: tuple[int, int]) -> None:
+    """Raise UsageError "target-wrong-size" or "target-not-finite" if ``picture``, read from ``path``, is no target."""
+    height, width = picture.shape[:2]
     if (width, height) != size:
         raise UsageError(
             "target-wrong-size",
@@ -43,9 +52,6 @@ def load_target(path: Path, size: tuple[int, int]) -> Target:
             what=f"{path.name} has {wrong} pixels that are not finite numbers.",
             remedy="Render it again, or replace infinite and undefined pixels.",
         )
-    mask = picture[..., 3] > 0.5 if picture.shape[2] == 4 else np.ones((height, width), dtype=np.bool_)
-    image = np.where(mask[..., None], np.maximum(picture[..., :3], 0), 0).astype(np.float32)
-    return Target(image, mask)
 
 
 def read_picture(path: Path) -> FloatImage:
