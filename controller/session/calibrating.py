@@ -16,7 +16,6 @@ from controller.calibrate.geometry import reconstruct
 from controller.calibrate.pixels import fit_metapixels
 from controller.calibrate.radiometry import measure_radiometry
 from controller.calibrate.reconstruction import CameraPrior
-from controller.calibrate.regularize import regularize
 from controller.calibrate.values import (
     Calibration,
     Correspondence,
@@ -139,7 +138,7 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
             remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
         )
     context.advance(0.4, "correspondences")
-    metapixels, moved = regularize(fit_metapixels(captures, plan, correspondence))
+    metapixels = fit_metapixels(captures, plan, correspondence)
     path = context.folder / f"pixels-{projector.name}.npz"
     save_arrays(
         path,
@@ -154,7 +153,7 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
     )
     valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
     figures = context.folder / f"pixels-{projector.name}.json"
-    content = {"fitted": int(valid), "pixels": int(metapixels.valid.size), "camera_pixels": int(seen), "moved": moved}
+    content = {"fitted": int(valid), "pixels": int(metapixels.valid.size), "camera_pixels": int(seen)}
     write_atomically(figures, json.dumps(content, indent=1).encode())
     return [path, figures]
 
