@@ -1,0 +1,178 @@
+"""Measured calibrations against the truth of their stages: figures by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks._stage import CalibratedStage
+from benchmarks._truth import Truth, developed, footprints, moments
+from controller.arrays import ByteImage, Float64, FloatImage, Mask, load_arrays
+from controller.calibrate.values import Calibration, Metapixels, Radiometry
+from controller.calibrate.verify import verify
+from controller.capture.patterns import device_frame, frame
+from controller.session.calibrating import read_geometry
+from controller.session.shots import read_index
+from controller.session.solving import random_pattern
+from controller.transport import LightTransport
+
+SPACING_PX = 16
+OFFSETS = ((2, 3), (7, 11), (12, 6), (14, 14))
+IN_FOCUS_PX = 0.40
+"""Defocus up to this many projector px counts as in focus (the emulated lenses' best is 0.28 to 0.36)."""
+GROSS_MM = 5.0
+HEAD_ON = 1.3
+"""Times the median slope of the map; a steeper one is grazing."""
+
+
+def rms(values: Float64) -> float:
+    """Root mean square of what is finite; NaN of nothing."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
+
+
+def radiometry_errors(truth: Truth, n: int, radiometry: Radiometry) -> dict[str, float]:
+    """Largest errors of response (of full scale) and mixing."""
+    return {
+        "response": float(np.abs(radiometry.response - truth.response(n)).max()),
+        "mixing": float(np.abs(radiometry.mixing - truth.mixing(n)).max()),
+    }
+
+
+def map_errors(truth: Truth, n: int, run: Path) -> dict[str, float]:
+    """Decoded against true projector positions, projector px."""
+    name = truth.bench.projectors[n].name
+    measured = load_arrays(run / f"pixels-{name}.npz")["projector_px"].astype(np.float64)
+    true = truth.projector_px(n)
+    error = np.hypot(*np.moveaxis(measured - true, 2, 0))
+    seen = np.isfinite(error)
+    gross = seen & (error > 1.0)
+    slope = np.full(error.shape, np.inf)
+    slope[1:, 1:] = np.hypot(np.diff(true, axis=1)[1:], np.diff(true, axis=0)[:, 1:]).max(axis=2)
+    good = seen & truth.one_surface(n, 3) & (truth.blur_px(n) <= IN_FOCUS_PX)
+    good &= slope <= HEAD_ON * float(np.nanmedian(slope[seen]))
+    return {
+        "map in focus px": rms(error[good]),
+        "map px": rms(error[seen & ~gross]),
+        "map gross": float(np.mean(gross[seen])),
+    }
+
+
+def metapixel_errors(truth: Truth, n: int, metapixels: Metapixels) -> dict[str, float]:
+    """Centres and sigmas against the moments of single projector pixels rendered without noise, camera px."""
+    spread = metapixels.covariance_px2[metapixels.valid]
+    spacing = _spacing_px(metapixels)
+    radius = int(np.ceil(4.5 * np.sqrt(np.median(spread[:, [0, 2]])) + 1))
+    radius = min(radius, int(SPACING_PX * spacing / 2))
+    whole, blur = truth.one_surface(n, radius), truth.blur_px(n)
+    rows = []
+    for (down, across), share in footprints(truth, n, SPACING_PX, OFFSETS):
+        for row, column in np.argwhere(metapixels.valid[down::SPACING_PX, across::SPACING_PX]):
+            at = (down + SPACING_PX * row, across + SPACING_PX * column)
+            centre, covariance = metapixels.centre_px[at], metapixels.covariance_px2[at].astype(np.float64)
+            true = moments(share, centre, radius)
+            if true is None:
+                continue
+            x, y = round(float(centre[0])), round(float(centre[1]))
+            area = np.sqrt(max(covariance[0] * covariance[2] - covariance[1] ** 2, 0))
+            true_area = np.sqrt(max(true[2] * true[4] - true[3] ** 2, 1e-9))
+            off = centre - true[:2]
+            rows.append((*off, np.sqrt(area / true_area) - 1, blur[y, x], whole[y, x]))
+    table = np.array(rows, np.float64)
+    inside = table[:, 4] > 0
+    sharp = inside & (table[:, 3] <= IN_FOCUS_PX)
+    soft = inside & (table[:, 3] > IN_FOCUS_PX)
+    return {
+        "centre in focus px": rms(table[sharp, :2]),
+        "centre defocused px": rms(table[soft, :2]),
+        "centre px": float(np.median(np.hypot(table[:, 0], table[:, 1]))),
+        "sigma": rms(table[inside, 2]),
+        "sigma bias": float(np.median(table[inside, 2])),
+    }
+
+
+def _spacing_px(metapixels: Metapixels) -> float:
+    step = np.diff(metapixels.centre_px, axis=1)
+    return float(np.nanmedian(np.hypot(step[..., 0], step[..., 1])))
+
+
+def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibration) -> list[dict[str, float]]:
+    """Predicted pictures of each projector against its photograph, and against pictures without noise."""
+    transport = LightTransport.build(calibration)
+    found = []
+    for n, part in enumerate(calibration.projectors):
+        rows, columns = part.metapixels.valid.shape
+        lit = transport.lit[n]
+        white = truth.white(n)
+        full = 1.02 * float(white.max())
+        clean_white = developed(white, full)
+        unit = float(part.white[lit].sum(dtype=np.float64) / clean_white[lit].sum(dtype=np.float64))
+
+        def clean(shown: ByteImage, n: int = n, full: float = full, unit: float = unit) -> FloatImage:
+            return developed(truth.light(n, shown), full) * np.float32(unit)
+
+        pattern = random_pattern((columns, rows))
+        photograph = read_index(stage.run, f"codes-{part.name}")[f"{part.name}-{pattern.name}"].per_second()
+        predicted = transport.project_one(n, frame(pattern, (columns, rows)))
+        real = clean(device_frame(pattern, (columns, rows), part.radiometry.response))
+        figures = {
+            "random photographed": verify(
+                predicted + calibration.black, photograph, calibration.black, lit
+            ).relative_rms,
+            "random": relative(predicted, real, lit),
+            "random noise": relative(photograph - calibration.black, real, lit),
+        }
+        y, x = np.mgrid[0:rows, 0:columns]
+        for name, on in (("chequers", (x + y) % 2), ("columns", (x // 2) % 2)):
+            light = np.repeat(on.astype(np.float32)[..., None], 3, axis=2)
+            figures[name] = relative(transport.project_one(n, light), clean((light * 255).astype(np.uint8)), lit)
+        found.append(figures)
+    return found
+
+
+def relative(predicted: FloatImage, seen: FloatImage, mask: Mask) -> float:
+    """Rms difference over rms of ``seen``, both (rows, columns, 3), where finite within ``mask``."""
+    use = mask & np.isfinite(predicted).all(axis=2) & np.isfinite(seen).all(axis=2)
+    difference = predicted[use].astype(np.float64) - seen[use]
+    return rms(difference) / rms(seen[use].astype(np.float64))
+
+
+def geometry_errors(stage: CalibratedStage, truth: Truth) -> dict[str, float]:
+    """Shape and poses against the truth. The measured camera frame is turned and scaled onto the true one by shape."""
+    geometry = read_geometry(stage.run)
+    measured, true = geometry.points_m.astype(np.float64), truth.points_m()
+    both = np.isfinite(measured).all(axis=2) & np.isfinite(true).all(axis=2)
+    a, b = measured[both], true[both]
+    near = np.ones(len(a), np.bool_)
+    for _ in range(4):
+        scale, turn, move = _similarity(a[near], b[near])
+        off_mm = 1000 * np.linalg.norm(scale * a @ turn.T + move - b, axis=1)
+        near = off_mm <= GROSS_MM
+    turned, displaced = [], []
+    camera = truth.bench.camera.pose
+    for found, real in zip(geometry.projectors, truth.bench.projectors, strict=True):
+        rotation = real.pose.rotation @ camera.rotation.T
+        centre = camera.rotation @ (np.asarray(real.pose.position_m) - camera.position_m)
+        measured_centre = -found.rotation.T @ found.translation_m
+        apart = found.rotation @ turn.T @ rotation.T
+        turned.append(float(np.degrees(Rotation.from_matrix(apart).magnitude())))
+        displaced.append(1000 * float(np.linalg.norm(scale * turn @ measured_centre + move - centre)))
+    return {
+        "shape mm": rms(off_mm[near]),
+        "shape gross": float(np.mean(~near)),
+        "pose degrees": max(turned),
+        "pose mm": max(displaced),
+        "scale": abs(scale - 1),
+    }
+
+
+def _similarity(a: Float64, b: Float64) -> tuple[float, Float64, Float64]:
+    """Scale, rotation and translation that take points ``a`` (n, 3) to ``b`` with least squares (Umeyama 1991)."""
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    left, values, right = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    turn = left @ sign @ right
+    scale = float(np.trace(np.diag(values) @ sign) / np.mean(np.sum((a - mean_a) ** 2, axis=1)))
+    return scale, turn, mean_b - scale * turn @ mean_a

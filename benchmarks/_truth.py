@@ -1,0 +1,165 @@
+"""What the emulated stage really is. For benchmarks alone, after the work that they judge has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+
+from controller.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.capture.raw import develop
+from plugins.emulated.objects import StageObject
+from plugins.emulated.rays import SIGMA_STEP_PX, directions, samples_of
+from plugins.emulated.render import Renderer, response
+from plugins.emulated.truth import FOLDER, BenchTruth, read_truth
+from plugins.emulated.world import object_of
+
+RGGB = np.array([[0, 1], [1, 2]])
+STEEPEST = 3.0
+"""Times the typical slope between adjacent camera pixels; more is another surface."""
+
+
+class Truth:
+    """The truth of a stage folder, and pictures of it without noise."""
+
+    def __init__(self, stage: Path) -> None:
+        self.bench: BenchTruth = read_truth(stage)
+        self.thing: StageObject = object_of(stage, self.bench.object)
+        self.samples = samples_of(self.bench, self.thing, stage / FOLDER, lambda share: None)
+        self._renderer = Renderer(self.bench, self.samples)
+        width, height = self.bench.camera.lens.size_px
+        self.shape = (height, width)
+
+    def light(self, n: int, frame: ByteImage) -> FloatImage:
+        """Linear light (rows, columns, 3) before the sensor, of projector ``n`` alone less that of its black."""
+        levels = [float(index == n) for index in range(len(self.bench.projectors))]
+        black = [np.zeros((p.lens.size_px[1], p.lens.size_px[0], 3), np.uint8) for p in self.bench.projectors]
+        shown = [frame if index == n else dark for index, dark in enumerate(black)]
+        lit = self._renderer.light(shown, levels)
+        return np.asarray(lit - self._renderer.light(black, levels), np.float32)
+
+    def white(self, n: int) -> FloatImage:
+        """``light`` of full white."""
+        width, height = self.bench.projectors[n].lens.size_px
+        return self.light(n, np.full((height, width, 3), 255, np.uint8))
+
+    def response(self, n: int) -> Float64:
+        """(3, 256): 0 at black, 1 at white."""
+        return np.ascontiguousarray(response(self.bench.projectors[n].light).T)
+
+    def mixing(self, n: int) -> Float64:
+        """(3, 3), rows summing to 1, as ``Radiometry.mixing``."""
+        mixing = np.asarray(self.bench.projectors[n].light.mixing, np.float64)
+        return np.asarray(mixing / mixing.sum(axis=1, keepdims=True))
+
+    def projector_px(self, n: int) -> Float64:
+        """(rows, columns, 2): mean of where a camera pixel's lit rays meet the projector's image; NaN if none is."""
+        return self._mean_of_lit(n, self.samples.at_px[n].astype(np.float64))
+
+    def blur_px(self, n: int) -> Float64:
+        """(rows, columns): defocus in projector px, standard deviation; NaN where unlit."""
+        sigma = self.samples.blur[n].astype(np.float64)[:, None] * SIGMA_STEP_PX
+        return np.asarray(self._mean_of_lit(n, sigma)[..., 0])
+
+    def wholly_lit(self, n: int) -> Mask:
+        """(rows, columns): every ray of the pixel meets the object where the projector lights it."""
+        lit = np.add.reduceat((self.samples.gain[n] > 0).astype(np.int64), self.samples.starts[:-1])
+        whole = np.zeros(self.shape[0] * self.shape[1], np.bool_)
+        whole[self.samples.pixels] = lit == self.bench.subsamples**2
+        return whole.reshape(self.shape)
+
+    def one_surface(self, n: int, radius_px: int) -> Mask:
+        """(rows, columns): no edge of the lit surface or of its image, and no fold, within ``radius_px``."""
+        at = self.projector_px(n)
+        steps = [np.hypot(*np.moveaxis(np.diff(at, axis=axis), 2, 0)) for axis in (0, 1)]
+        typical = float(np.nanmedian(np.concatenate([step.ravel() for step in steps])))
+        broken = ~self.wholly_lit(n)
+        broken[1:] |= ~(steps[0] < STEEPEST * typical)
+        broken[:, 1:] |= ~(steps[1] < STEEPEST * typical)
+        side = 2 * radius_px + 1
+        return np.asarray(cv2.dilate(broken.astype(np.uint8), np.ones((side, side), np.uint8)) == 0)
+
+    def points_m(self) -> Float64:
+        """(rows, columns, 3): where the middle of each camera pixel sees the object, in the camera's frame; or NaN."""
+        camera = self.bench.camera
+        rows, columns = self.shape
+        y, x = np.mgrid[0:rows, 0:columns].astype(np.float64)
+        ray = directions(camera.pose, camera.lens, x.ravel(), y.ravel())
+        scene = rtcore_scene.EmbreeScene(robust=True)
+        mesh = TriangleMesh(scene, self.thing.vertices, self.thing.faces)
+        origin = np.broadcast_to(np.asarray(camera.pose.position_m, np.float32), ray.shape).copy()
+        found = scene.run(origin, ray.astype(np.float32), output=1)
+        del mesh
+        hit = found["primID"] >= 0
+        u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
+        corners = self.thing.vertices[self.thing.faces[found["primID"][hit]]].astype(np.float64)
+        world = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), corners)
+        points = np.full((rows * columns, 3), np.nan)
+        points[hit] = (world - camera.pose.position_m) @ camera.pose.rotation.T
+        return points.reshape(rows, columns, 3)
+
+    def _mean_of_lit(self, n: int, values: Float64) -> Float64:
+        lit = (self.samples.gain[n] > 0).astype(np.float64)[:, None]
+        starts = self.samples.starts[:-1]
+        count = np.add.reduceat(lit, starts)
+        total = np.add.reduceat(np.where(lit > 0, values, 0.0), starts)
+        mean = np.full((self.shape[0] * self.shape[1], values.shape[1]), np.nan)
+        mean[self.samples.pixels] = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+        return mean.reshape(*self.shape, -1)
+
+
+def developed(light: FloatImage, full: float) -> FloatImage:
+    """What the controller's development makes of noise-free ``light``, in the same unit; ``full`` is full scale."""
+    mosaic = np.empty(light.shape[:2], np.uint16)
+    for row in range(2):
+        for column in range(2):
+            site = light[row::2, column::2, RGGB[row, column]]
+            mosaic[row::2, column::2] = np.rint(np.clip(site / full, 0, 1) * 65535)
+    scale = np.full((2, 2), 65535.0)
+    image = develop(mosaic, RGGB.astype(np.int64), np.zeros((2, 2)), scale).image
+    return np.asarray(image * np.float32(full), np.float32)
+
+
+def footprints(
+    truth: Truth, n: int, spacing_px: int, offsets: Sequence[tuple[int, int]]
+) -> list[tuple[tuple[int, int], FloatImage]]:
+    """Shares of single projector pixels at camera pixels, without noise: grids of lit pixels over white.
+
+    Returns for each offset (row, column) of the grid the image (rows, columns), grey, as developed.
+    """
+    width, height = truth.bench.projectors[n].lens.size_px
+    white = truth.white(n)
+    full = 1.02 * float(white.max())
+    grey = developed(white, full).sum(axis=2)
+    lit = grey > 0.01 * grey.max()
+    found = []
+    for row, column in offsets:
+        frame = np.zeros((height, width, 3), np.uint8)
+        frame[row::spacing_px, column::spacing_px] = 255
+        dots = developed(truth.light(n, frame), full).sum(axis=2)
+        share = np.divide(dots, grey, out=np.zeros_like(dots), where=lit)
+        found.append(((row, column), np.asarray(share, np.float32)))
+    return found
+
+
+def moments(share: FloatImage, centre: npt.NDArray[np.floating], radius_px: int) -> Float64 | None:
+    """(5,) x, y, xx, xy, yy of a footprint within a window around ``centre`` (x, y); None at the image's border."""
+    x, y = round(float(centre[0])), round(float(centre[1]))
+    rows, columns = share.shape
+    if not (radius_px <= x < columns - radius_px and radius_px <= y < rows - radius_px):
+        return None
+    window = share[y - radius_px : y + radius_px + 1, x - radius_px : x + radius_px + 1].astype(np.float64)
+    total = window.sum()
+    if not total > 0:
+        return None
+    along = np.arange(-radius_px, radius_px + 1)
+    dx, dy = float((window.sum(0) * along).sum() / total), float((window.sum(1) * along).sum() / total)
+    xx = float((window.sum(0) * (along - dx) ** 2).sum() / total)
+    yy = float((window.sum(1) * (along - dy) ** 2).sum() / total)
+    xy = float((window * (along - dy)[:, None] * (along - dx)[None, :]).sum() / total)
+    return np.array([x + dx, y + dy, xx, xy, yy])
