@@ -1,0 +1,58 @@
+"""The bench as a process, with its fault knobs on standard input: one line a knob, answered by ``{"knob": LINE}``.
+
+Usage: python -m tests.end_to_end.bench_with_knobs STAGE. Lines: ``unplug left``, ``replug left``, ``silent left``,
+``answering left``, ``camera off``.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from plugins.emulated import bench
+from plugins.emulated.lamp import EmulatedLamp
+from plugins.emulated.ptp_camera import EmulatedPtpCamera
+from plugins.emulated.serial_projector import EmulatedSerialProjector
+
+PROJECTORS: dict[str, EmulatedSerialProjector] = {}
+CAMERAS: list[EmulatedPtpCamera] = []
+
+
+class KnownProjector(EmulatedSerialProjector):
+    def __init__(self, port: Path, lamp: EmulatedLamp) -> None:
+        super().__init__(port, lamp)
+        PROJECTORS[port.name.removeprefix("tty-")] = self
+
+
+class KnownCamera(EmulatedPtpCamera):
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        CAMERAS.append(self)
+
+
+def turn(knob: str, name: str) -> None:
+    if knob == "camera":
+        CAMERAS[0].stop()
+        return
+    projector = PROJECTORS[name]
+    if knob == "unplug":
+        projector.unplug()
+    elif knob == "replug":
+        projector.replug()
+    else:
+        projector.faults.set(silent=knob == "silent")
+
+
+def listen() -> None:
+    for line in sys.stdin:
+        turn(*line.split())
+        print(json.dumps({"knob": line.strip()}), flush=True)
+
+
+if __name__ == "__main__":
+    vars(bench).update(EmulatedSerialProjector=KnownProjector, EmulatedPtpCamera=KnownCamera)
+    threading.Thread(target=listen, daemon=True).start()
+    sys.exit(bench.EmulatedBench().serve(Path(sys.argv[1]), json_lines=True))
