@@ -2,7 +2,8 @@
 
 Several serial families tell of warming and cooling by unsolicited lines, or not at all. This keeps what was seen and
 when, so that a fresh answer can be read in its light. A lamp that went off counts as hot until it told of standby or
-its cooling time is over; a lamp that came on counts as warming for its warm-up time. Pure: the caller brings the clock.
+its cooling time is over; a lamp that came on counts as warming for its warm-up time. Families that answer "warming" and
+"cooling" themselves are believed. Pure: the caller brings the clock.
 """
 
 from __future__ import annotations
@@ -11,10 +12,14 @@ from hal.values import LampRules, Power
 
 
 class PowerView:
-    """Reads power answers in the light of commands and notices. Times are seconds of one monotonic clock."""
+    """Reads power answers in the light of commands and notices. Times are seconds of one monotonic clock.
 
-    def __init__(self, rules: LampRules) -> None:
+    ``tells``: the states that this family names in its power answers.
+    """
+
+    def __init__(self, rules: LampRules, tells: frozenset[Power] = frozenset()) -> None:
         self._rules = rules
+        self._tells = tells
         self._last: Power | None = None
         self._phase: Power | None = None
         self._since_s = 0.0
@@ -53,7 +58,7 @@ class PowerView:
 
     def in_transition(self, now_s: float) -> bool:
         """Whether the lamp warms or cools, as far as is known."""
-        return self._phase_at(now_s) is not None
+        return self._phase_at(now_s) is not None or self._last in (Power.WARMING, Power.COOLING)
 
     def told(self, power: Power, now_s: float) -> bool:
         """Whether the projector itself said, unasked, that it is in ``power`` now."""
@@ -70,6 +75,9 @@ class PowerView:
         return answer
 
     def _burns(self, changed: bool, now_s: float) -> Power:
+        if Power.WARMING in self._tells:
+            self._phase = None
+            return Power.ON
         phase = self._phase_at(now_s)
         if phase is Power.COOLING:
             # It burns again, or still: when it goes out, its cooling begins anew.
@@ -79,6 +87,9 @@ class PowerView:
         return Power.WARMING if self._phase is Power.WARMING else Power.ON
 
     def _dark(self, changed: bool, now_s: float) -> Power:
+        if Power.COOLING in self._tells:
+            self._phase = None if self._phase is Power.COOLING else self._phase
+            return Power.FAULT if self.failed else Power.OFF
         if changed and self._phase_at(now_s) is not Power.COOLING:
             self._enter(Power.COOLING, now_s, told=False)
         phase = self._phase_at(now_s)

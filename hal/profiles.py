@@ -6,20 +6,13 @@ Words for trouble: a word that ends in ``-warning`` (``lamp-hours-warning``) tel
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from hal.errors import ProtocolError
+from hal.serial_table import MAY_BE_UNKNOWN, SerialTable, parse_serial
 from hal.toml_table import Table, parse_toml
-from hal.values import LampRules, Power
+from hal.values import LampRules
 
-COMMANDS: Final = ("power_on", "power_off", "shutter_close", "shutter_open")
-QUERIES: Final = ("power", "lamp_hours", "shutter", "model", "firmware")
-POWERS: Final = tuple(power.value for power in Power)
-_PLACEHOLDER: Final = re.compile(r"\{([^{}]*)\}")
-_WORD: Final = re.compile(r"[a-z][a-z0-9-]{0,39}")
 _DAY_S: Final = 86_400.0
 
 
@@ -42,41 +35,11 @@ class Timing:
 
 
 @dataclass(frozen=True, slots=True)
-class Query:
-    """One question: what to send, the shapes of its answer (``{value}`` marks the value) and what values mean."""
-
-    send: str
-    answers: tuple[str, ...]
-    values: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Notices:
-    """Lines that the projector sends unasked: ``prefix`` and a code, which tells of its power or of trouble."""
-
-    prefix: str
-    power: Mapping[str, Power]
-    trouble: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class SerialTable:
-    """The command table of a serial family. ``{address}`` in a command stands for the projector's address."""
-
-    baud: int
-    terminator: bytes
-    address: str
-    longest_answer: int
-    commands: Mapping[str, str]
-    queries: Mapping[str, Query]
-    accepted: tuple[str, ...]
-    refused: tuple[str, ...]
-    notices: Notices
-
-
-@dataclass(frozen=True, slots=True)
 class ProjectorProfile:
-    """A family of projectors. ``serial`` is None for those that speak PJLink."""
+    """A family of projectors. ``serial`` is None for those that speak PJLink.
+
+    ``unknown``: commands and questions whose codes nobody could find; the driver refuses what would need them.
+    """
 
     name: str
     maker: str
@@ -85,6 +48,7 @@ class ProjectorProfile:
     lamp: LampRules
     timing: Timing
     serial: SerialTable | None
+    unknown: tuple[str, ...] = ()
 
 
 def parse_profile(text: str, *, file: str = "profile") -> ProjectorProfile:
@@ -99,6 +63,10 @@ def parse_profile(text: str, *, file: str = "profile") -> ProjectorProfile:
     protocol = head.string("protocol")
     if protocol not in ("serial", "pjlink"):
         raise head.wrong("protocol", f"{protocol!r} is not one of serial, pjlink")
+    unknown = head.strings("unknown", ())
+    for name in unknown:
+        if name not in MAY_BE_UNKNOWN or protocol != "serial":
+            raise head.wrong("unknown", f"{name!r} is not one of {', '.join(MAY_BE_UNKNOWN)} of a serial profile")
     profile = ProjectorProfile(
         name=head.string("name"),
         maker=head.string("maker"),
@@ -106,7 +74,8 @@ def parse_profile(text: str, *, file: str = "profile") -> ProjectorProfile:
         source=head.string("source"),
         lamp=_lamp(root.table("lamp")),
         timing=_timing(root.table("timing")),
-        serial=_serial(root) if protocol == "serial" else None,
+        serial=parse_serial(root, unknown) if protocol == "serial" else None,
+        unknown=unknown,
     )
     head.finish()
     root.finish()
@@ -147,94 +116,3 @@ def _timing(table: Table) -> Timing:
         raise table.wrong("confirm_s", "there must be time for one question (boot_interval_s)")
     table.finish()
     return timing
-
-
-def _serial(root: Table) -> SerialTable:
-    line = root.table("serial")
-    replies = root.table("replies")
-    made = SerialTable(
-        baud=line.whole("baud", 300, 921_600),
-        terminator=_bytes(line, "terminator", line.string("terminator")),
-        address=line.string("address", ""),
-        longest_answer=line.whole("longest_answer", 4, 4096),
-        commands=_commands(root.table("commands")),
-        queries=_queries(root.table("queries")),
-        accepted=replies.strings("accepted"),
-        refused=replies.strings("refused"),
-        notices=_notices(root.table("notices", required=False)),
-    )
-    if not made.terminator:
-        raise line.wrong("terminator", "it is empty")
-    if not ((made.address.isascii() and made.address.isalnum()) or not made.address):
-        raise line.wrong("address", f"{made.address!r} is not made of letters and digits")
-    line.finish()
-    replies.finish()
-    return made
-
-
-def _commands(table: Table) -> dict[str, str]:
-    commands = {}
-    for name in COMMANDS:
-        if table.has(name) or name.startswith("power"):
-            commands[name] = _template(table, name, table.string(name), {"address"})
-    if ("shutter_close" in commands) != ("shutter_open" in commands):
-        raise table.wrong("shutter_close", "shutter_close and shutter_open must both be there, or neither")
-    table.finish()
-    return commands
-
-
-def _queries(table: Table) -> dict[str, Query]:
-    queries = {}
-    for name in QUERIES:
-        if not table.has(name) and name != "power":
-            continue
-        inner = table.table(name)
-        power = name == "power"
-        values = inner.mapping("values", allowed=POWERS if power else None)
-        if power and not {"on", "off"} <= set(values.values()):
-            raise inner.wrong("values", "it must say which answers mean on and off")
-        answers = inner.strings("answers")
-        for answer in answers:
-            if _template(inner, "answers", answer, {"value"}).count("{value}") != 1:
-                raise inner.wrong("answers", f"{answer!r} must hold {{value}} once")
-        queries[name] = Query(_template(inner, "send", inner.string("send"), {"address"}), answers, values)
-        inner.finish()
-    table.finish()
-    return queries
-
-
-def _notices(table: Table) -> Notices:
-    power = {code: Power(word) for code, word in table.mapping("power", allowed=POWERS).items()}
-    trouble = table.mapping("trouble")
-    for code, word in trouble.items():
-        if code in power:
-            raise table.wrong("trouble", f"the code {code} stands in power as well")
-        if not _WORD.fullmatch(word):
-            raise table.wrong("trouble", f"{word!r} is not lower case with hyphens")
-    prefix = table.string("prefix", "")
-    if (power or trouble) and not prefix:
-        raise table.wrong("prefix", "notices need the prefix that they begin with")
-    table.finish()
-    return Notices(prefix, power, trouble)
-
-
-def _template(table: Table, key: str, text: str, allowed: set[str]) -> str:
-    """Check a command or answer: not empty, bytes of Latin-1, known placeholders only."""
-    if not text:
-        raise table.wrong(key, "it is empty")
-    for name in _PLACEHOLDER.findall(text):
-        if name not in allowed:
-            raise table.wrong(key, f"{{{name}}} is not one of the placeholders {{{', '.join(sorted(allowed))}}}")
-    _bytes(table, key, text)
-    return text
-
-
-def _bytes(table: Table, key: str, text: str) -> bytes:
-    try:
-        return text.encode("latin-1")
-    except UnicodeEncodeError:
-        raise _not_bytes(table, key, text) from None
-
-
-def _not_bytes(table: Table, key: str, text: str) -> ProtocolError:
-    return table.wrong(key, f"{text!r} holds a character that is not a byte (Latin-1)")

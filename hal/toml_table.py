@@ -56,11 +56,26 @@ class Table:
             raise self.wrong(key, f"{value} seconds is not between {low:g} and {high:g}")
         return float(value)
 
-    def strings(self, key: str, default: Sequence[str] | None = None) -> tuple[str, ...]:
+    def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
+        value = self.string(key, default)
+        if value not in allowed:
+            raise self.wrong(key, f"{value!r} is not one of {', '.join(allowed)}")
+        return value
+
+    def flag(self, key: str) -> bool:
+        """true or false; false if absent."""
+        value = self._data.get(key, False)
+        self._asked.add(key)
+        if not isinstance(value, bool):
+            raise self.wrong(key, f"{value!r} is not true or false")
+        return value
+
+    def strings(self, key: str, default: Sequence[str] | None = None, *, empty: bool = False) -> tuple[str, ...]:
+        """A list of strings; ``empty``: a string in it may be empty."""
         values = self._value(key, list, "a list of strings", default)
         if not values and default is None:
             raise self.wrong(key, "the list is empty")
-        if not all(isinstance(value, str) and value for value in values):
+        if not all(isinstance(value, str) and (value or empty) for value in values):
             raise self.wrong(key, "every element must be a string that is not empty")
         return tuple(values)
 

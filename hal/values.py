@@ -44,13 +44,18 @@ class LampRules:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorCapabilities:
-    """What a projector's driver can do; callers ask, never guess by model."""
+    """What a projector's driver can do; callers ask, never guess by model.
+
+    ``power``: it can be switched, and tells whether it burns. Without it ``switch_on`` and ``switch_off`` raise
+    DeviceRefused, and the power state is UNKNOWN or COOLING.
+    """
 
     lamp_hours: bool
     shutter: bool
     inputs: tuple[str, ...]
     errors: bool
     lamp_rules: LampRules
+    power: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,23 @@ from typing import Final
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
-from hal.profiles import ProjectorProfile, Query, SerialTable
-from hal.serial_protocol import Answer, Notice, Reply, command_bytes, parse_line, query_bytes
+from hal.profiles import ProjectorProfile
+from hal.serial_protocol import (
+    Answer,
+    Notice,
+    Reply,
+    command_bytes,
+    head_bytes,
+    parse_line,
+    query_bytes,
+    rest_bytes,
+)
+from hal.serial_table import Frame, Query, SerialTable
 
 REAPPEAR_S: Final = 4.0
 """How long a port that was unplugged is waited for: USB adapters need a second or two to come back."""
+COOLS: Final = "projector-cools"
+"""Code of the DeviceBusy that a projector gives because its lamp cools."""
 
 
 class SerialConversation:
@@ -46,6 +58,7 @@ class SerialConversation:
         self._slow = slow
         self._link: ByteLink | None = None
         self._closed = False
+        self._sent = b""
         self._sent_at_s = -1e9
         self._owed = 0
         self._owed_until_s = 0.0
@@ -72,7 +85,7 @@ class SerialConversation:
         ------
         DeviceTimeout  no answer to either
         ProtocolError  what came was not an answer
-        DeviceBusy     the projector answered that it won't answer now
+        DeviceBusy     the projector answered that it won't answer now (code ``COOLS``: because its lamp cools)
         DeviceGone     the port went away and did not come back
         """
         query = self._table.queries[question]
@@ -83,7 +96,7 @@ class SerialConversation:
                 if not settled:
                     self._settle(deadline)
                     settled = True
-                self._say(query_bytes(query, self._address), deadline)
+                self._say(query_bytes(self._table, query, self._address), deadline)
                 reply = self._listen(query, deadline.within(self._timing.answer_s))
             except DeviceGone:
                 self._hang_up()
@@ -92,8 +105,8 @@ class SerialConversation:
                 continue
             if isinstance(reply, Answer):
                 return reply.value
-            if reply is Reply.REFUSED:
-                raise self._busy(question)
+            if reply is not None:
+                raise self._busy(question, cooling=reply is Reply.COOLING)
             self._check(deadline)
         raise self._garbage or self.no_answer()
 
@@ -141,7 +154,8 @@ class SerialConversation:
             if (line := self._line(link, late)) is not None and not self._swallow(line):
                 self._owed -= 1
         self._owed = 0
-        for line in link.drain().split(self._table.terminator):
+        left = link.drain()
+        for line in left.split(self._table.terminator) if self._table.terminator else ():
             self._swallow(line)
 
     def _say(self, data: bytes, deadline: Deadline) -> None:
@@ -151,7 +165,7 @@ class SerialConversation:
             link.write(data, deadline=deadline)
         except DeviceTimeout as error:
             raise self.no_answer() from error
-        self._sent_at_s = time.monotonic()
+        self._sent, self._sent_at_s = data, time.monotonic()
         self._owed += 1
         self._owed_until_s = self._sent_at_s + self._timing.late_s
 
@@ -160,40 +174,65 @@ class SerialConversation:
         link = self._connected(deadline)
         while (line := self._line(link, deadline)) is not None:
             try:
-                meaning = parse_line(self._table, line, query)
+                meaning = parse_line(self._table, line, query, sent=self._sent)
             except ProtocolError as error:
                 self._garbage = error
                 continue
             if isinstance(meaning, Notice):
                 self._notice(meaning)
-            elif query is None or meaning is not Reply.ACCEPTED:  # some models accept a question before they answer it
+            elif meaning is Reply.NOTHING or (query is not None and meaning is Reply.ACCEPTED):
+                continue  # some models accept a question before they answer it
+            else:
                 self._owed -= 1
                 return meaning
         return None
 
     def _line(self, link: ByteLink, deadline: Deadline) -> bytes | None:
-        """The next line that is not empty, or None when the deadline passes."""
+        """The next line that is not empty, or the next frame; None when the deadline passes."""
         while True:
             try:
-                line = link.read_until(self._table.terminator, limit=self._table.longest_answer, deadline=deadline)
+                line = (
+                    self._framed(link, self._table.frame, deadline)
+                    if self._table.frame
+                    else self._ended(link, deadline)
+                )
             except ProtocolError as error:
                 self._garbage = error
                 link.drain()
                 continue
             except DeviceTimeout:
-                return None
+                return self._abnormal(link)
             if line.strip():
                 return line
+
+    def _framed(self, link: ByteLink, frame: Frame, deadline: Deadline) -> bytes:
+        head = link.read_exactly(head_bytes(frame), deadline=deadline)
+        rest = rest_bytes(frame, head, longest=self._table.longest_answer)
+        return head + link.read_exactly(rest, deadline=deadline)
+
+    def _ended(self, link: ByteLink, deadline: Deadline) -> bytes:
+        """A line up to its terminator; one that stands in quotes ends nothing."""
+        quote, longest = self._table.quirks.quote.encode("latin-1"), self._table.longest_answer
+        line = link.read_until(self._table.terminator, limit=longest, deadline=deadline)
+        while quote and line.count(quote) % 2 and len(line) < longest:
+            line += link.read_until(self._table.terminator, limit=longest - len(line), deadline=deadline)
+        return line
+
+    def _abnormal(self, link: ByteLink) -> bytes | None:
+        """What came without its terminator, if it is whole by the rule for abnormal states."""
+        end = self._table.quirks.abnormal_terminator
+        left = link.drain() if end else b""
+        return left if end and left.strip() and left.endswith(end) else None
 
     def _swallow(self, line: bytes) -> bool:
         """Pass on a notice; return False for an old answer, True for what an old answer may still follow."""
         try:
-            meaning = parse_line(self._table, line)
+            meaning = parse_line(self._table, line, sent=self._sent)
         except ProtocolError:
             return False
         if isinstance(meaning, Notice):
             self._notice(meaning)
-        return meaning is not Reply.REFUSED
+        return meaning not in (Reply.REFUSED, Reply.COOLING)
 
     def _connected(self, deadline: Deadline) -> ByteLink:
         """The link; opened again, by the same name, if it was lost."""
@@ -213,9 +252,9 @@ class SerialConversation:
         explained = self.no_answer()
         deadline.check(explained.code, what=explained.what, remedy=explained.remedy)
 
-    def _busy(self, question: str) -> DeviceBusy:
+    def _busy(self, question: str, *, cooling: bool) -> DeviceBusy:
         return DeviceBusy(
-            "projector-busy",
+            COOLS if cooling else "projector-busy",
             what=f"The projector at {self._name} would not tell its {question.replace('_', ' ')} now.",
             remedy="Wait until it has finished starting or cooling, and ask again.",
         )

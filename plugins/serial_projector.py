@@ -1,4 +1,4 @@
-"""Projectors on a serial line, driven by a table (``firmware_configs/projectors``): Optoma's later models first."""
+"""Projectors on a serial line, driven by a table (``firmware_configs/projectors``)."""
 
 from __future__ import annotations
 
@@ -6,20 +6,24 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Final
 
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.links import SLICE_S, ByteLink
 from hal.power_view import PowerView
-from hal.profiles import ProjectorProfile, SerialTable
+from hal.profiles import ProjectorProfile
 from hal.registry import Driver, OpenContext, setting
 from hal.serial_link import SerialLink
 from hal.serial_protocol import Notice, Reply, parse_hours, parse_power
+from hal.serial_table import SerialTable
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
 from plugins.profile_files import load_profile
-from plugins.serial_conversation import SerialConversation
+from plugins.serial_conversation import COOLS, SerialConversation
+
+UNNAMED_FAULT: Final = "error-standby"
+"""The word for a projector that answers that it failed, and not how."""
 
 
 class SerialProjector:
@@ -46,7 +50,7 @@ class SerialProjector:
         self._name = name
         self._profile = profile
         self._table = table
-        self._view = PowerView(profile.lamp)
+        self._view = PowerView(profile.lamp, _told_powers(table))
         self._lock = threading.Lock()
         self._transcript = transcript
         self._talk = SerialConversation(
@@ -71,7 +75,12 @@ class SerialProjector:
             inputs=(),
             errors=bool(self._table.notices.trouble),
             lamp_rules=self._profile.lamp,
+            power=self._switchable,
         )
+
+    @property
+    def _switchable(self) -> bool:
+        return {"power_on", "power_off"} <= set(self._table.commands) and "power" in self._table.queries
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         with self._turn(deadline):
@@ -85,17 +94,19 @@ class SerialProjector:
         with self._turn(deadline):
             power = self._power(deadline)
             hours = self._hours(power, deadline)
-            return ProjectorStatus(power, self._view.trouble, hours)
+            unnamed = power is Power.FAULT and not self._view.trouble
+            return ProjectorStatus(power, (UNNAMED_FAULT,) if unnamed else self._view.trouble, hours)
 
     def switch_on(self, *, deadline: Deadline) -> None:
         with self._turn(deadline):
+            self._require_switchable()
             power = self._power(deadline)
             if power in (Power.ON, Power.WARMING):
                 return
             if power is Power.COOLING:
                 raise self._refused("projector-cooling", "is still cooling its lamp, and was not switched on")
             reply = self._talk.command("power_on", deadline=deadline)
-            if reply is Reply.REFUSED:
+            if reply in (Reply.REFUSED, Reply.COOLING):
                 raise self._refused("projector-refused-on", "refused to switch on; its lamp may still be cooling")
             if reply is Reply.ACCEPTED:
                 self._view.switched_on(time.monotonic())
@@ -103,10 +114,11 @@ class SerialProjector:
 
     def switch_off(self, *, deadline: Deadline) -> None:
         with self._turn(deadline):
+            self._require_switchable()
             if self._power(deadline) in (Power.OFF, Power.COOLING, Power.FAULT):
                 return
             reply = self._talk.command("power_off", deadline=deadline)
-            if reply is Reply.REFUSED:
+            if reply in (Reply.REFUSED, Reply.COOLING):
                 raise self._refused("projector-refused-off", "refused to switch off; it may still be starting")
             if reply is Reply.ACCEPTED:
                 self._view.switched_off(time.monotonic())
@@ -119,7 +131,7 @@ class SerialProjector:
             reply = self._talk.command("shutter_close" if closed else "shutter_open", deadline=deadline)
             if reply is None:
                 raise self._talk.no_answer()
-            if reply is Reply.REFUSED:
+            if reply in (Reply.REFUSED, Reply.COOLING):
                 raise self._refused("projector-refused-shutter", "refused to move its shutter; it may be off")
 
     def close(self) -> None:
@@ -128,13 +140,36 @@ class SerialProjector:
             self._transcript.close()
 
     def _power(self, deadline: Deadline) -> Power:
-        answer = parse_power(self._talk.ask("power", deadline=deadline))
+        if "power" not in self._table.queries:
+            return self._power_untold(deadline)
+        try:
+            answer = parse_power(self._talk.ask("power", deadline=deadline))
+        except DeviceBusy as busy:
+            if busy.code != COOLS:
+                raise
+            answer = Power.COOLING
         return self._view.answered(answer, time.monotonic())
+
+    def _power_untold(self, deadline: Deadline) -> Power:
+        """The power state where no question for it is known: any other question shows who is there, and who cools."""
+        try:
+            self._talk.ask(next(iter(self._table.queries)), deadline=deadline)
+        except DeviceBusy as busy:
+            return Power.COOLING if busy.code == COOLS else Power.UNKNOWN
+        return Power.UNKNOWN
+
+    def _require_switchable(self) -> None:
+        if not self._switchable:
+            raise DeviceRefused(
+                "projector-power-unknown",
+                what=f"The projector at {self._name} can't be switched: {self._profile.name} has no codes for it.",
+                remedy="Switch it by its own button or remote control, or add its power codes to the profile.",
+            )
 
     def _hours(self, power: Power, deadline: Deadline) -> int | None:
         try:
             told = self._told("lamp_hours", deadline)
-            return None if told is None else parse_hours(told)
+            return None if told is None else parse_hours(told, self._table.queries["lamp_hours"].per_hour)
         except (DeviceTimeout, ProtocolError):
             # In standby some models leave this unanswered, or answer in another shape; lit, they must tell.
             if power is Power.ON or deadline.passed:
@@ -153,9 +188,10 @@ class SerialProjector:
     def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
         """Wait until the power state shows what a command should have done, whether or not its reply arrived."""
         patience = deadline.within(self._profile.timing.confirm_s)
-        while not self._shows(wanted, deadline):
-            if word == "on" and self._view.failed:
-                raise self._refused("projector-fault", f"did not switch on: it reports {', '.join(self._view.trouble)}")
+        while (power := self._seen(deadline)) not in wanted:
+            if word == "on" and (self._view.failed or power is Power.FAULT):
+                trouble = ", ".join(self._view.trouble) or UNNAMED_FAULT
+                raise self._refused("projector-fault", f"did not switch on: it reports {trouble}")
             if patience.passed:
                 raise DeviceTimeout(
                     f"projector-not-{word}",
@@ -164,14 +200,14 @@ class SerialProjector:
                 )
             patience.sleep(self._profile.timing.interval_s)
 
-    def _shows(self, wanted: tuple[Power, ...], deadline: Deadline) -> bool:
+    def _seen(self, deadline: Deadline) -> Power | None:
         try:
-            return self._power(deadline) in wanted
+            return self._power(deadline)
         except (DeviceBusy, DeviceTimeout):
             # Some models answer nothing while they start; only the caller's own deadline ends the waiting early.
             if deadline.passed:
                 raise
-            return False
+            return None
 
     def _noticed(self, notice: Notice) -> None:
         if notice.power is not None:
@@ -208,6 +244,12 @@ def _serial_table(profile: ProjectorProfile) -> SerialTable:
             remedy='Use another profile, or the driver "pjlink".',
         )
     return profile.serial
+
+
+def _told_powers(table: SerialTable) -> frozenset[Power]:
+    """The power states that this family names in its answers."""
+    values = table.queries["power"].values if "power" in table.queries else {}
+    return frozenset(Power(word) for word in values.values())
 
 
 def _checked_address(table: SerialTable, address: str | None) -> str:

@@ -12,7 +12,8 @@ class WireFaults:
     """How the wire misbehaves now.
 
     ``silent``: nothing is answered; ``garbage``: answers are noise; ``slow_s``: seconds before every answer;
-    ``drop``: that many next answers are lost on the way; ``busy``: every command is refused for now.
+    ``drop``, ``cut``, ``garble``: that many next answers are lost on the way, end in the middle, or become noise;
+    ``late_s``: seconds before the next answer alone; ``busy``: every command is refused for now.
     """
 
     silent: bool = False
@@ -20,6 +21,9 @@ class WireFaults:
     slow_s: float = 0.0
     drop: int = 0
     busy: bool = False
+    cut: int = 0
+    garble: int = 0
+    late_s: float = 0.0
 
 
 class Faults:
@@ -55,6 +59,17 @@ class Faults:
                 self._now = replace(self._now, drop=self._now.drop - 1)
                 return True
             return False
+
+    def bent(self, answer: bytes) -> tuple[bytes, float]:
+        """An answer about to be sent, as the wire carries it, and the seconds that it takes; uses up what counts."""
+        with self._lock:
+            now = self._now
+            self._now = replace(now, cut=max(0, now.cut - 1), garble=max(0, now.garble - 1), late_s=0.0)
+        if now.garbage or now.garble:
+            answer = noise(answer)
+        if now.cut:
+            answer = answer[: len(answer) // 2]
+        return answer, now.slow_s + now.late_s
 
 
 def noise(answer: bytes) -> bytes:

@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Final
 
 from hal.errors import DeviceError
-from plugins.emulated.faults import Faults, noise
+from plugins.emulated.faults import Faults
 from plugins.emulated.lamp import EmulatedLamp, LampPhase
 
 _CR: Final = b"\r"
@@ -246,11 +246,12 @@ class EmulatedPjLinkProjector:
             buffer += data
 
     def _send(self, client: socket.socket, data: bytes) -> None:
-        faults = self.faults.now
-        if faults.slow_s:
-            self._stop.wait(faults.slow_s)
-        if not self.faults.loses_this_one():
-            client.sendall(noise(data) if faults.garbage else data)
+        lost = self.faults.loses_this_one()
+        carried, wait_s = self.faults.bent(data)
+        if wait_s:
+            self._stop.wait(wait_s)
+        if not lost:
+            client.sendall(carried)
 
 
 def _no_port(port: int, error: OSError) -> DeviceError:

@@ -12,14 +12,25 @@ import tty
 from collections import deque
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import Final, Protocol
 
 from hal.errors import DeviceError
-from plugins.emulated.faults import Faults, noise
-from plugins.emulated.lamp import EmulatedLamp
+from plugins.emulated.faults import Faults
+from plugins.emulated.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.optoma import OptomaBoard, OptomaQuirks
+from plugins.emulated.scenario import ScenarioPlayer
 
 _TICK_S: Final = 0.02
+
+
+class Board(Protocol):
+    """The control board of a projector: bytes in, bytes out. ``plugins.emulated.boards_*`` hold the families."""
+
+    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
+        """The answers to the commands that ``data`` completes, one an element; ``busy``: each is refused."""
+
+    def notices(self) -> list[bytes]:
+        """Lines that are due now, unasked."""
 
 
 class EmulatedSerialProjector:
@@ -31,8 +42,11 @@ class EmulatedSerialProjector:
     lamp : its lamp; the optical bench reads the same one
     baud : the rate it listens at; at any other the line carries noise both ways
     number : its own number on the line (it answers to 00 as well)
+    board : what it does with the bytes; an Optoma of a later model, with ``number`` and ``quirks``, unless given
+    wedges_below_s : spoken to twice within this time while it warms or cools, it hangs until ``power_cycle``
 
-    ``faults`` are its knobs. ``start`` and ``stop`` it, or use it in a ``with`` statement.
+    ``faults`` are its knobs, ``scenario`` a script that turns them. ``start`` and ``stop`` it, or use it in a ``with``
+    statement.
     """
 
     def __init__(
@@ -43,12 +57,18 @@ class EmulatedSerialProjector:
         baud: int = 9600,
         number: int = 1,
         quirks: OptomaQuirks | None = None,
+        board: Board | None = None,
+        wedges_below_s: float = 0.0,
     ) -> None:
         self.port = port
         self.lamp = lamp
         self.faults = Faults()
+        self.scenario: ScenarioPlayer | None = None
+        self._wedges_below_s = wedges_below_s
+        self._wedged = threading.Event()
+        self._heard_at_s = 0.0
         self._speed = getattr(termios, f"B{baud}")
-        self._board = OptomaBoard(lamp, number=number, quirks=quirks)
+        self._board = board or OptomaBoard(lamp, number=number, quirks=quirks)
         self._lock = threading.Lock()
         self._master: int | None = None
         self._slave: int | None = None
@@ -87,6 +107,15 @@ class EmulatedSerialProjector:
         """The tty behind the symlink now; None while unplugged."""
         with self._lock:
             return self._path
+
+    @property
+    def wedged(self) -> bool:
+        """Whether its control board hangs."""
+        return self._wedged.is_set()
+
+    def power_cycle(self) -> None:
+        """Pull the mains plug and put it back: a hanging control board starts anew. Never done to a hot lamp."""
+        self._wedged.clear()
 
     def unplug(self) -> None:
         """Pull the adapter: the tty hangs up and its name disappears. The projector itself goes on."""
@@ -138,16 +167,32 @@ class EmulatedSerialProjector:
 
     def _turn(self, master: int) -> None:
         readable, _, _ = select.select([master], [], [], _TICK_S)
-        faults = self.faults.now
+        if self.scenario is not None:
+            self.scenario.tick()
         if readable:
-            for answer in self._board.feed(self._heard(os.read(master, 4096)), busy=faults.busy):
-                if not self.faults.loses_this_one():
-                    self._due.append((time.monotonic() + faults.slow_s, noise(answer) if faults.garbage else answer))
+            self._hear(os.read(master, 4096))
         for notice in self._board.notices():
-            if not faults.silent:
+            if not self.faults.now.silent and not self.wedged:
                 self._due.append((time.monotonic(), notice))
         while self._due and self._due[0][0] <= time.monotonic():
             self._say(master, self._due.popleft()[1])
+
+    def _hear(self, data: bytes) -> None:
+        if self.scenario is not None:
+            self.scenario.heard(len(data))
+        self._wedge()
+        for answer in self._board.feed(self._heard(data), busy=self.faults.now.busy):
+            if not self.faults.loses_this_one() and not self.wedged:
+                carried, wait_s = self.faults.bent(answer)
+                self._due.append((time.monotonic() + wait_s, carried))
+
+    def _wedge(self) -> None:
+        """Hang if spoken to too soon while the board is occupied with the lamp."""
+        now_s, before_s = time.monotonic(), self._heard_at_s
+        self._heard_at_s = now_s
+        occupied = self.lamp.phase in (LampPhase.WARMING, LampPhase.COOLING)
+        if occupied and now_s - before_s < self._wedges_below_s:
+            self._wedged.set()
 
     def _say(self, master: int, data: bytes) -> None:
         with self._lock:

@@ -1,7 +1,7 @@
 """Frozen dataclasses to TOML and back, with errors that name the key and the line.
 
-A value may be bool, int, float, str, a nested tuple of these with fixed lengths, a dataclass (a table), or a tuple of
-dataclasses of any length (an array of tables).
+A field with a default may be missing in the text. A value may be bool, int, float, str, a nested tuple of these with
+fixed lengths, a dataclass (a table), or a tuple of dataclasses of any length (an array of tables).
 """
 
 from __future__ import annotations
@@ -89,14 +89,14 @@ class _Reader:
 
     def table(self, content: Mapping[str, Any], kind: type[Table], path: Path_) -> Table:
         hints = get_type_hints(kind, include_extras=True)
-        fields = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        fields = {field.name: field.default for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
         for key in content:
             if key not in fields:
                 raise self._error("unknown", (*path, key), f"is not known; allowed are {', '.join(fields)}")
-        for key in fields:
-            if key not in content:
+        for key, default in fields.items():
+            if key not in content and default is dataclasses.MISSING:
                 raise self._error("missing", (*path, key), "is missing")
-        values = {key: self.value(content[key], hints[key], (*path, key)) for key in fields}
+        values = {key: self.value(content[key], hints[key], (*path, key)) for key in fields if key in content}
         return kind(**values)
 
     def value(self, item: Any, hint: Any, path: Path_, limits: Between = _ANY_NUMBER) -> Any:

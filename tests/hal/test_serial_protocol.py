@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.errors import ProtocolError
-from hal.profiles import SerialTable, parse_profile
+from hal.profiles import parse_profile
 from hal.serial_protocol import (
     Answer,
     Notice,
@@ -20,6 +20,7 @@ from hal.serial_protocol import (
     parse_power,
     query_bytes,
 )
+from hal.serial_table import SerialTable
 from hal.values import Power
 
 
@@ -38,7 +39,7 @@ HOURS = TABLE.queries["lamp_hours"]
 def test_commands_are_the_bytes_of_the_manual() -> None:
     # "7E 30 30 30 30 20 31 0D" and "7E 30 30 31 32 34 20 31 0D" in the manuals' HEX column
     assert command_bytes(TABLE, "power_on", "00") == bytes.fromhex("7E3030303020310D")
-    assert query_bytes(POWER, "00") == bytes.fromhex("7E303031323420310D")
+    assert query_bytes(TABLE, POWER, "00") == bytes.fromhex("7E303031323420310D")
     assert command_bytes(TABLE, "shutter_close", "07") == b"~0702 1\r"
 
 

@@ -11,14 +11,26 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
+from plugins.emulated.boards_binary import Ep910Board, NecBoard
+from plugins.emulated.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
 from plugins.emulated.quick_profile import quick_profile
-from plugins.emulated.serial_projector import EmulatedSerialProjector
+from plugins.emulated.serial_projector import Board, EmulatedSerialProjector
 from plugins.pjlink_projector import PjLinkProjector, open_pjlink_projector
+from plugins.profile_files import load_profile
 from plugins.serial_projector import SerialProjector, open_serial_projector
 
 LAMP = LampTiming(warm_up_s=0.25, cool_down_s=0.4)
+BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {
+    "epson-escvp21": EpsonBoard,
+    "benq": BenqBoard,
+    "christie": ChristieBoard,
+    "nec": NecBoard,
+    "optoma-ep910": Ep910Board,
+    "panasonic": PanasonicBoard,
+}
+"""The emulated control board of each shipped profile but the first, Optoma's."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +58,23 @@ OpenPjLink = Callable[..., PjLinkPair]
 
 @pytest.fixture
 def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
-    """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator."""
+    """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator.
+
+    ``profile`` is a shipped one, ``edit`` changes its text, ``board`` makes another board than the profile's.
+    """
     opened: list[SerialPair] = []
 
     def make(*, settings: dict[str, Any] | None = None, **kwargs: Any) -> SerialPair:
         lamp = kwargs.pop("lamp", None) or EmulatedLamp(LAMP)
-        emulator = EmulatedSerialProjector(tmp_path / "run" / "tty-left", lamp, **kwargs)
+        profile = kwargs.pop("profile", "optoma-later")
+        edit = kwargs.pop("edit", lambda text: text)
+        if (board := kwargs.pop("board", BOARDS.get(profile))) is not None:
+            kwargs["board"] = board(lamp)
+        (tmp_path / "quick.toml").write_text(edit(quick_profile(LAMP, base=profile)))
+        table_read = load_profile("quick.toml", tmp_path).serial
+        assert table_read is not None
+        emulator = EmulatedSerialProjector(tmp_path / "run" / "tty-left", lamp, baud=table_read.baud, **kwargs)
         emulator.start()
-        (tmp_path / "quick.toml").write_text(quick_profile(LAMP))
         table = {"profile": "quick.toml", "port": "run/tty-left", **(settings or {})}
         context = OpenContext(tmp_path, transcripts=tmp_path / "transcripts")
         pair = SerialPair(open_serial_projector(table, context, in_seconds(5)), emulator, tmp_path)

@@ -9,6 +9,7 @@ import pytest
 from hal.conformance import ProjectorConformance
 from hal.interfaces import Projector
 from plugins.emulated.optoma import OptomaQuirks
+from plugins.profile_files import shipped_profiles
 
 
 class TestSerialProjector(ProjectorConformance):
@@ -26,6 +27,15 @@ class TestSerialProjectorThatAcknowledgesQuestionsFirst(ProjectorConformance):
     @pytest.fixture
     def projector(self, open_serial: Any) -> Projector:
         driver: Projector = open_serial(quirks=OptomaQuirks(ok=b"Ok", p_first=True)).driver
+        return driver
+
+
+class TestEverySerialFamily(ProjectorConformance):
+    poll_s = 0.05
+
+    @pytest.fixture(params=[name for name in shipped_profiles() if name not in ("optoma-later", "pjlink")])
+    def projector(self, request: pytest.FixtureRequest, open_serial: Any) -> Projector:
+        driver: Projector = open_serial(profile=request.param).driver
         return driver
 
 
