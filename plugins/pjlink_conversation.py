@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 from hal import pjlink
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
 from hal.pjlink import Failure, PjClass
+from hal.pjlink_udp import is_notification
 from hal.values import Power
+
+_PADDED_LINE: Final = 8 * pjlink.LONGEST_LINE
 
 
 class PjLinkConversation:
@@ -83,7 +87,7 @@ class PjLinkConversation:
             until = deadline.within(patience_s)
             link.write(self._prefix + pjlink.command(name, parameter, pj_class=pj_class), deadline=until)
             self._prefix = b""
-            line = link.read_until(pjlink.TERMINATOR, limit=pjlink.LONGEST_LINE, deadline=until)
+            line = _answer_line(link, until)
         except DeviceTimeout as error:
             self.close()
             raise self.no_answer() from error
@@ -112,3 +116,11 @@ class PjLinkConversation:
             what=f"The projector at {self._name} {had}.",
             remedy="Set password in stage.toml to the PJLink password of the projector's network menu.",
         )
+
+
+def _answer_line(link: ByteLink, deadline: Deadline) -> bytes:
+    """The next line that is an answer: users report projectors that tell of themselves first, and pad with NUL."""
+    while True:
+        line = link.read_until(pjlink.TERMINATOR, limit=_PADDED_LINE, deadline=deadline).lstrip(b"\0")
+        if not is_notification(line):
+            return line

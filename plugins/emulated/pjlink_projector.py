@@ -126,6 +126,7 @@ class EmulatedPjLinkProjector:
     port : TCP port, 0 for any free one (see ``address`` once started)
     password : asked of every client, or None
     idle_s : seconds after which an idle connection is closed (the specification says 30)
+    chatty : it tells that it came up before it answers, and pads with NUL, as users report of some
 
     ``faults`` are its knobs; ``silent`` and ``slow_s`` hold for the greeting too.
     """
@@ -139,6 +140,7 @@ class EmulatedPjLinkProjector:
         name: str = "emulated",
         idle_s: float = 30.0,
         seed: int = 1,
+        chatty: bool = False,
     ) -> None:
         self.lamp = lamp
         self.faults = Faults()
@@ -147,6 +149,7 @@ class EmulatedPjLinkProjector:
         self._wanted_port = port
         self._password = password
         self._idle_s = idle_s
+        self._chatty = chatty
         self._random = random.Random(seed)
         self._stop = threading.Event()
         self._listener: socket.socket | None = None
@@ -225,7 +228,7 @@ class EmulatedPjLinkProjector:
                 with self._board_lock:
                     answer = self._board.answer(line, busy=self.faults.now.busy)
                 if answer:
-                    self._send(client, answer)
+                    self._send(client, b"%2LKUP=02:00:00:00:00:01\r\0\0" + answer if self._chatty else answer)
 
     def _lines(self, client: socket.socket) -> Iterator[bytes]:
         """Lines without their CR until the client goes, is idle too long, or sends a line that never ends."""
