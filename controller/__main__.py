@@ -6,26 +6,29 @@ Heavy imports happen inside the commands, so that ``velatura --help`` answers at
 from __future__ import annotations
 
 import errno
-import importlib
 import os
 import platform
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
 from controller import console
+from controller.commands import bundle as bundle_commands
+from controller.commands.keys import keys
+from controller.commands.running import Json, StageFolder, group, work
 from controller.errors import UsageError, VelaturaError
+
+__all__ = ["COMMANDS", "GROUPS", "Json", "StageFolder", "application", "main", "run", "work"]
 
 DONE, FAILED, WRONG_USE, DEVICE_FAILED, STOPPED = 0, 1, 2, 3, 130
 
-StageFolder = Annotated[Path, typer.Argument(metavar="STAGE", help="The stage's folder, which holds stage.toml.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object a line, for machines.")]
+SUMMARY: Final = "Gives a physical object a new appearance with light from several superimposed projectors."
 
 
 def states(
@@ -104,43 +107,21 @@ def play(
     work("controller.services:play", as_json=as_json, stage=stage, name=name, seconds=seconds or None)
 
 
-COMMANDS: Final[tuple[Callable[..., Any], ...]] = (demo, calibrate, appearance, play, emulate, states)
+COMMANDS: Final[tuple[Callable[..., Any], ...]] = (demo, calibrate, appearance, play, keys, emulate, states)
 """Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
 
-
-def work(target: str, *, as_json: bool, **arguments: Any) -> None:
-    """Call ``"package.module:function"`` for a command, and show what it returns (a mapping, a text or None).
-
-    The function gets ``arguments`` and besides ``reporter`` (a ``session.progress.Reporter``) and ``cancel`` (an event
-    for its ``Deadline``). It must cool the lamps itself before it returns or raises: while it runs, signals only set
-    the event.
-    """
-    from controller.session.signals import cancelled_by_signals
-
-    module, _, name = target.partition(":")
-    with cancelled_by_signals() as cancel, console.reporter(as_json=as_json) as reporter:
-        result = getattr(importlib.import_module(module), name)(**arguments, reporter=reporter, cancel=cancel)
-    console.show_result(result, as_json=as_json)
+GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
+    "bundle": (bundle_commands.SUMMARY, bundle_commands.COMMANDS),
+}
+"""Commands of two words: the first word, what the group is for, and its commands."""
 
 
 def application() -> typer.Typer:
-    """The command line with every command of the table."""
-    app = typer.Typer(
-        name="velatura",
-        help="Gives a physical object a new appearance with light from several superimposed projectors.",
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-    )
-    # With a callback a single command stays a command, instead of becoming the whole program.
-    app.callback()(_nothing_before_a_command)
-    for command in COMMANDS:
-        app.command(command.__name__.replace("_", "-"))(command)
+    """The command line with every command of the table, and every group of commands."""
+    app = group("velatura", SUMMARY, COMMANDS)
+    for name, (summary, commands) in GROUPS.items():
+        app.add_typer(group(name, summary, commands), name=name)
     return app
-
-
-def _nothing_before_a_command() -> None:
-    """Gives a physical object a new appearance with light from several superimposed projectors."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -141,7 +141,8 @@ def _player(stage: Stage, context: OpenContext) -> PlayerProcess:
     settings = PlayerSettings(
         outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
         frames=frames,
-        trusted=_key_files(stage.tables.bundle.trusted_keys, context.runtime),
+        trusted=_key_files(stage.tables.bundle.trusted_keys, context.runtime, "trusted"),
+        revoked=_key_files(stage.tables.bundle.revoked_keys, context.runtime, "revoked"),
         allow_unsigned=stage.tables.bundle.allow_unsigned,
     )
     # A run that was killed leaves its player, which plays on by design; it still has our socket.
@@ -149,9 +150,9 @@ def _player(stage: Stage, context: OpenContext) -> PlayerProcess:
     return start_player(context.runtime, settings)
 
 
-def _key_files(keys: Sequence[str], folder: Path) -> list[Path]:
+def _key_files(keys: Sequence[str], folder: Path, name: str) -> list[Path]:
     """Public key files for the player, which reads no stage.toml."""
-    paths = [folder / f"trusted-{number}.pub" for number in range(len(keys))]
+    paths = [folder / f"{name}-{number}.pub" for number in range(len(keys))]
     for path, key in zip(paths, keys, strict=True):
         write_public_key(path, bytes.fromhex(key))
     return paths

@@ -9,6 +9,8 @@ from typing import Any
 
 from controller.app import LOCK, LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage
 from controller.bundle.install import current
+from controller.bundle.signing import Trust, load_signing_key
+from controller.config import Stage
 from controller.errors import UsageError
 from controller.session.calibrating import calibration_steps
 from controller.session.journal import Journal
@@ -72,9 +74,13 @@ def make_appearances(
 
 
 def signing_key(checked: Checked) -> Path | None:
-    """The stage's own key. Without one, bundles stay unsigned, which stage.toml must allow in so many words."""
+    """The stage's own key. Without one, bundles stay unsigned, which stage.toml must allow in so many words.
+
+    Raises UsageError("no-signing-key", or "signing-key-refused" for one whose bundles the stage would not play).
+    """
     key = checked.stage.path(KEY_FILE)
     if key.exists():
+        _check_own_key(key, stage_trust(checked.stage))
         return key
     if checked.stage.tables.bundle.allow_unsigned:
         return None
@@ -83,6 +89,25 @@ def signing_key(checked: Checked) -> Path | None:
         what=f"The stage has no signing key in {KEY_FILE}.",
         remedy="Make one with `velatura keys STAGE`, which also tells which line to add to stage.toml.",
     )
+
+
+def _check_own_key(path: Path, trust: Trust) -> None:
+    # Before the work: otherwise the player alone would tell, once everything is solved.
+    public = bytes(load_signing_key(path).verify_key)
+    if public in trust.revoked:
+        problem, remedy = "is revoked", f"Move {path} away, make a new key with `velatura keys STAGE`, and trust that."
+    elif public not in trust.keys and (trust.keys or not trust.allow_unsigned):
+        problem, remedy = "is not trusted", f'Add "{public.hex()}" to trusted_keys under [bundle] in stage.toml.'
+    else:
+        return
+    raise UsageError("signing-key-refused", what=f"The stage's own signing key {problem} by stage.toml.", remedy=remedy)
+
+
+def stage_trust(stage: Stage) -> Trust:
+    """Which bundles stage.toml lets play."""
+    table = stage.tables.bundle
+    keys, revoked = (tuple(map(bytes.fromhex, keys)) for keys in (table.trusted_keys, table.revoked_keys))
+    return Trust(keys, table.allow_unsigned, revoked)
 
 
 def finished_calibration(stage: Path) -> Path:
@@ -106,7 +131,10 @@ def output_sizes(checked: Checked) -> dict[str, tuple[str, tuple[int, int]]]:
     sizes = {output.name: (output.width_px, output.height_px) for output in display.outputs}
     if not sizes:
         raise display.place.missing("outputs", "a list of [[display.outputs]] tables with name, width_px and height_px")
-    return {table.name: (table.output, sizes[table.output]) for table in checked.stage.tables.projectors}
+    order = list(sizes)
+    # The player compares a bundle's outputs with its own, in the display's order.
+    tables = sorted(checked.stage.tables.projectors, key=lambda table: order.index(table.output))
+    return {table.name: (table.output, sizes[table.output]) for table in tables}
 
 
 def play(

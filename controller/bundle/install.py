@@ -8,16 +8,20 @@ from __future__ import annotations
 import contextlib
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
+from controller.bundle.format import Index
 from controller.bundle.reader import Bundle
+from controller.bundle.signing import Trust
 from controller.errors import BundleError
 from controller.storage import exclusive, sha256_of, stream_atomically, sync_folder
 
 CURRENT: Final = "current"
 PREVIOUS: Final = "previous"
+STARTS: Final = "starts.json"
+"""How often the player was started with the current bundle in vain (``fallback``)."""
 _INCOMING: Final = ".incoming.vel"
 _LOCK: Final = ".install.lock"
 _INSTALLED: Final = re.compile(r"[0-9a-f]{64}\.vel")
@@ -29,27 +33,36 @@ def install(
     *,
     trusted: Sequence[bytes] = (),
     allow_unsigned: bool = False,
+    revoked: Sequence[bytes] = (),
+    accept: Callable[[Index], None] = lambda index: None,
 ) -> Path:
     """Copy, verify in full, and make current; return the installed file. The one before is kept for ``rollback``.
 
-    Installing what is current already changes nothing. Files that are neither current nor previous are removed.
+    Installing what is current already changes nothing, but gives it its starts again (``fallback``). Files that are
+    neither current nor previous are removed. ``accept`` raises to refuse a sound bundle that does not fit.
 
     Raises BundleError as ``Bundle.open`` and ``Bundle.verify`` do, and ("bundle-older") for a lower revision than
-    the current bundle's; WorkError("no-space"). The folder then plays what it played before.
+    those of the installed bundles; WorkError("no-space"). The folder then plays what it played before.
     """
+    trust = Trust(tuple(trusted), allow_unsigned, tuple(revoked))
     folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder / _LOCK, what_is_running="Another installation"):
         incoming = folder / _INCOMING
+        _clear_unfinished(folder)
         try:
             _copy(source, incoming)
             # What is checked is the copy: the source may change while it is read.
-            with Bundle.open(incoming, trusted=trusted, allow_unsigned=allow_unsigned) as bundle:
-                bundle.verify()
-                _refuse_older(bundle, folder)
             target = folder / f"{sha256_of(incoming)}.vel"
+            with Bundle.open_trusted(incoming, trust) as bundle:
+                bundle.verify()
+                accept(bundle.index)
+                if target != current(folder):
+                    _refuse_older(bundle.index, folder, trust)
             incoming.replace(target)
         finally:
             incoming.unlink(missing_ok=True)
+        # Before the switch: a counter that is lost with the old bundle does no harm.
+        (folder / STARTS).unlink(missing_ok=True)
         sync_folder(folder)
         _switch(folder, target)
     return target
@@ -60,23 +73,55 @@ def rollback(folder: Path) -> Path:
 
     Raises BundleError("bundle-no-previous").
     """
+    if not folder.is_dir():
+        raise _no_previous()
     with exclusive(folder / _LOCK, what_is_running="Another installation"):
-        now, before = current(folder), _target(folder, PREVIOUS)
+        now, before = current(folder), previous(folder)
         if before is None or before == now:
-            raise BundleError(
-                "bundle-no-previous",
-                what="There is no earlier bundle to go back to.",
-                remedy="Install a bundle with 'velatura bundle install'.",
-            )
+            raise _no_previous()
+        (folder / STARTS).unlink(missing_ok=True)
         _link(folder, CURRENT, before)
         if now is not None:
             _link(folder, PREVIOUS, now)
     return before
 
 
+def _no_previous() -> BundleError:
+    return BundleError(
+        "bundle-no-previous",
+        what="There is no earlier bundle to go back to.",
+        remedy="Install a bundle with 'velatura bundle install'.",
+    )
+
+
 def current(folder: Path) -> Path | None:
     """The installed bundle's file, or None where none is installed."""
     return _target(folder, CURRENT)
+
+
+def previous(folder: Path) -> Path | None:
+    """The file of the bundle to go back to, or None."""
+    return _target(folder, PREVIOUS)
+
+
+def revision_floor(folder: Path, trust: Trust) -> int:
+    """The highest revision of the installed bundles, -1 if there is none.
+
+    What the stage would not play does not count: a damaged bundle, or one by a stolen and then revoked key, must not
+    keep sound ones out.
+    """
+    found = [-1]
+    for file in {current(folder), previous(folder)} - {None}:
+        assert file is not None
+        with contextlib.suppress(BundleError), Bundle.open_trusted(file, trust) as installed:
+            found.append(installed.index.revision)
+    return max(found)
+
+
+def _clear_unfinished(folder: Path) -> None:
+    """Remove copies that a power cut left unfinished; for the holder of the lock."""
+    for temporary in folder.glob(f".{_INCOMING}.*.part"):
+        temporary.unlink(missing_ok=True)
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -91,19 +136,12 @@ def _copy(source: Path, target: Path) -> None:
         ) from error
 
 
-def _refuse_older(bundle: Bundle, folder: Path) -> None:
-    now = current(folder)
-    if now is None:
-        return
-    try:
-        with Bundle.open(now, allow_unsigned=True) as installed:
-            least = installed.index.revision
-    except BundleError:  # a damaged current bundle must not keep a sound one out
-        return
-    if bundle.index.revision < least:
+def _refuse_older(index: Index, folder: Path, trust: Trust) -> None:
+    least = revision_floor(folder, trust)
+    if index.revision < least:
         raise BundleError(
             "bundle-older",
-            what=f"The bundle has revision {bundle.index.revision}, and revision {least} is installed.",
+            what=f"The bundle has revision {index.revision}, and revision {least} is installed.",
             remedy="Publish it again with a higher revision, or use 'velatura bundle rollback'.",
         )
 

@@ -10,17 +10,18 @@ import stat
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Final, Self
+from typing import BinaryIO, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 import xxhash
 import zstandard
+from nacl.signing import SigningKey
 
 from controller.bundle import format as fmt
 from controller.bundle.format import damaged
 from controller.bundle.index import parse_index
-from controller.bundle.signing import BLOCK_BYTES, check_signature
+from controller.bundle.signing import BLOCK_BYTES, Trust, check_signature, sign
 from controller.errors import BundleError
 
 _MAX_WINDOW_BYTES: Final = 2**23
@@ -33,7 +34,15 @@ class Bundle:
     ``identity`` is the SHA-256 of its index in hex: it changes with every pixel. Safe to decode from several threads.
     """
 
-    def __init__(self, data: mmap.mmap, path: Path, *, trusted: Sequence[bytes], allow_unsigned: bool) -> None:
+    def __init__(
+        self,
+        data: mmap.mmap,
+        path: Path,
+        *,
+        trusted: Sequence[bytes],
+        allow_unsigned: bool,
+        revoked: Sequence[bytes] = (),
+    ) -> None:
         self._data = data
         self.path = path
         start = data[: fmt.HEADER_BYTES]
@@ -42,17 +51,32 @@ class Bundle:
         index_bytes, block = data[header.index_offset : end], data[end : end + BLOCK_BYTES]
         if hashlib.sha256(index_bytes).digest() != header.index_sha256:
             raise damaged("its index does not have the hash that its header says")
-        self.signed_by = check_signature(start, index_bytes, block, trusted=trusted, allow_unsigned=allow_unsigned)
+        self.signed_by = check_signature(
+            start, index_bytes, block, trusted=trusted, allow_unsigned=allow_unsigned, revoked=revoked
+        )
         self.index = parse_index(index_bytes, data_end=header.index_offset)
         self.identity = header.index_sha256.hex()
         self._data_end = header.index_offset
 
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return len(self._data)
+
     @classmethod
-    def open(cls, path: Path, *, trusted: Sequence[bytes] = (), allow_unsigned: bool = False) -> Self:
+    def open_trusted(cls, path: Path, trust: Trust) -> Self:
+        """As ``open``, with what may be used as one value."""
+        return cls.open(path, trusted=trust.keys, allow_unsigned=trust.allow_unsigned, revoked=trust.revoked)
+
+    @classmethod
+    def open(
+        cls, path: Path, *, trusted: Sequence[bytes] = (), allow_unsigned: bool = False, revoked: Sequence[bytes] = ()
+    ) -> Self:
         """Map a bundle and check header, index and signature (not yet the pixels: see ``verify``).
 
-        ``trusted``: public keys, 32 bytes each. Raises BundleError, with code "bundle-unreadable" for a file that can
-        not be opened, and those of ``format.parse_header``, ``index.parse_index`` and ``signing.check_signature``.
+        ``trusted``, ``revoked``: public keys, 32 bytes each. Raises BundleError, with code "bundle-unreadable" for a
+        file that can not be opened, and those of ``format.parse_header``, ``index.parse_index`` and
+        ``signing.check_signature``.
         """
         try:
             # Not blocking: opening a pipe would otherwise wait for its other end, and the player with it.
@@ -69,7 +93,7 @@ class Bundle:
         except ValueError as error:
             raise damaged("it is empty") from error
         try:
-            return cls(data, path, trusted=trusted, allow_unsigned=allow_unsigned)
+            return cls(data, path, trusted=trusted, allow_unsigned=allow_unsigned, revoked=revoked)
         except BaseException:
             data.close()
             raise
@@ -96,6 +120,12 @@ class Bundle:
             self._check_gap(position, blob.offset)
             position = max(position, blob.offset + blob.length)
         self._check_gap(position, self._data_end)
+
+    def write_signed(self, file: BinaryIO, key: SigningKey) -> None:
+        """Write this bundle with the signature of ``key`` in the place of its own; what is mapped here is copied."""
+        end = len(self._data) - BLOCK_BYTES
+        file.write(memoryview(self._data)[:end])
+        file.write(sign(self._data[: fmt.HEADER_BYTES], self._data[self._data_end : end], key))
 
     def _check_gap(self, start: int, end: int) -> None:
         if end - start >= fmt.ALIGNMENT or self._data[start:end].strip(b"\0"):

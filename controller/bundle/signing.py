@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +28,19 @@ _SIGNING_PREFIX: Final = "velatura-signing-key-1 "
 _PUBLIC_PREFIX: Final = "velatura-public-key-1 "
 _KEY_BYTES: Final = 32
 _KEY_FILE_BYTES: Final = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """Which bundles may be used: signed by one of ``keys``, or, if so said, not signed at all; never by ``revoked``."""
+
+    keys: tuple[bytes, ...] = ()
+    allow_unsigned: bool = False
+    revoked: tuple[bytes, ...] = ()
+
+
+ANYONE: Final = Trust(allow_unsigned=True)
+"""To look into a bundle of whatever origin: a signature must fit its content, whoever signed."""
 
 
 def generate_key(path: Path) -> bytes:
@@ -95,14 +109,22 @@ def sign(header: bytes, index: bytes, key: SigningKey) -> bytes:
 
 
 def check_signature(
-    header: bytes, index: bytes, block: bytes, *, trusted: Sequence[bytes], allow_unsigned: bool
+    header: bytes,
+    index: bytes,
+    block: bytes,
+    *,
+    trusted: Sequence[bytes],
+    allow_unsigned: bool,
+    revoked: Sequence[bytes] = (),
 ) -> bytes | None:
     """Who signed: one of the ``trusted`` public keys, or None for an unsigned bundle that ``allow_unsigned`` lets pass.
 
     ``allow_unsigned`` lets pass only what carries no signature at all; a wrong one is refused in any case. With no
-    trusted key and ``allow_unsigned``, a signature is checked against the key that it names.
+    trusted key and ``allow_unsigned``, a signature is checked against the key that it names. A ``revoked`` key is
+    refused in any case, ``trusted`` or not.
 
-    Raises BundleError("bundle-unsigned", "bundle-untrusted", "bundle-signature-wrong" or "bundle-damaged").
+    Raises BundleError("bundle-unsigned", "bundle-untrusted", "bundle-revoked", "bundle-signature-wrong" or
+    "bundle-damaged").
     """
     if block == UNSIGNED_BLOCK:
         if allow_unsigned:
@@ -115,6 +137,12 @@ def check_signature(
     magic, public, signature = BLOCK.unpack(block)
     if magic != _MAGIC or block != BLOCK.pack(magic, public, signature):
         raise damaged("its signature block is not one")
+    if public in revoked:
+        raise BundleError(
+            "bundle-revoked",
+            what=f"The bundle is signed with the key {public.hex()[:16]}…, which this stage has revoked.",
+            remedy="Build it again where a key is that the stage trusts, or sign it with 'velatura bundle sign'.",
+        )
     if public not in trusted and (trusted or not allow_unsigned):
         raise BundleError(
             "bundle-untrusted",

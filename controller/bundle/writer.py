@@ -16,7 +16,8 @@ from nacl.signing import SigningKey
 
 from controller.bundle import format as fmt
 from controller.bundle.index import encode_index, parse_index
-from controller.bundle.signing import BLOCK_BYTES, UNSIGNED_BLOCK, sign
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import ANYONE, BLOCK_BYTES, UNSIGNED_BLOCK, sign
 from controller.errors import BundleError
 from controller.storage import stream_atomically
 
@@ -69,6 +70,17 @@ def write_bundle(
 
     stream_atomically(path, write)
     return written[0]
+
+
+def sign_bundle(path: Path, key: SigningKey) -> bytes:
+    """Check a bundle in full and give it the signature of ``key`` in the place of any other; returns the public key.
+
+    Raises BundleError as ``Bundle.open`` and ``Bundle.verify``: what is damaged or forged is not signed.
+    """
+    with Bundle.open_trusted(path, ANYONE) as bundle:
+        bundle.verify()
+        stream_atomically(path, lambda file: bundle.write_signed(file, key))
+    return bytes(key.verify_key)
 
 
 def _finish(file: BinaryIO, index: fmt.Index, key: SigningKey | None) -> None:

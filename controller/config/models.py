@@ -164,6 +164,9 @@ class BundleTable(Table):
     trusted_keys: Annotated[tuple[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")], ...], Field(strict=False)] = Field(
         default=(), description="a list of public keys, each 64 hexadecimal digits in lower case"
     )
+    revoked_keys: Annotated[tuple[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")], ...], Field(strict=False)] = Field(
+        default=(), description="a list of public keys whose bundles are refused, each 64 hexadecimal digits"
+    )
 
 
 class AppearanceTable(OpenTable):

@@ -10,11 +10,13 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from controller.bundle.signing import load_public_key
+from controller.bundle.fallback import CountedStart
+from controller.bundle.install import CURRENT
+from controller.bundle.signing import Trust, load_public_key
 from controller.errors import UsageError, VelaturaError
 from controller.play.commands import Commands
 from controller.play.frames import FrameFile, OutputSize, parse_outputs
-from controller.play.loop import Player, Trust
+from controller.play.loop import Player
 from controller.play.outputs import MemoryOutput, Output
 from controller.play.protocol import MAX_RATE_HZ
 from controller.play.server import Server
@@ -37,8 +39,9 @@ def _parser() -> argparse.ArgumentParser:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--frames", type=Path, help="show in this file (machines without projectors)")
     where.add_argument("--windows", action="store_true", help="show in one window over all outputs")
-    parser.add_argument("--bundle", type=Path, help="bundle to have ready")
+    parser.add_argument("--bundle", type=Path, help="bundle to have ready; a stage's bundles/current falls back")
     parser.add_argument("--trusted", type=Path, action="append", default=[], help="public key file; may be repeated")
+    parser.add_argument("--revoked", type=Path, action="append", default=[], help="key file never to be trusted")
     parser.add_argument("--allow-unsigned", action="store_true", help="play bundles without a signature, too")
     parser.add_argument("--rate", type=float, default=60.0, help="pictures change at multiples of 1/RATE seconds")
     return parser
@@ -52,7 +55,8 @@ def _run(options: argparse.Namespace) -> int:
             what=f"A rate of {options.rate:g} pictures a second can not be played.",
             remedy=f"Give a rate from 1 to {MAX_RATE_HZ:g}.",
         )
-    trust = Trust(tuple(load_public_key(path) for path in options.trusted), options.allow_unsigned)
+    keys, revoked = (tuple(map(load_public_key, paths)) for paths in (options.trusted, options.revoked))
+    trust = Trust(keys, options.allow_unsigned, revoked)
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(Server(options.socket))
         inbox = FrameFile(options.socket.with_name(options.socket.name + ".inbox"), sizes)
@@ -60,12 +64,23 @@ def _run(options: argparse.Namespace) -> int:
         stack.callback(inbox.close)
         output = _open_output(options, sizes)
         stack.callback(output.close)
-        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake)
+        start = _counted_start(options.bundle)
+        shown = None if start is None else start.shown
+        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, on_appearance=shown)
         if options.bundle is not None:
-            player.load_bundle(options.bundle)
+            player.load_bundle(options.bundle if start is None else start.file)
         broken = _end_on_signals(player)
         player.run(Commands(player, server, inbox).serve)
+        if start is not None and not broken.is_set() and not player.skipped:
+            start.ended()
     return 1 if broken.is_set() else 0
+
+
+def _counted_start(bundle: Path | None) -> CountedStart | None:
+    """The start's count where ``bundle`` is the link to a stage's installed bundle; None for any other file."""
+    if bundle is None or bundle.name != CURRENT or not bundle.is_symlink():
+        return None
+    return CountedStart(bundle.parent, lambda sentence: print(sentence, file=sys.stderr, flush=True))  # noqa: T201
 
 
 def _open_output(options: argparse.Namespace, sizes: tuple[OutputSize, ...]) -> Output:

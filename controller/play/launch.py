@@ -32,7 +32,7 @@ class PlayerSettings:
     """What a player is started with.
 
     ``outputs``: (name, width_px, height_px) in stage order; ``frames``: the memory output's file, None for windows;
-    ``trusted``: public key files; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
+    ``trusted``, ``revoked``: public key files; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
     """
 
     outputs: Sequence[tuple[str, int, int]]
@@ -41,6 +41,7 @@ class PlayerSettings:
     trusted: Sequence[Path] = field(default=())
     allow_unsigned: bool = False
     rate_hz: float = 60.0
+    revoked: Sequence[Path] = field(default=())
 
 
 class PlayerProcess:
@@ -62,6 +63,7 @@ class PlayerProcess:
         command += ["--windows"] if settings.frames is None else ["--frames", str(settings.frames)]
         command += [] if settings.bundle is None else ["--bundle", str(settings.bundle)]
         command += [word for key in settings.trusted for word in ("--trusted", str(key))]
+        command += [word for key in settings.revoked for word in ("--revoked", str(key))]
         command += ["--allow-unsigned"] if settings.allow_unsigned else []
         command += ["--rate", f"{settings.rate_hz:g}"]
         with self.log.open("wb") as log:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from controller.bundle.reader import Bundle
+from controller.bundle.signing import Trust
 from controller.errors import BundleError, UsageError, VelaturaError
 from controller.play.cache import DecodedAhead, check_fits
 from controller.play.frames import FrameSet, OutputSize
@@ -49,27 +50,28 @@ class _Coming:
     told: Told | None
 
 
-@dataclass(frozen=True, slots=True)
-class Trust:
-    """Which bundles may be played: signed by one of ``keys``, or, if so said, not signed at all."""
-
-    keys: tuple[bytes, ...] = ()
-    allow_unsigned: bool = False
-
-
 class Player:
     """Presents patterns and appearances on one ``Output``; patterns and appearances go the same way.
 
     ``serve`` waits at most so many seconds for requests and carries them out by calling the methods below, in the
-    loop's own thread; ``wake`` ends its waiting and is called from the decoding thread.
+    loop's own thread; ``wake`` ends its waiting and is called from the decoding thread. ``on_appearance`` is called
+    once, when the first appearance is on the outputs; it must return at once.
     """
 
     def __init__(
-        self, output: Output, sizes: Sequence[OutputSize], *, rate_hz: float, trust: Trust, wake: Callable[[], None]
+        self,
+        output: Output,
+        sizes: Sequence[OutputSize],
+        *,
+        rate_hz: float,
+        trust: Trust,
+        wake: Callable[[], None],
+        on_appearance: Callable[[], None] | None = None,
     ) -> None:
         self.sizes = tuple(sizes)
         self.rate_hz = rate_hz
         self._output, self._trust, self._wake = output, trust, wake
+        self._on_appearance = on_appearance
         self._notifier = Notifier()
         self._grid = Grid(rate_hz)
         self._black = FrameSet.black(sizes)
@@ -150,7 +152,7 @@ class Player:
 
     def load_bundle(self, path: Path) -> None:
         """Use this bundle from now on; the picture stays until something is played. Raises BundleError."""
-        bundle = Bundle.open(path, trusted=self._trust.keys, allow_unsigned=self._trust.allow_unsigned)
+        bundle = Bundle.open_trusted(path, self._trust)
         try:
             check_fits(bundle, self.sizes)
         except BundleError:
@@ -161,6 +163,11 @@ class Player:
                 self.withdraw()
             self._decoded.close()
         self._decoded = DecodedAhead(bundle, self.sizes, self._wake)
+
+    @property
+    def skipped(self) -> int:
+        """Appearances that could not be decoded, since the start."""
+        return self._skipped
 
     @property
     def bundle_identity(self) -> str | None:
@@ -243,6 +250,9 @@ class Player:
     def _presented(self, coming: _Coming, at_s: float) -> None:
         self._last = Presented(self._last.sequence + 1, at_s)
         self._showing, self._appearance = coming.showing, coming.appearance
+        if coming.appearance is not None and self._on_appearance is not None:
+            self._on_appearance()
+            self._on_appearance = None
         if self._playlist is not None:
             self._intervals.presented(at_s)
             self._go_on(coming.tick + self._grid.ticks(self._playlist.seconds))

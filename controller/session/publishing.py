@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from controller.arrays import FloatImage, save_arrays
-from controller.bundle.install import install
-from controller.bundle.signing import load_public_key, load_signing_key
+from controller.bundle.format import Index
+from controller.bundle.install import install, revision_floor
+from controller.bundle.signing import ANYONE, Trust, load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.capture.brackets import merge_brackets
 from controller.errors import UsageError
@@ -70,29 +71,60 @@ def _publish(
     key: Path | None,
     context: Context,
 ) -> Sequence[Path]:
-    def appearance(name: str) -> NewAppearance:
-        solved = read_solved(context.folder, name, tuple(outputs))
-        frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
-        return NewAppearance(name, frames, metadata={"mode": solved.figures["mode"], "exposure": solved.exposure})
-
-    built = context.folder / "bundle.vel"
-    trusted = () if key is None else (load_public_key(key.with_name(key.name + ".pub")),)
-    write_bundle(
-        built,
-        stage=identity[0],
-        calibration=identity[1],
-        created_unix_s=int(time.time()),
-        outputs=[(output, *size) for output, size in outputs.values()],
-        appearances=(appearance(name) for name in names),
-        key=None if key is None else load_signing_key(key),
-    )
-    installed = install(built, folder / "bundles", trusted=trusted, allow_unsigned=key is None)
+    built, slots = context.folder / "bundle.vel", folder / "bundles"
+    write_solved(
+        built, context.folder, outputs, names, stage=identity[0], calibration=identity[1],
+        revision=next_revision(slots), key=key,
+    )  # fmt: skip
+    trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
+    installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
     raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
     size = built.stat().st_size
     figures = {"bytes": size, "ratio": raw / size, "file": installed.name}
     path = context.folder / "bundle.json"
     write_atomically(path, json.dumps(figures, indent=1).encode())
     return [path, built]
+
+
+def next_revision(slots: Path, trust: Trust = ANYONE) -> int:
+    """One more than those installed bundles of the folder ``slots`` that ``trust`` lets pass."""
+    return revision_floor(slots, trust) + 1
+
+
+def write_solved(
+    path: Path,
+    run: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    *,
+    stage: str,
+    calibration: str,
+    revision: int,
+    key: Path | None,
+    check: Callable[[], None] = lambda: None,
+) -> Index:
+    """Write the appearances that the folder ``run`` holds solved as a bundle at ``path``, signed with the key file.
+
+    ``check`` is called before each appearance, to stop the work by raising.
+    Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then as it was.
+    """
+
+    def appearance(name: str) -> NewAppearance:
+        check()
+        solved = read_solved(run, name, tuple(outputs))
+        frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
+        return NewAppearance(name, frames, metadata={"mode": solved.figures["mode"], "exposure": solved.exposure})
+
+    return write_bundle(
+        path,
+        stage=stage,
+        calibration=calibration,
+        created_unix_s=int(time.time()),
+        outputs=[(output, *size) for output, size in outputs.values()],
+        appearances=(appearance(name) for name in names),
+        key=None if key is None else load_signing_key(key),
+        revision=revision,
+    )
 
 
 def photograph_step(rig: Rig, names: Sequence[str], *, longest_exposure_s: float) -> Step:

@@ -1,0 +1,130 @@
+"""What a bundle holds, and in what two differ, as tables of JSON values and as text for people."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, Final
+
+from controller.bundle.format import Appearance, Index, OutputLayout
+from controller.bundle.reader import Bundle
+
+_LAST_SECOND: Final = 253_402_300_799
+"""The end of the year 9999; a bundle may say more, the calendar does not."""
+_HEADS: Final = ("stage", "calibration", "created_unix_s", "revision")
+
+
+def describe(bundle: Bundle) -> dict[str, Any]:
+    """What ``velatura bundle inspect --json`` prints (docs/bundle-format.md, "The commands")."""
+    index = bundle.index
+    raw = sum(3 * output.width_px * output.height_px for output in index.outputs) * len(index.appearances)
+    return {
+        "file": str(bundle.path),
+        "bytes": bundle.size,
+        "ratio": raw / bundle.size,
+        "identity": bundle.identity,
+        "signed_by": None if bundle.signed_by is None else bundle.signed_by.hex(),
+        **{key: getattr(index, key) for key in _HEADS},
+        "created": _utc(index.created_unix_s),
+        "outputs": [_output(output) for output in index.outputs],
+        "appearances": [_appearance(appearance) for appearance in index.appearances],
+    }
+
+
+def _output(output: OutputLayout) -> dict[str, Any]:
+    return {"name": output.name, "width_px": output.width_px, "height_px": output.height_px}
+
+
+def _appearance(appearance: Appearance) -> dict[str, Any]:
+    return {
+        "name": appearance.name,
+        "bytes": sum(blob.length for blobs in appearance.stripes.values() for blob in blobs),
+        "thumbnail": appearance.thumbnail is not None,
+        "metadata": dict(appearance.metadata),
+    }
+
+
+def _utc(seconds: int) -> str:
+    if seconds > _LAST_SECOND:
+        return f"{seconds} s after 1970"
+    return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(seconds))
+
+
+def as_text(found: Mapping[str, Any]) -> str:
+    """What ``describe`` returned, in lines. Names of a bundle are printable; its metadata is left out."""
+    outputs = ", ".join(f"{output['name']} {output['width_px']}x{output['height_px']}" for output in found["outputs"])
+    lines = [
+        f"stage        {found['stage']}",
+        f"calibration  {found['calibration']}",
+        f"revision     {found['revision']}, made {found['created']}",
+        f"signed by    {found['signed_by'] or 'nobody'}",
+        f"size         {found['bytes']} bytes, {found['ratio']:.1f} x smaller than raw",
+        f"outputs      {outputs}",
+        f"appearances  {len(found['appearances'])}",
+    ]
+    lines += [f"  {appearance['name']}  {appearance['bytes']} bytes" for appearance in found["appearances"]]
+    return "\n".join(lines)
+
+
+def differences(one: Bundle, other: Bundle) -> dict[str, Any]:
+    """In what ``other`` differs from ``one``; ``same`` is true where nothing does.
+
+    Pictures are compared by the hashes in the index, so no pixel is read.
+    """
+    changed = {key: [getattr(one.index, key), getattr(other.index, key)] for key in _HEADS}
+    changed["signed_by"] = [None if key is None else key.hex() for key in (one.signed_by, other.signed_by)]
+    changed["outputs"] = [[_output(output) for output in bundle.index.outputs] for bundle in (one, other)]
+    changed = {key: pair for key, pair in changed.items() if pair[0] != pair[1]}
+    appearances = _appearance_differences(one.index, other.index)
+    return {"same": not (changed or any(appearances.values())), "changed": changed, "appearances": appearances}
+
+
+def _appearance_differences(one: Index, other: Index) -> dict[str, list[Any]]:
+    before = {appearance.name: appearance for appearance in one.appearances}
+    after = {appearance.name: appearance for appearance in other.appearances}
+    changed = [
+        {"name": name, **parts}
+        for name in before
+        if name in after and any((parts := _parts(before[name], after[name])).values())
+    ]
+    return {
+        "removed": [name for name in before if name not in after],
+        "added": [name for name in after if name not in before],
+        "changed": changed,
+    }
+
+
+def _parts(before: Appearance, after: Appearance) -> dict[str, Any]:
+    outputs = [*before.stripes, *(name for name in after.stripes if name not in before.stripes)]
+    thumbnails = [None if one.thumbnail is None else one.thumbnail.sha256 for one in (before, after)]
+    return {
+        "pictures": [name for name in outputs if _hashes(before, name) != _hashes(after, name)],
+        "thumbnail": thumbnails[0] != thumbnails[1],
+        "metadata": before.metadata != after.metadata,
+    }
+
+
+def _hashes(appearance: Appearance, output: str) -> list[bytes]:
+    return [blob.sha256 for blob in appearance.stripes.get(output, ())]
+
+
+def differences_as_text(found: Mapping[str, Any]) -> str:
+    """What ``differences`` returned, in lines: - for what only the first has, + for the second, ~ for both."""
+    if found["same"]:
+        return "The bundles hold the same."
+    lines = []
+    for key, (one, other) in found["changed"].items():
+        lines += [f"- {key} {_value(one)}", f"+ {key} {_value(other)}"]
+    appearances = found["appearances"]
+    lines += [f"- appearance {name}" for name in appearances["removed"]]
+    lines += [f"+ appearance {name}" for name in appearances["added"]]
+    for one in appearances["changed"]:
+        parts = [*one["pictures"], *(part for part in ("thumbnail", "metadata") if one[part])]
+        lines.append(f"~ appearance {one['name']}: {', '.join(parts)}")
+    return "\n".join(lines)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(f"{output['name']} {output['width_px']}x{output['height_px']}" for output in value)
+    return "nobody" if value is None else str(value)

@@ -1,0 +1,103 @@
+"""Counts starts of the player that led to no picture; after three with one bundle, the one before plays again.
+
+The count lies in ``bundles/starts.json`` and is written before the bundle is touched, so a start that ends in a crash,
+a hang or a power cut stays counted. A folder that can not be written never keeps the player from playing.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Self
+
+from controller.bundle.install import CURRENT, STARTS, current, previous, rollback
+from controller.errors import VelaturaError
+from controller.storage import write_atomically
+
+MOST_FAILED_STARTS: Final = 3
+_LARGEST_BYTES: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Starts:
+    """What is known of the starts with one bundle.
+
+    ``bundle``: its file's name; ``failed``: starts in a row without a picture, the one that goes on now among them;
+    ``given_up``: the file's name of a bundle that is not gone back to, because it failed itself.
+    """
+
+    bundle: str = ""
+    failed: int = 0
+    given_up: str | None = None
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """The count in ``folder``; none where the file is missing or is not ours."""
+        try:
+            with (folder / STARTS).open("rb") as file:
+                values: Any = json.loads(file.read(_LARGEST_BYTES))
+            found = cls(values["bundle"], values["failed"], values["given_up"])
+        except (OSError, ValueError, TypeError, KeyError, RecursionError):
+            return cls()
+        sound = isinstance(found.bundle, str) and type(found.failed) is int and found.failed >= 0
+        return found if sound and isinstance(found.given_up, str | None) else cls()
+
+    def write(self, folder: Path) -> None:
+        """Replace the count in ``folder``. Raises WorkError("cannot-write" or "no-space")."""
+        write_atomically(folder / STARTS, json.dumps(asdict(self)).encode())
+
+
+class CountedStart:
+    """One start of the player with the installed bundle; ``file`` is the bundle that it is to play.
+
+    Making it counts the start, and goes back to the previous bundle if three starts before it failed. ``tell`` gets
+    a sentence for the log when that happens, and when the count can not be kept.
+    """
+
+    def __init__(self, folder: Path, tell: Callable[[str], None]) -> None:
+        self._folder, self._tell = folder, tell
+        self._writing: threading.Thread | None = None
+        before, now = Starts.read(folder), current(folder)
+        name = "" if now is None else now.name
+        starts = before if before.bundle == name else Starts(name, 0, before.given_up)
+        earlier = previous(folder)
+        failing = now is None or starts.failed >= MOST_FAILED_STARTS
+        if failing and earlier is not None and earlier.name not in (name, starts.given_up):
+            why = f"{starts.failed} starts with the bundle {name} showed no picture" if name else "The bundle is gone"
+            tell(f"{why}; {earlier.name} plays again.")
+            self._kept(lambda: rollback(folder))
+            now, starts = earlier, Starts(earlier.name, 0, name or None)
+        self.file = folder / CURRENT if now is None else now
+        self._starts = replace(starts, failed=starts.failed + 1)
+        if now is not None:
+            self._kept(lambda: self._starts.write(folder))
+
+    def shown(self) -> None:
+        """The bundle's first picture is on the outputs: the start did not fail. Returns at once."""
+        # In a thread: the loop that presents pictures must not wait for a disk.
+        self._writing = threading.Thread(target=self._record, args=(0,), name="start-counter")
+        self._writing.start()
+
+    def ended(self) -> None:
+        """The player ends because it was asked to: if no picture came, that was no fault of the bundle."""
+        if self._writing is None:
+            self._record(self._starts.failed - 1)
+        else:
+            self._writing.join()
+
+    def _record(self, failed: int) -> None:
+        name = self._starts.bundle
+        # An installation since then has begun a count of its own.
+        if Starts.read(self._folder).bundle != name:
+            return
+        given_up = None if failed == 0 and self._starts.given_up == name else self._starts.given_up
+        self._kept(lambda: Starts(name, failed, given_up).write(self._folder))
+
+    def _kept(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except (VelaturaError, OSError) as error:
+            self._tell(f"The count of starts could not be kept: {error}")

@@ -1,0 +1,1 @@
+"""Commands, by groups; each is thin: it parses, calls one function elsewhere, and shows what that returns."""
