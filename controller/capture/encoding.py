@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import prange
 
 from controller.arrays import ByteImage, Float64, FloatImage
 from controller.compiled import compiled
@@ -27,6 +28,14 @@ def encode_frame(linear: FloatImage, response: Float64, *, dither: bool = True) 
             what=f"A frame must be (rows, columns, 3); this one is {linear.shape}.",
             remedy="Give one linear RGB image of the projector's size.",
         )
+    table = checked_response(response)
+    device = np.empty(linear.shape, np.uint8)
+    _quantise(np.ascontiguousarray(linear, dtype=np.float32), table, dither, device)
+    return device
+
+
+def checked_response(response: Float64) -> FloatImage:
+    """The table (3, 256) as the kernels take it. Raises UsageError("response-not-rising")."""
     table = np.ascontiguousarray(response, dtype=np.float32)
     if table.shape != (3, 256) or not np.all(np.isfinite(table)) or np.any(np.diff(table, axis=1) < 0):
         raise UsageError(
@@ -34,9 +43,7 @@ def encode_frame(linear: FloatImage, response: Float64, *, dither: bool = True) 
             what="The projector's response table is not 3 rows of 256 rising values.",
             remedy="Measure the projector's response again.",
         )
-    device = np.empty(linear.shape, np.uint8)
-    _quantise(np.ascontiguousarray(linear, dtype=np.float32), table, dither, device)
-    return device
+    return table
 
 
 def device_flat(level: tuple[int, int, int], size_px: tuple[int, int]) -> ByteImage:
@@ -57,26 +64,34 @@ def _nearest(table: FloatImage, light: float) -> int:
 
 
 @compiled()
+def _quantise_row(
+    wanted: FloatImage, table: FloatImage, step: int, dither: bool, here: FloatImage, below: FloatImage, row: ByteImage
+) -> None:
+    """One row of one channel; ``here`` and ``below`` hold the errors passed on to this row and the next."""
+    columns = wanted.size
+    for index in range(columns):
+        column = index if step == 1 else columns - 1 - index
+        value = wanted[column]
+        value = min(max(value, np.float32(0)), np.float32(1)) if value >= 0 else np.float32(0)  # NaN is not
+        light = value + here[column + 1]
+        nearest = _nearest(table, light)
+        row[column] = nearest
+        if dither and 0.0 < value < 1.0:
+            error = light - table[nearest]
+            here[column + 1 + step] += error * np.float32(7 / 16)
+            below[column + 1 - step] += error * np.float32(3 / 16)
+            below[column + 1] += error * np.float32(5 / 16)
+            below[column + 1 + step] += error * np.float32(1 / 16)
+
+
+@compiled(parallel=True)
 def _quantise(linear: FloatImage, response: FloatImage, dither: bool, device: ByteImage) -> None:
     rows, columns, channels = linear.shape
-    for channel in range(channels):
-        table = response[channel]
+    for channel in prange(channels):
         # one column more at both sides takes the errors that fall off the frame
-        here, below = np.zeros(columns + 2, np.float32), np.zeros(columns + 2, np.float32)
-        for row in range(rows):
-            step = 1 if row % 2 == 0 else -1
-            for index in range(columns):
-                column = index if step == 1 else columns - 1 - index
-                wanted = linear[row, column, channel]
-                wanted = min(max(wanted, 0.0), 1.0) if wanted == wanted else 0.0  # noqa: PLR0124  (NaN)
-                light = wanted + here[column + 1]
-                value = _nearest(table, light)
-                device[row, column, channel] = value
-                if dither and 0.0 < wanted < 1.0:
-                    error = light - table[value]
-                    here[column + 1 + step] += error * (7 / 16)
-                    below[column + 1 - step] += error * (3 / 16)
-                    below[column + 1] += error * (5 / 16)
-                    below[column + 1 + step] += error * (1 / 16)
-            here, below = below, here
+        errors = np.zeros((2, columns + 2), np.float32)
+        for y in range(rows):
+            step = 1 if y % 2 == 0 else -1
+            here, below = errors[y % 2], errors[1 - y % 2]
             below[:] = 0
+            _quantise_row(linear[y, :, channel], response[channel], step, dither, here, below, device[y, :, channel])

@@ -16,8 +16,8 @@ from numba import prange
 
 from controller.arrays import ByteImage, Float64, FloatImage
 from controller.calibrate.values import Radiometry
+from controller.capture.encoding import checked_response, encode_frame
 from controller.compiled import compiled
-from controller.errors import UsageError
 
 Method = Literal["blue-noise", "diffusion", "nearest"]
 TILE: Final = 64
@@ -29,22 +29,13 @@ def to_device(
     """Device values (rows, columns, 3) uint8 of linear light (rows, columns, 3) in [0, 1]; beyond that it is clipped.
 
     ``phase``: where in the blue-noise tile this projector begins; superimposed projectors should differ in it.
-    Raises UsageError("response-unusable") when the response does not rise.
+    Raises UsageError("response-not-rising", "frame-shape-wrong").
     """
-    light = radiometry.response.astype(np.float32)
-    if light.shape != (3, 256) or not np.isfinite(light).all() or (np.diff(light, axis=1) < 0).any():
-        raise UsageError(
-            "response-unusable",
-            what="A projector's response does not rise from black to white.",
-            remedy="Calibrate the stage again.",
-        )
+    if method != "blue-noise":
+        return encode_frame(frame, radiometry.response, dither=method == "diffusion")
+    light = checked_response(radiometry.response)
     out = np.empty(frame.shape, np.uint8)
-    source = np.ascontiguousarray(frame, np.float32)
-    if method == "diffusion":
-        _diffuse(source, light, out)
-    else:
-        noise = blue_noise() if method == "blue-noise" else np.full((TILE, TILE), 0.5, np.float32)
-        _threshold(source, light, noise, phase[0], phase[1], out)
+    _threshold(np.ascontiguousarray(frame, np.float32), light, blue_noise(), phase[0], phase[1], out)
     return out
 
 
@@ -130,26 +121,3 @@ def _threshold(frame: FloatImage, light: FloatImage, noise: FloatImage, down: in
                 # Channels read the tile at different places, or colours would speckle together as grey does.
                 limit = noise[(y + down + 21 * c) % TILE, (x + along + 43 * c) % TILE]
                 out[y, x, c] = i + 1 if part > limit else i
-
-
-@compiled(parallel=True)
-def _diffuse(frame: FloatImage, light: FloatImage, out: ByteImage) -> None:
-    rows, columns, _ = frame.shape
-    for c in prange(3):
-        here, below = np.zeros(columns + 2, np.float32), np.zeros(columns + 2, np.float32)
-        for y in range(rows):
-            below[:] = 0
-            step = 1 if y % 2 == 0 else -1
-            for k in range(columns):
-                x = k if step == 1 else columns - 1 - k
-                value = min(max(frame[y, x, c] + here[x + 1], light[c, 0]), light[c, 255])
-                i = _below(light[c], value)
-                if value - light[c, i] > light[c, i + 1] - value:
-                    i += 1
-                out[y, x, c] = i
-                error = value - light[c, i]
-                here[x + 1 + step] += error * np.float32(7 / 16)
-                below[x + 1 - step] += error * np.float32(3 / 16)
-                below[x + 1] += error * np.float32(5 / 16)
-                below[x + 1 + step] += error * np.float32(1 / 16)
-            here, below = below, here

@@ -59,7 +59,7 @@ def test_blue_noise_holds_each_threshold_once_and_little_low_frequency() -> None
 def test_a_response_that_falls_is_refused() -> None:
     with pytest.raises(UsageError) as refused:
         to_device(np.zeros((2, 2, 3), np.float32), Radiometry(1 - GAMMA.response, np.eye(3)))
-    assert refused.value.code == "response-unusable"
+    assert refused.value.code == "response-not-rising"
 
 
 def test_a_response_that_is_flat_at_its_ends_still_works() -> None:
