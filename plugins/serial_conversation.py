@@ -93,7 +93,9 @@ class SerialConversation:
         settled = False
         for attempt in (1, 2):
             try:
-                if not settled:
+                if settled:
+                    self._clear(self._connected(deadline))  # half an answer must not grow together with the next
+                else:
                     self._settle(deadline)
                     settled = True
                 self._say(query_bytes(self._table, query, self._address), deadline)
@@ -154,6 +156,10 @@ class SerialConversation:
             if (line := self._line(link, late)) is not None and not self._swallow(line):
                 self._owed -= 1
         self._owed = 0
+        self._clear(link)
+
+    def _clear(self, link: ByteLink) -> None:
+        """Take off the link whatever has arrived; what was told unasked is passed on."""
         left = link.drain()
         for line in left.split(self._table.terminator) if self._table.terminator else ():
             self._swallow(line)

@@ -53,19 +53,36 @@ class SerialProjector:
         self._view = PowerView(profile.lamp, _told_powers(table))
         self._lock = threading.Lock()
         self._transcript = transcript
+        self._open_link = open_link
+        self._opened_at_s = time.monotonic()
+        self._answered = False
         self._talk = SerialConversation(
-            open_link,
+            self._opened,
             name=name,
             profile=profile,
             table=table,
             address=_checked_address(table, address),
             notice=self._noticed,
-            slow=lambda: self._view.in_transition(time.monotonic()),
+            slow=self._may_be_starting,
         )
 
     def open(self, deadline: Deadline) -> None:
         """Open the port; asks nothing, because a projector that boots must not be disturbed."""
         self._talk.open(deadline)
+
+    def _opened(self, deadline: Deadline) -> ByteLink:
+        link = self._open_link(deadline)
+        self._opened_at_s, self._answered = time.monotonic(), False
+        return link
+
+    def _may_be_starting(self) -> bool:
+        """Whether it must be asked seldom: it starts or cools, or may do so for all that was seen since the opening."""
+        now_s = time.monotonic()
+        if self._view.in_transition(now_s):
+            return True
+        if Power.WARMING in _told_powers(self._table):
+            return not self._answered
+        return now_s - self._opened_at_s < self._profile.lamp.warm_up_s
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
@@ -148,6 +165,7 @@ class SerialProjector:
             if busy.code != COOLS:
                 raise
             answer = Power.COOLING
+        self._answered = True
         return self._view.answered(answer, time.monotonic())
 
     def _power_untold(self, deadline: Deadline) -> Power:

@@ -21,6 +21,7 @@ from plugins.emulated.objects import load_object
 from plugins.emulated.ptp_body import CameraNames
 from plugins.emulated.ptp_camera import EmulatedPtpCamera
 from plugins.emulated.quick_profile import quick_profile
+from plugins.emulated.scenario import ScenarioPlayer, read_scenario
 from plugins.emulated.serial_projector import EmulatedSerialProjector
 from plugins.emulated.staging import FAST_LAMP, FAST_PROFILE, device_tables, random_truth, size_named
 from plugins.emulated.truth import FOLDER, ObjectTruth, read_truth, write_truth
@@ -116,6 +117,7 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
     """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
     truth = read_truth(stage)
     _require_free(truth.camera.command_port, truth.camera.event_port)
+    scenario = read_scenario(stage / truth.scenario) if truth.scenario else None
     lamps = [EmulatedLamp(LampTiming(p.lamp.warm_up_s, p.lamp.cool_down_s)) for p in truth.projectors]
 
     def progress(share: float) -> None:
@@ -128,6 +130,8 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
     world.warm()
     for projector, lamp in zip(truth.projectors, lamps, strict=True):
         wire = EmulatedSerialProjector(stage / projector.port, lamp)
+        if scenario is not None:
+            wire.scenario = ScenarioPlayer(scenario, device=projector.name, faults=wire.faults, lamp=lamp, plug=wire)
         stack.enter_context(wire)
         out.served(projector.name, "projector", str(wire.port))
     # The world spends the exposure time itself, since it must know what is visible meanwhile.

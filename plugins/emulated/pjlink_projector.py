@@ -21,6 +21,7 @@ from typing import Final
 from hal.errors import DeviceError
 from plugins.emulated.faults import Faults
 from plugins.emulated.lamp import EmulatedLamp, LampPhase
+from plugins.emulated.scenario import ScenarioPlayer
 
 _CR: Final = b"\r"
 _LONGEST: Final = 200
@@ -128,7 +129,8 @@ class EmulatedPjLinkProjector:
     idle_s : seconds after which an idle connection is closed (the specification says 30)
     chatty : it tells that it came up before it answers, and pads with NUL, as users report of some
 
-    ``faults`` are its knobs; ``silent`` and ``slow_s`` hold for the greeting too.
+    ``faults`` are its knobs, ``scenario`` a script that turns them at what it hears; ``silent`` and ``slow_s`` hold for
+    the greeting too.
     """
 
     def __init__(
@@ -144,6 +146,7 @@ class EmulatedPjLinkProjector:
     ) -> None:
         self.lamp = lamp
         self.faults = Faults()
+        self.scenario: ScenarioPlayer | None = None
         self._board = PjLinkBoard(lamp, name)
         self._board_lock = threading.Lock()
         self._wanted_port = port
@@ -220,6 +223,9 @@ class EmulatedPjLinkProjector:
             proof = None if salt is None else hashlib.md5(f"{salt}{self._password}".encode(), usedforsecurity=False)
             expected = None if proof is None else proof.hexdigest().encode()
             for line in self._lines(client):
+                if self.scenario is not None:
+                    self.scenario.tick()
+                    self.scenario.heard(len(line) + 1)
                 if expected is not None:
                     if not hmac.compare_digest(line[:32].lower(), expected):
                         self._send(client, b"PJLINK ERRA\r")

@@ -154,6 +154,8 @@ class EmulatedSerialProjector:
 
     def _run(self) -> None:
         while not self._stop.is_set():
+            if self.scenario is not None:
+                self.scenario.tick()
             with self._lock:
                 master = self._master
             if master is None:
@@ -167,8 +169,6 @@ class EmulatedSerialProjector:
 
     def _turn(self, master: int) -> None:
         readable, _, _ = select.select([master], [], [], _TICK_S)
-        if self.scenario is not None:
-            self.scenario.tick()
         if readable:
             self._hear(os.read(master, 4096))
         for notice in self._board.notices():

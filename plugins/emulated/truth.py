@@ -139,7 +139,10 @@ class ObjectTruth:
 
 @dataclass(frozen=True, slots=True)
 class BenchTruth:
-    """A whole emulated stage. ``subsamples``: S x S rays a camera pixel; ``time_scale``: emulated / real duration."""
+    """A whole emulated stage. ``subsamples``: S x S rays a camera pixel; ``time_scale``: emulated / real duration;
+
+    ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder.
+    """
 
     size: str
     frames: str
@@ -151,6 +154,7 @@ class BenchTruth:
     object: ObjectTruth
     camera: CameraTruth
     projectors: tuple[ProjectorTruth, ...]
+    scenario: str = ""
 
 
 def write_truth(stage: Path, truth: BenchTruth) -> None:

@@ -60,17 +60,18 @@ OpenPjLink = Callable[..., PjLinkPair]
 def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
     """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator.
 
-    ``profile`` is a shipped one, ``edit`` changes its text, ``board`` makes another board than the profile's.
+    ``profile`` is a shipped one, ``edit`` changes its text, ``timing`` is its lamp's, ``board`` makes another board than the profile's.
     """
     opened: list[SerialPair] = []
 
     def make(*, settings: dict[str, Any] | None = None, **kwargs: Any) -> SerialPair:
-        lamp = kwargs.pop("lamp", None) or EmulatedLamp(LAMP)
+        timing = kwargs.pop("timing", LAMP)
+        lamp = kwargs.pop("lamp", None) or EmulatedLamp(timing)
         profile = kwargs.pop("profile", "optoma-later")
         edit = kwargs.pop("edit", lambda text: text)
         if (board := kwargs.pop("board", BOARDS.get(profile))) is not None:
             kwargs["board"] = board(lamp)
-        (tmp_path / "quick.toml").write_text(edit(quick_profile(LAMP, base=profile)))
+        (tmp_path / "quick.toml").write_text(edit(quick_profile(timing, base=profile)))
         table_read = load_profile("quick.toml", tmp_path).serial
         assert table_read is not None
         emulator = EmulatedSerialProjector(tmp_path / "run" / "tty-left", lamp, baud=table_read.baud, **kwargs)
