@@ -21,6 +21,7 @@ import typer
 from controller import console
 from controller.commands import bundle as bundle_commands
 from controller.commands.keys import keys
+from controller.commands.report import report
 from controller.commands.running import Json, StageFolder, group, work
 from controller.errors import UsageError, VelaturaError
 
@@ -107,7 +108,16 @@ def play(
     work("controller.services:play", as_json=as_json, stage=stage, name=name, seconds=seconds or None)
 
 
-COMMANDS: Final[tuple[Callable[..., Any], ...]] = (demo, calibrate, appearance, play, keys, emulate, states)
+COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
+    demo,
+    calibrate,
+    appearance,
+    play,
+    keys,
+    emulate,
+    report,
+    states,
+)
 """Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
 
 GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {

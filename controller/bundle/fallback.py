@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Self
 
-from controller.bundle.install import CURRENT, STARTS, current, previous, rollback
+from controller.bundle.install import CURRENT, STARTS, current, previous, switch_back
 from controller.errors import VelaturaError
 from controller.storage import write_atomically
 
@@ -68,12 +68,14 @@ class CountedStart:
         if failing and earlier is not None and earlier.name not in (name, starts.given_up):
             why = f"{starts.failed} starts with the bundle {name} showed no picture" if name else "The bundle is gone"
             tell(f"{why}; {earlier.name} plays again.")
-            self._kept(lambda: rollback(folder))
             now, starts = earlier, Starts(earlier.name, 0, name or None)
         self.file = folder / CURRENT if now is None else now
         self._starts = replace(starts, failed=starts.failed + 1)
         if now is not None:
             self._kept(lambda: self._starts.write(folder))
+        # After the count, which says what was given up: otherwise a power cut here lets two bad bundles take turns.
+        if now is not None and now.name != name:
+            self._kept(lambda: switch_back(folder, away_from=folder / name if name else None))
 
     def shown(self) -> None:
         """The bundle's first picture is on the outputs: the start did not fail. Returns at once."""

@@ -71,15 +71,22 @@ def install(
 def rollback(folder: Path) -> Path:
     """Make the previous bundle current again, and the current one previous; return the file that is now current.
 
-    Raises BundleError("bundle-no-previous").
+    It gets its starts again (``fallback``). Raises BundleError("bundle-no-previous").
     """
+    (folder / STARTS).unlink(missing_ok=True)
+    return switch_back(folder)
+
+
+def switch_back(folder: Path, *, away_from: Path | None = None) -> Path:
+    """As ``rollback``, but the count of starts stays; nothing changes if another than ``away_from`` is current."""
     if not folder.is_dir():
         raise _no_previous()
     with exclusive(folder / _LOCK, what_is_running="Another installation"):
         now, before = current(folder), previous(folder)
         if before is None or before == now:
             raise _no_previous()
-        (folder / STARTS).unlink(missing_ok=True)
+        if now is not None and away_from not in (None, now):
+            return now
         _link(folder, CURRENT, before)
         if now is not None:
             _link(folder, PREVIOUS, now)

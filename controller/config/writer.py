@@ -15,7 +15,7 @@ _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
 _ESCAPES: Final = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 _HEADING: Final = """\
 # A Velatura stage: the devices, the object and the options that a technician knows.
-# Relative paths start at this file's folder. `velatura doctor` checks it.
+# Relative paths start at this file's folder. Every command checks it first, and names the line of a mistake.
 """
 
 

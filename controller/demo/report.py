@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from controller.app import Checked
+from controller.app import Checked, check_stage
 from controller.arrays import FloatImage, Mask, load_arrays
 from controller.calibrate.values import Calibration
+from controller.errors import UsageError
 from controller.report.page import Goal, Page, Picture, Row, write_report
 from controller.report.pictures import Crop, crop_around, error_picture, fitted, to_screen
 from controller.session.calibrating import read_calibration
@@ -53,6 +54,32 @@ def write_demo_report(out: Path, run: Path, checked: Checked) -> tuple[Path, Pat
         steps, shots = journal.steps(), journal.shot_count()
     figures = _figures(run, checked.names, judged, steps, shots)
     return write_report(out, _page(checked, calibration, judged, figures, steps), figures)
+
+
+def report_again(run: Path, out: Path) -> Mapping[str, str]:
+    """Write the report of the finished demo run in the folder ``run``, STAGE/runs/NAME, into ``out``.
+
+    Raises UsageError("run-not-a-demo" or "run-not-finished"), and as ``check_stage`` for the stage that it lies in.
+    """
+    if not (run / Journal.FILE).exists():
+        raise UsageError(
+            "run-not-a-demo",
+            what=f"{run} is not the folder of a run.",
+            remedy="Give a folder of STAGE/runs whose name ends in -demo.",
+        )
+    checked = check_stage(run.resolve().parent.parent)
+    with Journal(run) as journal:
+        done = ("demo", "done") in journal.outcomes()
+    kinds = ("appearance", "photograph", "traditional")
+    names = [table.name for table in checked.stage.tables.appearances]
+    if not done or not all((run / f"{kind}-{name}.npz").exists() for kind in kinds for name in names):
+        raise UsageError(
+            "run-not-finished",
+            what=f"{run} is no demo that has photographed every appearance of stage.toml.",
+            remedy="Run `velatura demo` with the same --out again: it goes on and writes the report.",
+        )
+    html, figures = write_demo_report(out, run, checked)
+    return {"report": str(html), "figures": str(figures)}
 
 
 def _judge(run: Path, name: str, calibration: Calibration, projectors: Sequence[str]) -> Judged:

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from nacl.signing import SigningKey
 
+from controller.bundle.format import Index
 from controller.bundle.install import current, install, rollback
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.errors import BundleError
-
-
-class PowerCut(BaseException):
-    """Not an Exception: nothing may catch it and go on."""
 
 
 def made(path: Path, value: int, revision: int = 0, key: SigningKey | None = None) -> Path:
@@ -93,36 +87,44 @@ def test_unsound_foreign_and_older_bundles_change_nothing(tmp_path: Path) -> Non
         assert len(list(folder.glob("*.vel"))) == 1
 
 
-def test_a_power_cut_before_any_durable_step_leaves_the_old_or_the_new(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cuts = 0
-    for moment in range(50):
-        folder = tmp_path / f"bundles-{moment}"
-        install(made(tmp_path / "old.vel", 1), folder, allow_unsigned=True)
-        new = made(tmp_path / "new.vel", 2)
-        with monkeypatch.context() as patch:
-            countdown = iter(range(moment))
-            for owner, name in ((os, "fsync"), (Path, "replace"), (Path, "symlink_to"), (Path, "unlink")):
-                patch.setattr(owner, name, cutting(getattr(owner, name), countdown))
-            try:
-                install(new, folder, allow_unsigned=True)
-            except PowerCut:
-                cuts += 1
-        assert plays(folder) in (1, 2)
-        install(new, folder, allow_unsigned=True)
-        assert plays(folder) == 2
-        rollback(folder)
-        assert plays(folder) == 1
-        if cuts <= moment:
-            break
-    assert 8 < cuts < 50
+def test_a_revoked_key_is_refused_though_it_is_trusted_too(tmp_path: Path) -> None:
+    folder, key = tmp_path / "bundles", SigningKey(bytes(32))
+    public = bytes(key.verify_key)
+    bundle = made(tmp_path / "b.vel", 1, 7, key)
+    for how in ({"trusted": [public]}, {"allow_unsigned": True}):
+        with pytest.raises(BundleError) as caught:
+            install(bundle, folder, revoked=[public], **how)
+        assert caught.value.code == "bundle-revoked"
+    assert current(folder) is None
+    install(bundle, folder, trusted=[public])
 
 
-def cutting(real: Any, countdown: Iterator[int]) -> Any:
-    def step(*arguments: Any, **options: Any) -> Any:
-        if next(countdown, None) is None:
-            raise PowerCut
-        return real(*arguments, **options)
+def test_a_revision_may_not_go_down_even_after_a_rollback(tmp_path: Path) -> None:
+    folder = tmp_path / "bundles"
+    for value, revision in ((1, 3), (2, 5)):
+        install(made(tmp_path / f"{value}.vel", value, revision), folder, allow_unsigned=True)
+    rollback(folder)
+    with pytest.raises(BundleError, match="revision 5 is installed"):
+        install(made(tmp_path / "b.vel", 3, 4), folder, allow_unsigned=True)
+    install(tmp_path / "1.vel", folder, allow_unsigned=True)  # what is current already
+    assert plays(folder) == 1
 
-    return step
+
+def test_a_stolen_key_once_revoked_keeps_no_sound_bundle_out(tmp_path: Path) -> None:
+    folder, ours, stolen = tmp_path / "bundles", SigningKey(bytes(32)), SigningKey(bytes([1] * 32))
+    keys = [bytes(ours.verify_key), bytes(stolen.verify_key)]
+    install(made(tmp_path / "b.vel", 1, 2**53 - 1, stolen), folder, trusted=keys)
+    install(made(tmp_path / "b.vel", 2, 1, ours), folder, trusted=keys, revoked=keys[1:])
+    assert plays(folder) == 2
+
+
+def test_a_sound_bundle_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    def accept(index: Index) -> None:
+        raise BundleError("bundle-other-stage", what=index.stage, remedy="")
+
+    folder = tmp_path / "bundles"
+    install(made(tmp_path / "b.vel", 1), folder, allow_unsigned=True)
+    with pytest.raises(BundleError) as caught:
+        install(made(tmp_path / "b.vel", 2), folder, allow_unsigned=True, accept=accept)
+    assert caught.value.code == "bundle-other-stage"
+    assert plays(folder) == 1
