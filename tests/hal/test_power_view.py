@@ -118,3 +118,16 @@ def test_an_off_lamp_never_reads_as_burning_and_never_as_cold_right_after_light(
             assert power is not Power.ON
             if not standby and now_s - lit_at_s < 1.0 and step == "ask0":
                 assert power in (Power.COOLING, Power.WARMING)
+
+
+def test_a_family_that_names_its_states_is_believed() -> None:
+    view = PowerView(RULES, frozenset({Power.WARMING, Power.COOLING}))
+    view.switched_on(0.0)
+    assert view.answered(Power.WARMING, 1.0) is Power.WARMING
+    assert view.in_transition(1.0)
+    assert view.answered(Power.ON, 20.0) is Power.ON, "its own word counts, though warm_up_s is not over"
+    assert not view.in_transition(20.0)
+    view.switched_off(30.0)
+    assert view.answered(Power.COOLING, 31.0) is Power.COOLING
+    assert view.answered(Power.OFF, 60.0) is Power.OFF
+    assert not view.in_transition(60.0)

@@ -23,6 +23,50 @@ def test_every_shipped_profile_is_sound_and_bears_its_file_name(path: Path) -> N
     assert profile.source
 
 
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_a_profile_is_all_that_a_family_needs_and_short(path: Path) -> None:
+    assert len(path.read_text().splitlines()) < 60
+
+
+def test_codes_that_nobody_knows_may_be_left_out_only_when_it_is_said() -> None:
+    text = (FOLDER / "optoma-ep910.toml").read_text()
+    profile = parse_profile(text)
+    assert profile.unknown == ("power_on", "power_off", "power", "lamp_hours")
+    silent = "\n".join(line for line in text.splitlines() if not line.startswith("unknown"))
+    with pytest.raises(ProtocolError, match=r"commands.power_on: it is missing"):
+        parse_profile(silent)
+
+
+FAMILY_WRONG = [
+    ("nec", 'count = "byte"', 'count = "word"', "frame.count"),
+    ("nec", "overhead = 6", "overhead = 3", "frame.overhead"),
+    ("nec", 'checksum = "sum"', 'checksum = "crc"', "frame.checksum"),
+    ("nec", '"02 00 00 00 00 02"', '"02 00 00 00 00 0"', "commands.power_on"),
+    ("nec", '"02 00 00 00 00 02"', '"02 00 00 ? 00 02"', "commands.power_on"),
+    ("nec", 'unit = "seconds"', 'unit = "fortnights"', "queries.lamp_hours.unit"),
+    ("nec", 'notation = "hex"', 'notation = "octal"', "serial.notation"),
+    ("nec", '"22 00 ?*3"', '"22 00 ?*0"', "replies.accepted"),
+    ("optoma-ep910", '"power_on", ', '"model", ', "profile.unknown"),
+    ("optoma-ep910", "shutter_close =", 'power_on = "IR03001"\nshutter_close =', "commands.power_on"),
+    ("benq", "echo = true", 'echo = "yes"', "quirks.echo"),
+    ("benq", 'prompt = ">"', 'promt = ">"', "quirks.promt"),
+    ("panasonic", "[queries.lamp_hours]", '[queries.lamp_hours]\nreads = "big-endian"', "queries.lamp_hours.reads"),
+    ("christie", '"(PWR{any}"', '"(PWR{all}"', "replies.accepted"),
+    ("epson-escvp21", 'terminator = ":"', "", "serial.terminator"),
+]
+
+
+@pytest.mark.parametrize(("name", "right", "wrong", "key"), FAMILY_WRONG)
+def test_a_wrong_key_of_a_family_is_named_with_its_line(name: str, right: str, wrong: str, key: str) -> None:
+    text = (FOLDER / f"{name}.toml").read_text()
+    assert right in text
+    with pytest.raises(ProtocolError) as caught:
+        parse_profile(text.replace(right, wrong, 1), file="mine.toml")
+    assert caught.value.code == "profile-wrong"
+    assert key in caught.value.what
+    assert "mine.toml, line " in caught.value.what
+
+
 def test_the_optoma_table_says_what_the_manual_says() -> None:
     table = parse_profile(OPTOMA).serial
     assert table is not None
@@ -97,12 +141,13 @@ def test_no_text_ends_in_anything_but_a_protocol_error(text: str) -> None:
         parse_profile(text)
 
 
+TEXTS = [path.read_text() for path in sorted(FOLDER.glob("*.toml"))]
 SCALARS = st.one_of(st.booleans(), st.integers(), st.floats(), st.text(max_size=8))
 
 
 @given(st.data())
 def test_a_profile_with_any_line_changed_is_sound_or_a_protocol_error(data: st.DataObject) -> None:
-    lines = OPTOMA.splitlines()
+    lines = data.draw(st.sampled_from(TEXTS)).splitlines()
     index = data.draw(st.integers(0, len(lines) - 1))
     change = data.draw(st.sampled_from(["drop", "twice", "value", "text"]))
     if change == "drop":
