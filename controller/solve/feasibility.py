@@ -77,7 +77,8 @@ def choose_exposure(
     mask = drive.mask
     per_exposure, at_none = drive.of(target)[mask].astype(np.float64), drive.of(-black)[mask].astype(np.float64)
     room = np.full_like(per_exposure, np.inf)
-    largest = np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 0).min(axis=1)
+    # less than this needs no light worth counting, and its quotient would only overflow
+    largest = np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 1e-12).min(axis=1)
     largest.sort()
     # The pixel that bounds the exposure: at most (1 - share) of all pixels may need less.
     bound = int(np.floor((1 - share) * largest.size))
