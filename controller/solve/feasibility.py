@@ -76,6 +76,8 @@ def choose_exposure(
     drive = Drive(transport) if drive is None else drive
     mask = drive.mask
     per_exposure, at_none = drive.of(target)[mask].astype(np.float64), drive.of(-black)[mask].astype(np.float64)
+    possible = np.isfinite(per_exposure).all(axis=1) & np.isfinite(at_none).all(axis=1)
+    per_exposure, at_none = per_exposure[possible], at_none[possible]
     room = np.full_like(per_exposure, np.inf)
     # less than this needs no light worth counting, and its quotient would only overflow
     largest = np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 1e-12).min(axis=1)

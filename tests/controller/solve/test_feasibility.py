@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -101,3 +102,17 @@ def test_a_share_outside_zero_to_one_is_refused(stage: Stage) -> None:
     with pytest.raises(UsageError) as refused:
         choose_exposure(LightTransport.build(calibration), calibration.black, calibration.black, share=0)
     assert refused.value.code == "share-out-of-range"
+
+
+def test_pixels_without_light_in_a_channel_do_not_bear_on_the_exposure(stage: Stage) -> None:
+    calibration = stage()
+    dark = [dataclasses.replace(p, white=p.white.copy()) for p in calibration.projectors]
+    for part in dark:
+        part.white[10:20, 10:20, 2] = 0
+    transport = LightTransport.build(dataclasses.replace(calibration, projectors=tuple(dark)))
+    target = np.full((*transport.shape, 3), 0.5, np.float32)
+    exposure = choose_exposure(transport, target, calibration.black)
+    found = feasibility(transport, target_radiance(target, calibration.black, exposure), calibration.black)
+    assert 0 < exposure < np.inf
+    assert not found.reachable[10:20, 10:20].any()
+    assert found.share > 0.9
