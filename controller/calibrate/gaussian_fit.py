@@ -2,7 +2,7 @@
 
 The paper's six numbers (amplitude, centre, orientation, two sigmas) are looked for as amplitude, centre and a
 triangular root L of the inverse covariance: the same ellipses, but never an invalid one, and no angle that means
-nothing in a circle. Each camera pixel counts by its white light: the quotient's noise is the larger, the darker it is there.
+nothing in a circle. Each camera pixel counts by its white light: where it is dark, the quotient is mostly noise.
 """
 
 from __future__ import annotations

@@ -50,8 +50,13 @@ class Solution:
 
 
 @dataclass(frozen=True, slots=True)
-class _Problem:
-    """Data of one solve on planes; smoothness is already scaled by its strength."""
+class Problem:
+    """Data of one solve on planes; smoothness is already scaled by its strength.
+
+    ``wanted`` (3, camera rows, columns): target less black; ``weights`` (camera rows, columns): 0 off the object;
+    ``across``, ``down``, ``majoriser`` (3, pixels of all projectors): squared smoothness weights to the right and lower
+    neighbour, and the diagonal that bounds the Hessian, 0 where a pixel lights nothing
+    """
 
     transport: LightTransport
     wanted: FloatImage
@@ -109,9 +114,9 @@ def solve_bounded(
     """
     began = time.perf_counter()
     check_target(transport, target)
-    problem = _pose(transport, target, black, smoothness, weights)
+    problem = pose(transport, target, black, smoothness, weights)
     if start is None:
-        x = _first_guess(problem)
+        x = first_guess(problem)
     else:
         x = np.clip(frame_planes(start), 0, 1)
         if x.shape != problem.majoriser.shape:
@@ -119,7 +124,7 @@ def solve_bounded(
     x[problem.majoriser == 0] = 0
     x, kkt, iterations = _descend(problem, x, tolerance, most_iterations, progress, cancelled)
     light = transport.forward_planes(x)
-    objective = weighted_residual(light, problem.wanted, problem.weights, np.empty_like(light)) + _roughness(problem, x)
+    objective = weighted_residual(light, problem.wanted, problem.weights, np.empty_like(light)) + roughness(problem, x)
     frames = tuple(plane_frames(x, transport.sizes))
     seconds = time.perf_counter() - began
     return Solution(frames, plane_image(light), objective, kkt, iterations, seconds, kkt <= tolerance)
@@ -129,9 +134,10 @@ def _wrong(what: str) -> UsageError:
     return UsageError("solve-arguments", what=f"The solve can't start: {what}.", remedy="Correct it and solve again.")
 
 
-def _pose(
+def pose(
     transport: LightTransport, target: FloatImage, black: FloatImage, smoothness: float, weights: FloatImage | None
-) -> _Problem:
+) -> Problem:
+    """The equations of a solve, checked; the parameters are those of ``solve_bounded``."""
     if black.shape != target.shape or not np.isfinite(black).all():
         raise _wrong("the black image is not finite or not of the target's size")
     if not 0 <= smoothness < np.inf:
@@ -152,7 +158,7 @@ def _pose(
     for n in range(len(transport.sizes)):
         lit = active[:, transport.span(n)].reshape(3, *transport.sizes[n])
         _tie(lit, *(_frame_view(transport, n, planes) for planes in (across, down, diagonal)))
-    return _Problem(transport, wanted, counted, across, down, diagonal)
+    return Problem(transport, wanted, counted, across, down, diagonal)
 
 
 def _frame_view(transport: LightTransport, n: int, planes: FloatImage) -> FloatImage:
@@ -168,7 +174,7 @@ def _tie(active: Mask, across: FloatImage, down: FloatImage, diagonal: FloatImag
     diagonal[:, 1:] += 2 * down[:, :-1]
 
 
-def _first_guess(problem: _Problem) -> FloatImage:
+def first_guess(problem: Problem) -> FloatImage:
     """All projectors at the same share of their light: right wherever the target is smooth."""
     reach = problem.transport.reach_planes()
     share = np.divide(problem.wanted, reach, out=np.zeros_like(reach), where=reach > 0)
@@ -176,7 +182,7 @@ def _first_guess(problem: _Problem) -> FloatImage:
 
 
 def _descend(
-    problem: _Problem,
+    problem: Problem,
     x: FloatImage,
     tolerance: float,
     most_iterations: int,
@@ -210,9 +216,7 @@ def _descend(
     return x, kkt, iteration
 
 
-def _step(
-    problem: _Problem, y: FloatImage, x: FloatImage, gradient: FloatImage, new: FloatImage
-) -> tuple[float, float]:
+def _step(problem: Problem, y: FloatImage, x: FloatImage, gradient: FloatImage, new: FloatImage) -> tuple[float, float]:
     squared_step = uphill = 0.0
     for n, (rows, columns) in enumerate(problem.transport.sizes):
         start = int(problem.transport.patches.start[n])
@@ -223,7 +227,8 @@ def _step(
     return squared_step, uphill
 
 
-def _roughness(problem: _Problem, x: FloatImage) -> float:
+def roughness(problem: Problem, x: FloatImage) -> float:
+    """What the smoothness equations add to the objective at ``x`` (3, pixels)."""
     total = 0.0
     for n in range(len(problem.transport.sizes)):
         frame, across, down = (_frame_view(problem.transport, n, v) for v in (x, problem.across, problem.down))
