@@ -88,6 +88,7 @@ def metapixel_errors(truth: Truth, n: int, metapixels: Metapixels) -> dict[str, 
         "centre in focus px": rms(table[sharp, :2]),
         "centre defocused px": rms(table[soft, :2]),
         "centre px": float(np.median(np.hypot(table[:, 0], table[:, 1]))),
+        "judged": float(np.mean(inside)),
         "sigma": rms(table[inside, 2]),
         "sigma bias": float(np.median(table[inside, 2])),
     }

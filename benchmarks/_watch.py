@@ -1,4 +1,4 @@
-"""``python -m benchmarks._watch FILE SECONDS DIGEST...``: another process reads a memory output, looks for mixed sets.
+"""``python -m benchmarks._watch FILE SETS SECONDS DIGEST...``: read a memory output from outside.
 
 Ready when it prints a line; the result is one more line of JSON. DIGEST: of each whole set that may be shown, in hex.
 """
@@ -26,14 +26,14 @@ def digest(frames: Mapping[str, npt.NDArray[np.uint8]]) -> str:
     return found.hexdigest()
 
 
-def main(path: str, seconds: str, *known: str) -> None:
-    """Read whole sets until the time is over; count those that are none of the known ones."""
+def main(path: str, sets: str, seconds: str, *known: str) -> None:
+    """Read so many whole sets, or until the time is over; count those that are none of the known ones."""
     reader, whole = FrameReader(Path(path)), set(known)
     first = last = reader.latest()
     print(json.dumps({"ready": True}), flush=True)
     ends_s = time.monotonic() + float(seconds)
     read = mixed = 0
-    while time.monotonic() < ends_s:
+    while read < int(sets) and time.monotonic() < ends_s:
         found = reader.latest()
         if found is not None and found is not last:
             read += 1
