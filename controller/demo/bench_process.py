@@ -18,7 +18,7 @@ from hal.deadline import Cancelled
 from hal.errors import DeviceError
 
 END_S = 10.0
-STARTS = 3
+STARTS = 2
 TOLD = 400
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import resource
 import signal
 import sqlite3
@@ -13,7 +14,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -23,7 +24,7 @@ from hal.registry import OpenContext, load_drivers
 from hal.values import Power
 
 REPOSITORY = Path(__file__).parents[2]
-LONGEST_S = 500.0
+LONGEST_S = 400.0
 """Far beyond what anything here takes, for machines that do much else meanwhile."""
 Record = dict[str, Any]
 
@@ -52,6 +53,7 @@ class Command:
     def __init__(self, *words: str | Path) -> None:
         self.records: list[Record] = []
         self._seen = threading.Condition()
+        self._ended = False
         self._began_s = time.monotonic()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "controller", *map(str, words), "--json"],
@@ -60,33 +62,40 @@ class Command:
             stderr=subprocess.PIPE,
             text=True,
             cwd=REPOSITORY,
+            env=os.environ | {"PYTHONFAULTHANDLER": "1"},
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
-        for line in self.process.stdout:
+        try:
+            for line in self.process.stdout:
+                with self._seen:
+                    self.records.append({"at_s": time.monotonic() - self._began_s, **json.loads(line)})
+                    self._seen.notify_all()
+        finally:
             with self._seen:
-                self.records.append({"at_s": time.monotonic() - self._began_s, **json.loads(line)})
+                self._ended = True
                 self._seen.notify_all()
-        with self._seen:
-            self._seen.notify_all()
 
-    def wait_for(self, step: str, *, fraction: float = 0.0, timeout_s: float = LONGEST_S) -> None:
+    def wait_for(self, step: str, *, fraction: float = 0.0) -> None:
         """Until a step whose title begins with ``step`` has come that far."""
 
-        def reached() -> bool:
-            return any(
-                record["progress"]["step"].startswith(step) and record["progress"]["step_fraction"] >= fraction
-                for record in self.records
-                if "progress" in record
-            )
+        def reached(record: Record) -> bool:
+            progress = record.get("progress", {"step": "", "step_fraction": 0.0})
+            return bool(progress["step"].startswith(step) and progress["step_fraction"] >= fraction)
 
+        self._wait(reached, step)
+
+    def wait_for_message(self, text: str) -> None:
+        """Until it has said a sentence that begins so."""
+        self._wait(lambda record: str(record.get("message", {}).get("text", "")).startswith(text), text)
+
+    def _wait(self, reached: Callable[[Record], bool], what: str) -> None:
         with self._seen:
-            arrived = self._seen.wait_for(lambda: reached() or not self._reader.is_alive(), timeout_s)
-        assert arrived, f"{step} was not reached in {timeout_s:.0f} s: {self.records[-1:]}"
-        assert reached(), f"{step} was not reached: {self.records[-1:]}"
+            self._seen.wait_for(lambda: any(map(reached, self.records)) or self._ended, LONGEST_S)
+        assert any(map(reached, self.records)), f"{what} was not reached: {self.records[-1:]}"
 
     def limit_files_to(self, size: int) -> None:
         """From now on the process can't make a file larger than that, as on a disk that is nearly full."""
@@ -106,8 +115,7 @@ class Command:
         try:
             code = self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            self.process.kill()
-            raise
+            raise AssertionError(f"hung for {timeout_s:.0f} s after {self.records[-1:]}:\n{self._hung()}") from None
         ended_s = time.monotonic() - self._began_s
         self._reader.join(10)
         assert self.process.stderr is not None
@@ -117,13 +125,23 @@ class Command:
         self.process.stdout.close()
         return Outcome(code, self.records, stderr, ended_s)
 
+    def _hung(self) -> str:
+        """Where every thread hangs (the fault handler prints it), and how the system sees the process; it is ended."""
+        seen = Path(f"/proc/{self.process.pid}/status").read_text().split("\n")[2]
+        self.process.send_signal(signal.SIGABRT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(20)
+        self.process.kill()
+        assert self.process.stderr is not None
+        return f"{seen}\n{self.process.stderr.read()}"
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-            self.outcome(timeout_s=30)
+            self.outcome(timeout_s=60)
 
 
 def velatura(*words: str | Path, timeout_s: float = LONGEST_S) -> Outcome:
@@ -136,7 +154,7 @@ class Bench:
 
     def __init__(self, stage: Path) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.end_to_end.bench_with_knobs", str(stage)],
+            [sys.executable, "-X", "faulthandler", "-m", "tests.end_to_end.bench_with_knobs", str(stage)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -173,6 +191,17 @@ class Bench:
 
     def __exit__(self, *_: object) -> None:
         self.end()
+
+
+def wrong_code(outcome: Outcome, code: int = 2) -> str:
+    """The code of an error, which is told in two sentences and nothing else."""
+    assert outcome.code == code, outcome
+    assert outcome.stderr == ""
+    assert outcome.error.keys() == {"code", "what", "remedy"}
+    for sentence in (outcome.error["what"], outcome.error["remedy"]):
+        assert re.search(r"[.?]$", sentence), sentence
+        assert "Traceback" not in sentence
+    return str(outcome.error["code"])
 
 
 @contextlib.contextmanager

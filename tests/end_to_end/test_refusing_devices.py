@@ -1,0 +1,59 @@
+"""Devices that are not there, do not answer, or are in use: told before any lamp is struck. One bench for all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.program import Bench, Command, lamps, velatura, wrong_code
+
+pytestmark = pytest.mark.timeout(600)
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Bench]]:
+    out = tmp_path_factory.mktemp("served") / "out"
+    assert velatura("demo", "--prepare-only", "--out", out).code == 0
+    with Bench(out / "stage") as bench:
+        yield out / "stage", bench
+
+
+def test_a_port_in_use_is_told(served: tuple[Path, Bench]) -> None:
+    assert wrong_code(velatura("emulate", served[0]), code=3) == "port-in-use"
+
+
+def test_a_demo_beside_it_is_told_of_the_port_in_use_and_lights_nothing(served: tuple[Path, Bench]) -> None:
+    assert wrong_code(velatura("demo", "--out", served[0].parent), code=3) == "port-in-use"
+    assert lamps(served[0]) == {}
+
+
+def test_a_silent_projector_is_named_before_any_lamp_is_struck(served: tuple[Path, Bench]) -> None:
+    stage, bench = served
+    bench.turn("silent right")
+    outcome = velatura("calibrate", stage)
+    bench.turn("answering right")
+    assert wrong_code(outcome, code=3) == "projector-no-answer"
+    assert "tty-right" in outcome.error["what"]
+    assert outcome.seconds < 30
+    assert not any(lamps(stage).values())
+
+
+def test_a_stage_in_use_is_told_and_the_one_at_work_is_not_disturbed(served: tuple[Path, Bench]) -> None:
+    stage, _ = served
+    with Command("calibrate", stage) as working:
+        working.wait_for("Switching the projectors on")
+        for command in ("calibrate", "appearance", "demo"):
+            where = ["--out", stage.parent] if command == "demo" else [stage]
+            assert wrong_code(velatura(command, *where)) == "already-running"
+        assert working.interrupt().code == 130
+
+
+def test_a_camera_that_is_off_is_told_before_any_lamp_is_struck(served: tuple[Path, Bench]) -> None:
+    stage, bench = served
+    bench.turn("camera off")
+    outcome = velatura("calibrate", stage)
+    assert wrong_code(outcome, code=3) == "camera-off"
+    assert "battery" in outcome.error["remedy"]
+    assert not any(lamps(stage).values())
