@@ -58,11 +58,12 @@ class LightTransport:
     sizes: tuple[tuple[int, int], ...]
 
     @classmethod
-    def build(cls, calibration: Calibration) -> LightTransport:
+    def build(cls, calibration: Calibration, *, patches: Patches | None = None) -> LightTransport:
         """Build T from a calibration.
 
         Camera pixels outside ``object_mask``, or not lit by a projector, have no shares of it. Metapixels that are not
-        valid, not finite, or larger than 255 camera pixels light nothing.
+        valid, not finite, or larger than 255 camera pixels light nothing. ``patches`` replace the metapixels by another
+        model of a projector pixel (``any_weights``).
 
         Raises UsageError("calibration-inconsistent") when sizes differ or an image is not finite.
         """
@@ -71,7 +72,8 @@ class LightTransport:
         shape = calibration.object_mask.shape
         blur_px = calibration.camera_blur_px
         on_object = tuple(without_blur(p.metapixels, blur_px) for p in projectors)
-        patches = build_patches(on_object, (shape[0], shape[1]))
+        if patches is None:
+            patches = build_patches(on_object, (shape[0], shape[1]))
         taps = gaussian_taps(blur_px)
         blurred = taps.shape[1] > 1
         gain = np.ones((len(projectors), 3, *shape), np.float32)

@@ -72,7 +72,7 @@ def build_patches(metapixels: tuple[Metapixels, ...], camera_shape: tuple[int, i
     weights = np.zeros(int(cells.sum()) * LANES, Weight)
     _fill(centre, covariance, row, column, rows, groups, first, weights)
     margin = np.array([rows.max(initial=0), groups.max(initial=0) * LANES], np.int64)
-    members, tile_first = _tile_lists(row, column, rows, groups, start, shape)
+    members, tile_first = tile_lists(row, column, rows, groups, start, shape)
     return Patches(
         weights, first.astype(np.int32), row, column, rows, groups, start, members, tile_first, shape, margin
     )
@@ -136,7 +136,7 @@ def _fill(
 
 
 @compiled()
-def _tile_lists(
+def tile_lists(
     row: npt.NDArray[np.int16],
     column: npt.NDArray[np.int16],
     rows: npt.NDArray[np.uint8],
@@ -144,6 +144,7 @@ def _tile_lists(
     start: npt.NDArray[np.int64],
     shape: npt.NDArray[np.int64],
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+    """The patches that touch each tile, by projector and tile, and where each tile's list begins."""
     down, across = (shape[0] + TILE_ROWS - 1) // TILE_ROWS, (shape[1] + TILE_COLUMNS - 1) // TILE_COLUMNS
     tiles = down * across
     tile_first = np.zeros((start.size - 1) * tiles + 1, np.int64)
