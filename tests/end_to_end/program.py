@@ -47,6 +47,16 @@ class Outcome:
         return dict(next(record["result"] for record in self.records if "result" in record))
 
 
+@contextlib.contextmanager
+def listening_to_ctrl_c() -> Iterator[None]:
+    """A shell's background job ignores SIGINT, and so would its children; those begun inside do not."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class Command:
     """``velatura WORDS --json`` in a process of its own, its lines read as they come."""
 
@@ -55,15 +65,16 @@ class Command:
         self._seen = threading.Condition()
         self._ended = False
         self._began_s = time.monotonic()
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "controller", *map(str, words), "--json"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=REPOSITORY,
-            env=os.environ | {"PYTHONFAULTHANDLER": "1"},
-        )
+        with listening_to_ctrl_c():
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "controller", *map(str, words), "--json"],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                cwd=REPOSITORY,
+                env=os.environ | {"PYTHONFAULTHANDLER": "1"},
+            )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 

@@ -1,0 +1,144 @@
+"""Photographs of a run: taken once, unless something that they depend on changed, or a lamp's light was missing."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.arrays import ByteImage
+from controller.session.journal import Journal
+from controller.session.progress import Silent
+from controller.session.runner import Context
+from controller.session.shots import Developed, Planned, Taken, read_index, take_all, take_photograph
+from hal.deadline import Cancelled, in_seconds
+from hal.errors import DeviceGone, DeviceRefused
+from tests.controller.rig_model import SIZE_PX, STEADY_S, ModelRig
+from tests.controller.session.lamp_model import soon
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> ModelRig:
+    return ModelRig(tmp_path)
+
+
+@pytest.fixture
+def context(tmp_path: Path) -> Iterator[Context]:
+    with Journal(tmp_path / "run") as journal:
+        yield Context(journal.folder, journal, in_seconds(60), Silent(), {}, lambda fraction, note: None)
+
+
+def grey(value: int) -> dict[str, ByteImage]:
+    return {"left": np.full((SIZE_PX[1], SIZE_PX[0], 3), value, np.uint8)}
+
+
+def plan(values: Sequence[int] = (10, 20, 30), exposure_s: float = 0.5) -> list[Planned]:
+    return [Planned(f"grey-{n}", partial(grey, value), exposure_s) for n, value in enumerate(values)]
+
+
+def test_each_photograph_shows_its_frames_and_is_listed_in_order(stage: ModelRig, context: Context) -> None:
+    paths = take_all(stage.rig, context, plan(), index="greys")
+    assert [int(shown["P1"][0, 0, 0]) for shown in stage.display.shown] == [10, 20, 30]
+    assert not any(shown["P2"].any() for shown in stage.display.shown)
+    assert paths[0] == context.folder / "greys.json"
+    index = read_index(context.folder, "greys")
+    assert list(index) == ["grey-0", "grey-1", "grey-2"]
+    assert [taken.path for taken in index.values()] == paths[1:]
+    assert all(path.suffix == ".raw" for path in paths[1:])
+
+
+def test_nothing_is_taken_twice_and_the_confirmed_exposure_is_remembered(stage: ModelRig, context: Context) -> None:
+    stage.camera.rounding = 1.01
+    take_all(stage.rig, context, plan(), index="greys")
+    first = read_index(context.folder, "greys")
+    stage.camera.rounding = 1.5
+    take_all(stage.rig, context, plan(), index="greys")
+    assert stage.camera.taken == ["grey-0", "grey-1", "grey-2"]
+    assert read_index(context.folder, "greys") == first
+    assert {taken.exposure_s for taken in first.values()} == {0.505}
+
+
+def test_another_frame_or_another_exposure_is_taken_again(stage: ModelRig, context: Context) -> None:
+    take_all(stage.rig, context, plan(), index="greys")
+    take_all(stage.rig, context, plan((10, 21, 30)), index="greys")
+    assert stage.camera.taken[3:] == ["grey-1"]
+    take_all(stage.rig, context, plan((10, 21, 30), exposure_s=1.0), index="greys")
+    assert stage.camera.taken[4:] == ["grey-0", "grey-1", "grey-2"]
+
+
+def test_a_damaged_or_missing_photograph_is_taken_again(stage: ModelRig, context: Context) -> None:
+    paths = take_all(stage.rig, context, plan(), index="greys")
+    paths[1].write_bytes(b"damaged")
+    paths[3].unlink()
+    take_all(stage.rig, context, plan(), index="greys")
+    assert stage.camera.taken[3:] == ["grey-0", "grey-2"]
+
+
+def test_photographs_without_a_lamps_light_are_forgotten_but_earlier_ones_are_kept(
+    stage: ModelRig, context: Context
+) -> None:
+    take_all(stage.rig, context, plan()[:1], index="first")
+    stage.lamps["right"].go_dark()
+    with pytest.raises(DeviceRefused, match="went off"):
+        take_all(stage.rig, context, plan(), index="greys")
+    assert not (context.folder / "greys.json").exists()
+    stage.lamps["right"].strike(sin=False)
+    stage.rig.guards[1].status(deadline=soon())
+    stage.world.time_s += STEADY_S
+    take_all(stage.rig, context, plan(), index="greys")
+    assert stage.camera.taken == ["grey-0", "grey-1", "grey-2", "grey-1", "grey-2"]
+
+
+def test_lamps_are_not_asked_when_nothing_was_taken(stage: ModelRig, context: Context) -> None:
+    take_all(stage.rig, context, plan(), index="greys")
+    stage.lamps["right"].trouble = "gone"
+    take_all(stage.rig, context, plan(), index="greys")
+
+
+def test_a_stop_keeps_what_was_taken_so_far(stage: ModelRig, tmp_path: Path) -> None:
+    cancel = threading.Event()
+
+    def advance(fraction: float, note: str) -> None:
+        if note == "grey-2":
+            cancel.set()
+
+    with Journal(tmp_path / "run") as journal:
+        context = Context(journal.folder, journal, in_seconds(60, cancel), Silent(), {}, advance)
+        with pytest.raises(Cancelled):
+            take_all(stage.rig, context, plan(), index="greys")
+        assert journal.shot_count() == 2
+        again = Context(journal.folder, journal, in_seconds(60), Silent(), {}, lambda fraction, note: None)
+        take_all(stage.rig, again, plan(), index="greys")
+    assert stage.camera.taken == ["grey-0", "grey-1", "grey-2"]
+
+
+def test_a_camera_that_goes_leaves_the_photographs_before_it(stage: ModelRig, context: Context) -> None:
+    take_all(stage.rig, context, plan()[:2], index="first")
+    stage.camera.fails = DeviceGone("camera-gone", what="Gone.", remedy="Come back.")
+    with pytest.raises(DeviceGone):
+        take_all(stage.rig, context, plan(), index="greys")
+    assert context.journal.shot_count() == 2
+
+
+def test_what_plays_is_photographed_once_for_each_thing_it_may_be(stage: ModelRig, context: Context) -> None:
+    def photograph(bundle: str) -> Taken:
+        return take_photograph(stage.rig, context, "played", 1.0, shown_at_s=0.0, of={"bundle": bundle})
+
+    assert photograph("one").fresh
+    again = photograph("one")
+    assert not again.fresh
+    assert photograph("two").fresh
+    assert stage.camera.taken == ["played", "played"]
+
+
+def test_ready_images_go_before_photographs_of_the_same_name() -> None:
+    white = np.ones((2, 2, 3), np.float32)
+    taken = {name: Taken(name, Path(f"{name}.dng"), 1.0) for name in ("white", "red")}
+    developed = Developed(taken, {"black": 0 * white, "white": white})
+    assert list(developed) == ["black", "white", "red"]
+    assert len(developed) == 3
+    assert developed["white"] is white
