@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
@@ -68,8 +69,19 @@ def render(page: Page) -> str:
 
 
 def write_report(folder: Path, page: Page, figures: Mapping[str, Any]) -> tuple[Path, Path]:
-    """Write ``report.html`` and ``report.json`` (keys: docs/report.md) into ``folder``; return both paths."""
+    """Write ``report.html`` and ``report.json`` (keys: docs/report.md) into ``folder``; return both paths.
+
+    A figure that is no finite number becomes null: what could not be measured must not cost what could.
+    """
     html, machine = folder / "report.html", folder / "report.json"
-    write_atomically(machine, (json.dumps(figures, indent=2, allow_nan=False) + "\n").encode())
+    write_atomically(machine, (json.dumps(_finite(figures), indent=2, allow_nan=False) + "\n").encode())
     write_atomically(html, render(page).encode())
     return html, machine
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

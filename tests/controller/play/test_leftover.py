@@ -1,0 +1,32 @@
+"""A player whose starter was killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from controller.play.launch import PlayerProcess, end_leftover
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_it_is_ended_even_if_it_hangs_and_another_can_start(
+    start: Callable[..., PlayerProcess], tmp_path: Path, hangs: bool
+) -> None:
+    left = start()
+    if hangs:
+        os.kill(left.pid, signal.SIGSTOP)
+    assert end_leftover(tmp_path, timeout_s=0.5 if hangs else 10.0)
+    assert not left.alive
+    assert start().alive
+
+
+def test_where_none_serves_nothing_happens(tmp_path: Path) -> None:
+    assert not end_leftover(tmp_path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(tmp_path / "player.sock"))  # nobody listens: its player is dead
+    assert not end_leftover(tmp_path)
