@@ -25,7 +25,7 @@ from controller.session.calibrating import read_calibration
 from controller.session.shots import Developed, read_index
 
 STAGES = {"small": 5, "medium": 3, "paper": 1}
-CODES = ("gray-", "phase-", "blur-")
+CODES = ("gray-", "phase-")
 
 
 @dataclass(slots=True)

@@ -1,0 +1,169 @@
+"""The paper's regions against the global solver: time extrapolated from random regions, objective on a crop.
+
+Everything is timed in one run on one thread a region, and on all threads for the global solver; regions are independent
+within a phase, so their time is divided by the cores. The global solver is timed to 1e-3 of the optimum, and to where
+regions of 16 end. Where OSQP or Clarabel is not installed, its rows are left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+import statistics
+import time
+from typing import Final
+
+import numpy as np
+
+from benchmarks import Row, Timing, at_least, at_most
+from benchmarks._synthetic import synthetic_calibration, synthetic_target
+from controller.arrays import FloatImage
+from controller.calibrate.values import Calibration
+from controller.solve.bounded import first_guess, pose, solve_bounded
+from controller.solve.box_solvers import BoxProblem, solve_box
+from controller.solve.feasibility import choose_exposure, target_radiance
+from controller.solve.regions import PHASES, SIZE_PX, Regions, solve_regions
+from controller.transport import LightTransport
+
+SAMPLE: Final = 30
+GLOBAL_REPEATS: Final = 3
+MOST_ITERATIONS: Final = 1000
+NEAR_BEST: Final = 1e-3
+GOALS: Final = {"lsq_linear": 150.0, "osqp": 8.0, "clarabel": None}
+"""Times as fast as the regions, at size paper."""
+
+
+def measure(size: str) -> list[Row]:
+    """Regions by every solver there is, with colours mixed and apart, and how near they come to the optimum."""
+    rows, gap = _nearness()
+    for kind, mixed in (("colours mixed", True), ("each channel alone", False)):
+        calibration = synthetic_calibration(size)
+        rows += _times(calibration if mixed else _unmixed(calibration), kind, gap, paper=size == "paper")
+    return rows
+
+
+def _unmixed(calibration: Calibration) -> Calibration:
+    """The paper's case: mixing is taken out beforehand, and the channels are solved one by one."""
+    plain = [
+        dataclasses.replace(part, radiometry=dataclasses.replace(part.radiometry, mixing=np.eye(3)))
+        for part in calibration.projectors
+    ]
+    return dataclasses.replace(calibration, projectors=tuple(plain))
+
+
+def _target(transport: LightTransport, black: FloatImage) -> FloatImage:
+    reflectance = synthetic_target(transport.shape)
+    return target_radiance(reflectance, black, choose_exposure(transport, reflectance, black))
+
+
+def _times(calibration: Calibration, kind: str, gap: float, *, paper: bool) -> list[Row]:
+    transport = LightTransport.build(calibration)
+    target = _target(transport, calibration.black)
+    near, same = _global_seconds(transport, target, calibration.black, (NEAR_BEST, gap))
+    rows = [
+        at_most(f"global solve to {above:.1e} above the best, {kind}", timing.median, None, unit="s",
+                how=f"{iterations} iterations; {timing}")
+        for above, (timing, iterations) in ((NEAR_BEST, near), (gap, same))
+    ]  # fmt: skip
+    regions = Regions(pose(transport, target, calibration.black, 0.001, None))
+    count = sum(1 for phase in PHASES for _ in regions.of_phase(phase))
+    sample, cut_s = _sampled(regions)
+    cores = len(os.sched_getaffinity(0))
+    unknowns = statistics.median(problem.start.size for parts in sample for problem in parts)
+    rows.append(
+        at_most(f"cutting out the equations of a region, {kind}", cut_s, None, unit="s",
+                how=f"median of {SAMPLE} regions; {count} regions in all, {unknowns:g} unknowns a problem"),
+    )  # fmt: skip
+    for solver, goal in GOALS.items():
+        if importlib.util.find_spec(solver) is None and solver != "lsq_linear":
+            continue
+        spent = _region_seconds(solver, sample)
+        whole = statistics.mean(spent) * count / cores
+        rows += [
+            at_most(f"regions by {solver}, {kind}", whole, None, unit="s",
+                    how=f"{count} regions on {cores} cores, from {SAMPLE}; each {_timing(spent)}"),
+            at_least(f"regions by {solver} by global solve to {NEAR_BEST:g}, {kind}", whole / near[0].median,
+                     goal if paper else None, unit="x", how="solving alone, without cutting out the equations"),
+            at_least(f"regions by {solver} by global solve as near as they come, {kind}", whole / same[0].median,
+                     None, unit="x", how=f"to {gap:.1e} above the best, what regions of 16 leave on a crop"),
+        ]  # fmt: skip
+    return rows
+
+
+def _global_seconds(
+    transport: LightTransport, target: FloatImage, black: FloatImage, gaps: tuple[float, ...]
+) -> list[tuple[Timing, int]]:
+    """For each gap, the time of the iterations after which the objective is that near to the best, and their number."""
+    best = solve_bounded(transport, target, black, tolerance=1e-6, most_iterations=MOST_ITERATIONS).objective
+    found = []
+    for gap in gaps:
+        iterations, objective = 16, np.inf
+        while objective > best * (1 + gap) and iterations < MOST_ITERATIONS:
+            iterations = iterations * 4 // 3
+            objective = solve_bounded(
+                transport, target, black, tolerance=0, most_iterations=iterations
+            ).objective  # fmt: skip
+        spent = [
+            solve_bounded(transport, target, black, tolerance=0, most_iterations=iterations).seconds
+            for _ in range(GLOBAL_REPEATS)
+        ]
+        found.append((_timing(spent), iterations))
+    return found
+
+
+def _sampled(regions: Regions) -> tuple[list[list[BoxProblem]], float]:
+    """The problems of random regions of the first phase, which has the most unknowns; and the seconds to cut one out."""
+    problem = regions.problem
+    x = first_guess(problem)
+    light = problem.transport.forward_planes(x)
+    nothing = np.zeros(x.shape[1], np.bool_)
+    every = list(regions.of_phase(PHASES[0]))
+    picked = np.random.default_rng(0).choice(len(every), SAMPLE, replace=len(every) < SAMPLE)
+    sample, spent = [], []
+    for i, j in (every[k] for k in picked):
+        began = time.perf_counter()
+        sample.append(regions.equations(i, j, regions.unknown(i, j, nothing), x, light))
+        spent.append(time.perf_counter() - began)
+    return sample, statistics.median(spent)
+
+
+def _region_seconds(solver: str, sample: list[list[BoxProblem]]) -> list[float]:
+    for part in sample[0]:
+        solve_box(solver, part)
+    spent = []
+    for parts in sample:
+        began = time.perf_counter()
+        for part in parts:
+            solve_box(solver, part)
+        spent.append(time.perf_counter() - began)
+    return spent
+
+
+def _timing(seconds: list[float]) -> Timing:
+    return Timing(min(seconds), statistics.median(seconds), max(seconds))
+
+
+def _nearness() -> tuple[list[Row], float]:
+    """The whole four phases on a crop of 64x64 camera pixels, and how far above the optimum regions of 16 end there."""
+    gap = 0.0
+    calibration = synthetic_calibration(projector=(26, 26), camera=(64, 64))
+    transport = LightTransport.build(calibration)
+    target = _target(transport, calibration.black)
+    solver = "clarabel" if importlib.util.find_spec("clarabel") else "lsq_linear"
+    exact = solve_regions(transport, target, calibration.black, solver=solver, size_px=128)
+    best = solve_bounded(transport, target, calibration.black, tolerance=1e-7, most_iterations=6000)
+    rows = [
+        at_most("global objective above one region over the crop", abs(best.objective / exact.objective - 1), 1e-4,
+                unit="", how=f"64x64 camera pixels, {solver}, {exact.unknowns} unknowns"),
+    ]  # fmt: skip
+    for size_px in (8, 16, 32):
+        found = solve_regions(transport, target, calibration.black, solver=solver, size_px=size_px)
+        difference = np.sqrt(np.mean((found.light - best.light) ** 2) / np.mean(best.light**2))
+        above = found.objective / best.objective - 1
+        gap = above if size_px == SIZE_PX else gap
+        rows.append(
+            at_most(f"objective of regions of {size_px} above the optimum", above, None,
+                    unit="", how=f"{found.regions} regions by {solver}; their light differs by {difference:.2%} rms"),
+        )  # fmt: skip
+    return rows, gap
