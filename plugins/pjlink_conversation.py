@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Final
 
@@ -11,9 +12,28 @@ from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, Pro
 from hal.links import ByteLink
 from hal.pjlink import Failure, PjClass
 from hal.pjlink_udp import is_notification
+from hal.profiles import Timing
 from hal.values import Power
 
 _PADDED_LINE: Final = 8 * pjlink.LONGEST_LINE
+
+
+class Pace:
+    """How soon the next question may follow: users report projectors that hang when asked often while they start.
+
+    ``slow``: the projector starts, cools, or did not answer.
+    """
+
+    def __init__(self, timing: Timing) -> None:
+        self.slow = True
+        self._timing = timing
+        self._asked_at_s = -1e9
+
+    def wait(self, deadline: Deadline) -> None:
+        interval_s = self._timing.boot_interval_s if self.slow else self._timing.interval_s
+        while (wait_s := self._asked_at_s + interval_s - time.monotonic()) > 0 and not deadline.passed:
+            deadline.sleep(wait_s)
+        self._asked_at_s = time.monotonic()
 
 
 class PjLinkConversation:
@@ -24,14 +44,15 @@ class PjLinkConversation:
         connect: Callable[[Deadline], ByteLink],
         name: str,
         password: str | None,
-        answer_s: float,
-        command_s: float,
+        timing: Timing,
+        pace: Pace,
     ) -> None:
         self._connect = connect
         self._name = name
         self._password = password
-        self._answer_s = answer_s
-        self._command_s = command_s
+        self._answer_s = timing.answer_s
+        self._command_s = timing.command_s
+        self._pace = pace
         self._link: ByteLink | None = None
         self._prefix = b""
 
@@ -43,7 +64,9 @@ class PjLinkConversation:
                 what=f"The projector at {self._name} would not tell its power state: it answered {told.value}.",
                 remedy="Wait until it has finished starting or cooling, and ask again.",
             )
-        return pjlink.parse_power(told)
+        power = pjlink.parse_power(told)
+        self._pace.slow = power in (Power.WARMING, Power.COOLING)
+        return power
 
     def text(self, name: str, deadline: Deadline, pj_class: PjClass = 1) -> str:
         told = self.ask(name, deadline, pj_class)
@@ -59,8 +82,11 @@ class PjLinkConversation:
             return self._say(name, "?", deadline, self._answer_s, pj_class)
 
     def tell(self, name: str, parameter: str, deadline: Deadline) -> str | Failure:
-        """A command, sent once."""
-        return self._say(name, parameter, deadline, self._command_s, 1)
+        """A command, sent once. After one that switches, the projector is busy with its lamp."""
+        try:
+            return self._say(name, parameter, deadline, self._command_s, 1)
+        finally:
+            self._pace.slow |= name == "POWR"
 
     def close(self) -> None:
         if self._link is not None:
@@ -81,6 +107,7 @@ class PjLinkConversation:
     def _say(
         self, name: str, parameter: str, deadline: Deadline, patience_s: float, pj_class: PjClass
     ) -> str | Failure:
+        self._pace.wait(deadline)
         self.check(deadline)
         try:
             link = self._greeted(deadline.within(patience_s))
@@ -90,9 +117,11 @@ class PjLinkConversation:
             line = _answer_line(link, until)
         except DeviceTimeout as error:
             self.close()
+            self._pace.slow = True
             raise self.no_answer() from error
-        except (DeviceGone, ProtocolError):
+        except (DeviceGone, ProtocolError) as error:
             self.close()
+            self._pace.slow |= isinstance(error, DeviceGone)
             raise
         if pjlink.is_refusal(line):
             raise self._wrong_password()

@@ -16,7 +16,7 @@ from hal.profiles import ProjectorProfile
 from hal.registry import Driver, OpenContext, setting
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
-from plugins.pjlink_conversation import PjLinkConversation
+from plugins.pjlink_conversation import Pace, PjLinkConversation
 from plugins.profile_files import load_profile
 
 
@@ -45,6 +45,7 @@ class PjLinkProjector:
     ) -> None:
         self._connect = connect
         self._timing = profile.timing
+        self._pace = Pace(profile.timing)
         self._lamp = profile.lamp
         self._name = name
         self._password = password
@@ -56,6 +57,8 @@ class PjLinkProjector:
     def open(self, deadline: Deadline) -> None:
         """Reach the projector once, check the password, and learn its inputs."""
         with self._turn(deadline) as talk:
+            with contextlib.suppress(DeviceBusy):
+                talk.power(deadline)
             told = talk.ask("INST", deadline)
             self._inputs = pjlink.parse_inputs(told) if isinstance(told, str) else ()
 
@@ -166,9 +169,7 @@ class PjLinkProjector:
     @contextlib.contextmanager
     def _turn(self, deadline: Deadline) -> Iterator[PjLinkConversation]:
         """One caller at a time, none after ``close``; a conversation that ends with it."""
-        talk = PjLinkConversation(
-            self._connect, self._name, self._password, self._timing.answer_s, self._timing.command_s
-        )
+        talk = PjLinkConversation(self._connect, self._name, self._password, self._timing, self._pace)
         talk.check(deadline)
         while not self._lock.acquire(timeout=min(SLICE_S, deadline.left_s())):
             talk.check(deadline)

@@ -9,18 +9,18 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from hal.deadline import Deadline
-from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
+from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.links import SLICE_S, ByteLink
 from hal.power_view import PowerView
 from hal.profiles import ProjectorProfile
 from hal.registry import Driver, OpenContext, setting
 from hal.serial_link import SerialLink
 from hal.serial_protocol import Notice, Reply, parse_hours, parse_power
-from hal.serial_table import SerialTable
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
 from plugins.profile_files import load_profile
 from plugins.serial_conversation import COOLS, SerialConversation
+from plugins.serial_settings import checked_address, serial_table, told_powers
 
 UNNAMED_FAULT: Final = "error-standby"
 """The word for a projector that answers that it failed, and not how."""
@@ -46,11 +46,11 @@ class SerialProjector:
         address: str | None = None,
         transcript: Transcript | None = None,
     ) -> None:
-        table = _serial_table(profile)
+        table = serial_table(profile)
         self._name = name
         self._profile = profile
         self._table = table
-        self._view = PowerView(profile.lamp, _told_powers(table))
+        self._view = PowerView(profile.lamp, told_powers(table))
         self._lock = threading.Lock()
         self._transcript = transcript
         self._open_link = open_link
@@ -61,7 +61,7 @@ class SerialProjector:
             name=name,
             profile=profile,
             table=table,
-            address=_checked_address(table, address),
+            address=checked_address(table, address),
             notice=self._noticed,
             slow=self._may_be_starting,
         )
@@ -80,7 +80,7 @@ class SerialProjector:
         now_s = time.monotonic()
         if self._view.in_transition(now_s):
             return True
-        if Power.WARMING in _told_powers(self._table):
+        if Power.WARMING in told_powers(self._table):
             return not self._answered
         return now_s - self._opened_at_s < self._profile.lamp.warm_up_s
 
@@ -254,40 +254,10 @@ class SerialProjector:
             self._lock.release()
 
 
-def _serial_table(profile: ProjectorProfile) -> SerialTable:
-    if profile.serial is None:
-        raise PluginError(
-            "profile-not-serial",
-            what=f"The profile {profile.name!r} has no serial commands.",
-            remedy='Use another profile, or the driver "pjlink".',
-        )
-    return profile.serial
-
-
-def _told_powers(table: SerialTable) -> frozenset[Power]:
-    """The power states that this family names in its answers."""
-    values = table.queries["power"].values if "power" in table.queries else {}
-    return frozenset(Power(word) for word in values.values())
-
-
-def _checked_address(table: SerialTable, address: str | None) -> str:
-    """The address to use; it must look like the profile's own, e.g. two digits."""
-    if address is None:
-        return table.address
-    alike = len(address) == len(table.address) and address.isascii() and address.isalnum()
-    if not alike or (table.address.isdigit() and not address.isdigit()):
-        raise PluginError(
-            "setting-wrong",
-            what=f"The address {address!r} is not like {table.address!r}.",
-            remedy="Set address in stage.toml to the projector's own number, or leave it out.",
-        )
-    return address
-
-
 def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
     profile = load_profile(setting(settings, "profile", str), context.stage)
-    table = _serial_table(profile)
+    table = serial_table(profile)
     # Not resolved: the symlink is the stable name, and leads elsewhere after the adapter was unplugged.
     port = context.stage / setting(settings, "port", str)
     baud = setting(settings, "baud", int, table.baud)

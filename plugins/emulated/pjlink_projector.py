@@ -128,6 +128,7 @@ class EmulatedPjLinkProjector:
     password : asked of every client, or None
     idle_s : seconds after which an idle connection is closed (the specification says 30)
     chatty : it tells that it came up before it answers, and pads with NUL, as users report of some
+    wedges_below_s : asked twice within this time while it warms or cools, it hangs: ``wedged`` is true for good
 
     ``faults`` are its knobs, ``scenario`` a script that turns them at what it hears; ``silent`` and ``slow_s`` hold for
     the greeting too.
@@ -143,6 +144,7 @@ class EmulatedPjLinkProjector:
         idle_s: float = 30.0,
         seed: int = 1,
         chatty: bool = False,
+        wedges_below_s: float = 0.0,
     ) -> None:
         self.lamp = lamp
         self.faults = Faults()
@@ -153,6 +155,9 @@ class EmulatedPjLinkProjector:
         self._password = password
         self._idle_s = idle_s
         self._chatty = chatty
+        self._wedges_below_s = wedges_below_s
+        self._heard_at_s = 0.0
+        self.wedged = False
         self._random = random.Random(seed)
         self._stop = threading.Event()
         self._listener: socket.socket | None = None
@@ -231,10 +236,17 @@ class EmulatedPjLinkProjector:
                         self._send(client, b"PJLINK ERRA\r")
                         return
                     line, expected = line[32:], None  # noqa: PLW2901 - the proof goes before the first command only
+                self._wedge()
                 with self._board_lock:
                     answer = self._board.answer(line, busy=self.faults.now.busy)
-                if answer:
+                if answer and not self.wedged:
                     self._send(client, b"%2LKUP=02:00:00:00:00:01\r\0\0" + answer if self._chatty else answer)
+
+    def _wedge(self) -> None:
+        now_s, before_s = time.monotonic(), self._heard_at_s
+        self._heard_at_s = now_s
+        occupied = self.lamp.phase in (LampPhase.WARMING, LampPhase.COOLING)
+        self.wedged |= occupied and now_s - before_s < self._wedges_below_s
 
     def _lines(self, client: socket.socket) -> Iterator[bytes]:
         """Lines without their CR until the client goes, is idle too long, or sends a line that never ends."""

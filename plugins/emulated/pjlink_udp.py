@@ -69,8 +69,8 @@ class EmulatedPjLinkUdp:
         self._tell(b"%2INPT=" + name.encode("ascii") + b"\r")
 
     def _run(self) -> None:
-        self._tell(b"%2LKUP=" + self._mac + b"\r")
         before = self._state()
+        self._tell(b"%2LKUP=" + self._mac + b"\r")
         while not self._stop.is_set():
             self._answer()
             now = self._state()

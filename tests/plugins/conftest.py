@@ -60,7 +60,8 @@ OpenPjLink = Callable[..., PjLinkPair]
 def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
     """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator.
 
-    ``profile`` is a shipped one, ``edit`` changes its text, ``timing`` is its lamp's, ``board`` makes another board than the profile's.
+    ``profile`` is a shipped one, ``edit`` changes its text, ``timing`` is its lamp's; ``board`` makes another board
+    than the profile's.
     """
     opened: list[SerialPair] = []
 
@@ -94,7 +95,7 @@ def open_pjlink(tmp_path: Path) -> Iterator[OpenPjLink]:
     opened: list[PjLinkPair] = []
 
     def make(*, settings: dict[str, Any] | None = None, **kwargs: Any) -> PjLinkPair:
-        emulator = EmulatedPjLinkProjector(EmulatedLamp(LAMP), **kwargs)
+        emulator = EmulatedPjLinkProjector(kwargs.pop("lamp", None) or EmulatedLamp(LAMP), **kwargs)
         emulator.start()
         (tmp_path / "quick.toml").write_text(quick_profile(LAMP, base="pjlink"))
         table = {"address": emulator.address, "profile": "quick.toml", **(settings or {})}

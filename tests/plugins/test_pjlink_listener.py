@@ -45,11 +45,11 @@ def test_a_projector_that_takes_its_time_is_found_and_the_deadline_is_kept(liste
 
 
 def test_changes_are_heard_in_order_though_a_search_ran_meanwhile(listener: PjLinkListener) -> None:
-    lamp = EmulatedLamp(LampTiming(0.15, 0.1))
+    lamp = EmulatedLamp(LampTiming(0.4, 0.4))
     with EmulatedPjLinkUdp(lamp, mac=MAC, controller=("127.0.0.1", listener.port)) as projector:
         assert listener.heard(deadline=in_seconds(2)).told == CameUp(MAC)
         lamp.strike()
-        listener.search(deadline=in_seconds(5), to=projector.address, patience_s=0.3)
+        listener.search(deadline=in_seconds(5), to=projector.address, patience_s=0.7)
         projector.select_input("32")
         lamp.fail()
         expected = {

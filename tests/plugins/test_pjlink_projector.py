@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.registry import OpenContext
 from hal.values import Power
+from plugins.emulated.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.quick_profile import quick_profile
 from plugins.pjlink_projector import open_pjlink_projector
 
 SOON = 5.0
@@ -54,6 +57,21 @@ def test_a_silent_projector_is_a_timeout_well_before_the_deadline(open_pjlink: A
         pair.driver.status(deadline=in_seconds(20))
     assert caught.value.code == "projector-no-answer"
     assert time.monotonic() - started < 5
+
+
+@pytest.mark.parametrize(("interval", "wedged"), [("boot_interval_s = 0.05", False), ("boot_interval_s = 0.005", True)])
+def test_a_booting_projector_is_asked_only_as_often_as_its_profile_says(
+    open_pjlink: Any, tmp_path: Path, interval: str, wedged: bool
+) -> None:
+    timing = LampTiming(0.5, 0.5)
+    text = quick_profile(timing, base="pjlink").replace("boot_interval_s = 0.05", interval)
+    (tmp_path / "paced.toml").write_text(text)
+    pair = open_pjlink(settings={"profile": "paced.toml"}, lamp=EmulatedLamp(timing), wedges_below_s=0.04)
+    with contextlib.suppress(DeviceTimeout):  # a wedged projector answers nothing any more
+        pair.driver.switch_on(deadline=in_seconds(2))
+        for _ in range(3):
+            pair.driver.status(deadline=in_seconds(2))
+    assert pair.emulator.wedged is wedged
 
 
 def test_garbage_is_a_protocol_error(open_pjlink: Any) -> None:
