@@ -113,7 +113,7 @@ def _global_seconds(
 
 
 def _sampled(regions: Regions) -> tuple[list[list[BoxProblem]], float]:
-    """The problems of random regions of the first phase, which has the most unknowns; and the seconds to cut one out."""
+    """The problems of random regions of the first phase, which has most unknowns; and the seconds to cut one out."""
     problem = regions.problem
     x = first_guess(problem)
     light = problem.transport.forward_planes(x)
