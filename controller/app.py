@@ -190,11 +190,11 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
     try:
         yield
     finally:
-        reporter.say("Switching the projectors off.")
+        _tell(reporter, "Switching the projectors off.")
         # Before the machine is told: a listener that fails (a full disk under the journal) must not keep lamps lit.
         failures = power_down(rig.guards, within_s=power_down_s)
         for failure in failures:
-            reporter.say(f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
+            _tell(reporter, f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
         if machine.allows(Event.STOP):
             machine.handle(Event.STOP, "the lamps are switched off")
         if not failures and machine.allows(Event.COOLED):
@@ -206,6 +206,12 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
             what=f"The work is done, but {names} could not be switched off.",
             remedy="Switch off by the remote control, and leave the mains on until the fans stand still.",
         )
+
+
+def _tell(reporter: Reporter, text: str, level: Level = Level.INFO) -> None:
+    # A terminal that was closed, or a reader that went away, must not keep lamps lit.
+    with contextlib.suppress(OSError, ValueError):
+        reporter.say(text, level)
 
 
 def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -79,15 +80,18 @@ class QuickLamp:
 
 
 class Told:
-    """A reporter that remembers what was said."""
+    """A reporter that remembers what was said, until its terminal is ``closed``."""
 
     def __init__(self) -> None:
         self.said: list[tuple[Level, str]] = []
+        self.closed = False
 
     def progress(self, now: Progress) -> None:
         """Not of interest here."""
 
     def say(self, text: str, level: Level = Level.INFO) -> None:
+        if self.closed:
+            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
         self.said.append((level, text))
 
 
@@ -194,6 +198,19 @@ def test_a_lamp_that_stays_lit_does_not_hide_why_the_work_failed(models: Models)
         models.run(work)
     assert failed.value.code == "bad"
     assert any("left could not" in text for _, text in models.told.said)
+
+
+def test_a_terminal_that_went_away_keeps_no_lamp_lit(models: Models) -> None:
+    models.stuck = {"A"}
+
+    def work(context: Context) -> Sequence[Path]:
+        models.told.closed = True
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    with pytest.raises(BrokenPipeError):
+        models.run(work)
+    assert not models.lamps["B"].lit
+    assert models.states()[-1] == "ready -> cooling"
 
 
 def test_a_stage_at_work_is_refused_before_any_device_is_opened(models: Models) -> None:

@@ -1,21 +1,25 @@
-"""Devices that are not there, do not answer, or are in use: told before any lamp is struck. One bench for all."""
+"""Devices that do not answer or are in use, and people who go away: lamps are left alone, or off. One bench for all."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.program import Bench, Command, lamps, velatura, wrong_code
+from hal.values import Power
+from tests.end_to_end.program import REPOSITORY, Bench, Command, lamps, powers, velatura, wrong_code
 
 pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Bench]]:
-    out = tmp_path_factory.mktemp("served") / "out"
-    assert velatura("demo", "--prepare-only", "--out", out).code == 0
+def served(prepared_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Bench]]:
+    out = Path(shutil.copytree(prepared_once, tmp_path_factory.mktemp("served") / "out"))
     with Bench(out / "stage") as bench:
         yield out / "stage", bench
 
@@ -48,6 +52,24 @@ def test_a_stage_in_use_is_told_and_the_one_at_work_is_not_disturbed(served: tup
             where = ["--out", stage.parent] if command == "demo" else [stage]
             assert wrong_code(velatura(command, *where)) == "already-running"
         assert working.interrupt().code == 130
+
+
+@pytest.mark.parametrize("way", ["reader", "terminal"])
+def test_a_reader_or_a_terminal_that_goes_away_leaves_no_lamp_lit(served: tuple[Path, Bench], way: str) -> None:
+    stage, _ = served
+    ours, theirs = os.pipe() if way == "reader" else os.openpty()
+    words = ["setsid", "-c"] if way == "terminal" else []
+    words += [sys.executable, "-m", "controller", "calibrate", str(stage)]
+    working = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, cwd=REPOSITORY)
+    os.close(theirs)
+    told = b""
+    while b"Photographing black" not in told and working.poll() is None:
+        told += os.read(ours, 4096)
+    os.close(ours)
+    assert working.wait(60) in (1, 130)
+    assert lamps(stage) == {"left": False, "right": False, "above": False}
+    assert set(powers(stage).values()) <= {Power.OFF, Power.COOLING}
+    assert b"Traceback" not in told
 
 
 def test_a_camera_that_is_off_is_told_before_any_lamp_is_struck(served: tuple[Path, Bench]) -> None:
