@@ -185,6 +185,8 @@ class SerialProjector:
             )
 
     def _hours(self, power: Power, deadline: Deadline) -> int | None:
+        if power in (Power.WARMING, Power.COOLING):
+            return None  # a projector that is busy with its lamp is asked for its power alone
         try:
             told = self._told("lamp_hours", deadline)
             return None if told is None else parse_hours(told, self._table.queries["lamp_hours"].per_hour)

@@ -28,6 +28,14 @@ def test_a_profile_is_all_that_a_family_needs_and_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) < 60
 
 
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_a_switch_whose_acknowledgement_is_lost_is_confirmed_within_ten_seconds(path: Path) -> None:
+    profile = parse_profile(path.read_text())
+    timing = profile.timing
+    if profile.serial is not None:
+        assert max(timing.late_s, timing.command_s) + timing.boot_interval_s + timing.answer_s <= 10
+
+
 def test_codes_that_nobody_knows_may_be_left_out_only_when_it_is_said() -> None:
     text = (FOLDER / "optoma-ep910.toml").read_text()
     profile = parse_profile(text)

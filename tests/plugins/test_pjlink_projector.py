@@ -66,7 +66,7 @@ def test_a_booting_projector_is_asked_only_as_often_as_its_profile_says(
     timing = LampTiming(0.5, 0.5)
     text = quick_profile(timing, base="pjlink").replace("boot_interval_s = 0.05", interval)
     (tmp_path / "paced.toml").write_text(text)
-    pair = open_pjlink(settings={"profile": "paced.toml"}, lamp=EmulatedLamp(timing), wedges_below_s=0.04)
+    pair = open_pjlink(settings={"profile": "paced.toml"}, lamp=EmulatedLamp(timing), wedges_below_s=0.02)
     with contextlib.suppress(DeviceTimeout):  # a wedged projector answers nothing any more
         pair.driver.switch_on(deadline=in_seconds(2))
         for _ in range(3):

@@ -201,7 +201,7 @@ def test_an_ep910_that_cools_is_seen_to_cool(open_serial: Any) -> None:
 def test_a_projector_found_booting_is_asked_as_seldom_as_one_that_was_switched_on(open_serial: Any) -> None:
     lamp = EmulatedLamp(LampTiming(0.5, 0.4))
     lamp.strike()
-    pair = open_serial(timing=LampTiming(0.5, 0.4), lamp=lamp, wedges_below_s=0.04)
+    pair = open_serial(timing=LampTiming(0.5, 0.4), lamp=lamp, wedges_below_s=0.02)
     for _ in range(4):
         assert pair.driver.status(deadline=in_seconds(SOON)).power in (Power.ON, Power.WARMING)
     assert not pair.emulator.wedged
@@ -213,14 +213,14 @@ def faster(text: str) -> str:
 
 @pytest.mark.parametrize("profile", SWITCHABLE)
 def test_a_booting_projector_is_not_polled_into_a_wedge(open_serial: Any, profile: str) -> None:
-    pair = open_serial(profile=profile, timing=LampTiming(0.5, 0.4), wedges_below_s=0.04, edit=hasty)
+    pair = open_serial(profile=profile, timing=LampTiming(0.5, 0.4), wedges_below_s=0.02, edit=hasty)
     pair.driver.switch_on(deadline=in_seconds(SOON))
     wait_for(pair.driver, Power.ON)
     assert not pair.emulator.wedged
 
 
 def test_the_emulated_wedge_is_real_a_hastier_profile_falls_into_it(open_serial: Any) -> None:
-    pair = open_serial(timing=LampTiming(0.6, 0.4), wedges_below_s=0.04, edit=lambda text: faster(hasty(text)))
+    pair = open_serial(timing=LampTiming(0.6, 0.4), wedges_below_s=0.02, edit=lambda text: faster(hasty(text)))
     with pytest.raises(DeviceError):
         burn(pair)
     assert pair.emulator.wedged
