@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from controller.session.lamps import Clock, SystemClock
-from controller.session.safety import LampGuard, faulty
+from controller.session.safety import LampGuard, fatal_faults, faulty
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power
@@ -139,7 +139,7 @@ def cool_all(
 
 def _check(guard: LampGuard, deadline: Deadline) -> None:
     status = guard.status(deadline=deadline.within(ANSWER_S))
-    if status.power is Power.FAULT or status.faults:
+    if status.power is Power.FAULT or fatal_faults(status):
         raise faulty(guard.name, status)
 
 
@@ -161,7 +161,7 @@ def _is_on(guard: LampGuard, deadline: Deadline) -> bool:
         status = guard.status(deadline=deadline.within(ANSWER_S))
     except (DeviceTimeout, DeviceBusy, ProtocolError):
         return False
-    if status.power is Power.FAULT or status.faults:
+    if status.power is Power.FAULT or fatal_faults(status):
         raise faulty(guard.name, status)
     return status.power is Power.ON
 

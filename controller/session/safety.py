@@ -267,6 +267,11 @@ _REMEDIES = {
 }
 
 
+def fatal_faults(status: ProjectorStatus) -> tuple[str, ...]:
+    """Faults that forbid work; a driver's words that end in ``-warning`` (lamp hours, a filter) do not."""
+    return tuple(fault for fault in status.faults if not fault.endswith("-warning"))
+
+
 def faulty(name: str, status: ProjectorStatus) -> DeviceRefused:
     """The error for a projector that reports faults."""
     faults = ", ".join(status.faults) or "a fault without a name"

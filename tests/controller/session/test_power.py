@@ -79,6 +79,13 @@ def test_a_fault_during_warm_up_ends_it_with_the_projectors_name() -> None:
     assert "45 minutes" in error.value.remedy
 
 
+def test_a_warning_keeps_nobody_from_work() -> None:
+    room = Room()
+    light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
+    room.lamps[0].reports = ProjectorStatus(Power.ON, ("lamp-hours-warning",))
+    steady(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
+
+
 def test_a_lamp_that_goes_out_during_warm_up_is_named() -> None:
     room = Room()
     light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
