@@ -225,10 +225,14 @@ def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
         steady(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance)
         return ()
 
+    rules = [guard.capabilities.lamp_rules for guard in rig.guards]
+    light_s = max(rule.warm_up_s for rule in rules) + 0.5
+    steady_s = max(max(rule.stable_s for rule in rules) - light_s, 0.1)
     return [
-        Step("strike", strike, title="Switching the projectors on", weight=4, enter=Event.START,
+        Step("strike", strike, title="Switching the projectors on", weight=light_s, enter=Event.START,
              leave=Event.LAMPS_LIT, always=True),
-        Step("steady", settle, title="Waiting for steady light", weight=3, leave=Event.LAMPS_STABLE, always=True),
+        Step("steady", settle, title="Waiting for steady light", weight=steady_s,
+             leave=Event.LAMPS_STABLE, always=True),
     ]  # fmt: skip
 
 

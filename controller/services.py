@@ -12,6 +12,7 @@ from controller.bundle.install import current
 from controller.bundle.signing import Trust, load_signing_key
 from controller.config import Stage
 from controller.errors import UsageError
+from controller.session import costs
 from controller.session.calibrating import calibration_steps
 from controller.session.journal import Journal
 from controller.session.machine import Event
@@ -63,9 +64,10 @@ def make_appearances(
         wishes = wishes_of(checked.stage, calibrated, names)
         table = checked.stage.tables.solve
         options = SolveOptions(table.exposure_share, table.smoothness, table.mode)
+        outputs = output_sizes(checked)
         steps = [
-            *solve_steps(calibrated, wishes, options, after=()),
-            publish_step(folder, output_sizes(checked), [wish.name for wish in wishes],
+            *solve_steps(calibrated, wishes, options, (), costs.scale(size for _, size in outputs.values())),
+            publish_step(folder, outputs, [wish.name for wish in wishes],
                          stage=checked.stage.tables.stage.name, calibration=run.name, key=signing_key(checked)),
         ]  # fmt: skip
         with Journal(run) as journal:

@@ -14,9 +14,10 @@ from controller.demo.bench_process import BenchProcess
 from controller.demo.report import write_demo_report
 from controller.demo.stage import prepare
 from controller.services import calibrating, output_sizes, signing_key
+from controller.session import costs
 from controller.session.machine import Event
 from controller.session.progress import Reporter
-from controller.session.publishing import photograph_hdr, photograph_step, playback_step, publish_step
+from controller.session.publishing import photograph_hdr, photograph_step, photographs_s, playback_step, publish_step
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
 from controller.session.solving import Calibrated, SolveOptions, device_frames, read_solved, solve_steps
@@ -66,7 +67,7 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     return [
         *calibrating(rig, checked=checked),
         marker("solving", "Solving", enter=Event.SOLVE),
-        *solve_steps(calibrated, wishes, options, [*after, "geometry"]),
+        *solve_steps(calibrated, wishes, options, [*after, "geometry"], costs.scale(p.size_px for p in rig.projectors)),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
         publish_step(
@@ -93,7 +94,7 @@ def _traditional_step(rig: Rig, calibrated: Calibrated, names: Sequence[str], lo
         partial(_traditional, rig, calibrated, tuple(names), longest_s),
         after=tuple(f"appearance-{name}" for name in names),
         title="Photographing the traditional way for comparison",
-        weight=1.2 * len(names),
+        weight=photographs_s(rig, names),
     )
 
 

@@ -29,6 +29,7 @@ from controller.capture.brackets import merge_brackets
 from controller.capture.patterns import PatternPlan, plan_patterns
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.errors import CalibrationError
+from controller.session import costs
 from controller.session.capturing import capture_steps, code_step
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
@@ -54,7 +55,7 @@ def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float
             inputs={"prior": repr(prior)},
             after=tuple(f"pixels-{name}" for name in names),
             title="Reconstructing the object and the poses",
-            weight=8,
+            weight=costs.geometry_s(costs.scale(projector.size_px for projector in rig.projectors)),
         )
     )
     return steps
@@ -67,7 +68,7 @@ def _radiometry_step(projector: RigProjector) -> Step:
         lambda context: _radiometry(projector, plan, context),
         after=("black", f"light-{projector.name}"),
         title=f"Measuring the response of {projector.name}",
-        weight=1.0,
+        weight=costs.RADIOMETRY_S * costs.scale([projector.size_px]),
     )
 
 
@@ -78,7 +79,7 @@ def _pixels_step(projector: RigProjector) -> Step:
         lambda context: _pixels(projector, plan, context),
         after=("black", f"radiometry-{projector.name}", f"codes-{projector.name}"),
         title=f"Decoding {projector.name} and fitting its metapixels",
-        weight=3.0,
+        weight=costs.PIXELS_S * costs.scale([projector.size_px]),
     )
 
 

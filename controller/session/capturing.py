@@ -15,6 +15,7 @@ from controller.capture.brackets import choose_brackets, choose_exposure
 from controller.capture.patterns import Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
 from controller.capture.raw import read_photograph
 from controller.errors import CalibrationError
+from controller.session import costs
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
 from controller.session.shots import Planned, take_all
@@ -26,8 +27,6 @@ WHITE_EXPOSURES = 3
 """At most as many photographs for one HDR white image."""
 BLACK_BRACKET = (8.0, 32.0)
 """Exposures of the HDR black image, relative to the one at which white is well exposed."""
-SHOT_SECONDS = 0.4
-"""What a photograph costs on the reference machine beside its exposure; weighs the steps for the time left."""
 
 
 def plans_of(rig: Rig) -> dict[str, PatternPlan]:
@@ -39,13 +38,14 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
     """All capture steps but the codes, which wait for the radiometry (see ``code_step``)."""
     inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
     plans = plans_of(rig)
+    a_shot_s = _shot_s(rig)
     steps = [
         Step(
             "exposure",
             lambda context: _find_exposures(rig, context, longest_exposure_s),
             inputs=inputs,
             title="Finding the exposure",
-            weight=4 * len(rig.projectors) * SHOT_SECONDS,
+            weight=2 * len(rig.projectors) * a_shot_s,
         ),
         Step(
             "black",
@@ -53,7 +53,7 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
             inputs=inputs,
             after=("exposure",),
             title="Photographing black",
-            weight=4 * SHOT_SECONDS,
+            weight=3 * a_shot_s,
         ),
     ]
     for projector in rig.projectors:
@@ -65,7 +65,7 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
                 inputs=inputs,
                 after=("exposure",),
                 title=f"Photographing the light of {projector.name}",
-                weight=SHOT_SECONDS * (WHITE_EXPOSURES + 3 + len(plan.of_kind(PatternKind.RAMP))),
+                weight=a_shot_s * (WHITE_EXPOSURES + 3 + len(plan.of_kind(PatternKind.RAMP))),
             )
         )
     return steps
@@ -81,8 +81,12 @@ def code_step(rig: Rig, projector: RigProjector) -> Step:
         inputs={"sizes": _sizes(rig)},
         after=("exposure", f"radiometry-{projector.name}"),
         title=f"Photographing the patterns of {projector.name}",
-        weight=SHOT_SECONDS * len(coded),
+        weight=_shot_s(rig) * len(coded),
     )
+
+
+def _shot_s(rig: Rig) -> float:
+    return costs.shot_s(costs.scale(projector.size_px for projector in rig.projectors))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from controller.bundle.signing import ANYONE, Trust, load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.capture.brackets import merge_brackets
 from controller.errors import UsageError
+from controller.session import costs
 from controller.session.capturing import bracket
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
@@ -134,8 +135,13 @@ def photograph_step(rig: Rig, names: Sequence[str], *, longest_exposure_s: float
         partial(_photograph, rig, tuple(names), longest_exposure_s),
         after=("publish",),
         title="Photographing what plays",
-        weight=1.0 * len(names),
+        weight=photographs_s(rig, names),
     )
+
+
+def photographs_s(rig: Rig, names: Sequence[str]) -> float:
+    """What showing and photographing these appearances costs (``session.costs``)."""
+    return 3 * len(names) * costs.shot_s(costs.scale(projector.size_px for projector in rig.projectors))
 
 
 def _photograph(rig: Rig, names: Sequence[str], longest_s: float, context: Context) -> Sequence[Path]:

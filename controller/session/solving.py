@@ -16,6 +16,7 @@ from controller.calibrate.values import Calibration
 from controller.calibrate.verify import verify
 from controller.capture.patterns import Pattern, PatternKind, frame, plan_patterns
 from controller.errors import WorkError
+from controller.session import costs
 from controller.session.calibrating import read_calibration
 from controller.session.runner import Context, Step
 from controller.session.shots import read_index
@@ -110,18 +111,27 @@ class Calibrated:
 
 
 def solve_steps(
-    calibrated: Calibrated, wishes: Sequence[Wish], options: SolveOptions, after: Sequence[str]
+    calibrated: Calibrated, wishes: Sequence[Wish], options: SolveOptions, after: Sequence[str], scale: float = 1.0
 ) -> list[Step]:
-    """Grade the calibration, solve the base, then each wish. ``after``: the steps whose artefacts are read."""
+    """Grade the calibration, solve the base, then each wish.
+
+    ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``session.costs``.
+    """
     steps = [
-        Step("verify", partial(_verify, calibrated), after=tuple(after), title="Grading the calibration", weight=2),
+        Step(
+            "verify",
+            partial(_verify, calibrated),
+            after=tuple(after),
+            title="Grading the calibration",
+            weight=costs.VERIFY_S * scale,
+        ),
         Step(
             "base",
             partial(_solve_base, calibrated, options),
             inputs=options.inputs(),
             after=tuple(after),
             title="Solving the base image",
-            weight=5,
+            weight=costs.BASE_S * scale,
         ),
     ]
     for wish in wishes:
@@ -132,7 +142,7 @@ def solve_steps(
                 inputs={**options.inputs(), **wish.inputs},
                 after=(*after, "base"),
                 title=f"Solving {wish.title}",
-                weight=4,
+                weight=costs.APPEARANCE_S * scale,
             )
         )
     return steps
