@@ -14,9 +14,10 @@ from hal.deadline import Cancelled
 from hal.errors import DeviceError
 
 ENDS_WITH_INPUT = """
-import signal
+import signal, sys
 from controller.demo.bench_process import terminated_when_input_ends
-signal.signal(signal.SIGTERM, lambda *_: print("asked to end", flush=True))
+# It ends in the handler: the signal may come before the pause.
+signal.signal(signal.SIGTERM, lambda *_: (print("asked to end", flush=True), sys.exit(0)))
 terminated_when_input_ends()
 print("ready", flush=True)
 signal.pause()
