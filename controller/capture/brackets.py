@@ -8,7 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.arrays import FloatImage, Mask
+from controller.capture.profile import CameraNoise
 from controller.errors import UsageError
+
+__all__ = [
+    "BracketChoice",
+    "CameraNoise",
+    "ExposureChoice",
+    "Merged",
+    "choose_brackets",
+    "choose_exposure",
+    "merge_brackets",
+]
 
 TARGET = 0.75
 """Of full scale, for the brightest lit pixels of a pattern: bright enough, and room for the lamp's flicker."""
@@ -20,14 +31,6 @@ BRACKET_CEILING = 0.8
 BRACKET_DARK = 0.2
 BRACKET_STEP = 8.0
 """Three stops: neighbours overlap where both are well above noise."""
-
-
-@dataclass(frozen=True, slots=True)
-class CameraNoise:
-    """Variance of a full-scale value v: ``shot`` v + ``read`` squared. The defaults suit a 12-bit APS-C camera."""
-
-    shot: float = 1 / 30_000
-    read: float = 6 / 30_000
 
 
 @dataclass(frozen=True, slots=True)

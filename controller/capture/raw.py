@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.arrays import Float64, FloatImage, Mask
-from controller.compiled import compiled
+from controller.capture.demosaic import SensorLevels, demosaic, fill_bad
+from controller.capture.profile import CameraProfile
 from controller.errors import UsageError, WorkError
 
 SATURATED_SHARE = 0.985
@@ -37,11 +38,14 @@ class Photograph:
     ``image`` (rows, columns, 3) float32 camera RGB, 0 at the black level, 1 at full scale; noise may go below 0
     ``saturated`` (rows, columns) bool: some sample that this pixel is made of was clipped
     ``camera_to_xyz`` (3, 3) linear camera RGB to CIE XYZ as the file tells it, None where it does not
+    ``colours`` (2, 2) the Bayer pattern it was interpolated from (0 red, 1 green, 2 blue; see ``bayer_kernels``), None
+    for a JPEG, whose interpolation is the camera's secret
     """
 
     image: FloatImage
     saturated: Mask
     camera_to_xyz: Float64 | None
+    colours: npt.NDArray[np.int64] | None = None
 
     def measured(self) -> FloatImage:
         """The image with NaN where it was saturated: NaN means not measured everywhere in ``calibrate``."""
@@ -50,8 +54,36 @@ class Photograph:
         return image
 
 
-def read_photograph(path: Path, *, response: Float64 | None = None) -> Photograph:
+@dataclass(frozen=True, slots=True)
+class RawMosaic:
+    """A RAW file's samples as the sensor gave them: ``samples`` (rows, columns) uint16, and what they mean."""
+
+    samples: npt.NDArray[np.uint16]
+    levels: SensorLevels
+    camera_to_xyz: Float64 | None
+
+    def developed(self) -> Photograph:
+        """Interpolated to an image in linear light."""
+        image, saturated = demosaic(self.samples, self.levels)
+        return Photograph(image, saturated, self.camera_to_xyz, self.levels.colours)
+
+    def linear(self) -> tuple[FloatImage, Mask]:
+        """(rows, columns) float32 samples, 0 at black and 1 at full scale, and which were clipped."""
+        linear = np.empty(self.samples.shape, np.float32)
+        clipped = np.empty(self.samples.shape, np.bool_)
+        for row, column in np.ndindex(2, 2):
+            site = self.samples[row::2, column::2]
+            black, white = self.levels.black[row, column], self.levels.white[row, column]
+            linear[row::2, column::2] = (site - np.float32(black)) / np.float32(white - black)
+            clipped[row::2, column::2] = site >= self.levels.clip[row, column]
+        return linear, clipped
+
+
+def read_photograph(path: Path, *, response: Float64 | None = None, profile: CameraProfile | None = None) -> Photograph:
     """Read a RAW file (any kind that LibRaw knows, Bayer sensors), or a JPEG with its ``response`` (3, 256).
+
+    ``profile`` is what was measured of the camera: its black level, its limits, bad pixels and JPEG response go before
+    what the file says.
 
     Raises
     ------
@@ -59,7 +91,9 @@ def read_photograph(path: Path, *, response: Float64 | None = None) -> Photograp
     UsageError("raw-not-bayer")  the sensor has no 2x2 colour pattern
     UsageError("jpeg-response-missing")  a JPEG says nothing of light without the camera's response table
     """
-    if path.suffix.lower() in (".jpg", ".jpeg"):
+    if is_jpeg(path):
+        if response is None and profile is not None:
+            response = profile.response
         if response is None:
             raise UsageError(
                 "jpeg-response-missing",
@@ -67,18 +101,16 @@ def read_photograph(path: Path, *, response: Float64 | None = None) -> Photograp
                 remedy="Set the camera to RAW, or measure its response first.",
             )
         return _read_jpeg(path, response)
-    return _read_raw(path)
+    return read_mosaic(path, profile=profile).developed()
 
 
-def _unreadable(path: Path, reason: object) -> WorkError:
-    return WorkError(
-        "photograph-unreadable",
-        what=f"The photograph {path.name} can't be read ({reason}).",
-        remedy="Take it again; if this happens often, check the camera's card and cable.",
-    )
+def is_jpeg(path: Path) -> bool:
+    """Whether a photograph is a JPEG, by its name."""
+    return path.suffix.lower() in (".jpg", ".jpeg")
 
 
-def _read_raw(path: Path) -> Photograph:
+def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosaic:
+    """A RAW file before its interpolation; raises as ``read_photograph``."""
     import rawpy
 
     try:
@@ -89,7 +121,20 @@ def _read_raw(path: Path) -> Photograph:
             camera_to_xyz = _camera_to_xyz(raw)
     except (rawpy.LibRawError, OSError) as error:
         raise _unreadable(path, error) from error
-    return develop(mosaic, colours, black, white, camera_to_xyz=camera_to_xyz)
+    clip = black + SATURATED_SHARE * (white - black)
+    if profile is not None:
+        mosaic = fill_bad(mosaic, profile.bad_px)
+        black = black + profile.black_offset
+        clip = np.minimum(clip, profile.clip)
+    return RawMosaic(mosaic, SensorLevels(colours, black, white, clip), camera_to_xyz)
+
+
+def _unreadable(path: Path, reason: object) -> WorkError:
+    return WorkError(
+        "photograph-unreadable",
+        what=f"The photograph {path.name} can't be read ({reason}).",
+        remedy="Take it again; if this happens often, check the camera's card and cable.",
+    )
 
 
 def _colour_of_sites(raw: Any, path: Path) -> npt.NDArray[np.int64]:
@@ -139,49 +184,15 @@ def develop(
 ) -> Photograph:
     """Black level off, scaled to full scale, bilinear interpolation of the colours: linear in every sample.
 
-    ``mosaic`` (rows, columns) uint16; ``colours``, ``black``, ``white`` (2, 2) of the colour pattern's sites.
+    ``mosaic`` (rows, columns) uint16; ``colours``, ``black``, ``white`` (2, 2) of the colour pattern's sites. The exact
+    kernels of the interpolation: ``controller.capture.demosaic.bayer_kernels(photograph.colours)``.
     """
-    image = np.empty((*mosaic.shape, 3), np.float32)
-    saturated = np.empty(mosaic.shape, np.bool_)
-    scale = (1 / (white - black)).astype(np.float32)
-    clip = black + SATURATED_SHARE * (white - black)
-    _demosaic(np.ascontiguousarray(mosaic), colours, black.astype(np.float32), scale, clip, image, saturated)
-    return Photograph(image, saturated, camera_to_xyz)
+    levels = SensorLevels(colours, black, white, black + SATURATED_SHARE * (white - black))
+    return RawMosaic(mosaic, levels, camera_to_xyz).developed()
 
 
-@compiled(parallel=False, fastmath=False)
-def _demosaic(
-    mosaic: npt.NDArray[np.uint16],
-    colours: npt.NDArray[np.int64],
-    black: FloatImage,
-    scale: FloatImage,
-    clip: Float64,
-    image: FloatImage,
-    saturated: Mask,
-) -> None:
-    rows, columns = mosaic.shape
-    total, count = np.zeros(3, np.float32), np.zeros(3, np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            total[:] = 0
-            count[:] = 0
-            clipped = False
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(column - 1, 0), min(column + 2, columns)):
-                    sample = mosaic[r, c]
-                    clipped |= sample >= clip[r & 1, c & 1]
-                    colour = colours[r & 1, c & 1]
-                    total[colour] += (sample - black[r & 1, c & 1]) * scale[r & 1, c & 1]
-                    count[colour] += 1
-            own = colours[row & 1, column & 1]
-            for colour in range(3):
-                image[row, column, colour] = total[colour] / count[colour]
-            # a sample's own colour is measured there, not interpolated
-            image[row, column, own] = (mosaic[row, column] - black[row & 1, column & 1]) * scale[row & 1, column & 1]
-            saturated[row, column] = clipped
-
-
-def _read_jpeg(path: Path, response: Float64) -> Photograph:
+def read_jpeg_values(path: Path) -> npt.NDArray[np.uint8]:
+    """(rows, columns, 3) uint8 RGB of a JPEG as it lies on the sensor, without light. Raises WorkError as above."""
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
@@ -189,6 +200,11 @@ def _read_jpeg(path: Path, response: Float64) -> Photograph:
     decoded = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if decoded is None:
         raise _unreadable(path, "it is not a whole JPEG")
+    return np.asarray(decoded, np.uint8)
+
+
+def _read_jpeg(path: Path, response: Float64) -> Photograph:
+    decoded = read_jpeg_values(path)
     table = np.asarray(response, np.float32)
     image = np.stack([table[channel][decoded[:, :, channel]] for channel in range(3)], axis=2)
     return Photograph(image, np.any(decoded >= JPEG_SATURATED, axis=2), None)

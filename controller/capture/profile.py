@@ -1,0 +1,76 @@
+"""What was measured of the camera itself during a run, and how it is kept beside the photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.arrays import Float64, load_arrays, save_arrays
+
+FILE_NAME = "camera.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraNoise:
+    """Variance of a full-scale value v: ``shot`` v + ``read`` squared. The defaults suit a 12-bit APS-C camera."""
+
+    shot: float = 1 / 30_000
+    read: float = 6 / 30_000
+
+
+def _nothing_clips() -> Float64:
+    return np.full((2, 2), np.inf)
+
+
+def _nothing_added() -> Float64:
+    return np.zeros((2, 2))
+
+
+def _none_bad() -> npt.NDArray[np.int64]:
+    return np.empty((0, 2), np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraProfile:
+    """Measured properties of the camera; the defaults leave to each file what it says of itself.
+
+    ``noise`` of one raw sample (JPEG: of one value in linear light)
+    ``black_offset`` (2, 2) raw steps by which each site's black level lies above the file's word
+    ``clip`` (2, 2) raw value from which a site saturates or is no longer linear, inf where none was found
+    ``bad_px`` (n, 2) column and row of samples that do not measure light
+    ``response`` (3, 256) linear light of a JPEG value, 1 at 255; None for a camera that delivers RAW
+    """
+
+    noise: CameraNoise = field(default_factory=CameraNoise)
+    black_offset: Float64 = field(default_factory=_nothing_added)
+    clip: Float64 = field(default_factory=_nothing_clips)
+    bad_px: npt.NDArray[np.int64] = field(default_factory=_none_bad)
+    response: Float64 | None = None
+
+    def save(self, folder: Path) -> Path:
+        """Write ``camera.npz`` into a run's folder."""
+        arrays: dict[str, npt.NDArray[np.generic]] = {
+            "noise": np.array([self.noise.shot, self.noise.read]),
+            "black_offset": self.black_offset,
+            "clip": self.clip,
+            "bad_px": self.bad_px,
+        }
+        if self.response is not None:
+            arrays["response"] = self.response
+        save_arrays(folder / FILE_NAME, arrays)
+        return folder / FILE_NAME
+
+
+def load_profile(folder: Path) -> CameraProfile | None:
+    """What a run measured of its camera, None before it has."""
+    path = folder / FILE_NAME
+    if not path.exists():
+        return None
+    arrays = load_arrays(path)
+    shot, read = (float(value) for value in arrays["noise"])
+    return CameraProfile(
+        CameraNoise(shot, read), arrays["black_offset"], arrays["clip"], arrays["bad_px"], arrays.get("response")
+    )
