@@ -65,7 +65,7 @@ class EmulatedBench:
         stopped = threading.Event()
         with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
             try:
-                _start(stage.resolve(), out, stack, stopped)
+                world = _start(stage.resolve(), out, stack, stopped)
             except DeviceError as error:
                 out.failed(error)
                 return DEVICE_FAILED
@@ -73,7 +73,7 @@ class EmulatedBench:
                 return 0
             out.ready()
             while not stopped.wait(0.5):
-                pass
+                _follow_bumps(world, out)
         out.say({"stopped": True}, "All devices are off.")
         return 0
 
@@ -113,7 +113,7 @@ class _Lines:
             sys.stderr.write(f"velatura: {error.what}\n{error.remedy}\n")
 
 
-def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event) -> None:
+def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event) -> World:
     """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
     truth = read_truth(stage)
     _require_free(truth.camera.command_port, truth.camera.event_port)
@@ -128,6 +128,7 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
     with _explained(stage):
         world = stack.enter_context(World(stage, truth, lamps, progress=progress))
     world.warm()
+    _follow_bumps(world, out)
     for projector, lamp in zip(truth.projectors, lamps, strict=True):
         wire = EmulatedSerialProjector(stage / projector.port, lamp)
         if scenario is not None:
@@ -146,6 +147,17 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
     stack.enter_context(camera)
     out.served("camera", "camera", camera.address)
     out.served("display", "display", str(stage / truth.frames))
+    return world
+
+
+def _follow_bumps(world: World, out: _Lines) -> None:
+    try:
+        count = world.follow_bumps()
+    except DeviceError as error:  # somebody is writing it, or wrote it wrongly: the stage stays as it was
+        out.failed(error)
+        return
+    if count is not None:
+        out.say({"bumps": count}, f"The stage is as it was set up, but for {count} bumps.")
 
 
 def _free_ports() -> tuple[int, int]:

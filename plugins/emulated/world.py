@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from plugins.emulated.bumps import FILE as BUMPS
+from plugins.emulated.bumps import bumped, read_bumps
 from plugins.emulated.dng import PictureFacts, dng, with_exif
 from plugins.emulated.objects import StageObject, default_object
 from plugins.emulated.outputs import FrameSet, VisibleFrames
@@ -40,10 +42,11 @@ class World:
     def __init__(
         self, stage: Path, truth: BenchTruth, lamps: Sequence[Lamp], *, progress: Progress = lambda share: None
     ) -> None:
-        self._truth = truth
+        self._stage, self._set_up, self._truth = stage, truth, truth
         self._lamps = tuple(lamps)
-        samples = samples_of(truth, object_of(stage, truth.object), stage / FOLDER, progress)
-        self._renderer = Renderer(truth, samples)
+        self._samples = samples_of(truth, object_of(stage, truth.object), stage / FOLDER, progress)
+        self._renderer = Renderer(truth, self._samples)
+        self._bumps_seen: tuple[int, int] | None = None
         self._visible = VisibleFrames(stage / truth.frames, truth.latency_s)
         self._rng = np.random.default_rng([truth.seed, 2])
 
@@ -59,6 +62,29 @@ class World:
     def warm(self) -> None:
         """Compile the kernels now, so that the first exposure is not late."""
         self._renderer.light([self._frame(i, None) for i in range(len(self._lamps))], [1.0] * len(self._lamps))
+
+    def follow_bumps(self) -> int | None:
+        """Look at the bumps of the stage; where they have changed, let them count, and return how many there are.
+
+        Rays are cast anew for that; until they are, pictures show the stage as it was.
+        Raises DeviceError as ``read_bumps``; the stage then stays as it is.
+        """
+        path = self._stage / BUMPS
+        try:
+            state = path.stat()
+            seen: tuple[int, int] | None = (state.st_mtime_ns, state.st_size)
+        except OSError:
+            seen = None
+        if seen == self._bumps_seen:
+            return None
+        self._bumps_seen = seen
+        bumps = read_bumps(path, self._set_up)
+        truth = bumped(self._set_up, bumps)
+        samples = self._samples
+        if bumps.bump:
+            samples = samples_of(truth, object_of(self._stage, truth.object), None, lambda share: None)
+        self._truth, self._renderer = truth, Renderer(truth, samples)
+        return len(bumps.bump)
 
     def expose(self, settings: ShotSettings) -> ShotFiles:
         """Take one picture: lasts the (scaled) exposure time, and shows what was visible during it."""
