@@ -82,9 +82,18 @@ def emulate(
     return bench_of(stage).serve(stage, json_lines=as_json)
 
 
-def calibrate(stage: StageFolder, as_json: Json = False) -> None:
+def calibrate(
+    stage: StageFolder,
+    mode: Annotated[
+        str, typer.Option(help="fast (sinusoids), paper (dots everywhere) or auto (dots at depth edges).")
+    ] = "fast",
+    dot_spacing: Annotated[
+        str | None, typer.Option(help='Projector pixels between dots, or "auto" for what the blur needs.')
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Photograph patterns and calibrate the stage; goes on with an unfinished calibration."""
-    work("controller.services:calibrate", as_json=as_json, stage=stage)
+    work("controller.services:calibrate", as_json=as_json, stage=stage, mode=mode, dot_spacing=dot_spacing)
 
 
 def appearance(

@@ -14,8 +14,10 @@ from controller.config import Stage
 from controller.errors import UsageError
 from controller.session import costs
 from controller.session.calibrating import calibration_steps
+from controller.session.dotting import dot_steps
 from controller.session.journal import Journal
 from controller.session.machine import Event
+from controller.session.modes import DotOptions, dot_options
 from controller.session.progress import Reporter
 from controller.session.publishing import bundle_display, publish_step
 from controller.session.rig import Rig
@@ -29,21 +31,32 @@ KEY_FILE = "keys/stage.key"
 """The stage's signing key, where there is one."""
 
 
-def calibrate(*, stage: Path, reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-    """Calibrate the stage, going on with an unfinished calibration; returns where the results lie."""
+def calibrate(
+    *, stage: Path, reporter: Reporter, cancel: threading.Event, mode: str = "fast", dot_spacing: str | None = None
+) -> Mapping[str, Any]:
+    """Calibrate the stage, going on with an unfinished calibration; returns where the results lie.
+
+    ``mode`` and ``dot_spacing``, and what is raised for wrong ones: see ``session.modes.dot_options``.
+    """
+    options = dot_options(mode, dot_spacing)
     checked = check_stage(stage)
     run = run_on_stage(
-        checked, lambda rig, _: calibrating(rig, checked=checked), name="calibrate", reporter=reporter, cancel=cancel
+        checked,
+        lambda rig, _: calibrating(rig, checked=checked, options=options),
+        name="calibrate",
+        reporter=reporter,
+        cancel=cancel,
     )
     return {"run": str(run)}
 
 
-def calibrating(rig: Rig, *, checked: Checked) -> Sequence[Step]:
+def calibrating(rig: Rig, *, checked: Checked, options: DotOptions | None = None) -> Sequence[Step]:
     """The calibration's steps between their state markers."""
     longest_s = checked.stage.tables.capture.longest_exposure_s
     return [
         marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
         *calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+        *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s),
         marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
     ]
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from controller.arrays import FloatImage, Mask
 from controller.calibrate.captures import Captures, coloured
 from controller.calibrate.gaussian_fit import PARAMETERS, fit_gaussian
+from controller.calibrate.pixels import carry_covariance
 from controller.calibrate.values import Metapixels
 from controller.capture.dots import PAPER_SPACING_PX, dot_patterns
 from controller.compiled import compiled
@@ -53,6 +54,7 @@ def fit_dots(
     guess: Metapixels,
     r: int = PAPER_SPACING_PX,
     *,
+    fallback: Metapixels | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Metapixels, DotReport]:
     """One projector's metapixels from photographs of its dots.
@@ -63,8 +65,9 @@ def fit_dots(
         each is asked for once
     white : (camera rows, columns, 3) the projector alone at white, less black, in the same unit; or (rows, columns)
         where the photographs are grey
-    guess : where the fits start, and what stays where they fail; see ``controller.calibrate.guess``
+    guess : where the fits start; see ``controller.calibrate.guess``
     r : the dots' spacing in projector pixels
+    fallback : what is taken where a fit fails, if it is valid there: the 3D model's guess (paper 4.2.2); else the guess
     progress : called with the share of the pictures that are done
 
     Returns
@@ -89,6 +92,9 @@ def fit_dots(
         if progress is not None:
             progress((number + 1) / len(patterns))
     fitted = status == _FITTED
+    if fallback is not None:
+        instead = (status == _FAILED) & fallback.valid
+        centre[instead], covariance[instead] = fallback.centre_px[instead], fallback.covariance_px2[instead]
     report = DotReport(
         fitted=int(fitted.sum()),
         failed=int((status == _FAILED).sum()),
@@ -96,6 +102,43 @@ def fit_dots(
         residual=float(np.median(residual[fitted])) if fitted.any() else float("nan"),
     )
     return Metapixels(centre, covariance, guess.valid.copy()), report
+
+
+def blur_px2(metapixels: Metapixels) -> FloatImage:
+    """(rows, columns, 3) xx, xy, yy: each metapixel's covariance in projector pixels squared, the camera's blur in it.
+
+    NaN at pixels that lack a neighbour in a row or column, of which the local scale would be taken.
+    """
+    centre = np.where(metapixels.valid[..., None], metapixels.centre_px, np.nan)
+    a, c = np.moveaxis(np.gradient(centre, axis=1), -1, 0)
+    b, d = np.moveaxis(np.gradient(centre, axis=0), -1, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = 1 / (a * d - b * c)
+        inverse = np.stack([d, -b, -c, a], axis=-1) * scale[..., None]
+        return carry_covariance(inverse, np.where(metapixels.valid[..., None], metapixels.covariance_px2, np.nan))
+
+
+def largest_sigma_px(metapixels: Metapixels) -> float:
+    """The blur that dots must keep clear of: the long axis, in projector pixels, that 95 % of metapixels stay below.
+
+    NaN where there is no metapixel.
+    """
+    xx, xy, yy = np.moveaxis(blur_px2(metapixels).astype(np.float64), -1, 0)
+    long = np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
+    long = long[np.isfinite(long)]
+    return float(np.quantile(long, 0.95)) if long.size else float("nan")
+
+
+def peak_share(metapixels: Metapixels) -> float:
+    """Share of the white light at a dot's centre that only one metapixel in fifty exceeds; at most 1.
+
+    With all pixels at white, a camera pixel's light is the sum of Gaussians one projector pixel apart.
+    """
+    xx, xy, yy = np.moveaxis(blur_px2(metapixels).astype(np.float64), -1, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        peak = 1 / (2 * np.pi * np.sqrt(xx * yy - xy * xy))
+    peak = peak[np.isfinite(peak)]
+    return float(min(np.quantile(peak, 0.98), 1.0)) if peak.size else 1.0
 
 
 def _stacked(image: FloatImage) -> FloatImage:

@@ -39,6 +39,16 @@ def guess_metapixels(
     return Metapixels(inverse.centre_px, covariance, inverse.valid)
 
 
+def where_missing(metapixels: Metapixels, other: Metapixels) -> Metapixels:
+    """``metapixels``, and those of ``other`` where they are not valid."""
+    take = (~metapixels.valid & other.valid)[..., None]
+    return Metapixels(
+        np.where(take, other.centre_px, metapixels.centre_px),
+        np.where(take, other.covariance_px2, metapixels.covariance_px2),
+        metapixels.valid | other.valid,
+    )
+
+
 def modelled_correspondence(geometry: Geometry, n: int) -> Correspondence:
     """Where each camera pixel's point lies in projector ``n``'s image, by the reconstructed object and pose.
 

@@ -20,7 +20,6 @@ from controller.calibrate.values import (
     Calibration,
     Correspondence,
     Geometry,
-    Metapixels,
     Pinhole,
     ProjectorCalibration,
     Radiometry,
@@ -31,6 +30,7 @@ from controller.capture.raw import CAMERA_BLUR_PX
 from controller.errors import CalibrationError
 from controller.session import costs
 from controller.session.capturing import capture_steps, code_step
+from controller.session.modes import read_metapixels
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
 from controller.session.shots import Developed, Taken, read_index
@@ -227,8 +227,7 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     parts = []
     for name in projectors:
         light = load_arrays(folder / f"radiometry-{name}.npz")
-        pixels = load_arrays(folder / f"pixels-{name}.npz")
-        metapixels = Metapixels(pixels["centre_px"], pixels["covariance_px2"], pixels["valid"])
+        metapixels = read_metapixels(folder, name)
         radiometry = Radiometry(light["response"], light["mixing"])
         parts.append(ProjectorCalibration(name, metapixels, radiometry, np.nan_to_num(light["white"])))
     black = np.nan_to_num(light["black"])

@@ -33,3 +33,8 @@ def shot_s(of_scale: float) -> float:
 def geometry_s(of_scale: float) -> float:
     """The reconstruction; most of it works on a sample of the points."""
     return 3.5 + 0.5 * of_scale
+
+
+def dots_s(of_scale: float, photographs: int) -> float:
+    """Metapixels from that many photographs of dots: the fits, and the development of each photograph."""
+    return of_scale * (0.8 + 0.06 * photographs)
