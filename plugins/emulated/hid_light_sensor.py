@@ -1,0 +1,60 @@
+"""An emulated ColorHug ALS (273f:1008): ambient light through the HID sensor usages."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from plugins.emulated.usb_bus_device import Stall, UsbNames
+from plugins.emulated.usb_bus_hid import FEATURE, INPUT, EmulatedHidDevice
+
+_LUX_UNIT: Final = 0.01
+_READY, _CHANGED = 2, 2
+_FULL_POWER: Final = 2
+
+
+class EmulatedLightSensor(EmulatedHidDevice):
+    """Reports ``lux`` when asked, and by itself whenever it changes while it is at full power."""
+
+    numbered = True
+    # Collection "Sensor: Environmental: Light" with feature and input report 1 (HID usage page 0x20).
+    hid_descriptor = bytes.fromhex(
+        "05200941a10085010a09031500250275089501b1020a16031500250575089501b1020a19031500250575089501b102"
+        "0a01021500250675089501b1020a0e0315002700ffffff75209501b102"
+        "0a01021500250675089501810 20a02021500250575089501810 20ad1041500 27ffffff7f75209501550e8102c0".replace(" ", "")
+    )
+
+    def __init__(self, *, lux: float = 0.5, serial: str = "") -> None:
+        super().__init__(UsbNames(0x273F, 0x1008, "Hughski Ltd.", "ColorHugALS", serial))
+        self._lux = lux
+        self.settings = (0, 0, 0, 0, 0)
+        """Connection, reporting, power, state, interval in ms."""
+
+    @property
+    def lux(self) -> float:
+        return self._lux
+
+    @lux.setter
+    def lux(self, lux: float) -> None:
+        self._lux = lux
+        if self.settings[2] == _FULL_POWER:
+            self.input(self._reading())
+
+    def plugged(self) -> None:
+        super().plugged()
+        self.settings = (0, 0, 0, 0, 0)
+
+    def get_report(self, kind: int, number: int) -> bytes:
+        if number != 1 or kind not in (INPUT, FEATURE):
+            raise Stall
+        return self._reading() if kind == INPUT else struct.pack("<BBBBBI", 1, *self.settings)
+
+    def set_report(self, kind: int, number: int, data: bytes) -> None:
+        if kind != FEATURE or number != 1 or len(data) < 9:
+            raise Stall
+        _, *settings = struct.unpack("<BBBBBI", data[:9])
+        connection, reporting, power, state, interval = settings
+        self.settings = (connection, reporting, power, state, interval)
+
+    def _reading(self) -> bytes:
+        return struct.pack("<BBBI", 1, _READY, _CHANGED, max(0, round(self._lux / _LUX_UNIT)))
