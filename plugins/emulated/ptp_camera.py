@@ -38,7 +38,7 @@ from plugins.emulated.ptp_wire import (
 from plugins.emulated.shot import Expose
 
 Flavour = Literal["generic", "eos-new", "eos-old"]
-_BODIES: Final = {"generic": GenericBody, "eos-new": EosBody, "eos-old": OldEosBody}
+BODIES: Final = {"generic": GenericBody, "eos-new": EosBody, "eos-old": OldEosBody}
 NAMES: Final = {
     "generic": CameraNames(),
     "eos-new": CameraNames("Canon Inc.", "Canon EOS 1300D", "0320010001", "3-1.1.0"),
@@ -76,7 +76,7 @@ class EmulatedPtpCamera:
     ) -> None:
         self.faults = faults or CameraFaults()
         self.names = names or NAMES[flavour]
-        self._body = _BODIES[flavour](
+        self._body = BODIES[flavour](
             expose,
             names=self.names,
             time_scale=time_scale,
