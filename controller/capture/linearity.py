@@ -1,0 +1,197 @@
+"""What a RAW camera's numbers are worth: black level, true exposure ratios, limit of linearity, bad samples."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.arrays import Float64
+from controller.capture.demosaic import SensorLevels
+
+WELL_LIT = (0.08, 0.6)
+"""Shares of full scale between which a ratio of exposures is taken: above noise, below every limit."""
+BINS = 40
+FEWEST = 200
+FEWEST_IN_BIN = 40
+TOLERANCE = 0.01
+"""A level counts as linear while the median of its samples is within 1 % of what the shorter exposure predicts."""
+PILED = 1.15
+"""Samples that should exceed full scale by this are saturated for certain; what they show is the ceiling."""
+HOT_SIGMAS = 12.0
+WORST_BLACK_STEPS = 64.0
+"""A black level farther from the file's word than this is no camera's; the light in between was not still."""
+
+Samples = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True)
+class Exposed:
+    """Raw ``samples`` (rows, columns) uint16 of a picture, and the ``exposure_s`` that the camera told."""
+
+    samples: Samples
+    exposure_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Linearity:
+    """How a bracket series fits a linear camera.
+
+    ``ratios`` measured exposure of each photograph relative to the first; ``nominal`` as the camera told them
+    ``clip`` (2, 2) raw value from which a site is saturated or no longer linear, inf where no sample came near
+    ``worst`` largest relative deviation from linearity at the levels below ``clip``
+    """
+
+    ratios: tuple[float, ...]
+    nominal: tuple[float, ...]
+    clip: Float64
+    worst: float
+
+
+def check_series(series: Sequence[Exposed], levels: SensorLevels) -> Linearity:
+    """Compare the photographs of one still picture, exposure by exposure.
+
+    Each longer exposure should be the next shorter one times one ratio at every level. The ratio is measured where
+    both are well exposed; the level from which the longer falls behind is the sensor's limit. Two equal exposures
+    tell nothing.
+
+    Parameters
+    ----------
+    series : of one picture, in any order; ``levels`` as the files tell them (``clip`` is not used)
+    """
+    ordered = sorted(series, key=lambda one: one.exposure_s)
+    ratios, nominal = [1.0], [1.0]
+    limits: list[Float64] = []
+    worst = 0.0
+    for shorter, longer in itertools.pairwise(ordered):
+        told = longer.exposure_s / shorter.exposure_s
+        ratio = exposure_ratio(shorter, longer, levels)
+        ratios.append(ratios[-1] * ratio)
+        nominal.append(nominal[-1] * told)
+        if told <= 1:
+            continue
+        limit, deviation = _limits(shorter, longer, levels, ratio)
+        limits.append(limit)
+        worst = max(worst, deviation)
+    clip = np.minimum.reduce(limits) if limits else np.full((2, 2), np.inf)
+    return Linearity(tuple(ratios), tuple(nominal), clip, worst)
+
+
+def exposure_ratio(shorter: Exposed, longer: Exposed, levels: SensorLevels) -> float:
+    """Light of ``longer`` over that of ``shorter``, measured; as told where no sample is well exposed in both."""
+    told = longer.exposure_s / shorter.exposure_s
+    tops, bottoms = 0.0, 0.0
+    for row, column in np.ndindex(2, 2):
+        x, y = (_site(one, levels, row, column) for one in (shorter, longer))
+        good = (y > WELL_LIT[0]) & (y < WELL_LIT[1]) & (x > 0)
+        if np.count_nonzero(good) < FEWEST:
+            continue
+        # Samples at an edge or a highlight that something moved are left out; then the ratio of the sums.
+        each = y[good] / x[good]
+        near = np.abs(each / np.median(each) - 1) < 0.5
+        tops += float(y[good][near].sum(dtype=np.float64))
+        bottoms += float(x[good][near].sum(dtype=np.float64))
+    return tops / bottoms if bottoms > 0 else told
+
+
+def _site(one: Exposed, levels: SensorLevels, row: int, column: int) -> npt.NDArray[np.float32]:
+    black, white = levels.black[row, column], levels.white[row, column]
+    site = one.samples[row::2, column::2].ravel().astype(np.float32)
+    return np.asarray((site - np.float32(black)) / np.float32(white - black))
+
+
+def _limits(shorter: Exposed, longer: Exposed, levels: SensorLevels, ratio: float) -> tuple[Float64, float]:
+    limits, worst = np.full((2, 2), np.inf), 0.0
+    for row, column in np.ndindex(2, 2):
+        x, y = (_site(one, levels, row, column) for one in (shorter, longer))
+        limit, deviation = _limit(x * np.float32(ratio), y)
+        worst = max(worst, deviation)
+        if limit is not None:
+            black, white = levels.black[row, column], levels.white[row, column]
+            limits[row, column] = black + limit * (white - black)
+    return limits, worst
+
+
+def _limit(predicted: npt.NDArray[np.float32], seen: npt.NDArray[np.float32]) -> tuple[float | None, float]:
+    """Of one site: the level from which it is not linear (None: none found), and the largest deviation below it."""
+    ceiling = None
+    certain = seen[predicted > PILED * max(1.0, float(np.percentile(seen, 99.99)))]
+    if certain.size >= FEWEST:
+        # Noise spreads a ceiling that lies below the converter's own; its low end is where trust ends.
+        ceiling = float(np.percentile(certain, 1))
+    edges = np.linspace(WELL_LIT[0], 1.0, BINS + 1)
+    top = ceiling if ceiling is not None else np.inf
+    worst, bent, behind = 0.0, None, 0
+    which = np.digitize(predicted, edges)
+    for number in range(1, BINS + 1):
+        inside = which == number
+        if edges[number] > 0.995 * top or np.count_nonzero(inside) < FEWEST_IN_BIN:
+            continue
+        deviation = float(np.mean(seen[inside], dtype=np.float64) / np.mean(predicted[inside], dtype=np.float64) - 1)
+        if abs(deviation) > TOLERANCE:
+            behind += 1
+            if behind == 2 and bent is None:
+                bent = float(edges[number - 2])
+        else:
+            behind = 0
+            worst = max(worst, abs(deviation)) if bent is None else worst
+    found = [level for level in (ceiling, bent) if level is not None]
+    return (min(found) * (1 - TOLERANCE / 2) if found else None), worst
+
+
+def black_offset(series: Sequence[Exposed], levels: SensorLevels) -> Float64:
+    """(2, 2) raw steps by which the black level lies above the file's word: a line through the exposures at 0 s.
+
+    ``series``: a dark picture at two exposures or more. Without two different ones, and where the result is no
+    camera's, zeros: the file is then believed.
+    """
+    ordered = sorted(series, key=lambda one: one.exposure_s)
+    offset = np.zeros((2, 2))
+    if len(ordered) < 2 or ordered[-1].exposure_s < 1.5 * ordered[0].exposure_s:
+        return offset
+    short, long = ordered[0], ordered[-1]
+    for row, column in np.ndindex(2, 2):
+        x = short.samples[row::2, column::2].astype(np.float64)
+        y = long.samples[row::2, column::2].astype(np.float64)
+        unclipped = y < 0.5 * levels.white[row, column]
+        if np.count_nonzero(unclipped) < FEWEST:
+            return np.zeros((2, 2))
+        zero = (long.exposure_s * x - short.exposure_s * y)[unclipped] / (long.exposure_s - short.exposure_s)
+        low, high = np.percentile(zero, (1, 99))
+        inside = zero[(zero >= low) & (zero <= high)]
+        offset[row, column] = float(inside.mean()) - levels.black[row, column]
+    return offset if np.abs(offset).max() <= WORST_BLACK_STEPS else np.zeros((2, 2))
+
+
+def find_hot(series: Sequence[Exposed], levels: SensorLevels) -> npt.NDArray[np.int64]:
+    """(n, 2) column and row of samples that stand far out of their neighbours in every one of the dark photographs.
+
+    Compared with the median of the eight nearest samples of the same site, in units of the photograph's own spread.
+    A highlight stands out too, but not alone in its 5x5 samples; a sample at an edge is near one of its neighbours.
+    """
+    if not series:
+        return np.empty((0, 2), np.int64)
+    hot = np.logical_and.reduce([_standing_out(one.samples, levels) for one in series])
+    rows, columns = np.nonzero(hot)
+    return np.stack((columns, rows), axis=1).astype(np.int64)
+
+
+def _standing_out(samples: Samples, levels: SensorLevels) -> npt.NDArray[np.bool_]:
+    """Above the brightest of the eight neighbours of its own site, and above their median by many deviations."""
+    found = np.zeros(samples.shape, np.bool_)
+    ring = np.ones((3, 3), np.uint8)
+    ring[1, 1] = 0
+    for row, column in np.ndindex(2, 2):
+        site = np.ascontiguousarray(samples[row::2, column::2])
+        brightest = cv2.dilate(site, ring).astype(np.float32)
+        middle = cv2.medianBlur(site, 3).astype(np.float32)
+        above = site.astype(np.float32) - middle
+        spread = max(1.4826 * float(np.median(np.abs(above))), 1.0)
+        shot = np.sqrt(np.maximum(middle - np.float32(levels.black[row, column]), 0))
+        threshold = np.float32(HOT_SIGMAS) * (np.float32(spread) + shot)
+        found[row::2, column::2] = (above > threshold) & (site > brightest + 0.5 * threshold)
+    return found
