@@ -16,6 +16,7 @@ import numpy.typing as npt
 from hal.deadline import Deadline
 from hal.values import (
     CameraCapabilities,
+    CameraStatus,
     CapturedFile,
     DeviceIdentity,
     ExposureSettings,
@@ -83,6 +84,25 @@ class Camera(Device, Protocol):
         ``destination`` is a path without suffix; each file gets the camera's suffix (``.dng``, ``.jpg``), written
         under a temporary name and renamed when whole.
         """
+
+
+@runtime_checkable
+class WatchedCamera(Camera, Protocol):
+    """A camera that tells how long it can go on."""
+
+    def status(self, *, deadline: Deadline) -> CameraStatus:
+        """Battery, card and warnings as the camera answers now."""
+
+
+@runtime_checkable
+class LiveViewCamera(Camera, Protocol):
+    """A camera that may show what it sees without taking a picture, for aiming: see ``capabilities.live_view``."""
+
+    def live_view(self, *, deadline: Deadline) -> bytes:
+        """One frame, a JPEG; the first one starts it. Raises DeviceRefused without ``capabilities.live_view``."""
+
+    def end_live_view(self, *, deadline: Deadline) -> None:
+        """Close the shutter again. Harmless when it is not on; ``capture`` does it by itself."""
 
 
 @runtime_checkable

@@ -96,6 +96,21 @@ class CameraCapabilities:
 
 
 @dataclass(frozen=True, slots=True)
+class CameraStatus:
+    """How long a camera can go on; None for what it does not tell.
+
+    ``battery_percent`` 0 to 100; ``free_bytes`` and ``free_pictures`` on its card. ``warnings``: ``"battery-low"``,
+    ``"card-nearly-full"``, ``"card-unusable"``, ``"autofocus-on"``, ``"mode-dial"`` (not on M), ``"target-changed"``
+    (it sent pictures elsewhere than it was told to, and was told again).
+    """
+
+    battery_percent: int | None = None
+    free_bytes: int | None = None
+    free_pictures: int | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class CapturedFile:
     """A file of one photograph, complete and fsynced. ``sha256`` is the hex digest of its bytes."""
 

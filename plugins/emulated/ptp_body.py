@@ -6,13 +6,14 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from plugins.emulated.ptp_card import STORAGE, Card, Stored
 from plugins.emulated.ptp_wire import (
     ALREADY_OPEN,
     BUSY,
+    GENERAL_ERROR,
     NO_SUCH_HANDLE,
     NO_SUCH_PROPERTY,
     NO_THUMBNAIL,
@@ -48,7 +49,9 @@ class CameraFaults:
     ``busy``: that many requests to set or release are answered with busy; ``drop_before_exposure``,
     ``drop_after_exposure``, ``drop_in_transfer``: the connection ends there, that many times; ``lost_events``: that
     many reports of a new picture never come; ``wrong_lengths``: that many data phases announce more than they send;
-    ``garbage``: that many answers are noise; ``slow_s``: before every answer; ``card_full``; ``silent``: no answers.
+    ``garbage``: that many answers are noise; ``slow_s``: before every answer; ``card_full``; ``silent``: no answers;
+    ``autofocus_fails``: that many presses find no focus; ``target_flips``: that many times the body changes by itself
+    from the computer to its card before an exposure, and says nothing.
     """
 
     busy: int = 0
@@ -61,6 +64,8 @@ class CameraFaults:
     slow_s: float = 0.0
     card_full: bool = False
     silent: bool = False
+    autofocus_fails: int = 0
+    target_flips: int = 0
 
     def take(self, name: str) -> bool:
         """Use up one of a count; False when none is left."""
@@ -107,6 +112,7 @@ class EmulatedBody:
         self._expose = expose
         self._open = False
         self._picture = 0
+        self._held: tuple[Exposed, float] | None = None
 
     def power_on(self) -> None:
         """Settings as after the battery was put in."""
@@ -168,8 +174,8 @@ class EmulatedBody:
             (len(o.data) for o in self.card.objects.values()), default=1
         )
 
-    def open_shutter(self, settings: ShotSettings, *, to_host: bool) -> Outcome:
-        """Begin an exposure, unless a fault, a full card or the last one is in the way."""
+    def open_shutter(self, settings: ShotSettings, *, to_host: bool, bulb: bool = False) -> Outcome:
+        """Begin an exposure, unless a fault, a full card or the last one is in the way; ``bulb``: without an end."""
         if self.faults.take("busy") or self.exposing:
             return Outcome(BUSY)
         if not to_host and self.full():
@@ -178,15 +184,27 @@ class EmulatedBody:
             raise Gone
         self.exposing = True
         self.exposures += 1
-        threading.Thread(target=self._shutter, args=(Exposed(settings, to_host),), daemon=True).start()
+        self._held = (Exposed(settings, to_host), time.monotonic()) if bulb else None
+        if not bulb:
+            threading.Thread(target=self._shutter, args=(Exposed(settings, to_host),), daemon=True).start()
+        return Outcome()
+
+    def close_shutter(self) -> Outcome:
+        """End an exposure that was begun with ``bulb``; it has lasted as long as it has."""
+        if self._held is None:
+            return Outcome(GENERAL_ERROR)
+        (exposed, began), self._held = self._held, None
+        seconds = (time.monotonic() - began) / (self.time_scale or 1.0)
+        exposed.settings = replace(exposed.settings, exposure_s=seconds)
+        threading.Thread(target=self._shutter, args=(exposed, 0.0), daemon=True).start()
         return Outcome()
 
     def exposed(self, exposed: Exposed) -> None:
         """Hook: the files are stored; tell the computer."""
 
-    def _shutter(self, exposed: Exposed) -> None:
+    def _shutter(self, exposed: Exposed, lasts_s: float | None = None) -> None:
         """The shutter's own thread: it stays open for its time, whatever happens to the connection."""
-        until = time.monotonic() + exposed.settings.exposure_s * self.time_scale
+        until = time.monotonic() + (exposed.settings.exposure_s * self.time_scale if lasts_s is None else lasts_s)
         while (left_s := until - time.monotonic()) > 0 and not self.stopped.is_set():
             self.stopped.wait(min(left_s, 1.0))
         if self.stopped.is_set():

@@ -7,16 +7,29 @@ connects next, as long as nobody has confirmed them.
 from __future__ import annotations
 
 import struct
+import time
+from dataclasses import replace
 from typing import Final
 
 from plugins.emulated.ptp_body import JPEG, EmulatedBody, Exposed
 from plugins.emulated.ptp_card import STORAGE, Stored
-from plugins.emulated.ptp_wire import BUSY, NO_SUCH_HANDLE, OK, STORE_FULL, WRONG_VALUE, Outcome, u32s
+from plugins.emulated.ptp_wire import (
+    BUSY,
+    GENERAL_ERROR,
+    NO_SUCH_HANDLE,
+    NOT_READY,
+    OK,
+    STORE_FULL,
+    WRONG_VALUE,
+    Outcome,
+    u32s,
+)
 from plugins.emulated.shot import ShotSettings
 
 _HOST: Final = 4
 _CARD: Final = 2
 _MANUAL: Final = 3
+_MIRROR_REASON: Final = 3
 _FULL_REASON: Final = 7
 _JPEG_FINE: Final = (1, 0, 3)
 _JPEG_COARSE: Final = (1, 0, 2)
@@ -29,6 +42,7 @@ def _thirds(first: int, last: int) -> tuple[int, ...]:
     return tuple(code for code in range(first, last + 1) if code % 8 in (0, 3, 5))
 
 
+_BULB: Final = 0x0C
 _SHUTTER: Final = _thirds(0x10, 0x98)
 _APERTURES: Final = _thirds(0x20, 0x50)
 _ISO_NAMES: Final = dict(
@@ -60,20 +74,22 @@ class EosBody(EmulatedBody):
     isos: tuple[int, ...] = tuple(_ISO_NAMES)
     operations: tuple[int, ...] = (
         *(0x101B, 0x9101, 0x9102, 0x9107, 0x910F, 0x9110, 0x9114, 0x9115, 0x9116, 0x9117),
-        *(0x911A, 0x911B, 0x911C, 0x911D, 0x911E, 0x9128, 0x9129),
+        *(0x911A, 0x911B, 0x911C, 0x911D, 0x911E, 0x9125, 0x9126, 0x9128, 0x9129, 0x9153),
     )
 
     def power_on(self) -> None:
         """Settings as after the battery was put in; the dial stands on M, the lens on manual focus."""
         self._values: dict[int, int] = {
             **{0xD101: 0x30, 0xD102: 0x60, 0xD103: 0x48, 0xD105: _MANUAL, 0xD106: 0, 0xD108: 3, 0xD111: 0, 0xD11B: 0},
-            **{0xD11C: _CARD, 0xD11E: STORAGE, 0xD1B0: 0},
+            **{0xD11C: _CARD, 0xD11E: STORAGE, 0xD1B0: 0, 0xD1B1: 0},
         }
-        self._lists = {0xD101: _APERTURES, 0xD102: _SHUTTER, 0xD103: self.isos, 0xD11C: (_CARD, _HOST)}
+        shutter = (*((_BULB,) if 0x9125 in self.operations else ()), *_SHUTTER)
+        self._lists = {0xD101: _APERTURES, 0xD102: shutter, 0xD103: self.isos, 0xD11C: (_CARD, _HOST)}
         self._format: tuple[tuple[int, int, int], ...] = _FORMATS[0]
         self._reports: list[bytes] = []
         self._reporting = False
         self._pressed = 0
+        self._view_at = 0.0
 
     def disconnected(self) -> None:
         super().disconnected()
@@ -81,7 +97,7 @@ class EosBody(EmulatedBody):
             self._reporting = False
             self._reports.clear()
 
-    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> Outcome:  # noqa: PLR0911
+    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> Outcome:  # noqa: PLR0911, PLR0912
         match code:
             case 0x101B | 0x9107:
                 return self.partial(asked)
@@ -104,6 +120,12 @@ class EosBody(EmulatedBody):
                 return self._release_old()
             case 0x9128 | 0x9129:
                 return self._button(asked[0], down=code == 0x9128)
+            case 0x9125:
+                return self._fire(bulb=True) if self._values[0xD102] == _BULB else Outcome(GENERAL_ERROR)
+            case 0x9126:
+                return self.close_shutter()
+            case 0x9153:
+                return self._view()
             case _:
                 return Outcome()  # remote mode, locks, keep-alive: accepted, nothing to see
 
@@ -117,37 +139,63 @@ class EosBody(EmulatedBody):
         if not down:
             self._pressed &= ~button
             return Outcome()
+        if button & 1 and self.faults.take("autofocus_fails"):
+            self._pressed |= button
+            return Outcome(parameters=(1,))
         if button & 2 and not self._pressed & 1:
             return Outcome(BUSY)  # a full press begins with a half one
         if button & 2 and self._pressed & 2:
             return Outcome(BUSY)  # nobody let go
         if button & 2:
             outcome = self._fire()
-            if outcome.code != OK:
+            if outcome.code != OK or outcome.parameters:
                 return outcome
         self._pressed |= button
         return Outcome()
 
     def _release_old(self) -> Outcome:
+        if self.faults.take("autofocus_fails"):
+            return Outcome(parameters=(1,))
         outcome = self._fire()
         if outcome.code == STORE_FULL:
             return Outcome(parameters=(_FULL_REASON,))
-        return Outcome(outcome.code, (0,) if outcome.code == OK else ())
+        return Outcome(outcome.code, outcome.parameters or ((0,) if outcome.code == OK else ()))
 
-    def _fire(self) -> Outcome:
+    def _view(self) -> Outcome:
+        """A frame of live view: a record of type 1 with a JPEG, after one of a type that is of no interest here."""
+        if self._values[0xD1B0] & 2 == 0:
+            return Outcome(GENERAL_ERROR)
+        if self._view_at == 0.0:
+            self._view_at = time.monotonic() + 0.05
+        if time.monotonic() < self._view_at or self.exposing:
+            return Outcome(NOT_READY)
+        frame = self._expose(self._settings(raw=False)).jpeg or b""
+        return Outcome(data=struct.pack("<IIQ", 16, 3, 0) + struct.pack("<II", 8 + len(frame), 1) + frame)
+
+    def _settings(self, *, raw: bool) -> ShotSettings:
+        code = self._values[0xD102]
+        return ShotSettings(
+            exposure_s=0.0 if code == _BULB else _seconds(code),
+            iso=_ISO_NAMES[self._values[0xD103]],
+            aperture_f=_f_number(self._values[0xD101]),
+            raw=raw,
+            jpeg=not raw,
+        )
+
+    def _fire(self, *, bulb: bool = False) -> Outcome:
+        if self._values.get(0xD1B0, 0):
+            return Outcome(parameters=(_MIRROR_REASON,))
+        if self._values[0xD102] == _BULB and not bulb:
+            return Outcome(BUSY)
+        if self._values[0xD11C] == _HOST and self.faults.take("target_flips"):
+            self._values[0xD11C] = _CARD
         to_host = self._values[0xD11C] == _HOST
         if to_host and (self.faults.card_full or self._values[0xD11B] == 0):
             return Outcome(STORE_FULL)
         kinds = {kind for kind, _, _ in self._format}
-        settings = ShotSettings(
-            exposure_s=_seconds(self._values[0xD102]),
-            iso=_ISO_NAMES[self._values[0xD103]],
-            aperture_f=_f_number(self._values[0xD101]),
-            raw=6 in kinds,
-            jpeg=1 in kinds,
-        )
-        outcome = self.open_shutter(settings, to_host=to_host)
-        if outcome.code == OK:
+        settings = replace(self._settings(raw=6 in kinds), jpeg=1 in kinds)
+        outcome = self.open_shutter(settings, to_host=to_host, bulb=bulb)
+        if outcome.code == OK and not outcome.parameters:
             self._report(0xC18B, struct.pack("<I", 1))
             if to_host:
                 self._change(0xD11B, self._values[0xD11B] - 1)
@@ -169,6 +217,8 @@ class EosBody(EmulatedBody):
         if code not in self._values or value not in self._lists.get(code, (value,)):
             return Outcome(WRONG_VALUE)
         self._change(code, value)
+        if code == 0xD1B0:
+            self._view_at = 0.0
         return Outcome()
 
     def _change(self, code: int, value: int) -> None:
@@ -213,7 +263,7 @@ class OldEosBody(EosBody):
 
     def power_on(self) -> None:
         super().power_on()
-        del self._values[0xD1B0]  # no live view
+        del self._values[0xD1B0], self._values[0xD1B1]  # no live view
 
 
 def _record(code: int, body: bytes) -> bytes:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 OK: Final = 0x2001
+GENERAL_ERROR: Final = 0x2002
 NOT_SUPPORTED: Final = 0x2005
 NO_SUCH_HANDLE: Final = 0x2009
 NO_SUCH_PROPERTY: Final = 0x200A
@@ -18,6 +19,7 @@ WRONG_FORMAT: Final = 0x200B
 STORE_FULL: Final = 0x200C
 NO_THUMBNAIL: Final = 0x2010
 BUSY: Final = 0x2019
+NOT_READY: Final = 0xA102
 WRONG_VALUE: Final = 0x201C
 NOT_OPEN: Final = 0x2003
 ALREADY_OPEN: Final = 0x201E
