@@ -1,0 +1,187 @@
+"""The response of a camera that delivers JPEG only: one monotone curve a channel, all three from one system.
+
+After Debevec and Malik (1997), with three differences: every pixel takes part, through a table of how often two values
+meet at one pixel; the curve's steps are the unknowns and are kept from falling; and the channels are pulled towards
+each other, since a camera has one tone curve, so that their scales agree where one of them saw no light.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
+
+from controller.arrays import Float64
+from controller.errors import CalibrationError, UsageError
+
+VALUES = 256
+DARKEST, BRIGHTEST = 3, 252
+"""Values that take part: below, noise and rounding rule; above, clipping."""
+SMOOTHNESS = 0.1
+TOGETHER = 0.02
+SMALLEST_STEP = 1e-4
+"""Of the logarithm of light between neighbouring values."""
+FEWEST_MEETINGS = 2000
+FEWEST_VALUES = 48
+WORST_MISFIT = 0.25
+
+Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class JpegResponse:
+    """``table`` (3, 256): linear light of each value, rising, 0 at 0 and 1 at 255.
+
+    ``misfit`` weighted rms of the logarithm of exposure ratios, after the fit; ``seen`` share of the values that met
+    """
+
+    table: Float64
+    misfit: float
+    seen: float
+
+
+def nominal_response() -> Float64:
+    """(3, 256) of a JPEG that follows IEC 61966-2-1 (sRGB) to the letter: for choosing exposures before measuring."""
+    value = np.arange(VALUES) / (VALUES - 1)
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return np.tile(light, (3, 1))
+
+
+def measure_response(images: Sequence[Bytes], exposures_s: Sequence[float]) -> JpegResponse:
+    """The response from a bracket series of one still scene.
+
+    Parameters
+    ----------
+    images : (rows, columns, 3) uint8, two at least, a stop or two apart, together dark to clipped
+    exposures_s : of each, > 0
+
+    Raises
+    ------
+    UsageError("bracket-mismatch")
+    CalibrationError("response-unseen")  too few values of some channel occur unclipped in two exposures
+    CalibrationError("response-inconsistent")  no curve explains the photographs: something moved or flickered
+    """
+    if len(images) < 2 or len(images) != len(exposures_s) or min(exposures_s, default=0) <= 0:
+        raise UsageError(
+            "bracket-mismatch",
+            what="A camera's response needs two photographs or more, each with its exposure time.",
+            remedy="Give one exposure time in seconds for each photograph.",
+        )
+    order = np.argsort(exposures_s)
+    pairs = [(images[a], images[b], exposures_s[b] / exposures_s[a]) for a, b in itertools.pairwise(order)]
+    meetings = [[(_meetings(x[..., c], y[..., c]), float(np.log(r))) for x, y, r in pairs] for c in range(3)]
+    seen = [_seen(of_channel) for of_channel in meetings]
+    if min(seen) * VALUES < FEWEST_VALUES:
+        raise CalibrationError(
+            "response-unseen",
+            what="The bracket series shows too few brightnesses to tell the camera's response.",
+            remedy="Photograph bright and dark parts at exposures one stop apart, or set the camera to RAW.",
+        )
+    curves = _solve(meetings)
+    misfit = _misfit(curves, meetings)
+    if misfit > WORST_MISFIT:
+        raise CalibrationError(
+            "response-inconsistent",
+            what="No response of the camera explains its bracket series.",
+            remedy="Set the camera to manual exposure and white balance, keep the scene still, and take it again.",
+        )
+    return JpegResponse(np.stack([_table(curve) for curve in curves]), misfit, min(seen))
+
+
+def _meetings(shorter: Bytes, longer: Bytes) -> Float64:
+    """(256, 256): how often a value of the shorter exposure meets one of the longer at a pixel; clipped ones out.
+
+    A value far from the typical partner of its row was moved there by an edge or by the compression; the count of each
+    row is capped, so that a large background does not outweigh everything else.
+    """
+    both = shorter.astype(np.int64) * VALUES + longer
+    table = np.bincount(both.ravel(), minlength=VALUES * VALUES).reshape(VALUES, VALUES).astype(np.float64)
+    inside = np.zeros((VALUES, VALUES), np.bool_)
+    inside[DARKEST : BRIGHTEST + 1, DARKEST : BRIGHTEST + 1] = True
+    table *= inside
+    cap = max(4 * float(table.sum()) / VALUES, 1.0)
+    for axis in (0, 1):
+        table *= np.minimum(1.0, cap / np.maximum(table.sum(axis=axis, keepdims=True), 1.0))
+    return table
+
+
+def _seen(meetings: Sequence[tuple[Float64, float]]) -> float:
+    total = np.sum([table for table, _ in meetings], axis=0)
+    met = total.sum(axis=0) + total.sum(axis=1) >= FEWEST_MEETINGS / VALUES
+    return float(np.count_nonzero(met)) / VALUES
+
+
+def _base() -> Float64:
+    """Logarithm of the light that sRGB gives each value: what the true curve differs from smoothly."""
+    light = nominal_response()[0]
+    light[0] = light[1] / 2
+    return np.asarray(np.log(light), np.float64)
+
+
+def _weight() -> Float64:
+    """Trust in a value (Debevec's hat, broadened): least near black and near clipping."""
+    value = np.arange(VALUES)
+    return np.minimum(1.0, np.minimum(value + 1, VALUES - value) / 64.0)
+
+
+def _solve(meetings: Sequence[Sequence[tuple[Float64, float]]]) -> list[Float64]:
+    """Logarithm of light at each value, one curve a channel, 0 at 255: non-negative least squares on the steps."""
+    steps = VALUES - 1
+    # g = -(sum of the steps above a value), so that g(255) = 0
+    to_curve = -np.triu(np.ones((VALUES, steps)))
+    bend = np.diff(np.eye(VALUES), 2, axis=0) * (VALUES / 4)
+    base = _base()
+    normal, right = np.zeros((3 * steps, 3 * steps)), np.zeros(3 * steps)
+    for channel, of_channel in enumerate(meetings):
+        total = sum(float(table.sum()) for table, _ in of_channel)
+        laplacian, wanted = np.zeros((VALUES, VALUES)), np.zeros(VALUES)
+        for table, log_ratio in of_channel:
+            weights = table * _weight()[:, None] * _weight()[None, :] / total * VALUES
+            laplacian += np.diag(weights.sum(axis=0) + weights.sum(axis=1)) - weights - weights.T
+            # g(longer) - g(shorter) = log of the ratio of exposures
+            wanted += log_ratio * (weights.sum(axis=0) - weights.sum(axis=1))
+        smooth = SMOOTHNESS * bend.T @ bend
+        laplacian += smooth
+        wanted += smooth @ base
+        part = slice(channel * steps, (channel + 1) * steps)
+        normal[part, part] += to_curve.T @ laplacian @ to_curve
+        right[part] += to_curve.T @ wanted
+    _pull_together(normal, steps)
+    factor = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal)))
+    shifted = right - normal @ np.full(3 * steps, SMALLEST_STEP)
+    found, _ = nnls(factor.T, solve_triangular(factor, shifted, lower=True), maxiter=30 * steps)
+    return [to_curve @ (found[c * steps : (c + 1) * steps] + SMALLEST_STEP) for c in range(3)]
+
+
+def _pull_together(normal: Float64, steps: int) -> None:
+    """Equal steps in all channels, softly: what one channel did not see, it takes from the others."""
+    # A step near black is large; its weight falls accordingly, or black would decide over everything.
+    size = np.diff(_base())
+    pull = TOGETHER * (1 / size) ** 2 / np.mean((1 / size) ** 2) * VALUES
+    for a, b in itertools.combinations(range(3), 2):
+        for c, d, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
+            rows, columns = np.arange(steps) + c * steps, np.arange(steps) + d * steps
+            normal[rows, columns] += sign * pull
+
+
+def _misfit(curves: Sequence[Float64], meetings: Sequence[Sequence[tuple[Float64, float]]]) -> float:
+    squares, weights = 0.0, 0.0
+    trust = _weight()[:, None] * _weight()[None, :]
+    for curve, of_channel in zip(curves, meetings, strict=True):
+        for table, log_ratio in of_channel:
+            left = curve[None, :] - curve[:, None] - log_ratio
+            squares += float(np.sum(table * trust * left**2))
+            weights += float(np.sum(table * trust))
+    return float(np.sqrt(squares / weights))
+
+
+def _table(curve: Float64) -> Float64:
+    """Light of each value; towards 0, where values are rounded to nothing, in a straight line."""
+    light = np.exp(curve)
+    light[: DARKEST + 1] = light[DARKEST] * np.arange(DARKEST + 1) / DARKEST
+    return np.asarray(light / light[-1], np.float64)
