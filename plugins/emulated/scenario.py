@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Protocol
 
 from hal.errors import DeviceError
-from plugins.emulated.faults import Faults
 from plugins.emulated.lamp import EmulatedLamp
 from plugins.emulated.tables import Between, load
 
@@ -31,7 +30,8 @@ _WIRE: Final[dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]] =
     "busy": ({"busy": True}, {"busy": False}, {}),
 }
 """What to set at the beginning and at the end of an event, and for an event of a single answer."""
-DEEDS: Final = (*_WIRE, "slow", "lamp-failure", "overheat", "unplug")
+_LAMP: Final = ("lamp-failure", "overheat")
+DEEDS: Final = (*_WIRE, "slow", *_LAMP, "unplug")
 _NEVER: Final = -1.0
 
 
@@ -60,6 +60,12 @@ class Scenario:
 
     event: tuple[Event, ...]
     seed: Annotated[int, Between(0, 2**63 - 1)] = 1
+
+
+class Knobs(Protocol):
+    """What has the knobs of ``faults.WireFaults``."""
+
+    def set(self, **knobs: Any) -> None: ...
 
 
 class Plug(Protocol):
@@ -111,8 +117,8 @@ class ScenarioPlayer:
         scenario: Scenario,
         *,
         device: str,
-        faults: Faults,
-        lamp: EmulatedLamp,
+        faults: Knobs,
+        lamp: EmulatedLamp | None = None,
         plug: Plug | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -155,10 +161,10 @@ class ScenarioPlayer:
 
     def _deed(self, event: Event) -> tuple[Callable[[], None], Callable[[], None] | None]:
         """How an event begins and ends."""
-        if event.do == "lamp-failure":
-            return self._lamp.fail, self._lamp.mend
-        if event.do == "overheat":
-            return self._lamp.overheat, self._lamp.mend
+        if event.do in _LAMP:
+            if self._lamp is None:
+                return (lambda: None), None
+            return (self._lamp.fail if event.do == "lamp-failure" else self._lamp.overheat), self._lamp.mend
         if event.do == "unplug":
             return (self._plug.unplug, self._plug.replug) if self._plug is not None else (lambda: None, None)
         if event.do == "slow":

@@ -15,7 +15,8 @@ unchanged libusb and hidapi work on it. Run such programs with ``environment(fol
         subprocess.run(client, env={**os.environ, **environment(folder)})
         bus.unplug(echo)
 
-A device's hooks run with its ``lock`` held. ``usb_bus_process`` runs a bus in a process of its own, with commands.
+A device's hooks run with its ``lock`` held: one that unplugs its own device must do it from another thread.
+``usb_bus_process`` runs a bus in a process of its own, with commands.
 The folder's path must be short (below about 70 characters): ``tempfile.mkdtemp(prefix="usb", dir="/tmp")``.
 """
 
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -66,11 +68,16 @@ class UsbBus:
         self._ports: dict[int, str] = {}
         self._address = 0
         self._raws = 0
+        self._lock = threading.Lock()
         for empty in ("sys/bus/usb/devices", "sys/bus/hid/devices", "sys/class/hidraw", "sys/dev/char"):
             (folder / empty).mkdir(parents=True, exist_ok=True)
 
     def plug(self, device: EmulatedUsbDevice) -> None:
         """Plug ``device`` in: always at the same port, every time at another address."""
+        with self._lock:
+            self._plug(device)
+
+    def _plug(self, device: EmulatedUsbDevice) -> None:
         if id(device) in self._places:
             return
         self._address = self._address % 127 + 1
@@ -92,9 +99,12 @@ class UsbBus:
 
     def unplug(self, device: EmulatedUsbDevice) -> None:
         """Pull the cable: its files stay open but fail, its nodes are gone."""
-        place = self._places.pop(id(device), None)
-        if place is None:
-            return
+        with self._lock:
+            place = self._places.pop(id(device), None)
+            if place is not None:
+                self._unplug(place)
+
+    def _unplug(self, place: _Place) -> None:
         place.plugged.leave()
         for file in place.raw_files:
             file.gone = True

@@ -56,12 +56,33 @@ class UsbNames:
 
 @dataclass(slots=True)
 class UsbFaults:
-    """Knobs, turned at any time: ``silent``: nothing completes; ``slow_s`` before every transfer completes;
-    ``stalls``: that many control requests or bulk transfers towards the computer are stalled."""
+    """Knobs, turned at any time; counts go down as they are used.
+
+    ``silent``: nothing completes; ``slow_s`` before every transfer completes; ``stalls``, ``drop``, ``cut``,
+    ``garble``: that many next control requests are stalled, never complete, or are answered with half of their bytes,
+    or with noise; ``stuck``: the kernel's HID driver hangs, and a program's call in it with it.
+    """
 
     silent: bool = False
     slow_s: float = 0.0
     stalls: int = 0
+    drop: int = 0
+    cut: int = 0
+    garble: int = 0
+    stuck: bool = False
+
+    def take(self, name: str) -> bool:
+        """Use up one of a count; False when none is left."""
+        left: int = getattr(self, name)
+        if left > 0:
+            setattr(self, name, left - 1)
+        return left > 0
+
+    def bent(self, answer: bytes) -> bytes:
+        """An answer as it comes through."""
+        if self.take("garble"):
+            answer = bytes(byte ^ 0xA5 for byte in answer)
+        return answer[: len(answer) // 2] if self.take("cut") else answer
 
 
 class InPipe:
@@ -118,6 +139,7 @@ class EmulatedUsbDevice:
         self.faults = UsbFaults()
         self.lock = threading.RLock()
         self.on_ready: Callable[[], None] = lambda: None
+        self.on_control: Callable[[int], None] = lambda count: None
         self.pull: Callable[[], None] = lambda: None
         self.push: Callable[[], None] = lambda: None
         self.pipes = {one.address: InPipe(one.packet) for one in self.endpoints if one.address & 0x80}
@@ -143,11 +165,11 @@ class EmulatedUsbDevice:
 
     def control(self, setup: Setup, data: bytes) -> bytes:
         """Answer a control transfer. Raises Stall."""
-        if self.faults.stalls > 0:
-            self.faults.stalls -= 1
+        if self.faults.take("stalls"):
             raise Stall
         kind = setup.request_type >> 5 & 3
-        return (self._standard(setup) if kind == 0 else self.class_request(setup, data))[: setup.length]
+        answer = self._standard(setup) if kind == 0 else self.class_request(setup, data)
+        return self.faults.bent(answer)[: setup.length]
 
     def clear_halt(self, endpoint: int) -> None:
         if endpoint in self.pipes:

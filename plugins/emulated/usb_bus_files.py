@@ -59,6 +59,7 @@ class Urb:
     setup: Setup | None = None
     data: bytes = b""
     ready_at: float = 0.0
+    lost: bool = False
     result: tuple[int, int] = (0, 0)
     answer: bytes | memoryview = field(default=b"")
 
@@ -73,6 +74,7 @@ class Plugged:
         self.driver_bound = bool(device.kernel_driver)
         self.claimed_by: UsbFile | None = None
         self.files: list[UsbFile] = []
+        self._pumping = self._again = False
         self.on_completed: Callable[[bool], None] = lambda waiting: None
         device.on_ready = self.pump
 
@@ -85,8 +87,17 @@ class Plugged:
     def pump(self) -> None:
         """Complete whatever can be completed."""
         with self.lock:
-            for file in self.files:
-                file.pump()
+            self._again = True
+            if self._pumping:  # a device that answers at once calls this from within
+                return
+            self._pumping = True
+            try:
+                while self._again:
+                    self._again = False
+                    for file in tuple(self.files):
+                        file.pump()
+            finally:
+                self._pumping = False
             self.show()
 
     def show(self) -> None:
@@ -135,7 +146,7 @@ class UsbFile:
                 case _Call.SPEED:
                     return _HIGH_SPEED
                 case _:
-                    self._manage(number, argument, memory)
+                    return self._manage(number, argument, memory)
         return 0
 
     def closed(self) -> None:
@@ -155,11 +166,12 @@ class UsbFile:
         for urb in tuple(self._pending):
             if urb.endpoint in blocked:
                 continue
-            if self._device.faults.silent or urb.ready_at > now or not self._attempt(urb):
+            if urb.lost or self._device.faults.silent or urb.ready_at > now or not self._attempt(urb):
                 blocked.add(urb.endpoint)
                 continue
-            self._pending.remove(urb)
-            self.done.append(urb)
+            if urb in self._pending:  # the device may have left because of it
+                self._pending.remove(urb)
+                self.done.append(urb)
 
     def end_all(self, status: int) -> None:
         for urb in self._pending:
@@ -167,7 +179,7 @@ class UsbFile:
             self.done.append(urb)
         self._pending.clear()
 
-    def _manage(self, number: int, argument: int, memory: Memory) -> None:
+    def _manage(self, number: int, argument: int, memory: Memory) -> int:
         """Interfaces, drivers, halts: what has no transfer of its own."""
         plugged = self._plugged
         if number == _Call.CLAIM:
@@ -182,23 +194,27 @@ class UsbFile:
                 raise CallFailed(errno.ENODATA)
             memory.poke(argument + 4, self._device.kernel_driver.encode() + b"\0")
         elif number == _Call.DRIVER_CALL:
-            self._driver_call(struct.unpack("<iiQ", memory.peek(argument, 16))[1] & 0xFF)
+            return self._driver_call(struct.unpack("<iiQ", memory.peek(argument, 16))[1] & 0xFF)
         elif number in (_Call.CLEAR_HALT, _Call.RESET_EP):
             self._device.clear_halt(struct.unpack("<I", memory.peek(argument, 4))[0])
         elif number == _Call.RESET:
             self._device.plugged()
         elif number not in (_Call.SET_INTERFACE, _Call.SET_CONFIGURATION):
             raise CallFailed(errno.ENOTTY)
+        return 0
 
-    def _driver_call(self, number: int) -> None:
+    def _driver_call(self, number: int) -> int:
+        """As Linux: whether there is a driver that was connected, and 0 for disconnecting."""
         if number == _Call.DISCONNECT:
             if not self._plugged.driver_bound:
                 raise CallFailed(errno.ENODATA)
             self._plugged.driver_bound = False
         elif number == _Call.CONNECT:
             self._plugged.driver_bound = bool(self._device.kernel_driver)
+            return int(self._plugged.driver_bound)
         else:
             raise CallFailed(errno.ENOTTY)
+        return 0
 
     def _submit(self, address: int, memory: Memory) -> None:
         kind, endpoint, _, _, buffer, length, *_ = _URB.unpack(memory.peek(address, _URB.size))
@@ -207,6 +223,8 @@ class UsbFile:
             urb.setup = Setup(*_SETUP.unpack(memory.peek(buffer, _SETUP.size)))
             if not urb.setup.to_host:
                 urb.data = memory.peek(buffer + _SETUP.size, length - _SETUP.size)
+            self._device.on_control(length)
+            urb.lost = self._device.faults.take("drop")
         elif self._plugged.claimed_by is not self or endpoint not in {one.address for one in self._device.endpoints}:
             raise CallFailed(errno.ENOENT)
         elif not endpoint & 0x80:

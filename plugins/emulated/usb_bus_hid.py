@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import struct
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final
@@ -15,6 +16,7 @@ INPUT, OUTPUT, FEATURE = 1, 2, 3
 _GET_REPORT, _SET_REPORT, _SET_IDLE = 1, 9, 10
 _BUS_USB: Final = 3
 _DESCRIPTOR_ROOM: Final = 4096
+_LOOK_S: Final = 0.01
 _MOST_WAITING: Final = 64
 """Input reports that are kept for a program that does not read."""
 
@@ -146,8 +148,14 @@ class HidrawFile:
         return len(answer) + skip
 
     def _transfer(self, setup: Setup, data: bytes) -> bytes:
-        """What usbhid does for hidraw; it gives a silent device five seconds."""
-        if self._device.faults.silent:
+        """What usbhid does for hidraw; the five seconds that it gives a silent device are not waited for here."""
+        faults = self._device.faults
+        self._device.on_control(8 + len(data))
+        time.sleep(faults.slow_s)
+        while faults.stuck:
+            time.sleep(_LOOK_S)
+        self._check()
+        if faults.silent or faults.take("drop"):
             raise CallFailed(errno.ETIMEDOUT)
         try:
             with self._device.lock:

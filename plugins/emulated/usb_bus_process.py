@@ -6,6 +6,7 @@ answers are lines of JSON on the child's standard input and output: ``python -m 
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -18,8 +19,10 @@ from typing import IO, Any, Final, Self
 from plugins.emulated.hid_light_sensor import EmulatedLightSensor
 from plugins.emulated.hid_relay import EmulatedRelayBoard
 from plugins.emulated.ptp_usb_camera import numbered_camera
+from plugins.emulated.scenario import parse_scenario
 from plugins.emulated.usb_bus import UsbBus
 from plugins.emulated.usb_bus_device import EmulatedUsbDevice
+from plugins.emulated.usb_bus_scenario import UsbScenario
 
 KINDS: Final[Mapping[str, Callable[..., EmulatedUsbDevice]]] = {
     "relay": EmulatedRelayBoard,
@@ -47,6 +50,15 @@ class UsbBusProcess:
     def add(self, name: str, kind: str, **settings: Any) -> None:
         """Make a device and plug it in; ``kind``: one of ``KINDS``, or the place of a class, ``module:Class``."""
         self._ask({"do": "add", "name": name, "kind": kind, "settings": settings})
+
+    def play(self, name: str, scenario: str) -> None:
+        """Play the events of a TOML scenario (see ``plugins.emulated.scenario``) on a device."""
+        self._ask({"do": "play", "name": name, "scenario": scenario})
+
+    def told(self, name: str) -> list[list[Any]]:
+        """What a scenario has done so far: [seconds, deed] each."""
+        told: list[list[Any]] = self._ask({"do": "told", "name": name})
+        return told
 
     def plug(self, name: str) -> None:
         self._ask({"do": "plug", "name": name})
@@ -112,6 +124,11 @@ class _Commands:
     def __init__(self, bus: UsbBus) -> None:
         self._bus = bus
         self._devices: dict[str, EmulatedUsbDevice] = {}
+        self._scenarios: dict[str, UsbScenario] = {}
+
+    def close(self) -> None:
+        for scenario in self._scenarios.values():
+            scenario.close()
 
     def obey(self, command: Mapping[str, Any]) -> Any:
         name = command["name"]
@@ -121,6 +138,10 @@ class _Commands:
             return None
         device = self._devices[name]
         match command["do"]:
+            case "play":
+                self._play(name, device, command["scenario"])
+            case "told":
+                return self._scenarios[name].told
             case "plug":
                 self._bus.plug(device)
             case "unplug":
@@ -141,6 +162,17 @@ class _Commands:
             case unknown:
                 raise ValueError(f"no command {unknown}")
         return None
+
+    def _play(self, name: str, device: EmulatedUsbDevice, text: str) -> None:
+        if name in self._scenarios:
+            self._scenarios.pop(name).close()
+        self._scenarios[name] = UsbScenario(
+            parse_scenario(text, file=name),
+            device,
+            name=name,
+            plug=lambda: self._bus.plug(device),
+            unplug=lambda: self._bus.unplug(device),
+        )
 
 
 def _kind(name: str) -> Callable[..., EmulatedUsbDevice]:
@@ -163,8 +195,7 @@ def _find(device: EmulatedUsbDevice, dotted: str) -> tuple[Any, str]:
 
 def serve(folder: Path, commands: IO[str], answers: IO[str]) -> None:
     """Serve a bus until ``commands`` ends."""
-    with UsbBus(folder) as bus:
-        table = _Commands(bus)
+    with UsbBus(folder) as bus, contextlib.closing(_Commands(bus)) as table:
         for line in commands:
             try:
                 answer = {"value": table.obey(json.loads(line))}

@@ -1,0 +1,20 @@
+"""Tests in this folder run inside a process under the umockdev preload library: see ``test_on_usb_bus.py``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from plugins.emulated.usb_bus_process import UsbBusProcess
+
+collect_ignore_glob = [] if "UMOCKDEV_DIR" in os.environ else ["test_*.py"]
+
+
+@pytest.fixture
+def bus() -> Iterator[UsbBusProcess]:
+    """An emulated USB bus without devices, which this very process sees."""
+    with UsbBusProcess(Path(os.environ["UMOCKDEV_DIR"])) as bus:
+        yield bus
