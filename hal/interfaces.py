@@ -21,6 +21,7 @@ from hal.values import (
     DeviceIdentity,
     ExposureSettings,
     OutputInfo,
+    PanelCapabilities,
     PlaybackStatus,
     Presented,
     ProjectorCapabilities,
@@ -92,6 +93,9 @@ class WatchedCamera(Camera, Protocol):
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
         """Battery, card and warnings as the camera answers now."""
+
+    def troubles(self) -> list[tuple[str, str]]:
+        """What went wrong and was mended since the last call: (stable code, one sentence), for the journal."""
 
 
 @runtime_checkable
@@ -165,8 +169,18 @@ class LightSensor(Device, Protocol):
 class ButtonPanel(Device, Protocol):
     """Keys for the technician."""
 
+    @property
+    def capabilities(self) -> PanelCapabilities: ...
+
+    def show(self, key: int, picture: npt.NDArray[np.uint8], *, deadline: Deadline) -> None:
+        """Put a picture on a key (0-based): (rows, columns, 3) uint8 sRGB of the size in ``capabilities``.
+
+        It stays there, also after the panel was unplugged. Raises DeviceRefused for a key or a picture that does not
+        fit, and where keys have no pictures.
+        """
+
     def wait_pressed(self, *, deadline: Deadline) -> int | None:
-        """The key pressed next (0-based), or None when the deadline passes."""
+        """The key pressed next (0-based), or None when the deadline passes. Presses are kept until asked for."""
 
 
 class Bench(Protocol):

@@ -121,6 +121,14 @@ class CapturedFile:
 
 
 @dataclass(frozen=True, slots=True)
+class PanelCapabilities:
+    """Keys of a button panel, and the size (width, height) of the picture on each; None: they have none."""
+
+    keys: int
+    picture_px: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class OutputInfo:
     """One projector output of a display."""
 

@@ -1,0 +1,30 @@
+"""What every driver must do, as tests: ours and a third party's run the same ones, with one line each.
+
+    from hal.conformance import CameraConformance
+
+    class TestMyCamera(CameraConformance):
+        @pytest.fixture
+        def camera(self): return MyCamera.open("emulated")
+
+The fixture (``projector``, ``camera``, ``display``, ``power_switch``, ``light_sensor`` or ``button_panel``) gives an
+opened device and closes it afterwards. The device may be in any healthy state when a test gets it. Class attributes say
+how patient a test is; give a slow device more. This is the only part of ``hal`` that needs pytest.
+"""
+
+from hal.conformance.button_panel import ButtonPanelConformance
+from hal.conformance.camera import CameraConformance
+from hal.conformance.device import DeviceConformance
+from hal.conformance.display import DisplayConformance
+from hal.conformance.light_sensor import LightSensorConformance
+from hal.conformance.power_switch import PowerSwitchConformance
+from hal.conformance.projector import ProjectorConformance
+
+__all__ = [
+    "ButtonPanelConformance",
+    "CameraConformance",
+    "DeviceConformance",
+    "DisplayConformance",
+    "LightSensorConformance",
+    "PowerSwitchConformance",
+    "ProjectorConformance",
+]

@@ -1,0 +1,50 @@
+"""What holds for every kind of device."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import ClassVar
+
+import pytest
+
+from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.errors import DeviceError, DeviceTimeout
+from hal.interfaces import Device
+
+
+class DeviceConformance:
+    """What holds for every kind of device; the subclasses below add their kind."""
+
+    patience_s: ClassVar[float] = 30.0
+    """Deadline of an ordinary call."""
+    prompt_s: ClassVar[float] = 2.0
+    """A call whose deadline has passed, or that was cancelled, must have ended after this."""
+
+    def soon(self) -> Deadline:
+        return in_seconds(self.patience_s)
+
+    def check_identity(self, device: Device) -> None:
+        who = device.identity(deadline=self.soon())
+        assert who.model.strip(), "the device must say which model it is"
+
+    def check_closes_twice(self, device: Device) -> None:
+        for _ in range(2):
+            started = time.monotonic()
+            device.close()
+            assert time.monotonic() - started < self.prompt_s, "close() must not block"
+        with pytest.raises(DeviceError):
+            device.identity(deadline=self.soon())
+
+    def check_deadline_and_cancel(self, device: Device) -> None:
+        started = time.monotonic()
+        with pytest.raises(DeviceTimeout) as caught:
+            device.identity(deadline=in_seconds(-1.0))
+        assert caught.value.what
+        assert caught.value.remedy
+        stop = threading.Event()
+        stop.set()
+        with pytest.raises(Cancelled):
+            device.identity(deadline=in_seconds(self.patience_s, stop))
+        assert time.monotonic() - started < self.prompt_s
+        self.check_identity(device)
