@@ -46,8 +46,11 @@ class Operation(enum.IntEnum):
     EOS_TRANSFER_COMPLETE = 0x9117
     EOS_HOST_CAPACITY = 0x911A
     EOS_KEEP_DEVICE_ON = 0x911D
+    EOS_BULB_START = 0x9125
+    EOS_BULB_END = 0x9126
     EOS_RELEASE_ON = 0x9128
     EOS_RELEASE_OFF = 0x9129
+    EOS_GET_VIEWFINDER = 0x9153
 
 
 class Answer(enum.IntEnum):

@@ -22,10 +22,13 @@ class EosProperty(enum.IntEnum):
     SHUTTER = 0xD102
     ISO = 0xD103
     EXPOSURE_MODE = 0xD105
+    FOCUS_MODE = 0xD108
     BATTERY = 0xD111
     AVAILABLE_SHOTS = 0xD11B
     CAPTURE_DESTINATION = 0xD11C
     IMAGE_FORMAT = 0xD120
+    VIEW_OUTPUT = 0xD1B0
+    VIEW_MODE = 0xD1B1
 
 
 class Destination(enum.IntEnum):
@@ -36,6 +39,20 @@ class Destination(enum.IntEnum):
 
 MANUAL_EXPOSURE: Final = 3
 """Value of EXPOSURE_MODE with the dial on M."""
+
+MANUAL_FOCUS: Final = 3
+"""Value of FOCUS_MODE with the lens' switch on MF."""
+
+BULB_CODES: Final = (0x0C, 0x04)
+"""Shutter codes of bulb."""
+
+VIEW_TO_COMPUTER: Final = 2
+"""Value of VIEW_OUTPUT that sends live view here."""
+
+BATTERY_PERCENT: Final = {0: 10, 5: 25, 1: 50, 4: 75, 2: 100}
+"""What the values of BATTERY mean, as libgphoto2 names them; 0 is "low"."""
+
+_VIEW_JPEGS: Final = (1, 9, 11)
 
 
 class EosCode(enum.IntEnum):
@@ -185,6 +202,22 @@ def _image_part(read: Reader) -> ImagePart:
 def _name(read: Reader) -> str:
     raw = bytes(read.take(min(read.left, _LONGEST_NAME)))
     return printable(raw.split(b"\0", 1)[0].decode("ascii", errors="replace"))
+
+
+def parse_view(data: Buffer) -> bytes:
+    """The JPEG in an answer to 9153: records {u32 size, u32 kind, ...}, of which kinds 1, 9 and 11 are the frame.
+
+    Raises ProtocolError where there is none, or a record does not fit.
+    """
+    read = Reader(data, "a frame of live view")
+    while read.left >= 8:
+        size, kind = read.numbers("I", 2)
+        if size < 8:
+            break
+        body = read.take(size - 8)
+        if kind in _VIEW_JPEGS and bytes(body[:2]) == b"\xff\xd8":
+            return bytes(body)
+    raise broken("a frame of live view without a picture")
 
 
 def pack_image_format(image_format: ImageFormat) -> bytes:

@@ -5,109 +5,40 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from hal.deadline import Deadline
-from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
+from hal.errors import DeviceRefused
 from hal.ptp import Operation, broken, parse_handles
-from hal.ptp_datasets import ObjectInfo
-from hal.values import CameraCapabilities, ExposureSettings
+from hal.ptp_datasets import ObjectInfo, StorageInfo
+from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
 from plugins.ptp_files import PendingFile, kind_of
-from plugins.ptp_link import PtpLink, Reply, Sink, camera_busy, refused
+from plugins.ptp_link import MOST_IN_MEMORY, Diary, PtpLink, Reply, Sink, camera_busy, refused
+from plugins.ptp_shot import Picture, Shot, Timing
 
 LARGEST_PICTURE: Final = 1 << 30
 """Bytes; what claims to be larger is no photograph, and would only fill the disk."""
 _EVERY_STORE: Final = 0xFFFF_FFFF
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """How patient the driver is, in seconds.
-
-    ``answer_s``: for an ordinary answer; ``busy_s``: with a busy camera; ``margin_s``: for a picture, beyond twice its
-    exposure; ``grace_s``: for an event, before asking for what it would have told; ``come_back_s``: for a lost camera
-    to answer again, ``reconnect_s``: the same during a picture; ``keep_alive_s``: between two signs of life.
-    """
-
-    answer_s: float = 15.0
-    busy_s: float = 20.0
-    margin_s: float = 15.0
-    grace_s: float = 1.0
-    come_back_s: float = 2.0
-    reconnect_s: float = 30.0
-    keep_alive_s: float = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A file on the camera; ``waiting`` in its memory until its transfer is confirmed, else on the card."""
-
-    handle: int
-    format: int
-    size: int
-    filename: str
-    waiting: bool = False
-
-
-@dataclass(slots=True)
-class Shot:
-    """One press of the button. ``fired`` from just before the request until the camera says that it did nothing.
-
-    ``known``: handles on the card before it; ``recovering``: the connection was lost since.
-    """
-
-    exposure_s: float
-    known: frozenset[int] = frozenset()
-    fired: bool = False
-    fired_at_s: float = 0.0
-    waiting_since_s: float = 0.0
-    recovering: bool = False
-    found: dict[int, Picture] = field(default_factory=dict)
-
-    def fire(self) -> None:
-        self.fired = True
-        self.fired_at_s = self.waiting_since_s = time.monotonic()
-
-    def not_fired(self) -> None:
-        self.fired = False
-
-    def resume(self) -> None:
-        """Look for the picture on a new connection."""
-        self.recovering = True
-        self.waiting_since_s = time.monotonic()
-        self.found.clear()
-
-    def age_s(self) -> float:
-        """Seconds since the button was pressed."""
-        return time.monotonic() - self.fired_at_s
-
-    def overdue(self, timing: Timing) -> bool:
-        """Whether the picture should have been there by now: twice its exposure and a margin."""
-        return time.monotonic() - self.waiting_since_s > 2 * self.exposure_s + timing.margin_s
-
-    def missing(self) -> DeviceError:
-        """The error for a picture that was fired and never came."""
-        if self.recovering:
-            return DeviceGone(
-                "camera-shot-lost",
-                what="The connection to the camera was lost during a picture, and the camera has no new one.",
-                remedy="Check cable, network and battery, then take this picture again; it was not taken twice.",
-            )
-        return DeviceTimeout(
-            "camera-no-picture",
-            what="The camera was released but no picture came from it in time.",
-            remedy="Check that its lens is on manual focus and its drive mode on single shot, then take it again.",
-        )
+_LITTLE_SPACE: Final = 1 << 30
+_LOW_BATTERY: Final = 25
 
 
 class Channel:
-    """A link, what the camera at its end can do, and patience with it."""
+    """A link, what the camera at its end can do, and patience with it.
 
-    def __init__(self, link: PtpLink, operations: frozenset[int], timing: Timing) -> None:
+    ``exposing_until_s``: when, on the monotonic clock, an exposure will be over that nobody waits for any more.
+    """
+
+    def __init__(self, link: PtpLink, operations: frozenset[int], timing: Timing, diary: Diary) -> None:
         self.link = link
         self.timing = timing
+        self.diary = diary
+        self.exposing_until_s = 0.0
         self._operations = operations
+
+    def patience(self, deadline: Deadline) -> Deadline:
+        """Until when a busy camera is asked again: beyond any exposure that goes on without us."""
+        return deadline.within(max(0.0, self.exposing_until_s - time.monotonic()) + self.timing.busy_s)
 
     def has(self, operation: int) -> bool:
         return operation in self._operations
@@ -129,7 +60,7 @@ class Channel:
         ``doing`` completes "The camera refused to ..."; ``meanwhile`` runs between two attempts. Raises DeviceBusy,
         DeviceRefused, and what the link raises.
         """
-        give_up = deadline.within(self.timing.busy_s)
+        give_up = self.patience(deadline)
         pause_s = 0.01
         while True:
             reply = self.once(
@@ -158,14 +89,40 @@ class Channel:
     ) -> Reply:
         """Do an operation once and return whatever the camera answers."""
         until = deadline.within(self.timing.answer_s if patience_s is None else patience_s)
-        if most is None:
-            return self.link.transact(operation, *parameters, data=data, sink=sink, deadline=until)
-        return self.link.transact(operation, *parameters, data=data, sink=sink, most=most, deadline=until)
+        began_s = time.monotonic()
+        reply = self.link.transact(
+            operation, *parameters, data=data, sink=sink, most=MOST_IN_MEMORY if most is None else most, deadline=until
+        )
+        took_s = time.monotonic() - began_s
+        if took_s > self.timing.slow_s and sink is None:
+            self.diary.add("camera-slow", f"The camera took {took_s:.1f} s to answer operation 0x{operation:04x}.")
+        if reply.busy:
+            self.diary.add("camera-busy", f"The camera was busy when asked for operation 0x{operation:04x}.")
+        return reply
 
     def handles(self, deadline: Deadline) -> frozenset[int]:
         """Every object on every card."""
         reply = self.ask(Operation.GET_OBJECT_HANDLES, _EVERY_STORE, 0, 0, doing="list its pictures", deadline=deadline)
         return frozenset(parse_handles(reply.data))
+
+    def status(self, battery_percent: int | None, warnings: list[str], deadline: Deadline) -> CameraStatus:
+        """The card, with what else is known."""
+        free_bytes = free_pictures = None
+        if self.has(Operation.GET_STORAGE_IDS) and self.has(Operation.GET_STORAGE_INFO):
+            stores = self.once(Operation.GET_STORAGE_IDS, deadline=deadline)
+            # A store without a medium has a logical number of 0.
+            present = [store for store in parse_handles(stores.data) if store & 0xFFFF] if stores.ok else []
+            infos = [self.once(Operation.GET_STORAGE_INFO, store, deadline=deadline) for store in present[:8]]
+            cards = [StorageInfo.parse(info.data) for info in infos if info.ok]
+            if cards:
+                free_bytes, free_pictures = sum(one.free for one in cards), sum(one.free_images for one in cards)
+            if not any(one.writable for one in cards):
+                warnings.append("card-unusable")
+            elif free_bytes is not None and free_bytes < _LITTLE_SPACE:
+                warnings.append("card-nearly-full")
+        if battery_percent is not None and battery_percent <= _LOW_BATTERY:
+            warnings.append("battery-low")
+        return CameraStatus(battery_percent, free_bytes, free_pictures, tuple(warnings))
 
     def picture(self, handle: int, deadline: Deadline) -> Picture | None:
         """What lies under a handle, if it is a picture and ready; else None."""
@@ -241,6 +198,18 @@ class Body(Protocol):
     def done(self, picture: Picture, *, deadline: Deadline) -> None:
         """The picture is safe on this computer; the camera may forget it."""
 
+    def keep_alive(self, *, deadline: Deadline) -> None:
+        """Tell the camera that somebody is there."""
+
+    def status(self, *, deadline: Deadline) -> CameraStatus:
+        """See ``hal.interfaces.WatchedCamera``."""
+
+    def live_view(self, *, deadline: Deadline) -> bytes:
+        """See ``hal.interfaces.LiveViewCamera``."""
+
+    def end_live_view(self, *, deadline: Deadline) -> None:
+        """See ``hal.interfaces.LiveViewCamera``."""
+
     def leave(self, *, deadline: Deadline) -> None:
         """Give control back."""
 
@@ -270,6 +239,14 @@ def nearest(allowed: Collection[float], wanted: float, *, setting: str) -> float
         "camera-setting-range",
         what=f"The camera has no {setting} of {wanted:g}; it has {min(allowed):g} to {max(allowed):g}.",
         remedy="Choose a value within its range.",
+    )
+
+
+def no_live_view() -> DeviceRefused:
+    return DeviceRefused(
+        "camera-no-live-view",
+        what="The camera can't show what it sees over its cable.",
+        remedy="Look through its finder, or take a picture to aim with.",
     )
 
 

@@ -1,263 +1,58 @@
-"""Still cameras that speak PTP: one driver for all, which does what the camera's DeviceInfo lists."""
+"""The driver ``ptp``: still cameras that speak PTP, over the network or USB, which do what their DeviceInfo lists."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
-from pathlib import Path
-from typing import Any, Final, TypeVar
+import re
+from collections.abc import Mapping
+from typing import Any, Final
 
-from hal.deadline import Deadline, in_seconds
-from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
-from hal.ptp import Answer, Operation
-from hal.ptp_datasets import DeviceInfo
+from hal.deadline import Deadline
+from hal.errors import PluginError
 from hal.registry import Driver, OpenContext
 from hal.transcript import Transcript
-from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings
-from plugins.ptp_body import Body, Channel, Picture, Shot, Timing
-from plugins.ptp_canon import EosBody
-from plugins.ptp_files import PendingFile, commit_all, kind_of
-from plugins.ptp_generic import GenericBody
-from plugins.ptp_link import PtpLink, refused
+from plugins.ptp_still import Connect, PtpCamera
 from plugins.ptpip import PtpIpLink
 from plugins.ptpip_wire import PtpIpAddress
-
-Connect = Callable[[Deadline], PtpLink]
-Result = TypeVar("Result")
-
-_SESSION: Final = 1
-_ATTEMPTS: Final = 4
-_CLOSE_S: Final = 0.7
-
-
-class PtpCamera:
-    """A camera over any PTP link (``hal.interfaces.Camera``).
-
-    ``connect`` opens a new link whenever one is needed: a lost connection is opened again, the settings are restored,
-    and a picture in progress is looked for on the camera instead of being taken again. For one thread at a time.
-
-    Parameters
-    ----------
-    serial : the camera must say this serial number; "" takes the first that answers and stays with it
-    to_card : let a Canon EOS store on its card instead of sending straight to this computer
-    keep_on_card : leave pictures on the card after they are safe here
-    transcript : closed with the camera; what passes over a link is recorded by whoever opens it
-    """
-
-    def __init__(
-        self,
-        connect: Connect,
-        *,
-        serial: str = "",
-        to_card: bool = False,
-        keep_on_card: bool = False,
-        timing: Timing | None = None,
-        transcript: Transcript | None = None,
-        deadline: Deadline,
-    ) -> None:
-        self._connect = connect
-        self._transcript = transcript
-        self._serial = serial
-        self._to_card = to_card
-        self._keep = keep_on_card
-        self._timing = timing or Timing()
-        self._channel: Channel | None = None
-        self._body: Body | None = None
-        self._settings: ExposureSettings | None = None
-        self._closed = False
-        self._capabilities = self._reopen(deadline).capabilities
-
-    @property
-    def capabilities(self) -> CameraCapabilities:
-        return self._capabilities
-
-    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        info = self._with_body(lambda _: self._device_info(deadline), deadline)
-        return DeviceIdentity(info.manufacturer, info.model, info.serial, info.version)
-
-    def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
-        confirmed = self._with_body(lambda body: body.configure(settings, deadline=deadline), deadline)
-        self._settings = confirmed
-        return confirmed
-
-    def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
-        """See ``hal.interfaces.Camera.capture``.
-
-        A connection that is lost in the middle is opened again. Where the button may have been pressed, the picture
-        is then looked for on the camera; it is never taken again. Raises DeviceGone("camera-shot-lost") where the
-        camera has none.
-        """
-        shot = Shot(self._with_body(lambda body: self._exposure_s(body, deadline), deadline))
-        self._check_time_for(shot, deadline)
-        attempt = 0
-        while True:
-            attempt += 1
-            body = self._ready(deadline, self._timing.reconnect_s if shot.fired else self._timing.come_back_s)
-            try:
-                if shot.fired:
-                    shot.resume()
-                else:
-                    body.release(shot, deadline=deadline)
-                pictures = body.collect(shot, deadline=deadline)
-                return self._fetch(body, pictures, destination, deadline)
-            except (DeviceGone, DeviceTimeout, ProtocolError):
-                # Only a broken link is worth another attempt; a camera that answers has said its last word.
-                if attempt == _ATTEMPTS or deadline.passed or not self._link_broken():
-                    raise
-
-    def close(self) -> None:
-        self._closed = True
-        deadline = in_seconds(_CLOSE_S)
-        body, channel, self._body, self._channel = self._body, self._channel, None, None
-        if channel is not None:
-            with contextlib.suppress(DeviceError):
-                if body is not None and not channel.link.broken:
-                    body.leave(deadline=deadline)
-                    channel.once(Operation.CLOSE_SESSION, deadline=deadline)
-            channel.link.close()
-        if self._transcript is not None:
-            self._transcript.close()
-
-    def _with_body(self, work: Callable[[Body], Result], deadline: Deadline) -> Result:
-        """Do ``work``; if that breaks the connection, once more on a new one. Only for what may be done twice."""
-        body = self._ready(deadline, self._timing.come_back_s)
-        try:
-            return work(body)
-        except (DeviceGone, DeviceTimeout, ProtocolError):
-            if deadline.passed or not self._link_broken():
-                raise
-        return work(self._ready(deadline, self._timing.come_back_s))
-
-    def _exposure_s(self, body: Body, deadline: Deadline) -> float:
-        return self._settings.exposure_s if self._settings is not None else body.exposure_s(deadline=deadline)
-
-    def _check_time_for(self, shot: Shot, deadline: Deadline) -> None:
-        if deadline.left_s() <= shot.exposure_s:
-            raise DeviceTimeout(
-                "camera-deadline-too-short",
-                what=f"An exposure of {shot.exposure_s:g} s does not fit in the {deadline.left_s():.1f} s left for it.",
-                remedy="Give the picture more than twice its exposure; nothing was exposed.",
-            )
-
-    def _fetch(self, body: Body, pictures: list[Picture], destination: Path, deadline: Deadline) -> list[CapturedFile]:
-        """Download all files of one picture, name them together, and only then let the camera forget them."""
-        with ExitStack() as temporary:
-            pending: list[PendingFile] = []
-            for picture in pictures:
-                kind = kind_of(picture.format, picture.filename)
-                if kind is None:
-                    continue
-                path = destination.parent / f"{destination.name}{kind[1]}"
-                file = temporary.enter_context(PendingFile(path, kind[0]))
-                body.download(picture, file, deadline=deadline)
-                pending.append(file)
-            captured = commit_all(pending)
-        # The files are safe: whatever goes wrong now must not make the caller take this picture again.
-        with contextlib.suppress(DeviceError):
-            for picture in pictures:
-                body.done(picture, deadline=in_seconds(max(1.0, min(5.0, deadline.left_s()))))
-        return captured
-
-    def _ready(self, deadline: Deadline, patience_s: float) -> Body:
-        """The body on a working connection; a broken one is opened again within ``patience_s``."""
-        deadline.check(
-            "camera-no-answer",
-            what="There was no time left to ask the camera.",
-            remedy="Give it more time, then try again.",
-        )
-        if self._closed:
-            raise DeviceGone(
-                "camera-closed", what="The camera's connection was closed.", remedy="Open the camera again."
-            )
-        if self._body is not None and not self._link_broken():
-            return self._body
-        give_up = deadline.within(patience_s)
-        pause_s = 0.05
-        while True:
-            try:
-                return self._reopen(deadline, after_break=True)
-            except (DeviceGone, DeviceBusy, DeviceTimeout, ProtocolError):
-                # A camera that restarts refuses connections at first, or still holds the lost one.
-                if give_up.passed:
-                    raise
-                give_up.sleep(pause_s)
-                pause_s = min(1.0, 2 * pause_s)
-
-    def _link_broken(self) -> bool:
-        return self._channel is None or self._channel.link.broken
-
-    def _reopen(self, deadline: Deadline, *, after_break: bool = False) -> Body:
-        if self._channel is not None:
-            self._channel.link.close()
-        link = self._connect(deadline)
-        try:
-            self._channel = Channel(link, frozenset({Operation.GET_DEVICE_INFO}), self._timing)
-            reply = self._channel.once(Operation.OPEN_SESSION, _SESSION, deadline=deadline)
-            if not reply.ok and reply.code != Answer.SESSION_ALREADY_OPEN:
-                raise refused(reply, "open a session")
-            info = self._device_info(deadline)
-            self._check_serial(info)
-            self._channel = Channel(link, info.operations, self._timing)
-            body = self._choose_body(info)
-            body.prepare(after_break=after_break, deadline=deadline)
-            if self._settings is not None:
-                body.configure(self._settings, deadline=deadline)
-        except BaseException:
-            link.close()
-            raise
-        self._body = body
-        self._capabilities = body.capabilities
-        return body
-
-    def _choose_body(self, info: DeviceInfo) -> Body:
-        assert self._channel is not None
-        eos = {Operation.EOS_SET_PROPERTY, Operation.EOS_GET_EVENT} <= info.operations
-        if eos and info.operations & {Operation.EOS_RELEASE, Operation.EOS_RELEASE_ON}:
-            return EosBody(self._channel, to_card=self._to_card, keep_on_card=self._keep)
-        if Operation.INITIATE_CAPTURE in info.operations:
-            return GenericBody(self._channel, info, keep_on_card=self._keep)
-        raise DeviceRefused(
-            "camera-no-remote-release",
-            what=f"The {info.model or 'camera'} cannot be released over its cable.",
-            remedy="Set its USB or network mode to PTP or remote control, or use another camera.",
-        )
-
-    def _device_info(self, deadline: Deadline) -> DeviceInfo:
-        assert self._channel is not None
-        return DeviceInfo.parse(
-            self._channel.ask(Operation.GET_DEVICE_INFO, doing="say what it is", deadline=deadline).data
-        )
-
-    def _check_serial(self, info: DeviceInfo) -> None:
-        """Calibration belongs to one camera: another one at the same address must not go unnoticed."""
-        if self._serial and info.serial != self._serial:
-            raise DeviceRefused(
-                "camera-other",
-                what=f"The camera that answers is number {info.serial or '(none)'}, not {self._serial}.",
-                remedy="Connect the right camera, or change serial in stage.toml and recalibrate.",
-            )
-        self._serial = self._serial or info.serial
 
 
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
     """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
-    address = PtpIpAddress.parse(str(settings["address"]))
+    address = str(settings["address"])
     to_card = _choice(settings, "target", "computer", "card") == "card"
-    keep_on_card = _flag(settings, "keep_on_card")
+    keep_on_card, both = _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg")
+    _way(address, None)  # a wrong address leaves no file behind
     transcript = None
     if context.transcripts is not None:
         context.transcripts.mkdir(parents=True, exist_ok=True)
-        name = f"ptpip-{address.host.replace(':', '_')}-{address.command_port}.txt"
-        transcript = Transcript(context.transcripts / name, keep=1000)
+        name = re.sub(r"[^A-Za-z0-9.-]+", "-", _named(address))
+        transcript = Transcript(context.transcripts / f"{name}.txt", keep=1000)
     return PtpCamera(
-        lambda until: PtpIpLink.connect(address, transcript=transcript, deadline=until),
+        _way(address, transcript),
         serial=str(settings.get("serial", "")),
         to_card=to_card,
         keep_on_card=keep_on_card,
+        both=both,
         transcript=transcript,
         deadline=deadline,
     )
+
+
+def _way(address: str, transcript: Transcript | None) -> Connect:
+    """What opens a link to ``address``. Raises PluginError."""
+    if address.startswith("usb:"):
+        # Only here: a stage with its camera on the network needs no libusb.
+        from plugins.ptp_usb_bus import UsbAddress, UsbFinder
+
+        return UsbFinder(UsbAddress.parse(address), transcript=transcript).connect
+    place = PtpIpAddress.parse(address)
+    return lambda until: PtpIpLink.connect(place, transcript=transcript, deadline=until)
+
+
+def _named(address: str) -> str:
+    if address.startswith("usb:"):
+        return address
+    place = PtpIpAddress.parse(address)
+    return f"ptpip-{place.host}-{place.command_port}"
 
 
 def _choice(settings: Mapping[str, Any], key: str, *allowed: str) -> str:
@@ -285,12 +80,13 @@ def _wrong_setting(key: str, value: object, allowed: str) -> PluginError:
 DRIVER: Final = Driver(
     kind="camera",
     name="ptp",
-    summary="Still cameras that speak PTP over the network (PTP/IP): standard ones and Canon EOS.",
+    summary="Still cameras that speak PTP over USB or the network (PTP/IP): standard ones and Canon EOS.",
     open=open_camera,
     settings={
-        "address": "ptpip:HOST:COMMANDPORT[:EVENTPORT]",
+        "address": "usb:SERIAL, usb:VENDOR:PRODUCT, usb:PORT, usb: for any, or ptpip:HOST:COMMANDPORT[:EVENTPORT]",
         "serial": "serial number that the camera must have; left out: whichever answers",
         "target": '"computer" (default) or "card": where a Canon EOS puts its pictures first',
+        "raw_and_jpeg": "true to get a JPEG beside each RAW file, where the camera can do that (default false)",
         "keep_on_card": "true to leave pictures on the card after they were fetched (default false)",
     },
     required=("address",),

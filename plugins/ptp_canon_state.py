@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from hal.ptp_eos import (
+    BATTERY_PERCENT,
+    BULB_CODES,
     MANUAL_EXPOSURE,
+    MANUAL_FOCUS,
+    EosCode,
     EosProperty,
     EosRecord,
     ImageFormat,
     ObjectAdded,
+    OtherRecord,
     PropertyChanged,
+    StatusChanged,
     ValuesChanged,
     aperture_of,
     exposure_of,
@@ -25,6 +31,8 @@ class EosState:
 
     def __init__(self) -> None:
         self.fresh: list[ObjectAdded] = []
+        self.busy = False
+        self.falls_asleep = False
         self._values: dict[int, bytes] = {}
         self._allowed: dict[int, tuple[int, ...]] = {}
         self._formats: tuple[ImageFormat, ...] = ()
@@ -41,6 +49,10 @@ class EosState:
                     self._allowed[code] = values
                 case ObjectAdded():
                     self.fresh.append(record)
+                case StatusChanged(busy):
+                    self.busy = busy
+                case OtherRecord(EosCode.SHUTS_DOWN_SOON):
+                    self.falls_asleep = True
 
     @property
     def capabilities(self) -> CameraCapabilities:
@@ -59,6 +71,10 @@ class EosState:
         """The value is about to change: what comes next is the new one."""
         self._values.pop(code, None)
 
+    def assume(self, code: EosProperty, data: bytes) -> None:
+        """Take a value for set, unless the body has said something else."""
+        self._values.setdefault(code, data)
+
     def is_set(self, code: EosProperty, data: bytes) -> bool:
         return self._values.get(code, b"")[: len(data)] == data
 
@@ -74,6 +90,19 @@ class EosState:
         codes = self.allowed(EosProperty.SHUTTER) if self._manual() else ()
         return {seconds: code for code in codes if (seconds := exposure_of(code)) is not None}
 
+    def bulb(self) -> int | None:
+        """The shutter code of bulb, where the body takes it now."""
+        codes = self.allowed(EosProperty.SHUTTER) if self._manual() else ()
+        return next((code for code in BULB_CODES if code in codes), None)
+
+    def battery_percent(self) -> int | None:
+        return BATTERY_PERCENT.get(self.number(EosProperty.BATTERY)) if self.knows(EosProperty.BATTERY) else None
+
+    def warnings(self) -> list[str]:
+        """What is set on the body itself and will be in the way."""
+        focus = self.knows(EosProperty.FOCUS_MODE) and self.number(EosProperty.FOCUS_MODE) != MANUAL_FOCUS
+        return ["autofocus-on"] * focus + ["mode-dial"] * (not self._manual())
+
     def isos(self) -> dict[int, int]:
         return {iso: code for code in self.allowed(EosProperty.ISO) if (iso := iso_of(code)) is not None}
 
@@ -85,13 +114,16 @@ class EosState:
         data = self._values.get(EosProperty.IMAGE_FORMAT)
         return None if data is None else parse_image_format(data)
 
-    def pick_format(self, *, raw: bool) -> ImageFormat | None:
-        """The best format of a kind: full-size RAW, alone where the body has it; else one full-size fine JPEG."""
+    def pick_format(self, *, raw: bool, both: bool = False) -> ImageFormat | None:
+        """The best format of a kind: full-size RAW, alone where the body has it; else one full-size fine JPEG.
+
+        ``both``: RAW and JPEG, where the body has that.
+        """
         known = self._formats
         if not known and (current := self.current_format()):
             known = (current,)
         able = [one for one in known if any(part.raw == raw for part in one)]
-        return min(able, default=None, key=lambda one: _rank(one, raw))
+        return min(able, default=None, key=lambda one: (both and raw and len(one) == 1, _rank(one, raw)))
 
     def _manual(self) -> bool:
         return not self.knows(EosProperty.EXPOSURE_MODE) or self.number(EosProperty.EXPOSURE_MODE) == MANUAL_EXPOSURE

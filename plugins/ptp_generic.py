@@ -7,10 +7,11 @@ from typing import Final
 from hal.deadline import Deadline
 from hal.ptp import RAW_FORMATS, Answer, EventCode, Format, Operation, Property, broken
 from hal.ptp_datasets import DeviceInfo, Form, PropertyDescription, pack_value, parse_value
-from hal.values import CameraCapabilities, ExposureSettings
-from plugins.ptp_body import Channel, Picture, Shot, nearest, no_such_file, still_waiting
+from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
+from plugins.ptp_body import Channel, nearest, no_live_view, no_such_file, still_waiting
 from plugins.ptp_files import PendingFile
 from plugins.ptp_link import camera_busy, card_full, refused
+from plugins.ptp_shot import Picture, Shot
 
 _MANUAL: Final = 1
 _BLOCK: Final = 4 << 20
@@ -79,11 +80,12 @@ class GenericBody:
         return 30.0 if value == _BULB else value * _STEPS[Property.EXPOSURE_TIME]
 
     def release(self, shot: Shot, *, deadline: Deadline) -> None:
-        shot.known = self._channel.handles(deadline)
-        self._channel.link.events()
-        give_up = deadline.within(self._channel.timing.busy_s)
+        give_up = self._channel.patience(deadline)
         pause_s = 0.01
         while True:
+            # Anew each time: while the camera was busy, an earlier picture may have been finished.
+            shot.known = self._channel.handles(deadline)
+            self._channel.link.events()
             wanted = (self._raw_format if self._raw else Format.JPEG) if self._format_selectable else 0
             shot.fire()
             reply = self._channel.once(
@@ -146,6 +148,23 @@ class GenericBody:
     def done(self, picture: Picture, *, deadline: Deadline) -> None:
         if not self._keep and self._channel.has(Operation.DELETE_OBJECT):
             self._channel.once(Operation.DELETE_OBJECT, picture.handle, 0, deadline=deadline)
+
+    def keep_alive(self, *, deadline: Deadline) -> None:
+        """Any question keeps a standard camera awake."""
+        self._channel.once(Operation.GET_STORAGE_IDS, deadline=deadline)
+
+    def status(self, *, deadline: Deadline) -> CameraStatus:
+        battery = None
+        if Property.BATTERY_LEVEL in self._info.properties:
+            reply = self._channel.once(Operation.GET_PROPERTY, Property.BATTERY_LEVEL, deadline=deadline)
+            battery = reply.data[0] if reply.ok and reply.data else None
+        return self._channel.status(battery, [], deadline)
+
+    def live_view(self, *, deadline: Deadline) -> bytes:
+        raise no_live_view()
+
+    def end_live_view(self, *, deadline: Deadline) -> None:
+        """There is none."""
 
     def leave(self, *, deadline: Deadline) -> None:
         """A standard camera is not taken over, so there is nothing to give back."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -9,12 +10,16 @@ from typing import Final, Protocol
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused
 from hal.ptp import Answer
+from hal.transcript import Transcript
 
 Sink = Callable[[memoryview], object]
 """Takes the bytes of a data phase piece by piece; the memory is reused after it returns."""
 
 MOST_IN_MEMORY: Final = 32 << 20
 """Bytes of a data phase that is not streamed: 8 million object handles would fit."""
+
+
+_MOST_NOTES: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,25 @@ class LinkEvent:
 
     code: int
     parameters: tuple[int, ...]
+
+
+class Diary:
+    """What went wrong with a camera and was mended, for a journal; the oldest is forgotten where nobody asks."""
+
+    def __init__(self, transcript: Transcript | None = None) -> None:
+        self._notes: deque[tuple[str, str]] = deque(maxlen=_MOST_NOTES)
+        self._transcript = transcript
+
+    def add(self, code: str, what: str) -> None:
+        self._notes.append((code, what))
+        if self._transcript is not None:
+            self._transcript.remark(f"{code}: {what}")
+
+    def take(self) -> list[tuple[str, str]]:
+        """(stable code, one sentence) of each since the last call, oldest first."""
+        found = list(self._notes)
+        self._notes.clear()
+        return found
 
 
 class PtpLink(Protocol):

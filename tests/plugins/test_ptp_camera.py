@@ -28,8 +28,9 @@ from hal.values import ExposureSettings, FileKind
 from plugins.emulated.ptp_body import CameraNames
 from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.shot import ShotFiles, ShotSettings
-from plugins.ptp_body import Timing
-from plugins.ptp_camera import DRIVER, PtpCamera, open_camera
+from plugins.ptp_camera import DRIVER, open_camera
+from plugins.ptp_shot import Timing
+from plugins.ptp_still import PtpCamera
 from plugins.ptpip import PtpIpLink
 from plugins.ptpip_wire import PtpIpAddress
 

@@ -1,0 +1,99 @@
+"""One press of a camera's button and what came of it, and how patient the driver is meanwhile."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from hal.errors import DeviceError, DeviceGone, DeviceTimeout
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How patient the driver is, in seconds.
+
+    ``answer_s``: for an ordinary answer; ``busy_s``: with a busy camera; ``margin_s``: for a picture, beyond twice its
+    exposure; ``grace_s``: for an event, before asking for what it would have told; ``come_back_s``: for a lost camera
+    to answer again, ``reconnect_s``: the same during a picture; ``keep_alive_s``: between two signs of life while it
+    works, ``idle_s``: while nobody asks for anything; ``slow_s``: an answer that took longer is noted.
+    """
+
+    answer_s: float = 15.0
+    busy_s: float = 20.0
+    margin_s: float = 15.0
+    grace_s: float = 1.0
+    come_back_s: float = 2.0
+    reconnect_s: float = 30.0
+    keep_alive_s: float = 5.0
+    idle_s: float = 20.0
+    slow_s: float = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A file on the camera; ``waiting`` in its memory until its transfer is confirmed, else on the card."""
+
+    handle: int
+    format: int
+    size: int
+    filename: str
+    waiting: bool = False
+
+
+@dataclass(slots=True)
+class Shot:
+    """One press of the button. ``fired`` from just before the request until the camera says that it did nothing.
+
+    ``known``: handles on the card before it; ``recovering``: the connection was lost since; ``held``: the shutter is
+    open and waits to be closed by us (bulb).
+    """
+
+    exposure_s: float
+    known: frozenset[int] = frozenset()
+    fired: bool = False
+    fired_at_s: float = 0.0
+    waiting_since_s: float = 0.0
+    recovering: bool = False
+    held: bool = False
+    found: dict[int, Picture] = field(default_factory=dict)
+
+    def fire(self) -> None:
+        self.fired = True
+        self.fired_at_s = self.waiting_since_s = time.monotonic()
+
+    def not_fired(self) -> None:
+        self.fired = False
+
+    def resume(self) -> None:
+        """Look for the picture on a new connection."""
+        self.recovering = True
+        self.waiting_since_s = time.monotonic()
+        self.found.clear()
+
+    def age_s(self) -> float:
+        """Seconds since the button was pressed."""
+        return time.monotonic() - self.fired_at_s
+
+    def overdue(self, timing: Timing) -> bool:
+        """Whether the picture should have been there by now: twice its exposure and a margin."""
+        return time.monotonic() - self.waiting_since_s > 2 * self.exposure_s + timing.margin_s
+
+    def missing(self) -> DeviceError:
+        """The error for a picture that was fired and never came, or was exposed for too long."""
+        if self.held:
+            return DeviceGone(
+                "camera-bulb-cut",
+                what="The connection to the camera was lost during a long exposure, which so got a wrong length.",
+                remedy="Check cable, network and battery, then take this picture again.",
+            )
+        if self.recovering:
+            return DeviceGone(
+                "camera-shot-lost",
+                what="The connection to the camera was lost during a picture, and the camera has no new one.",
+                remedy="Check cable, network and battery, then take this picture again; it was not taken twice.",
+            )
+        return DeviceTimeout(
+            "camera-no-picture",
+            what="The camera was released but no picture came from it in time.",
+            remedy="Check that its lens is on manual focus and its drive mode on single shot, then take it again.",
+        )
