@@ -78,7 +78,7 @@ def mode_of(folder: Path) -> str:
 
 
 def read_metapixels(folder: Path, projector: str) -> Metapixels:
-    """The metapixels that count in a run: from the sinusoids, or from dots where its mode has them."""
-    name = "pixels" if mode_of(folder) == "fast" else "dots"
+    """The metapixels that count in a run: from dots in the paper's mode, else from the sinusoids."""
+    name = "dots" if mode_of(folder) == "paper" else "pixels"
     arrays = load_arrays(folder / f"{name}-{projector}.npz")
     return Metapixels(arrays["centre_px"], arrays["covariance_px2"], arrays["valid"])
