@@ -35,8 +35,9 @@ class Acquirer:
 
     Parameters
     ----------
-    settle_s : seconds between the display's word that frames are presented and the opening of the shutter; at least the
-        projectors' own delay, so that no photograph shows the pattern before
+    settle_s : seconds between the display's word that frames are presented and the release of the shutter, at least.
+        Where the delay of the stage has been measured (``set_delay``), the longer of the two is waited, so that no
+        photograph shows the pattern before
     """
 
     def __init__(
@@ -47,23 +48,54 @@ class Acquirer:
         self._iso = iso
         self._aperture_f = aperture_f
         self._settle_s = settle_s
+        self._delay_s: float | None = None
         self._confirmed: tuple[float, ExposureSettings] | None = None
+
+    @property
+    def wait_s(self) -> float:
+        """Seconds that are waited between presentation and shutter."""
+        return max(self._settle_s, self._delay_s or 0.0)
+
+    @property
+    def protected(self) -> bool:
+        """Whether the stage's delay is known; until then nobody can tell a late picture from a short wait."""
+        return self._delay_s is not None
+
+    def set_delay(self, delay_s: float) -> None:
+        """What was measured between presentation and a photograph that shows the picture (``capture.latency``)."""
+        self._delay_s = delay_s
+
+    def show(self, frames: Mapping[str, ByteImage], *, deadline: Deadline) -> float:
+        """Show frames; return when they were presented, on the monotonic clock."""
+        presented = self._display.show(frames, deadline=deadline.within(10.0))
+        return presented.at_s
 
     def exposures_s(self) -> tuple[float, ...]:
         """The exposures that the camera offers, ascending, in seconds."""
         return self._camera.capabilities.exposures_s
 
-    def take(self, shot: Shot, folder: Path, *, deadline: Deadline) -> tuple[CapturedFile, float]:
+    def take(
+        self, shot: Shot, folder: Path, *, deadline: Deadline, wait_s: float | None = None
+    ) -> tuple[CapturedFile, float]:
         """Show and photograph one shot into ``folder``; return as ``photograph``."""
         # The camera is set first: that takes a while, in which the frames would only wait.
         self._set(shot.exposure_s, deadline)
-        shown = self._display.show(shot.frames, deadline=deadline.within(10.0))
-        return self.photograph(shot.name, shot.exposure_s, folder, shown_at_s=shown.at_s, deadline=deadline)
+        shown_at_s = self.show(shot.frames, deadline=deadline)
+        return self.photograph(
+            shot.name, shot.exposure_s, folder, shown_at_s=shown_at_s, deadline=deadline, wait_s=wait_s
+        )
 
     def photograph(
-        self, name: str, exposure_s: float, folder: Path, *, shown_at_s: float, deadline: Deadline
+        self,
+        name: str,
+        exposure_s: float,
+        folder: Path,
+        *,
+        shown_at_s: float,
+        deadline: Deadline,
+        wait_s: float | None = None,
     ) -> tuple[CapturedFile, float]:
-        """Photograph what has been shown since ``shown_at_s`` (monotonic clock).
+        """Photograph what has been shown since ``shown_at_s`` (monotonic clock), ``wait_s`` after it (as ``wait_s``).
 
         Returns the RAW file (JPEG where there is no RAW) and the confirmed exposure in seconds.
 
@@ -74,7 +106,8 @@ class Acquirer:
         and every error of the display and the camera
         """
         confirmed = self._set(exposure_s, deadline)
-        deadline.sleep(max(0.0, shown_at_s + self._settle_s - time.monotonic()))
+        waited_s = self.wait_s if wait_s is None else wait_s
+        deadline.sleep(max(0.0, shown_at_s + waited_s - time.monotonic()))
         bound = deadline.within(2 * confirmed.exposure_s + TRANSFER_MARGIN_S)
         try:
             files = self._camera.capture(folder / name, deadline=bound)
@@ -98,6 +131,11 @@ class Acquirer:
 
     def _set(self, exposure_s: float, deadline: Deadline) -> ExposureSettings:
         if self._confirmed is None or self._confirmed[0] != exposure_s:
-            wanted = ExposureSettings(exposure_s=exposure_s, iso=self._iso, aperture_f=self._aperture_f)
+            wanted = ExposureSettings(
+                exposure_s=exposure_s,
+                iso=self._iso,
+                aperture_f=self._aperture_f,
+                raw=self._camera.capabilities.raw,
+            )
             self._confirmed = (exposure_s, self._camera.configure(wanted, deadline=deadline.within(15.0)))
         return self._confirmed[1]

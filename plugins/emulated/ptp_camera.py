@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Final, Literal, Self
 
 from hal.errors import DeviceError
-from plugins.emulated.ptp_body import CameraFaults, CameraNames
+from plugins.emulated.ptp_body import JPEG, CameraFaults, CameraNames
 from plugins.emulated.ptp_eos import EosBody, OldEosBody
 from plugins.emulated.ptp_generic import GenericBody
 from plugins.emulated.ptp_wire import (
@@ -58,6 +58,7 @@ class EmulatedPtpCamera:
     names : identity; by default one that fits the flavour
     time_scale : real seconds for each second of exposure
     card_bytes : size of the memory card
+    raw : False for a camera that makes JPEG files only
     faults : knobs that may be turned while it runs
     """
 
@@ -72,6 +73,7 @@ class EmulatedPtpCamera:
         names: CameraNames | None = None,
         time_scale: float = 1.0,
         card_bytes: int = 4 << 30,
+        raw: bool = True,
         faults: CameraFaults | None = None,
     ) -> None:
         self.faults = faults or CameraFaults()
@@ -83,6 +85,8 @@ class EmulatedPtpCamera:
             card_bytes=card_bytes,
             faults=self.faults,
         )
+        if not raw:
+            self._body.capture_formats = (JPEG,)
         self._body.power_on()
         self._body.on_event = self._send_event
         self._body.on_drop = self.drop_connection

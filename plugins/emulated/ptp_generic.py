@@ -76,7 +76,7 @@ class GenericBody(EmulatedBody):
         return Outcome()
 
     def _capture(self, format_code: int) -> Outcome:
-        if format_code not in (0, JPEG, DNG):
+        if format_code not in (0, *self.capture_formats):
             return Outcome(WRONG_FORMAT)
         raw = format_code == DNG
         settings = ShotSettings(

@@ -53,5 +53,5 @@ def tone_curve(sensor: Sensor) -> npt.NDArray[np.uint8]:
     steps = np.arange(sensor.white_level + 1)
     linear = np.clip((steps - sensor.black_level) / (sensor.white_level - sensor.black_level), 0.0, 1.0)
     value = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    value += 0.25 * value * (1.0 - value) * (2.0 * value - 1.0)
+    value += sensor.contrast * value * (1.0 - value) * (2.0 * value - 1.0)
     return np.clip(np.rint(255.0 * value), 0, 255).astype(np.uint8)

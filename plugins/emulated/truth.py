@@ -51,7 +51,7 @@ class Lens:
 class Sensor:
     """A 12-bit Bayer sensor (RGGB). ``electrons_per_light_s``: photo-electrons of linear light 1 in 1 s at f/8;
 
-    ``electrons_per_step``: of one raw step at ISO 100.
+    ``electrons_per_step``: of one raw step at ISO 100; ``contrast``: how far the JPEG tone curve leaves sRGB.
     """
 
     electrons_per_light_s: Annotated[float, Between(1.0, 1e9)]
@@ -60,11 +60,12 @@ class Sensor:
     read_noise_e: Annotated[float, Between(0.0, 1e3)]
     black_level: Annotated[int, Between(0, 1023)]
     white_level: Annotated[int, Between(1024, 4095)]
+    contrast: Annotated[float, Between(0.0, 0.9)] = 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class CameraTruth:
-    """The camera. ``vignetting``: share of light lost in the image's corners."""
+    """The camera. ``vignetting``: share of light lost in the image's corners; ``raw``: False makes JPEG files only."""
 
     pose: Pose
     lens: Lens
@@ -74,6 +75,7 @@ class CameraTruth:
     event_port: Annotated[int, Between(0, 65535)]
     psf_sigma_px: Annotated[float, Between(0.0, 10.0)]
     vignetting: Annotated[float, Between(0.0, 0.95)]
+    raw: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +142,9 @@ class ObjectTruth:
 @dataclass(frozen=True, slots=True)
 class BenchTruth:
     """A whole emulated stage. ``subsamples``: S x S rays a camera pixel; ``time_scale``: emulated / real duration;
+
+    ``latency_s``: from a frame's presentation to its light, real seconds (projectors: one to eight frames, the stage's
+    default is two).
 
     ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder.
     """
