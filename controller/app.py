@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from controller.bundle.signing import write_public_key
+from controller.calibrate.intrinsics import read_intrinsics
 from controller.calibrate.reconstruction import CameraPrior
+from controller.calibrate.scale import MeasuredDistance
 from controller.capture.acquire import Acquirer
 from controller.config import Stage, check_driver_settings, load_stage
 from controller.config.models import CameraTable, OpenTable
@@ -50,12 +52,26 @@ class Checked:
 
     @property
     def prior(self) -> CameraPrior:
+        """What stage.toml knows of the camera, and what was measured on the stage.
+
+        Raises UsageError as ``read_intrinsics``, and "stage-key-missing" without any focal length.
+        """
         table: CameraTable = self.stage.tables.camera
+        measured = self.stage.tables.object.distances
+        distances = tuple(MeasuredDistance(d.from_px, d.to_px, d.distance_m, d.sigma_m) for d in measured)
+        if table.intrinsics is not None:
+            return read_intrinsics(self.stage.path(table.intrinsics)).prior(
+                distance_m=table.distance_m, distance_rel_sigma=table.distance_rel_sigma, distances=distances
+            )
+        if table.focal_length_px is None:
+            allowed = "a number above 0, unless intrinsics names a file of `velatura camera calibrate`"
+            raise table.place.missing("focal_length_px", allowed, written=[])
         return CameraPrior(
             focal_length_px=table.focal_length_px,
             focal_length_rel_sigma=table.focal_length_rel_sigma,
             distance_m=table.distance_m,
             distance_rel_sigma=table.distance_rel_sigma,
+            distances=distances,
         )
 
     @property

@@ -34,7 +34,7 @@ def reconstruct(
     projector_sizes: Sequence[tuple[int, int]],
     prior: CameraPrior,
     *,
-    smoothing_px: int = 3,
+    smoothing_px: int = 2,
     progress: Callable[[float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Reconstruction:
@@ -44,18 +44,20 @@ def reconstruct(
     ----------
     correspondences : one per projector, each of the camera's (rows, columns)
     camera_size, projector_sizes : (width, height) in pixels
-    smoothing_px : points and normals come from planes through (2 smoothing_px + 1) pixels squared
+    smoothing_px : points come from curved patches through (2 smoothing_px + 1) pixels squared, at least 2; normals from
+        planes one pixel wider
     progress : called with the share done, 0 to 1
     cancelled : asked often; when it says True, WorkError("cancelled") is raised
 
     Raises
     ------
-    UsageError  "correspondence-wrong-size"
+    UsageError  "correspondence-wrong-size", "camera-intrinsics-wrong-size"
     CalibrationError  "one-projector", "overlap-too-small", "scene-flat", "correspondences-inconsistent",
         "camera-prior-contradicted", "geometry-uncertain",
+        "distance-point-unknown", "distances-contradict" (see ``scale``),
         "geometry-ambiguous" (two shapes explain the pictures equally well, e.g. one with its depth reversed)
     """
-    _check(correspondences, camera_size, projector_sizes)
+    _check(correspondences, camera_size, projector_sizes, prior)
     report = progress or (lambda share: None)
 
     def tick() -> None:
@@ -71,20 +73,28 @@ def reconstruct(
     _refuse_if_contradicted(problem, adjusted.state)
     shape_sigma = _shape_sigma(problem, adjusted)
     _refuse_if_uncertain(shape_sigma, margin, pairs)
-    geometry, unit_m = object_points(
-        adjusted.state, problem.noise_px, correspondences, camera_size, projector_sizes, prior.distance_m, smoothing_px
+    found = object_points(
+        adjusted.state,
+        problem.noise_px,
+        shape_sigma,
+        correspondences,
+        camera_size,
+        projector_sizes,
+        prior,
+        smoothing_px,
     )
     report(1.0)
     return Reconstruction(
-        geometry=geometry,
-        covariance=_in_metres(adjusted.covariance, unit_m, len(projector_sizes)),
+        geometry=found.geometry,
+        covariance=_in_metres(adjusted.covariance, found.unit_m, len(projector_sizes)),
         parameter_names=parameter_names(len(projector_sizes)),
         noise_px=problem.noise_px,
         shape_rel_sigma=shape_sigma,
-        scale_rel_sigma=prior.distance_rel_sigma if prior.distance_m is not None else float("inf"),
+        scale_rel_sigma=found.unit_rel_sigma,
         stages_tried=tried,
         margin=margin,
         inlier_share=kept_share,
+        sigma_m=found.sigma_m,
     )
 
 
@@ -92,7 +102,14 @@ def _check(
     correspondences: Sequence[Correspondence],
     camera_size: tuple[int, int],
     projector_sizes: Sequence[tuple[int, int]],
+    prior: CameraPrior,
 ) -> None:
+    if prior.size_px is not None and prior.size_px != camera_size:
+        raise UsageError(
+            "camera-intrinsics-wrong-size",
+            what=f"The camera's focal length was measured in pictures of {prior.size_px} pixels, not {camera_size}.",
+            remedy="Photograph the board with the camera set as on the stage, and calibrate the camera again.",
+        )
     expected = (camera_size[1], camera_size[0])
     for n, own in enumerate(correspondences):
         if own.valid.shape != expected or own.projector_px.shape != (*expected, 2) or n >= len(projector_sizes):
@@ -134,7 +151,7 @@ def _problem(
         camera_px,
         projector_px,
         seen,
-        np.array([np.log(prior.focal_length_px), x, y, 0.0]),
+        np.array([np.log(prior.focal_length_px), x, y, prior.distortion_k1]),
         np.array([prior.focal_length_rel_sigma, sigma, sigma, prior.distortion_sigma]),
         shapes,
         widths,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from controller.arrays import Float64
+from controller.arrays import Float64, FloatImage
+from controller.calibrate.scale import MeasuredDistance
 from controller.calibrate.values import Geometry
 from controller.errors import UsageError
 
@@ -16,7 +17,9 @@ class CameraPrior:
 
     ``focal_length_rel_sigma``: 0.001 after a ChArUco session, 0.01-0.03 from EXIF.
     ``principal_point_px`` (x, y): the middle of the image if None; ``principal_point_sigma_px``: 0.5 % of the width if
-    None. ``distortion_sigma`` of k1. ``distance_m``: from the camera to the median object point.
+    None. ``distortion_k1`` with its ``distortion_sigma``. ``distance_m``: from the front of the lens to the nearest
+    visible point of the object. ``distances``: between points of the picture; they tell the scale better.
+    ``size_px`` of the picture that the focal length belongs to, if that is known.
     """
 
     focal_length_px: float
@@ -26,6 +29,9 @@ class CameraPrior:
     distortion_sigma: float = 0.05
     distance_m: float | None = None
     distance_rel_sigma: float = 0.01
+    distortion_k1: float = 0.0
+    distances: tuple[MeasuredDistance, ...] = ()
+    size_px: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         """Raises UsageError("camera-prior-invalid")."""
@@ -50,7 +56,9 @@ class Reconstruction:
     ``covariance`` (4 + 9 N, 4 + 9 N) of ``parameter_names``, rotations in radians, centres in metres at a fixed scale
     ``noise_px`` estimated standard deviation of one projector coordinate
     ``shape_rel_sigma`` expected rms error of the points by wrong parameters, as a share of their distance, scale apart
-    ``scale_rel_sigma`` of the measured distance; infinite where none was given
+    ``scale_rel_sigma`` by the measured distances; infinite where none was given
+    ``sigma_m`` (rows, columns) float32: standard deviation of each point along the camera's ray, at a fixed scale; NaN
+    where unknown
     ``stages_tried`` starting points that were adjusted as a whole; ``margin`` by which the best beat the next shape, in
     halved chi-square, infinite where all led to the same
     ``inlier_share`` of the sampled correspondences
@@ -65,6 +73,7 @@ class Reconstruction:
     stages_tried: int
     margin: float
     inlier_share: float
+    sigma_m: FloatImage
 
 
 def parameter_names(projectors: int) -> tuple[str, ...]:

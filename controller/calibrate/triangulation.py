@@ -23,7 +23,7 @@ def inverse_depth_map(
     rotations: Float64,
     centres: Float64,
     noise_px: float,
-) -> tuple[FloatImage, FloatImage]:
+) -> tuple[FloatImage, FloatImage, FloatImage]:
     """Robust multi-view least squares for every camera pixel.
 
     Parameters
@@ -35,12 +35,14 @@ def inverse_depth_map(
 
     Returns
     -------
-    inverse depth, and rms residual in projector pixels over the projectors that agree within four times the noise; NaN
-    where none sees the pixel, or where several do and fewer than two agree
+    inverse depth; rms residual in projector pixels over the projectors that agree within four times the noise; and the
+    inverse depth's change per projector pixel, all projectors together (times the noise it is the standard deviation).
+    NaN where none sees the pixel, or where several do and fewer than two agree
     """
     projectors, rows, columns = seen.shape
     inverse = np.full((rows, columns), np.nan, dtype=np.float32)
     residual = np.full((rows, columns), np.nan, dtype=np.float32)
+    leverage = np.full((rows, columns), np.nan, dtype=np.float32)
     turned = np.empty((projectors, 3))
     for n in range(projectors):
         turned[n] = rotations[n] @ centres[n]
@@ -81,7 +83,8 @@ def inverse_depth_map(
                 elif agreeing >= min(count, 2):
                     inverse[row, column] = rho
                     residual[row, column] = np.sqrt(squares / (2 * agreeing))
-    return inverse, residual
+                    leverage[row, column] = 1.0 / np.sqrt(bottom)
+    return inverse, residual, leverage
 
 
 @compiled(parallel=True)

@@ -71,14 +71,24 @@ class CameraTable(OpenTable):
     aperture_f: Annotated[float, Field(ge=0.5, le=128)] | None = Field(
         default=None, description="the f-number from 0.5 to 128; left out: as the lens is set"
     )
-    focal_length_px: Positive = Field(
-        description="the focal length in pixels of the camera's full image, a number above 0 (from the lens and sensor)"
+    intrinsics: str | None = Field(
+        default=None,
+        min_length=1,
+        description="a file that `velatura camera calibrate` wrote, relative to the stage's folder; it takes the"
+        " place of focal_length_px",
+    )
+    focal_length_px: Positive | None = Field(
+        default=None,
+        description="the focal length in pixels of the camera's full image, a number above 0 (from the lens and"
+        " sensor); may be left out where intrinsics stands",
     )
     focal_length_rel_sigma: float = Field(
         default=0.02, gt=0, le=1, description="how far focal_length_px may be off as a share of it, above 0, at most 1"
     )
     distance_m: Positive | None = Field(
-        default=None, description="metres from the camera to the middle of the object, above 0; left out: not measured"
+        default=None,
+        description="metres from the front of the camera's lens to the nearest visible point of the object, above 0;"
+        " left out: not measured",
     )
     distance_rel_sigma: float = Field(
         default=0.01, gt=0, le=1, description="how far distance_m may be off as a share of it, above 0, at most 1"
@@ -107,6 +117,7 @@ class DistanceTable(Table):
     from_px: Annotated[tuple[float, float], Field(strict=False)] = Field(description="[x, y] in camera pixels")
     to_px: Annotated[tuple[float, float], Field(strict=False)] = Field(description="[x, y] in camera pixels")
     distance_m: Positive = Field(description="metres between the two points, above 0")
+    sigma_m: Positive = Field(default=0.001, description="how far distance_m may be off in metres, above 0")
 
 
 class ObjectTable(Table):

@@ -23,7 +23,15 @@ from plugins.emulated.ptp_camera import EmulatedPtpCamera
 from plugins.emulated.quick_profile import quick_profile
 from plugins.emulated.scenario import ScenarioPlayer, read_scenario
 from plugins.emulated.serial_projector import EmulatedSerialProjector
-from plugins.emulated.staging import FAST_LAMP, FAST_PROFILE, device_tables, random_truth, size_named
+from plugins.emulated.staging import (
+    FAST_LAMP,
+    FAST_PROFILE,
+    INTRINSICS,
+    device_tables,
+    intrinsics_of,
+    random_truth,
+    size_named,
+)
 from plugins.emulated.truth import FOLDER, ObjectTruth, read_truth, write_truth
 from plugins.emulated.world import World, object_of
 
@@ -57,7 +65,8 @@ class EmulatedBench:
                 thing.save(stage / OBJECT_FILE)
             (stage / FAST_PROFILE).write_text(profile, encoding="utf-8")
             write_truth(stage, truth)
-        return device_tables(truth)
+            (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
+        return device_tables(truth, shape)
 
     def serve(self, stage: Path, *, json_lines: bool) -> int:
         """Serve the stage's devices until SIGINT or SIGTERM; returns 0, or 3 when a device can't be served."""
@@ -143,6 +152,7 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
         event_port=truth.camera.event_port,
         names=CameraNames(serial=truth.camera.serial_number),
         time_scale=0.0,
+        raw=truth.camera.raw,
     )
     stack.enter_context(camera)
     out.served("camera", "camera", camera.address)

@@ -45,6 +45,9 @@ SIZES: Final[Mapping[str, Size]] = {
     "medium": Size((700, 526), (1944, 1296), 2),
     "paper": Size((1400, 1050), (3888, 2592), 2),
 }
+INTRINSICS: Final = "camera-intrinsics.toml"
+FOCAL_REL_SIGMA, CENTRE_SIGMA_PX, K1_SIGMA = 0.001, 3.0, 0.01
+"""How well a session with a ChArUco board tells a lens at the size ``paper``; the centre scales with the picture."""
 FRAMES: Final = "run/outputs.frame"
 FAST_PROFILE: Final = "bench/optoma-fast.toml"
 PLACES: Final = (("left", -29.0, 6.0), ("right", 27.0, 3.0), ("above", 2.0, 27.0))
@@ -89,11 +92,14 @@ def random_truth(size: str, seed: int, thing: StageObject, kept: ObjectTruth, po
     )
 
 
-def device_tables(truth: BenchTruth) -> dict[str, Any]:
-    """The device tables for stage.toml: what a technician reads off the devices, or measures with a tape."""
+def device_tables(truth: BenchTruth, thing: StageObject) -> dict[str, Any]:
+    """The device tables for stage.toml: what a technician reads off the devices, or measures with a tape.
+
+    ``distance_m`` is from the camera to the nearest point of ``thing``, which nothing can hide.
+    """
     rng = np.random.default_rng([truth.seed, 1])
     camera = truth.camera
-    distance = float(np.linalg.norm(camera.pose.position_m))
+    distance = float(np.linalg.norm(thing.vertices - np.asarray(camera.pose.position_m), axis=1).min())
     return {
         "projectors": [
             {"name": p.name, "output": p.output, "driver": "serial", "profile": p.profile, "port": p.port}
@@ -103,8 +109,7 @@ def device_tables(truth: BenchTruth) -> dict[str, Any]:
             "driver": "ptp",
             "address": f"ptpip:127.0.0.1:{camera.command_port}:{camera.event_port}",
             "iso": 100,
-            "focal_length_px": round(camera.lens.focal_px * (1.0 + 0.005 * rng.uniform(-1.0, 1.0)), 2),
-            "focal_length_rel_sigma": 0.01,
+            "intrinsics": INTRINSICS,
             "distance_m": round(distance * (1.0 + 0.01 * rng.uniform(-1.0, 1.0)), 3),
         },
         "display": {
@@ -116,6 +121,30 @@ def device_tables(truth: BenchTruth) -> dict[str, Any]:
             ],
         },
     }
+
+
+def intrinsics_of(truth: BenchTruth) -> str:
+    """The file that a ChArUco session with this camera would have left: the truth, off by a session's errors."""
+    rng = np.random.default_rng([truth.seed, 3])
+    lens = truth.camera.lens
+    (width, height), centre_sigma = lens.size_px, CENTRE_SIGMA_PX * lens.size_px[0] / SIZES["paper"].camera_px[0]
+    focal = lens.focal_px * (1.0 + FOCAL_REL_SIGMA * float(rng.uniform(-1.0, 1.0)))
+    x, y = np.asarray(lens.centre_px) + centre_sigma * rng.uniform(-1.0, 1.0, 2)
+    k1 = lens.distortion[0] + K1_SIGMA * float(rng.uniform(-1.0, 1.0))
+    variances = np.square([FOCAL_REL_SIGMA, centre_sigma, centre_sigma, K1_SIGMA])
+    rows = ", ".join(str([float(v) for v in row]) for row in np.diag(variances))
+    return "\n".join(
+        (
+            'method = "charuco"',
+            f"width_px = {width}",
+            f"height_px = {height}",
+            f"focal_length_px = {focal!r}",
+            f"principal_point_px = [{float(x)!r}, {float(y)!r}]",
+            f"distortion_k1 = {k1!r}",
+            f"covariance = [{rows}]",
+            "",
+        )
+    )
 
 
 def _camera(sizes: Size, rng: np.random.Generator, points: Floats, ports: tuple[int, int]) -> CameraTruth:

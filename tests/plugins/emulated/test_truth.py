@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from hal.errors import DeviceError
 from plugins.emulated.objects import StageObject
-from plugins.emulated.staging import SIZES, device_tables, random_truth
+from plugins.emulated.staging import INTRINSICS, SIZES, device_tables, intrinsics_of, random_truth
 from plugins.emulated.truth import BenchTruth, ObjectTruth, read_truth, write_truth
 
 KEPT = ObjectTruth("vase-and-bust", "", 1)
@@ -112,11 +113,13 @@ def test_a_technician_knows_the_focal_length_and_the_distance_only_roughly(
     vase_and_bust: StageObject, size: str
 ) -> None:
     truth = random_truth(size, 9, vase_and_bust, KEPT, (15740, 15741))
-    tables = device_tables(truth)
-    focal = tables["camera"]["focal_length_px"] / truth.camera.lens.focal_px
-    assert 0.0 < abs(focal - 1.0) < 0.01
-    distance = float(np.linalg.norm(truth.camera.pose.position_m))
-    assert tables["camera"]["distance_m"] == pytest.approx(distance, rel=0.011)
+    tables = device_tables(truth, vase_and_bust)
+    assert tables["camera"]["intrinsics"] == INTRINSICS
+    kept = tomllib.loads(intrinsics_of(truth))
+    assert 0.0 < abs(kept["focal_length_px"] / truth.camera.lens.focal_px - 1.0) <= 0.001
+    assert np.sqrt(kept["covariance"][0][0]) == pytest.approx(0.001)
+    nearest = min(np.linalg.norm(vertex - truth.camera.pose.position_m) for vertex in vase_and_bust.vertices)
+    assert tables["camera"]["distance_m"] == pytest.approx(nearest, rel=0.011)
     assert tables["camera"]["address"] == "ptpip:127.0.0.1:15740:15741"
     names = [output["name"] for output in tables["display"]["outputs"]]
     assert names == [projector["output"] for projector in tables["projectors"]]
