@@ -1,28 +1,18 @@
-"""A HID device through hidapi, which may hang, and which may lose its device: deadlines, and finding it again.
-
-hidapi's calls run on a thread of their own. A call that outlives its deadline is left behind with its thread; the next
-one waits for that thread to end before it opens the device anew, so that at most one is ever left behind.
-"""
+"""A HID device through hidapi, which may hang, and which may lose its device: deadlines, and finding it again."""
 
 from __future__ import annotations
 
 import importlib
-import queue
-import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final, Generic, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
 
-from hal.deadline import Deadline
-from hal.errors import DeviceError, DeviceGone, DeviceRefused, PluginError, ProtocolError
+from hal.errors import DeviceGone, DeviceRefused, PluginError
 from hal.ptp import printable
-
-Result = TypeVar("Result")
+from plugins.worker_link import WorkerLink
 
 BACKENDS: Final = {"hidraw": "hidraw", "libusb": "hid"}
 """hidapi's modules: ``hidraw`` leaves the kernel's driver in place, ``hid`` goes round it through libusb."""
-_SLICE_S: Final = 0.05
-_CLOSE_S: Final = 0.7
 _LONGEST_NAME: Final = 126
 
 
@@ -69,127 +59,23 @@ class OpenHid:
     serial: str
 
 
-@dataclass(slots=True)
-class _Job(Generic[Result]):
-    work: Callable[[_Worker], Result]
-    done: threading.Event = field(default_factory=threading.Event)
-    result: list[Result] = field(default_factory=list)
-    error: BaseException | None = None
-
-
-class _Worker:
-    """One thread, and the device that it has open. Whatever becomes of it, it closes what it opened."""
-
-    def __init__(self) -> None:
-        self.open: OpenHid | None = None
-        self._jobs: queue.SimpleQueue[_Job[Any] | None] = queue.SimpleQueue()
-        self.thread = threading.Thread(target=self._run, name="hid", daemon=True)
-        self.thread.start()
-
-    def start(self, job: _Job[Any]) -> None:
-        self._jobs.put(job)
-
-    def end(self) -> None:
-        self._jobs.put(None)
-
-    def drop(self) -> None:
-        """Close the device. On the worker's thread."""
-        was_open, self.open = self.open, None
-        if was_open is not None:
-            was_open.handle.close()
-
-    def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                job.result.append(job.work(self))
-            except BaseException as error:  # noqa: BLE001 - it is raised again by whoever waits for the job
-                job.error = error
-            job.done.set()
-        self.drop()
-
-
-class HidLink:
-    """The way to one HID device; opens it when needed, and again after it was unplugged. For one thread at a time.
+class HidLink(WorkerLink[OpenHid]):
+    """A ``WorkerLink`` to one HID device.
 
     ``serial``: it must have this serial number; "" takes the only one there is, and stays with it.
     """
 
     def __init__(self, kind: HidKind, *, serial: str = "", backend: str = "hidraw") -> None:
+        super().__init__(kind.name, broken=(OSError, ValueError))
         self._kind = kind
         self._serial = serial
         self._module = _hidapi(backend)
-        self._worker: _Worker | None = None
-        self._left_behind: _Worker | None = None
-        self._closed = False
 
-    def call(self, work: Callable[[OpenHid], Result], *, deadline: Deadline) -> Result:
-        """Do ``work`` with the open device; once more where the connection had broken, so it must bear repetition.
+    def let_go(self, opened: OpenHid) -> None:
+        opened.handle.close()
 
-        Raises DeviceGone, DeviceTimeout, DeviceRefused (several of them, or no permission), ProtocolError where the
-        device is there and fails the transfer, or Cancelled.
-        """
-        self._still_time(deadline)
-        if self._closed:
-            raise DeviceGone(
-                "hid-closed", what=f"The {self._kind.name} was closed.", remedy=f"Open the {self._kind.name} again."
-            )
-
-        def done(worker: _Worker) -> Result:
-            for again in (False, True):
-                if worker.open is None:
-                    worker.open = self._find()
-                try:
-                    return work(worker.open)
-                except (OSError, ValueError) as error:
-                    worker.drop()
-                    if again:
-                        raise self._failed(error) from error
-                except ProtocolError:
-                    worker.drop()
-                    raise
-            raise AssertionError
-
-        return self._on_worker(done, deadline)
-
-    def close(self) -> None:
-        """Close the device; a call that hangs is left behind after 0.7 s."""
-        self._closed = True
-        worker, self._worker = self._worker, None
-        if worker is not None:
-            worker.end()
-            worker.thread.join(_CLOSE_S)
-
-    def _on_worker(self, work: Callable[[_Worker], Result], deadline: Deadline) -> Result:
-        if self._left_behind is not None:
-            self._wait(lambda seconds: self._left_behind is None or _ended(self._left_behind, seconds), deadline)
-            self._left_behind = None
-        worker = self._worker = self._worker or _Worker()
-        job: _Job[Result] = _Job(work)
-        worker.start(job)
-        try:
-            self._wait(job.done.wait, deadline)
-        except DeviceError:
-            if not job.done.is_set():
-                worker.end()
-                self._left_behind, self._worker = worker, None
-            raise
-        if job.error is not None:
-            raise job.error
-        return job.result[0]
-
-    def _wait(self, ready: Callable[[float], bool], deadline: Deadline) -> None:
-        while not ready(min(_SLICE_S, deadline.left_s())):
-            self._still_time(deadline)
-
-    def _still_time(self, deadline: Deadline) -> None:
-        deadline.check(
-            "hid-no-answer",
-            what=f"The {self._kind.name} did not answer in time.",
-            remedy="Unplug it and plug it in again; use another cable or hub if it happens often.",
-        )
-
-    def _find(self) -> OpenHid:
-        """Find and open the device. On the worker's thread."""
+    def find(self) -> OpenHid:
+        """See ``WorkerLink.find``. Raises DeviceGone, or DeviceRefused (several of them, or no permission)."""
         matching = self._matching()
         if len(matching) == 1:
             self._serial = matching[0].serial
@@ -247,18 +133,6 @@ class HidLink:
             what=f"The {self._kind.name} is plugged in, but cannot be opened ({error}).",
             remedy="End other programs that use it, and install firmware_configs/udev/70-velatura-hid.rules.",
         )
-
-    def _failed(self, error: Exception) -> ProtocolError:
-        return ProtocolError(
-            "hid-transfer",
-            what=f"The {self._kind.name} is plugged in, but refuses what it is asked ({error}).",
-            remedy="Unplug it and plug it in again; if it happens again, replace it.",
-        )
-
-
-def _ended(worker: _Worker, seconds: float) -> bool:
-    worker.thread.join(seconds)
-    return not worker.thread.is_alive()
 
 
 def _name(text: object) -> str:

@@ -10,6 +10,7 @@ from plugins.emulated.usb_bus_hid import FEATURE, INPUT, EmulatedHidDevice
 
 _LUX_UNIT: Final = 0.01
 _READY, _CHANGED = 2, 2
+"""State of a sensor that works, and the event "data has changed"."""
 _FULL_POWER: Final = 2
 
 
@@ -27,6 +28,8 @@ class EmulatedLightSensor(EmulatedHidDevice):
     def __init__(self, *, lux: float = 0.5, serial: str = "") -> None:
         super().__init__(UsbNames(0x273F, 0x1008, "Hughski Ltd.", "ColorHugALS", serial))
         self._lux = lux
+        self.state = _READY
+        """What it says of itself with each reading; 5 is "initializing"."""
         self.settings = (0, 0, 0, 0, 0)
         """Connection, reporting, power, state, interval in ms."""
 
@@ -57,4 +60,4 @@ class EmulatedLightSensor(EmulatedHidDevice):
         self.settings = (connection, reporting, power, state, interval)
 
     def _reading(self) -> bytes:
-        return struct.pack("<BBBI", 1, _READY, _CHANGED, max(0, round(self._lux / _LUX_UNIT)))
+        return struct.pack("<BBBI", 1, self.state, _CHANGED, max(0, round(self._lux / _LUX_UNIT)))

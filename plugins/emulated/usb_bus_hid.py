@@ -41,6 +41,10 @@ class EmulatedHidDevice(EmulatedUsbDevice):
         """Hook: SET_REPORT, or an output report. Raises Stall."""
         raise Stall
 
+    def out(self, endpoint: int, data: bytes) -> None:
+        """Output reports of devices that have a pipe for them."""
+        self.set_report(OUTPUT, data[0] if self.numbered and data else 0, data)
+
     def input(self, report: bytes) -> None:
         """Send an input report to whoever listens."""
         self.send(0x81, report)

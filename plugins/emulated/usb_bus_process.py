@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
+from plugins.emulated.hid_key_panel import EmulatedKeyPanel
 from plugins.emulated.hid_light_sensor import EmulatedLightSensor
 from plugins.emulated.hid_relay import EmulatedRelayBoard
 from plugins.emulated.ptp_usb_camera import numbered_camera
@@ -27,6 +28,7 @@ from plugins.emulated.usb_bus_scenario import UsbScenario
 KINDS: Final[Mapping[str, Callable[..., EmulatedUsbDevice]]] = {
     "relay": EmulatedRelayBoard,
     "light": EmulatedLightSensor,
+    "keys": EmulatedKeyPanel,
     "camera": numbered_camera,
 }
 _PATIENCE_S: Final = 10.0

@@ -1,0 +1,175 @@
+"""Calls of a library that may hang, with deadlines: they run on a thread of their own.
+
+A call that outlives its deadline is left behind with its thread; the next one waits for that thread to end before
+anything is opened anew, so that at most one is ever left behind.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final, Generic, TypeVar
+
+from hal.deadline import Cancelled, Deadline
+from hal.errors import DeviceError, DeviceGone, ProtocolError
+
+Opened = TypeVar("Opened")
+Result = TypeVar("Result")
+
+_SLICE_S: Final = 0.05
+_CLOSE_S: Final = 0.7
+
+
+@dataclass(slots=True)
+class _Job(Generic[Result]):
+    work: Callable[[_Worker[Any]], Result]
+    done: threading.Event = field(default_factory=threading.Event)
+    result: list[Result] = field(default_factory=list)
+    error: BaseException | None = None
+
+
+class _Worker(Generic[Opened]):
+    """One thread, and the device that it has open. Whatever becomes of it, it closes what it opened."""
+
+    def __init__(self, close: Callable[[Opened], None]) -> None:
+        self.open: Opened | None = None
+        self._close = close
+        self._jobs: queue.SimpleQueue[_Job[Any] | None] = queue.SimpleQueue()
+        self.thread = threading.Thread(target=self._run, name="hid", daemon=True)
+        self.thread.start()
+
+    def start(self, job: _Job[Any]) -> None:
+        self._jobs.put(job)
+
+    def end(self) -> None:
+        self._jobs.put(None)
+
+    def drop(self) -> None:
+        """Close the device. On the worker's thread."""
+        was_open, self.open = self.open, None
+        if was_open is not None:
+            self._close(was_open)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job.result.append(job.work(self))
+            except BaseException as error:  # noqa: BLE001 - it is raised again by whoever waits for the job
+                job.error = error
+            job.done.set()
+        self.drop()
+
+
+class WorkerLink(ABC, Generic[Opened]):
+    """The way to one device that is opened when needed, and again after it was lost. Callers take turns.
+
+    ``name``: of the device, for sentences, e.g. "relay board"; ``broken``: what the library raises when the way to the
+    device breaks.
+    """
+
+    def __init__(self, name: str, *, broken: tuple[type[Exception], ...]) -> None:
+        self._name = name
+        self._broken = broken
+        self._turn = threading.Lock()
+        self._worker: _Worker[Opened] | None = None
+        self._left_behind: _Worker[Opened] | None = None
+        self._closed = False
+
+    @abstractmethod
+    def find(self) -> Opened:
+        """Find and open the device; on the worker's thread. Raises DeviceError."""
+
+    @abstractmethod
+    def let_go(self, opened: Opened) -> None:
+        """Close the device; on the worker's thread. Raises nothing."""
+
+    def call(self, work: Callable[[Opened], Result], *, deadline: Deadline) -> Result:
+        """Do ``work`` with the open device; once more where the connection had broken, so it must bear repetition.
+
+        Raises what ``find`` and ``work`` raise, DeviceGone for one that was closed, DeviceTimeout, ProtocolError where
+        the device is there and fails the transfer, or Cancelled.
+        """
+        while not self._turn.acquire(timeout=min(_SLICE_S, deadline.left_s())):
+            self._still_time(deadline)
+        try:
+            self._still_time(deadline)
+            if self._closed:
+                raise DeviceGone(
+                    "hid-closed", what=f"The {self._name} was closed.", remedy=f"Open the {self._name} again."
+                )
+            given_up = threading.Event()
+            return self._on_worker(lambda worker: self._try(worker, work, given_up), deadline, given_up)
+        finally:
+            self._turn.release()
+
+    def close(self) -> None:
+        """Close the device; a call that hangs is left behind after 0.7 s."""
+        self._closed = True
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.end()
+            worker.thread.join(_CLOSE_S)
+
+    def _try(self, worker: _Worker[Opened], work: Callable[[Opened], Result], given_up: threading.Event) -> Result:
+        for again in (False, True):
+            if worker.open is None:
+                worker.open = self.find()
+            if given_up.is_set():  # nobody wants it done any more: a relay must not move minutes later
+                raise Cancelled
+            try:
+                return work(worker.open)
+            except self._broken as error:
+                worker.drop()
+                if again:
+                    raise self._failed(error) from error
+            except ProtocolError:
+                worker.drop()
+                raise
+        raise AssertionError
+
+    def _on_worker(
+        self, work: Callable[[_Worker[Opened]], Result], deadline: Deadline, given_up: threading.Event
+    ) -> Result:
+        if (behind := self._left_behind) is not None:
+            self._wait(lambda seconds: _ended(behind, seconds), deadline)
+            self._left_behind = None
+        worker = self._worker = self._worker or _Worker(self.let_go)
+        job: _Job[Result] = _Job(work)
+        worker.start(job)
+        try:
+            self._wait(job.done.wait, deadline)
+        except DeviceError:
+            given_up.set()
+            if not job.done.is_set():
+                worker.end()
+                self._left_behind, self._worker = worker, None
+            raise
+        if job.error is not None:
+            raise job.error
+        return job.result[0]
+
+    def _wait(self, ready: Callable[[float], bool], deadline: Deadline) -> None:
+        while not ready(min(_SLICE_S, deadline.left_s())):
+            self._still_time(deadline)
+
+    def _still_time(self, deadline: Deadline) -> None:
+        deadline.check(
+            "hid-no-answer",
+            what=f"The {self._name} did not answer in time.",
+            remedy="Unplug it and plug it in again; use another cable or hub if it happens often.",
+        )
+
+    def _failed(self, error: Exception) -> ProtocolError:
+        return ProtocolError(
+            "hid-transfer",
+            what=f"The {self._name} is plugged in, but refuses what it is asked ({error}).",
+            remedy="Unplug it and plug it in again; if it happens again, replace it.",
+        )
+
+
+def _ended(worker: _Worker[Any], seconds: float) -> bool:
+    worker.thread.join(seconds)
+    return not worker.thread.is_alive()

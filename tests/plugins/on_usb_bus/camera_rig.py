@@ -1,0 +1,57 @@
+"""Our driver on an emulated camera on the emulated USB bus, and what its pictures must be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hal.deadline import in_seconds
+from hal.values import ExposureSettings
+from plugins.emulated.ptp_usb_camera import numbered_files
+from plugins.emulated.shot import ShotSettings
+from plugins.emulated.usb_bus_process import UsbBusProcess
+from plugins.ptp_shot import Timing
+from plugins.ptp_still import PtpCamera
+from plugins.ptp_usb_bus import UsbAddress, UsbFinder
+
+SIZE = 300_000
+QUICK = Timing(answer_s=1.5, busy_s=1.0, margin_s=0.6, grace_s=0.1, come_back_s=1.0, reconnect_s=5.0, keep_alive_s=0.05)
+SHORT = ExposureSettings(0.125, 200, 8.0, raw=False)
+
+
+@dataclass
+class Rig:
+    bus: UsbBusProcess
+    driver: PtpCamera
+
+    def capture(self, folder: Path, name: str = "shot", *, seconds: float = 10.0) -> bytes:
+        files = self.driver.capture(folder / name, deadline=in_seconds(seconds))
+        assert len(files) == 1
+        return files[0].path.read_bytes()
+
+    def exposures(self) -> int:
+        return int(self.bus.get("camera", "exposures"))
+
+    def latest(self) -> bytes:
+        """The bytes of the last JPEG that was exposed."""
+        return numbered_files(self.exposures(), SIZE, ShotSettings(1, 1, 1, raw=False, jpeg=True)).jpeg or b""
+
+    def fault(self, knob: str, value: object) -> None:
+        """``camera_faults.X`` or ``pipe_faults.X``."""
+        self.bus.set("camera", knob, value)
+
+
+@contextmanager
+def running(bus: UsbBusProcess, flavour: str, *, address: str = "usb:", **options: Any) -> Iterator[Rig]:
+    camera = options.pop("camera", {})
+    bus.add("camera", "camera", flavour=flavour, size=SIZE, time_scale=0.2, **camera)
+    finder = UsbFinder(UsbAddress.parse(address))
+    driver = PtpCamera(finder.connect, deadline=in_seconds(10), **{"timing": QUICK, **options})
+    driver.configure(SHORT, deadline=in_seconds(5))
+    try:
+        yield Rig(bus, driver)
+    finally:
+        driver.close()

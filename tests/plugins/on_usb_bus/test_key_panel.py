@@ -1,0 +1,134 @@
+"""The technician's keys: the library ``streamdeck``, and our driver on it, with an emulated Stream Deck."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+from StreamDeck.DeviceManager import DeviceManager
+
+from hal.conformance import ButtonPanelConformance
+from hal.deadline import in_seconds
+from hal.errors import DeviceError, DeviceGone, DeviceRefused
+from plugins.emulated.usb_bus_process import UsbBusProcess
+from plugins.stream_deck import StreamDeckPanel
+
+
+@pytest.fixture
+def panel(bus: UsbBusProcess) -> Iterator[StreamDeckPanel]:
+    bus.add("keys", "keys")
+    panel = StreamDeckPanel(deadline=in_seconds(20))
+    yield panel
+    panel.close()
+
+
+class TestStreamDeck(ButtonPanelConformance):
+    @pytest.fixture
+    def button_panel(self, panel: StreamDeckPanel) -> StreamDeckPanel:
+        return panel
+
+
+def on_key(bus: UsbBusProcess, key: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    """What is seen on a key, RGB: the panel turns what it gets by half a turn."""
+    file = np.frombuffer(bytes.fromhex(bus.call("keys", "picture_of", key)), np.uint8)
+    decoded = cv2.imdecode(file, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return np.asarray(decoded[::-1, ::-1, ::-1], np.uint8)
+
+
+def test_the_unchanged_library_takes_the_emulated_panel_for_a_real_one(bus: UsbBusProcess) -> None:
+    bus.add("keys", "keys", serial="PEER12345", firmware="1.02.003")
+    (deck,) = DeviceManager().enumerate()
+    deck.open()
+    assert (deck.get_serial_number(), deck.get_firmware_version()) == ("PEER12345", "1.02.003")
+    assert (deck.key_count(), deck.deck_type()) == (15, "Stream Deck Original")
+    deck.set_brightness(30)
+    assert bus.get("keys", "brightness") == 30
+    heard: list[tuple[int, bool]] = []
+    deck.set_key_callback(lambda _, key, down: heard.append((key, down)))
+    bus.call("keys", "press", 7)
+    wait_until = time.monotonic() + 5
+    while len(heard) < 2 and time.monotonic() < wait_until:
+        time.sleep(0.01)
+    assert heard == [(7, True), (7, False)]
+    picture = bytes(range(256)) * 12  # three pages
+    deck.set_key_image(4, picture)
+    assert bytes.fromhex(bus.call("keys", "picture_of", 4)) == picture
+    deck.reset()
+    assert bus.call("keys", "picture_of", 4) == ""
+    deck.close()
+
+
+def test_a_picture_is_seen_upright_and_in_its_colours(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
+    assert panel.capabilities.keys == 15
+    assert panel.capabilities.picture_px == (72, 72)
+    picture = np.zeros((72, 72, 3), np.uint8)
+    picture[:36, :36] = (255, 0, 0)
+    picture[36:, 36:] = (0, 0, 255)
+    panel.show(3, picture, deadline=in_seconds(5))
+    assert np.abs(on_key(bus, 3).astype(int) - picture)[4:32, 4:32].max() < 12
+    assert np.abs(on_key(bus, 3).astype(int) - picture)[40:68, 40:68].max() < 12
+
+
+def test_presses_are_told_once_and_in_their_order(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
+    for key in (2, 0, 14):
+        bus.call("keys", "press", key)
+    assert [panel.wait_pressed(deadline=in_seconds(5)) for _ in range(3)] == [2, 0, 14]
+    assert panel.wait_pressed(deadline=in_seconds(0.2)) is None
+
+
+def test_an_unplugged_panel_is_gone_and_gets_its_pictures_back(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
+    picture = np.full((72, 72, 3), 200, np.uint8)
+    panel.show(1, picture, deadline=in_seconds(5))
+    pull = threading.Timer(0.3, bus.unplug, ["keys"])
+    pull.start()
+    started = time.monotonic()
+    with pytest.raises(DeviceGone):
+        panel.wait_pressed(deadline=in_seconds(20))
+    assert time.monotonic() - started < 5
+    pull.join()
+    bus.plug("keys")
+    assert bus.call("keys", "picture_of", 1) == ""
+    assert panel.wait_pressed(deadline=in_seconds(0.3)) is None
+    assert on_key(bus, 1).mean() == pytest.approx(200, abs=3)
+    bus.call("keys", "press", 5)
+    assert panel.wait_pressed(deadline=in_seconds(5)) == 5
+
+
+def test_a_silent_panel_ends_at_the_deadline(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
+    bus.set("keys", "faults.silent", True)
+    started = time.monotonic()
+    with pytest.raises(DeviceError):
+        panel.show(0, np.zeros((72, 72, 3), np.uint8), deadline=in_seconds(0.5))
+    assert time.monotonic() - started < 1.5
+    bus.set("keys", "faults.silent", False)
+    panel.show(0, np.zeros((72, 72, 3), np.uint8), deadline=in_seconds(15))
+
+
+def test_closing_leaves_dark_keys(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
+    panel.show(2, np.full((72, 72, 3), 250, np.uint8), deadline=in_seconds(5))
+    panel.close()
+    assert bus.call("keys", "picture_of", 2) == ""
+
+
+def test_two_panels_are_told_apart_by_serial_number(bus: UsbBusProcess) -> None:
+    bus.add("one", "keys", serial="KEYS-1")
+    bus.add("two", "keys", serial="KEYS-2")
+    with pytest.raises(DeviceRefused) as caught:
+        StreamDeckPanel(deadline=in_seconds(10))
+    assert caught.value.code == "hid-several"
+    panel = StreamDeckPanel(serial="KEYS-2", deadline=in_seconds(10))
+    bus.call("one", "press", 1)
+    bus.call("two", "press", 2)
+    assert panel.wait_pressed(deadline=in_seconds(5)) == 2
+    panel.close()
+
+
+def test_without_a_panel_the_error_says_what_to_check(bus: UsbBusProcess) -> None:
+    with pytest.raises(DeviceGone) as caught:
+        StreamDeckPanel(deadline=in_seconds(5))
+    assert "udev" in caught.value.remedy
