@@ -23,6 +23,8 @@ TOLERANCE = 0.01
 PILED = 1.15
 """Samples that should exceed full scale by this are saturated for certain; what they show is the ceiling."""
 HOT_SIGMAS = 12.0
+WRONGLY_TOLD = 0.015
+"""Spread of an exposure series' corrections from which the camera's exposure times are corrected."""
 WORST_BLACK_STEPS = 64.0
 """A black level farther from the file's word than this is no camera's; the light in between was not still."""
 
@@ -102,6 +104,34 @@ def _site(one: Exposed, levels: SensorLevels, row: int, column: int) -> npt.NDAr
     black, white = levels.black[row, column], levels.white[row, column]
     site = one.samples[row::2, column::2].ravel().astype(np.float32)
     return np.asarray((site - np.float32(black)) / np.float32(white - black))
+
+
+def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Float64:
+    """(n, 2) exposures as told and as they truly are, in seconds, for those that are told noticeably wrong.
+
+    Cameras round: one that tells 1/30 s opens for 1/32 s. Each series says how its exposures relate; together they are
+    solved for the corrections that are smallest on the whole, since no photograph tells absolute time.
+
+    Parameters
+    ----------
+    measured : for each series its exposures as told, rising, and their measured ratios to the first
+    """
+    told = sorted({value for exposures, _ in measured for value in exposures})
+    if len(told) < 2:
+        return np.empty((0, 2))
+    rows, wanted = [], []
+    for exposures, ratios in measured:
+        for (a, b), (x, y) in zip(itertools.pairwise(exposures), itertools.pairwise(ratios), strict=True):
+            row = np.zeros(len(told))
+            row[told.index(b)] += 1
+            row[told.index(a)] -= 1
+            rows.append(row)
+            wanted.append(np.log(y / x) - np.log(b / a))
+    correction = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
+    # Below this it may as well be the lamp, and the camera's word stands.
+    if np.ptp(correction) < WRONGLY_TOLD:
+        return np.empty((0, 2))
+    return np.stack((np.array(told), np.array(told) * np.exp(correction)), axis=1)
 
 
 def _limits(shorter: Exposed, longer: Exposed, levels: SensorLevels, ratio: float) -> tuple[Float64, float]:

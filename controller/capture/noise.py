@@ -15,6 +15,8 @@ __all__ = ["CameraNoise", "NoiseReport", "measure_noise"]
 BLOCK = 8
 """Samples of one site along a block's side: small enough for one ratio, large enough for a variance."""
 FEWEST_BLOCKS = 60
+MOST_BLOCKS = 8000
+"""Of one site of one pair: more only cost memory."""
 ROUNDS = 12
 OUTLIER = 4.0
 """Standard deviations of a block's variance: beyond it something moved, or an edge did not fit."""
@@ -81,6 +83,7 @@ def _blocks(first: FloatImage, second: FloatImage) -> Float64:
 def _tiles(samples: FloatImage) -> Float64:
     rows, columns = (side // BLOCK * BLOCK for side in samples.shape)
     tiles = samples[:rows, :columns].reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK)
+    tiles = tiles[:: max(1, -(-rows * columns // (BLOCK * BLOCK * MOST_BLOCKS)))]
     return tiles.transpose(0, 2, 1, 3).reshape(-1, BLOCK * BLOCK).astype(np.float64)
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from controller.arrays import Float64, load_arrays, save_arrays
 
 FILE_NAME = "camera.npz"
+SAME_EXPOSURE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,10 @@ def _nothing_added() -> Float64:
     return np.zeros((2, 2))
 
 
+def _as_told() -> Float64:
+    return np.empty((0, 2))
+
+
 def _none_bad() -> npt.NDArray[np.int64]:
     return np.empty((0, 2), np.int64)
 
@@ -40,6 +45,7 @@ class CameraProfile:
     ``noise`` of one raw sample (JPEG: of one value in linear light)
     ``black_offset`` (2, 2) raw steps by which each site's black level lies above the file's word
     ``clip`` (2, 2) raw value from which a site saturates or is no longer linear, inf where none was found
+    ``exposures`` (n, 2) exposures in seconds as told and as they truly are; those that are not listed are as told
     ``bad_px`` (n, 2) column and row of samples that do not measure light
     ``response`` (3, 256) linear light of a JPEG value, 1 at 255; None for a camera that delivers RAW
     """
@@ -48,7 +54,15 @@ class CameraProfile:
     black_offset: Float64 = field(default_factory=_nothing_added)
     clip: Float64 = field(default_factory=_nothing_clips)
     bad_px: npt.NDArray[np.int64] = field(default_factory=_none_bad)
+    exposures: Float64 = field(default_factory=_as_told)
     response: Float64 | None = None
+
+    def true_exposure(self, told_s: float) -> float:
+        """Seconds for which the shutter really opens when the camera tells ``told_s``."""
+        for told, true in self.exposures:
+            if abs(told / told_s - 1) < SAME_EXPOSURE:
+                return float(true)
+        return told_s
 
     def save(self, folder: Path) -> Path:
         """Write ``camera.npz`` into a run's folder."""
@@ -57,6 +71,7 @@ class CameraProfile:
             "black_offset": self.black_offset,
             "clip": self.clip,
             "bad_px": self.bad_px,
+            "exposures": self.exposures,
         }
         if self.response is not None:
             arrays["response"] = self.response
@@ -72,5 +87,10 @@ def load_profile(folder: Path) -> CameraProfile | None:
     arrays = load_arrays(path)
     shot, read = (float(value) for value in arrays["noise"])
     return CameraProfile(
-        CameraNoise(shot, read), arrays["black_offset"], arrays["clip"], arrays["bad_px"], arrays.get("response")
+        noise=CameraNoise(shot, read),
+        black_offset=arrays["black_offset"],
+        clip=arrays["clip"],
+        bad_px=arrays["bad_px"],
+        exposures=arrays["exposures"],
+        response=arrays.get("response"),
     )

@@ -5,19 +5,34 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from controller.arrays import ByteImage, FloatImage
 from controller.capture.acquire import Shot
+from controller.capture.latency import (
+    CHANGED_FRAMES,
+    LONGEST_S,
+    Thumbprint,
+    changed_share,
+    same_picture,
+    thumbprint,
+)
+from controller.capture.profile import CameraProfile, load_profile
 from controller.capture.raw import Photograph, read_photograph
+from controller.session.progress import Level
 from controller.session.rig import Rig
 from controller.session.runner import Context
 from controller.storage import write_atomically
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
+
+DELAY_FILE, RAISED = "delay.json", "delay-raised.json"
+"""What the step ``delay`` measured, and what proved necessary later: that is no artefact of the step."""
+MORE_DELAY_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +55,18 @@ class Taken:
     path: Path
     exposure_s: float
     fresh: bool = False
+    profile: CameraProfile | None = field(default=None, compare=False, repr=False)
+    """What the run has measured of the camera, where it has."""
 
     def read(self) -> Photograph:
-        return read_photograph(self.path)
+        return read_photograph(self.path, profile=self.profile)
 
     def per_second(self) -> FloatImage:
         """(rows, columns, 3) float32: full scales per second, NaN where saturated."""
-        image: FloatImage = self.read().measured() / np.float32(self.exposure_s)
+        photograph = self.read()
+        image = photograph.image
+        image /= np.float32(self.exposure_s)
+        image[photograph.saturated] = np.nan
         return image
 
 
@@ -56,10 +76,13 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, index: str)
     A photograph that the journal knows, taken of the same frames with the same exposure, is not taken again.
     """
     folder = context.folder / "captures"
-    taken = []
+    use_delay(rig, context.folder)
+    taken: list[Taken] = []
+    before: _Before | None = None
     for number, planned in enumerate(plan):
         context.advance(number / len(plan), planned.name)
-        taken.append(_take(rig, context, planned, folder))
+        one, before = _take(rig, context, planned, folder, before)
+        taken.append(one)
     keep_if_lit(rig, context, taken)
     path = context.folder / f"{index}.json"
     rows = [
@@ -87,15 +110,65 @@ def keep_if_lit(rig: Rig, context: Context, taken: Sequence[Taken]) -> None:
         raise
 
 
-def _take(rig: Rig, context: Context, planned: Planned, folder: Path) -> Taken:
+def use_delay(rig: Rig, folder: Path) -> None:
+    """Let the acquirer wait as long as the run in ``folder`` has found necessary; nothing before it has."""
+    waits = [json.loads(path.read_text())["wait_s"] for path in (folder / DELAY_FILE, folder / RAISED) if path.exists()]
+    if waits:
+        rig.acquirer.set_delay(max(map(float, waits)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Before:
+    """The photograph that was taken last: what it should show, and what it shows."""
+
+    frames: Mapping[str, ByteImage]
+    shows: Thumbprint
+
+
+def _take(
+    rig: Rig, context: Context, planned: Planned, folder: Path, before: _Before | None
+) -> tuple[Taken, _Before | None]:
     frames = rig.on_outputs(planned.frames())
     settings = {"exposure_s": repr(planned.exposure_s), "frames": _digest(frames)}
     known = context.journal.shot(planned.name, settings)
     if known is not None:
-        return Taken(planned.name, known.path, confirmed_exposure(known.path))
+        return Taken(planned.name, known.path, confirmed_exposure(known.path)), None
     shot = Shot(planned.name, frames, planned.exposure_s)
     file, exposure_s = rig.acquirer.take(shot, folder, deadline=context.deadline)
-    return _journalled(context, planned.name, settings, file.path, exposure_s)
+    path, shows = file.path, None
+    if rig.acquirer.protected:
+        shows = thumbprint(path, exposure_s)
+        if before is not None and changed_share(before.frames, frames) > CHANGED_FRAMES:
+            path, exposure_s, shows = _not_the_one_before(rig, context, shot, (path, exposure_s, shows), before.shows)
+    taken = _journalled(context, planned.name, settings, path, exposure_s)
+    return taken, _Before(frames, shows) if shows is not None else None
+
+
+def _not_the_one_before(
+    rig: Rig, context: Context, shot: Shot, first: tuple[Path, float, Thumbprint], before: Thumbprint
+) -> tuple[Path, float, Thumbprint]:
+    """The photograph as it is where it differs from the one before; else one taken long after.
+
+    Where that one differs at last, the pictures have become later than was measured, and from now on more is waited.
+    Where it does not, the two pictures look alike to the camera.
+    """
+    if not same_picture(first[2], before):
+        return first
+    first[0].unlink()
+    file, exposure_s = rig.acquirer.take(
+        shot, first[0].parent, deadline=context.deadline, wait_s=max(LONGEST_S, 2 * rig.acquirer.wait_s)
+    )
+    again = thumbprint(file.path, exposure_s)
+    if not same_picture(again, before):
+        longer_s = min(rig.acquirer.wait_s + MORE_DELAY_S, LONGEST_S)
+        rig.acquirer.set_delay(longer_s)
+        write_atomically(context.folder / RAISED, json.dumps({"wait_s": longer_s}).encode())
+        context.reporter.say(
+            f"Photograph {shot.name} showed the picture before it and was taken again; from now on "
+            f"{longer_s:.2f} s are waited for each picture.",
+            Level.WARNING,
+        )
+    return file.path, exposure_s, again
 
 
 def take_photograph(
@@ -138,7 +211,14 @@ def _digest(frames: Mapping[str, ByteImage]) -> str:
 def read_index(folder: Path, index: str) -> dict[str, Taken]:
     """The photographs that ``take_all`` listed, by name, in the order in which they were taken."""
     rows = json.loads((folder / f"{index}.json").read_text())
-    return {row["name"]: Taken(row["name"], folder / row["path"], float(row["exposure_s"])) for row in rows}
+    profile = load_profile(folder)
+
+    def taken(row: dict[str, Any]) -> Taken:
+        told_s = float(row["exposure_s"])
+        exposure_s = told_s if profile is None else profile.true_exposure(told_s)
+        return Taken(row["name"], folder / row["path"], exposure_s, profile=profile)
+
+    return {row["name"]: taken(row) for row in rows}
 
 
 class Developed(Mapping[str, FloatImage]):
