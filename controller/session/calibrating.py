@@ -29,6 +29,7 @@ from controller.capture.patterns import PatternPlan, plan_patterns
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.errors import CalibrationError
 from controller.session import costs
+from controller.session.camera_steps import camera_step
 from controller.session.capturing import capture_steps, code_step
 from controller.session.modes import read_metapixels
 from controller.session.rig import Rig, RigProjector
@@ -43,6 +44,7 @@ LIT_SHARE = 0.004
 def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float) -> list[Step]:
     """Everything from the first photograph to ``calibration.npz`` and ``geometry.npz``."""
     steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
+    steps.append(camera_step(rig))
     names = [projector.name for projector in rig.projectors]
     for projector in rig.projectors:
         steps.append(_radiometry_step(projector))
@@ -66,7 +68,7 @@ def _radiometry_step(projector: RigProjector) -> Step:
     return Step(
         f"radiometry-{projector.name}",
         lambda context: _radiometry(projector, plan, context),
-        after=("black", f"light-{projector.name}"),
+        after=("black", f"light-{projector.name}", "camera"),
         title=f"Measuring the response of {projector.name}",
         weight=costs.RADIOMETRY_S * costs.scale([projector.size_px]),
     )
@@ -85,7 +87,8 @@ def _pixels_step(projector: RigProjector) -> Step:
 
 def _merge(taken: Sequence[Taken]) -> FloatImage:
     """HDR radiance in full scales per second from photographs of one picture."""
-    return merge_brackets([t.read().measured() for t in taken], [t.exposure_s for t in taken]).radiance
+    noise = taken[0].profile.noise if taken and taken[0].profile is not None else None
+    return merge_brackets([t.read().measured() for t in taken], [t.exposure_s for t in taken], noise=noise).radiance
 
 
 def read_black(folder: Path) -> FloatImage:

@@ -12,10 +12,13 @@ from pathlib import Path
 from controller.arrays import ByteImage, Float64, load_arrays
 from controller.capture.acquire import Shot
 from controller.capture.brackets import choose_brackets, choose_exposure
+from controller.capture.jpeg_response import nominal_response
+from controller.capture.latency import LONGEST_S
 from controller.capture.patterns import Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
 from controller.capture.raw import read_photograph
 from controller.errors import CalibrationError
 from controller.session import costs
+from controller.session.camera_steps import delay_step, response_steps
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
 from controller.session.shots import Planned, take_all
@@ -47,11 +50,13 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
             title="Finding the exposure",
             weight=2 * len(rig.projectors) * a_shot_s,
         ),
+        delay_step(rig),
+        *response_steps(rig),
         Step(
             "black",
             lambda context: _photograph_black(rig, context, longest_exposure_s),
             inputs=inputs,
-            after=("exposure",),
+            after=("exposure", "delay"),
             title="Photographing black",
             weight=3 * a_shot_s,
         ),
@@ -63,7 +68,7 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
                 f"light-{projector.name}",
                 partial(_photograph_light, rig, projector, plan),
                 inputs=inputs,
-                after=("exposure",),
+                after=("exposure", "delay"),
                 title=f"Photographing the light of {projector.name}",
                 weight=a_shot_s * (WHITE_EXPOSURES + 3 + len(plan.of_kind(PatternKind.RAMP))),
             )
@@ -128,8 +133,11 @@ def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_
     for number in range(EXPOSURE_TRIES):
         context.check()
         shot = Shot(f"try-{projector.name}-{number}", rig.on_outputs({projector.name: white}), exposure_s)
-        file, confirmed_s = rig.acquirer.take(shot, context.folder / "captures", deadline=context.deadline)
-        image = read_photograph(file.path).measured()
+        # How late pictures appear is not known yet: the first photograph of this white waits for as long as any takes.
+        file, confirmed_s = rig.acquirer.take(
+            shot, context.folder / "captures", deadline=context.deadline, wait_s=LONGEST_S if number == 0 else None
+        )
+        image = read_photograph(file.path, response=nominal_response()).measured()
         file.path.unlink()
         choice = choose_exposure(image, confirmed_s, available)
         if choice.settled:
