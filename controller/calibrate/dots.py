@@ -24,7 +24,7 @@ from controller.capture.dots import PAPER_SPACING_PX, dot_patterns
 from controller.compiled import compiled
 from controller.errors import CalibrationError
 
-WIDEST_CUT: Final = 4.0
+WIDEST_CUT: Final = 3.25
 """A window ends at this Mahalanobis distance from the guess, or half way to the next dot."""
 NARROWEST_CUT: Final = 1.5
 """Dots whose light overlaps further than this can't be told apart."""
@@ -118,15 +118,15 @@ def blur_px2(metapixels: Metapixels) -> FloatImage:
         return carry_covariance(inverse, np.where(metapixels.valid[..., None], metapixels.covariance_px2, np.nan))
 
 
-def largest_sigma_px(metapixels: Metapixels) -> float:
-    """The blur that dots must keep clear of: the long axis, in projector pixels, that 95 % of metapixels stay below.
+def largest_sigma_px(metapixels: Metapixels, share: float = 0.95) -> float:
+    """The blur that dots must keep clear of: the long axis, in projector pixels, that most metapixels stay below.
 
-    NaN where there is no metapixel.
+    ``share`` of the metapixels that do. NaN where there is no metapixel.
     """
     xx, xy, yy = np.moveaxis(blur_px2(metapixels).astype(np.float64), -1, 0)
     long = np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
     long = long[np.isfinite(long)]
-    return float(np.quantile(long, 0.95)) if long.size else float("nan")
+    return float(np.quantile(long, share)) if long.size else float("nan")
 
 
 def peak_share(metapixels: Metapixels) -> float:

@@ -61,13 +61,25 @@ def edge_pixels(metapixels: Metapixels, correspondence: Correspondence) -> Mask:
     return np.asarray(near & seen)
 
 
-@compiled()
 def edge_patterns(lit: Mask, spacing_px: int) -> npt.NDArray[np.int16]:
     """Share pixels out among pictures: (rows, columns) int16, -1 where not ``lit``.
 
     Two pixels of one picture are at least ``spacing_px`` apart, in x or in y. Each goes to the first picture that has
-    room, so that there are fewer pictures than of a whole grid of dots.
+    room; where that makes more pictures than a whole grid of dots has, to those of the grid.
     """
+    rows, columns = lit.shape
+    pattern = _first_with_room(lit, spacing_px)
+    y, x = np.mgrid[0:rows, 0:columns]
+    grid = np.where(lit, y % spacing_px * spacing_px + x % spacing_px, -1)
+    shown, grid_pattern = np.unique(grid, return_inverse=True)
+    first = 1 if shown[0] < 0 else 0
+    if shown.size - first < int(pattern.max(initial=-1)) + 1:
+        pattern = (grid_pattern.reshape(rows, columns) - first).astype(np.int16)
+    return pattern
+
+
+@compiled()
+def _first_with_room(lit: Mask, spacing_px: int) -> npt.NDArray[np.int16]:
     rows, columns = lit.shape
     pattern = np.full((rows, columns), np.int16(-1))
     taken = np.zeros(4 * spacing_px * spacing_px + 1, np.bool_)

@@ -36,9 +36,9 @@ def of_sinusoids(folder: Path, projector: str) -> Metapixels:
     return Metapixels(arrays["centre_px"], arrays["covariance_px2"], arrays["valid"])
 
 
-def spacing_of(options: DotOptions, known: Metapixels) -> int:
-    """The dots' spacing: as asked for, or r >= 6.5 sigma by the measured blur, at most the paper's."""
-    return options.spacing_px or min(dot_spacing(largest_sigma_px(known)), PAPER_SPACING_PX)
+def spacing_of(options: DotOptions, known: Metapixels, *, share: float = 0.95) -> int:
+    """The dots' spacing: as asked for, or r >= 6.5 sigma by the blur of ``share`` of the pixels, at most the paper's."""
+    return options.spacing_px or min(dot_spacing(largest_sigma_px(known, share)), PAPER_SPACING_PX)
 
 
 def dot_exposure_s(rig: Rig, folder: Path, projector: str, known: Metapixels, longest_s: float) -> float:

@@ -29,7 +29,9 @@ from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
 from controller.storage import write_atomically
 
-EXPECTED_SHOTS: Final = 25
+EXPECTED_SHOTS: Final = 36
+TYPICAL: Final = 0.5
+"""Of the pixels whose blur sets the spacing: no ellipse is fitted here, so a few dots that meet do less harm."""
 
 
 def edge_steps(rig: Rig, projector: RigProjector, options: DotOptions, longest_exposure_s: float) -> list[Step]:
@@ -60,7 +62,7 @@ def _photograph(
 ) -> Sequence[Path]:
     folder, name = context.folder, projector.name
     known = of_sinusoids(folder, name)
-    spacing = spacing_of(options, known)
+    spacing = spacing_of(options, known, share=TYPICAL)
     pattern = edge_patterns(edge_pixels(known, read_correspondence(folder, name)), spacing)
     count = int(pattern.max(initial=-1)) + 1
     check_disk(folder, projector, count)

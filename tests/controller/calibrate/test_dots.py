@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from controller.arrays import Float64, FloatImage
 from controller.calibrate.decode import decode
-from controller.calibrate.dots import fit_dots
+from controller.calibrate.dots import WIDEST_CUT, fit_dots
 from controller.calibrate.guess import guess_metapixels, modelled_correspondence
 from controller.calibrate.values import Geometry, Metapixels, Pinhole
 from controller.capture.dots import dot_frame, dot_patterns
@@ -112,7 +112,7 @@ def test_fits_agree_with_scipys_least_squares_in_the_papers_own_parameters() -> 
             if (i or j) and 0 <= row + i < 40 and 0 <= column + j < 48 and near.valid[row + i, column + j]
         ]
         inverse = np.linalg.inv([[xx, xy], [xy, yy]])
-        cut = min(4.0, *(0.5 * float(np.sqrt(d @ inverse @ d)) for d in others))
+        cut = min(WIDEST_CUT, *(0.5 * float(np.sqrt(d @ inverse @ d)) for d in others))
         d = np.stack([x - cx, y - cy], axis=-1)
         window = np.einsum("...i,ij,...j", d, inverse, d) <= cut**2
         weight = np.where(window, full / full[window].max(), 0.0)
