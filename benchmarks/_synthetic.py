@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from controller.arrays import FloatImage, Mask
-from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
+from controller.calibrate.values import Calibration, Metapixels, PhaseMap, ProjectorCalibration, Radiometry
 
 PROJECTOR: Final = {"small": (210, 280), "medium": (526, 700), "paper": (1050, 1400)}
 CAMERA: Final = {"small": (520, 776), "medium": (1296, 1944), "paper": (2592, 3888)}
@@ -24,9 +24,10 @@ def synthetic_calibration(
     u, v = x / camera[1] * 2 - 1, y / camera[0] * 2 - 1
     mask: Mask = (u / 0.8) ** 2 + (v / 0.85) ** 2 < 1
     albedo = _albedo(u, v)
-    projectors = tuple(_projector(n, projector, camera, u, v, albedo * mask[..., None]) for n in range(3))
+    projectors = tuple(_projector(n, projector, camera, u, v, albedo * mask[..., None], mask) for n in range(3))
     black = (0.002 * albedo + 0.0005).astype(np.float32)
-    return Calibration(projectors, black, mask, np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]]))
+    to_xyz = np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]])
+    return Calibration(projectors, black, mask, to_xyz, mosaic=np.array([[0, 1], [1, 2]]))
 
 
 def synthetic_target(camera: tuple[int, int]) -> FloatImage:
@@ -46,7 +47,7 @@ def _albedo(u: FloatImage, v: FloatImage) -> FloatImage:
 
 
 def _projector(
-    n: int, size: tuple[int, int], camera: tuple[int, int], u: FloatImage, v: FloatImage, albedo: FloatImage
+    n: int, size: tuple[int, int], camera: tuple[int, int], u: FloatImage, v: FloatImage, albedo: FloatImage, mask: Mask
 ) -> ProjectorCalibration:
     rows, columns = size
     row, column = np.mgrid[0:rows, 0:columns].astype(np.float64)
@@ -72,4 +73,22 @@ def _projector(
     response = np.tile(np.linspace(0, 1, 256) ** 2.2, (3, 1))
     metapixels = Metapixels(centre.astype(np.float32), packed.astype(np.float32), valid)
     white = (albedo * falloff[..., None]).astype(np.float32)
-    return ProjectorCalibration(("left", "middle", "right")[n], metapixels, Radiometry(response, mixing), white)
+    phase_map = _phase_map(n, size, camera, mask)
+    return ProjectorCalibration(("left", "middle", "right")[n], metapixels, Radiometry(response, mixing), white, phase_map)
+
+
+def _phase_map(n: int, size: tuple[int, int], camera: tuple[int, int], mask: Mask) -> PhaseMap:
+    """The inverse of the centres of ``_projector``, in closed form."""
+    foreshortening, angle = (0.0, 0.25, -0.25)[n], (0.0, 0.12, -0.1)[n]
+    y, x = np.mgrid[0 : camera[0], 0 : camera[1]].astype(np.float32)
+    aspect = camera[1] / camera[0]
+    c, s = np.cos(angle), np.sin(angle)
+    along, across = ((x - 0.13 * n) * 2 / camera[1] - 1) / 0.88, ((y + 0.21 * n) * 2 / camera[0] - 1) / 0.88
+    a, b = c * along + s * across / aspect, -s * along * aspect + c * across
+    bend = 0.6 * foreshortening
+    p = a if bend == 0 else (np.sqrt(np.maximum(1 + 4 * bend * (a + bend), 0)) - 1) / (2 * bend)
+    q = b - 0.03 * np.sin(3 * p + n)
+    position = np.stack([(p + 1) / 2 * size[1] - 0.5, (q + 1) / 2 * size[0] - 0.5], -1).astype(np.float32)
+    position[~mask] = np.nan
+    spread = np.broadcast_to(np.array([0.19, 0.01 * n, 0.2], np.float32), (*size, 3))
+    return PhaseMap(position, np.ascontiguousarray(spread))

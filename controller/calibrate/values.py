@@ -41,6 +41,21 @@ class Metapixels:
 
 
 @dataclass(frozen=True, slots=True)
+class PhaseMap:
+    """Where each camera pixel looks on a projector's image, and how far the projector's pixels spread there.
+
+    From it the transport makes the shares of each camera pixel's light (docs/decisions/0010).
+
+    ``projector_px`` (camera rows, columns, 2) float32: x and y in projector pixels, NaN where unknown
+    ``spread_px2`` (projector rows, columns, 3) float32: covariance xx, xy, yy of the light of a pixel in projector
+    pixels squared, as a single camera sample sees it, NaN where unknown
+    """
+
+    projector_px: FloatImage
+    spread_px2: FloatImage
+
+
+@dataclass(frozen=True, slots=True)
 class Radiometry:
     """How one projector turns device values into light.
 
@@ -59,12 +74,14 @@ class ProjectorCalibration:
 
     ``white`` (camera rows, columns, 3) float32: HDR image of this projector alone at white, less the black image;
     linear camera units, >= 0, 0 where the projector does not reach
+    ``phase_map``: None where metapixels are all that is known
     """
 
     name: str
     metapixels: Metapixels
     radiometry: Radiometry
     white: FloatImage
+    phase_map: PhaseMap | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +123,8 @@ class Calibration:
     ``object_mask`` (rows, columns): camera pixels on the object that at least one projector lights
     ``camera_to_xyz`` (3, 3): linear camera RGB to CIE XYZ (D65), from the camera's own colour matrix
     ``camera_blur_px``: standard deviation in camera pixels of the camera's own blur, red, green and blue; 0: not known
+    ``mosaic`` (2, 2): colour of the camera's samples at even and odd rows and columns, 0 red, 1 green, 2 blue, where
+    pictures are interpolated from them as ``capture.raw`` does; None where each pixel has its own three colours
     """
 
     projectors: tuple[ProjectorCalibration, ...]
@@ -113,3 +132,4 @@ class Calibration:
     object_mask: Mask
     camera_to_xyz: npt.NDArray[np.float64]
     camera_blur_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mosaic: npt.NDArray[np.int64] | None = None

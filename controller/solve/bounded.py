@@ -219,7 +219,7 @@ def _descend(
 def _step(problem: Problem, y: FloatImage, x: FloatImage, gradient: FloatImage, new: FloatImage) -> tuple[float, float]:
     squared_step = uphill = 0.0
     for n, (rows, columns) in enumerate(problem.transport.sizes):
-        start = int(problem.transport.patches.start[n])
+        start = problem.transport.span(n).start
         a, b = projected_step(
             y, x, gradient, problem.majoriser, problem.across, problem.down, start, rows, columns, new
         )

@@ -18,7 +18,10 @@ from controller.solve.bounded import Problem
 from controller.solve.box_solvers import BoxProblem
 from controller.transport import LightTransport
 from controller.transport.lanes import LANES
+from controller.transport.patch_transport import PatchTransport
 from controller.transport.patches import Patches
+from controller.transport.window_matrix import box_rows
+from controller.transport.window_transport import WindowTransport
 
 Pixels = npt.NDArray[np.int64]
 
@@ -78,6 +81,10 @@ def local_transport(
     transport: LightTransport, box: Box, unknown: Pixels, channels: tuple[int, ...]
 ) -> sp.csr_matrix[np.float64]:
     """Rows (channel, pixel of the box) of T in the columns (channel, unknown pixel)."""
+    if isinstance(transport, WindowTransport):
+        return box_rows(transport, (box.top, box.left, box.bottom, box.right), unknown, channels)
+    if not isinstance(transport, PatchTransport):
+        raise TypeError(f"no equations for a {type(transport).__name__}")
     radius = transport.taps.shape[1] // 2
     wide = box.grown(radius, transport.shape)
     owner = np.searchsorted(transport.patches.start, unknown, side="right") - 1
@@ -148,7 +155,8 @@ def _smoothness(
     problem: Problem, unknown: Pixels, channels: tuple[int, ...], x: FloatImage
 ) -> tuple[sp.csr_matrix[np.float64], Float64]:
     """One row alpha (p_i - p_j) for each pair of which at least one pixel is unknown (paper 2.4, eq. 3)."""
-    start = problem.transport.patches.start
+    sizes = problem.transport.sizes
+    start = np.cumsum([0, *(rows * columns for rows, columns in sizes)])
     owner = np.searchsorted(start, unknown, side="right") - 1
     width = np.array([size[1] for size in problem.transport.sizes], np.int64)[owner]
     rows, columns, values, wanted, count = [], [], [], [], 0

@@ -20,15 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.arrays import FloatImage
-from controller.compiled import compiled
 from controller.errors import UsageError, WorkError
 from controller.solve.bounded import SMOOTHNESS, Problem, check_target, first_guess, pose, roughness
 from controller.solve.box_solvers import BoxProblem, BoxSolver, solve_box
 from controller.solve.gradient import weighted_residual
 from controller.solve.region_equations import Box, Pixels, box_problem, channel_groups
 from controller.transport import LightTransport
-from controller.transport.lanes import LANES
-from controller.transport.patches import Patches
 from controller.transport.planes import plane_frames, plane_image
 
 SIZE_PX: Final = 16
@@ -71,9 +68,8 @@ class Regions:
                 what=f"Regions of {size_px} pixels can't overlap by {overlap:g}.",
                 remedy="Choose regions of at least 4 pixels, and an overlap from 0 to below 1.",
             )
-        patches = problem.transport.patches
         self._pixels = np.flatnonzero(problem.majoriser.max(axis=0) > 0)
-        self._at = _middles(patches, self._pixels)
+        self._at = _middles(problem.transport, self._pixels)
         shape = problem.transport.shape
         self.counts = (-(-shape[0] // size_px), -(-shape[1] // size_px))
         cell = self._at // size_px
@@ -198,25 +194,11 @@ def _solve_phase(
         yield 3 * pixels.size
 
 
-def _middles(patches: Patches, pixels: Pixels) -> Pixels:
-    """(n, 2): camera row and column in which the middle of each metapixel's visible light lies."""
-    at = np.empty((pixels.size, 2), np.int64)
-    _find_middles(patches, pixels, at)
-    return at
-
-
-@compiled()
-def _find_middles(patches: Patches, pixels: Pixels, at: Pixels) -> None:
-    for i in range(pixels.size):
-        v = pixels[i]
-        k = np.int64(patches.first[v]) * LANES
-        total = down = across = 0.0
-        for y in range(patches.rows[v]):
-            for x in range(patches.groups[v] * LANES):
-                weight = float(patches.weights[k])
-                total += weight
-                down += weight * y
-                across += weight * x
-                k += 1
-        at[i, 0] = min(patches.row[v] + int(np.floor(down / total + 0.5)), patches.camera_shape[0] - 1)
-        at[i, 1] = min(patches.column[v] + int(np.floor(across / total + 0.5)), patches.camera_shape[1] - 1)
+def _middles(transport: LightTransport, pixels: Pixels) -> Pixels:
+    """(n, 2): camera row and column in which the middle of each projector pixel's light lies."""
+    rows, columns = transport.shape
+    place = np.zeros((3, rows, columns), np.float32)
+    place[0], place[1] = np.arange(rows)[:, None], np.arange(columns)[None, :]
+    at = np.floor(transport.gaussian_mean_planes(place)[:2, pixels].T + 0.5).astype(np.int64)
+    inside: Pixels = np.clip(at, 0, np.array([rows - 1, columns - 1]))
+    return inside

@@ -64,7 +64,7 @@ def squared_edges(transport: LightTransport, wanted: FloatImage) -> tuple[FloatI
     ``wanted`` (3, camera rows, columns): the light to be made, without the black image. Returns two arrays
     (3, pixels): from each pixel to its right neighbour, and to the one below; 0 at the last column and row.
     """
-    count = transport.patches.first.size
+    count = transport.pixels
     across, down = np.zeros((3, count), np.float32), np.zeros((3, count), np.float32)
     light = np.empty_like(wanted)
     ones = np.ones((3, count), np.float32)

@@ -1,21 +1,22 @@
 """The light transport T of a stage: camera image = K + T p (paper 2.1, eq. 1; 4.2.3).
 
 For projector n with frame p_n, T_n p_n = W_n (.) G_n (p_n M_n'). W_n is the projector's white image, M_n its colour
-mixing, and G_n holds, for each camera pixel, the shares of its light that come from each projector pixel: metapixel
-Gaussians, normalised to sum 1 over the projector pixels. So T_n 1 reproduces W_n, which a plain Gaussian model counts
-twice where neighbours overlap, and edges of the object's colour stay as sharp as the camera sees them.
+mixing, and G_n holds, for each camera pixel, the shares of its light that come from each projector pixel; they sum to
+1. So T_n 1 reproduces W_n, which a plain Gaussian model counts twice where neighbours overlap, and edges of the
+object's colour stay as sharp as the camera sees them.
 
-Where the camera's own blur H is known, it stands in the shares: G_n p = H (a_n (.) g_n p) / H (a_n (.) g_n 1), with g_n
-the shares on the object and a_n the white image before the blur (docs/decisions/0006).
+There are two kinds. Where the phase map is known, each camera sample has its own shares (``window_transport``,
+docs/decisions/0010). Where only metapixels are, the shares are their Gaussians (``patch_transport``).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -24,85 +25,49 @@ from controller.arrays import FloatImage, Mask
 from controller.calibrate.values import Calibration, Metapixels
 from controller.errors import UsageError
 from controller.storage import stream_atomically
-from controller.transport.blur import blur_planes, gaussian_taps, sharpened, without_blur
-from controller.transport.patches import Patches, build_patches
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
-from controller.transport.products import adjoint_planes, forward_planes, gaussian_sums, multiply_add
 
-VERSION: Final = 2
+if TYPE_CHECKING:
+    from controller.transport.patches import Patches
+
+VERSION: Final = 3
 FAINTEST: Final = 1e-6
 """A camera pixel counts as lit by a projector above this fraction of the projector's brightest white."""
 
 
-@dataclass(frozen=True, slots=True)
-class LightTransport:
+@dataclass(frozen=True, slots=True, eq=False)
+class LightTransport(ABC):
     """T without its black image K, for all projectors of a stage and three channels at once.
 
-    ``patches``: Gaussian weights of every metapixel, before normalisation
-    ``gain`` (projectors, 3, rows, columns) float32: white over sum of weights, 0 where a camera pixel is not counted
-    ``after`` (projectors, 3, rows, columns) float32: factor after the camera's blur; without blur (projectors, 3, 0, 0)
-    ``taps`` (3, 2 r + 1) float32: the camera's blur along an axis; a single 1 where it is not modelled
     ``mixing`` (projectors, 3, 3) float32: camera channel by projector channel
     ``lit`` (projectors, rows, columns) bool: camera pixels on the object with shares of that projector
-    ``per_weight`` (pixels,) float32: 1 / sum of a metapixel's weights over its lit camera pixels, or 0
+    ``per_weight`` (pixels,) float32: 1 / sum of a projector pixel's shares over its lit camera pixels, or 0
     ``sizes``: (rows, columns) of each projector's image
     """
 
-    patches: Patches
-    gain: FloatImage
     mixing: FloatImage
     lit: Mask
     per_weight: FloatImage
-    after: FloatImage
-    taps: FloatImage
     sizes: tuple[tuple[int, int], ...]
 
-    @classmethod
-    def build(cls, calibration: Calibration, *, patches: Patches | None = None) -> LightTransport:
+    @staticmethod
+    def build(calibration: Calibration, *, patches: Patches | None = None) -> LightTransport:
         """Build T from a calibration.
 
-        Camera pixels outside ``object_mask``, or not lit by a projector, have no shares of it. Metapixels that are not
-        valid, not finite, or larger than 255 camera pixels light nothing. ``patches`` replace the metapixels by another
-        model of a projector pixel (``any_weights``).
+        Camera pixels outside ``object_mask``, or not lit by a projector, have no shares of it. Shares come from the
+        phase maps where every projector has one, else from the metapixels; of these, those that are not valid, not
+        finite, or larger than 255 camera pixels light nothing. ``patches`` take the place of both, for another model of
+        a projector pixel (``any_weights``).
 
         Raises UsageError("calibration-inconsistent") when sizes differ or an image is not finite.
         """
-        _check(calibration)
-        projectors = calibration.projectors
-        shape = calibration.object_mask.shape
-        blur_px = calibration.camera_blur_px
-        on_object = tuple(without_blur(p.metapixels, blur_px) for p in projectors)
-        if patches is None:
-            patches = build_patches(on_object, (shape[0], shape[1]))
-        taps = gaussian_taps(blur_px)
-        blurred = taps.shape[1] > 1
-        gain = np.ones((len(projectors), 3, *shape), np.float32)
-        after = np.zeros((len(projectors), 3, *(shape if blurred else (0, 0))), np.float32)
-        lit = np.zeros((len(projectors), *shape), np.bool_)
-        ones = np.ones((3, patches.first.size), np.float32)
-        plain = np.broadcast_to(np.eye(3, dtype=np.float32), (len(projectors), 3, 3)).copy()
-        total = np.empty((3, *shape), np.float32)
-        for n, projector in enumerate(projectors):
-            forward_planes(patches, gain, plain, ones, (n, n + 1), total)
-            white = projector.white
-            lit[n] = calibration.object_mask & (total[0] > 0) & (white.max(axis=2) > FAINTEST * white.max(initial=0))
-            inverse = np.divide(1, total[0], out=np.zeros(shape, np.float32), where=lit[n])
-            planes = image_planes(white)
-            colour = sharpened(planes, taps) if blurred else planes
-            np.multiply(colour, inverse, out=gain[n])
-            if blurred:
-                _match_white(planes, np.where(lit[n], colour, 0), taps, lit[n], after[n])
-        total[:] = 1
-        weights = np.zeros_like(ones)
-        gaussian_sums(patches, lit, total, ones[0], (0, len(projectors)), weights)
-        per_weight = np.divide(1, weights[0], out=np.zeros_like(weights[0]), where=weights[0] > 0)
-        mixing = np.stack([p.radiometry.mixing for p in projectors]).astype(np.float32)
-        sizes = tuple((p.metapixels.valid.shape[0], p.metapixels.valid.shape[1]) for p in projectors)
-        return cls(patches, gain, mixing, lit, per_weight, after, taps, sizes)
+        from controller.transport.patch_transport import PatchTransport
+        from controller.transport.window_transport import WindowTransport
 
-    @property
-    def _blurred(self) -> bool:
-        return int(self.taps.shape[1]) > 1
+        check_calibration(calibration)
+        if patches is None and all(part.phase_map is not None for part in calibration.projectors):
+            return WindowTransport.from_calibration(calibration)
+        return PatchTransport.from_calibration(calibration, patches)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -114,9 +79,15 @@ class LightTransport:
         """(rows, columns): camera pixels that at least one projector lights."""
         return np.asarray(self.lit.any(axis=0))
 
+    @property
+    def pixels(self) -> int:
+        """How many pixels all projectors have."""
+        return sum(rows * columns for rows, columns in self.sizes)
+
     def span(self, n: int) -> slice:
         """The pixels of projector ``n`` among those of all projectors."""
-        return slice(int(self.patches.start[n]), int(self.patches.start[n + 1]))
+        start = sum(rows * columns for rows, columns in self.sizes[:n])
+        return slice(start, start + self.sizes[n][0] * self.sizes[n][1])
 
     def forward(self, p: Sequence[FloatImage]) -> FloatImage:
         """T p: (rows, columns, 3) light from one (rows, columns, 3) frame a projector; K is not in it."""
@@ -127,7 +98,7 @@ class LightTransport:
     def project_one(self, n: int, p: FloatImage) -> FloatImage:
         """T_n p_n: (rows, columns, 3) light from projector ``n`` alone."""
         self._check_frame(n, p)
-        planes = np.zeros((3, self.patches.first.size), np.float32)
+        planes = np.zeros((3, self.pixels), np.float32)
         planes[:, self.span(n)] = frame_planes([p])
         return plane_image(self.forward_planes(planes, projectors=(n, n + 1)))
 
@@ -152,47 +123,39 @@ class LightTransport:
         (frame,) = plane_frames(means[:, self.span(n)], [self.sizes[n]])
         return frame
 
+    @abstractmethod
     def forward_planes(
         self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
     ) -> FloatImage:
         """T p on planes: (3, pixels) to (3, rows, columns), for a range of projectors or for all."""
-        out = np.empty((3, *self.shape), np.float32) if out is None else out
-        projectors = projectors or (0, len(self.sizes))
-        if not self._blurred:
-            forward_planes(self.patches, self.gain, self.mixing, p, projectors, out)
-            return out
-        out[:] = 0
-        light, scratch = np.empty_like(out), np.empty_like(out)
-        for n in range(*projectors):
-            forward_planes(self.patches, self.gain, self.mixing, p, (n, n + 1), light)
-            blur_planes(light, self.taps, scratch, light)
-            multiply_add(out, self.after[n], light)
-        return out
 
+    @abstractmethod
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         """T' r on planes: (3, rows, columns) to (3, pixels)."""
-        out = np.empty((3, self.patches.first.size), np.float32) if out is None else out
-        if not self._blurred:
-            adjoint_planes(self.patches, self.gain, self.mixing, r, (0, len(self.sizes)), out)
-            return out
-        part, scratch = np.empty_like(r), np.empty_like(r)
-        for n in range(len(self.sizes)):
-            np.multiply(self.after[n], r, out=part)
-            blur_planes(part, self.taps, scratch, part)
-            adjoint_planes(self.patches, self.gain, self.mixing, part, (n, n + 1), out)
-        return out
 
+    @abstractmethod
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         """``gaussian_mean`` on planes: (3, rows, columns) to (3, pixels); pixels of other projectors are 0."""
-        out = np.zeros((3, self.patches.first.size), np.float32)
-        gaussian_sums(self.patches, self.lit, image, self.per_weight, projectors or (0, len(self.sizes)), out)
-        return out
+
+    @abstractmethod
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Everything that ``restored`` needs, by name."""
+
+    @classmethod
+    @abstractmethod
+    def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> LightTransport:
+        """From ``arrays``. Raises KeyError where one is missing."""
+
+    @property
+    def stored_bytes(self) -> int:
+        """The size of what a product reads of T."""
+        return sum(array.nbytes for name, array in self.arrays().items() if name not in ("lit", "per_weight"))
 
     def reach_planes(self) -> FloatImage:
         """T 1 as (3, rows, columns)."""
-        return self.forward_planes(np.ones((3, self.patches.first.size), np.float32))
+        return self.forward_planes(np.ones((3, self.pixels), np.float32))
 
-    def with_absolute_mixing(self) -> LightTransport:
+    def with_absolute_mixing(self) -> Self:
         """T with every entry's magnitude: mixing may be slightly negative, a majoriser must not be."""
         return dataclasses.replace(self, mixing=np.abs(self.mixing))
 
@@ -201,28 +164,28 @@ class LightTransport:
         folder.mkdir(parents=True, exist_ok=True)
         header = folder / "header.npy"
         header.unlink(missing_ok=True)
-        arrays = self.patches._asdict() | {name: getattr(self, name) for name in _ARRAYS}
-        for name, array in arrays.items():
+        for name, array in self.arrays().items():
             _save(folder / f"{name}.npy", array)
-        _save(header, np.array([(VERSION, len(self.sizes)), *self.sizes], np.int64))
+        _save(folder / "sizes.npy", np.array(self.sizes, np.int64).reshape(-1, 2))
+        _save(header, np.array([VERSION, _kinds().index(type(self))], np.int64))
 
-    @classmethod
-    def load(cls, folder: Path) -> LightTransport:
+    @staticmethod
+    def load(folder: Path) -> LightTransport:
         """Map what ``save`` wrote. Raises UsageError("transport-unreadable") for anything else."""
         try:
-            header = np.load(folder / "header.npy", allow_pickle=False)
-            if header[0, 0] != VERSION:
-                raise ValueError(f"version {header[0, 0]} instead of {VERSION}")
-            patches = Patches(*(_load(folder / f"{name}.npy") for name in Patches._fields))
-            gain, mixing, lit, per_weight, after, taps = (_load(folder / f"{name}.npy") for name in _ARRAYS)
-        except (OSError, ValueError, IndexError) as error:
+            version, kind = (int(value) for value in np.load(folder / "header.npy", allow_pickle=False))
+            if version != VERSION:
+                raise ValueError(f"version {version} instead of {VERSION}")
+            sizes = tuple((int(r), int(c)) for r, c in np.load(folder / "sizes.npy", allow_pickle=False))
+            left_out = ("header", "sizes")
+            arrays = {path.stem: _load(path) for path in sorted(folder.glob("*.npy")) if path.stem not in left_out}
+            return _kinds()[kind].restored(arrays, sizes)
+        except (OSError, ValueError, IndexError, KeyError, TypeError) as error:
             raise UsageError(
                 "transport-unreadable",
                 what=f"{folder} does not hold a light transport ({error}).",
                 remedy="Remove the folder and solve again; it is rebuilt from the calibration.",
             ) from error
-        sizes = tuple((int(rows), int(columns)) for rows, columns in header[1:])
-        return cls(patches, gain, mixing, lit, per_weight, after, taps, sizes)
 
     def _checked(self, image: FloatImage) -> FloatImage:
         if image.shape != (*self.shape, 3):
@@ -234,14 +197,11 @@ class LightTransport:
             raise _wrong_size(f"frame of projector {n + 1}", frame.shape, (*self.sizes[n], 3))
 
 
-_ARRAYS: Final = ("gain", "mixing", "lit", "per_weight", "after", "taps")
+def _kinds() -> list[type[LightTransport]]:
+    from controller.transport.patch_transport import PatchTransport
+    from controller.transport.window_transport import WindowTransport
 
-
-def _match_white(white: FloatImage, colour: FloatImage, taps: FloatImage, lit: Mask, after: FloatImage) -> None:
-    """Write the factor that makes the blurred ``colour`` (3, rows, columns) the ``white`` image again, where lit."""
-    scratch, blurred = np.empty_like(white), np.empty_like(white)
-    blur_planes(colour, taps, scratch, blurred)
-    np.divide(white, blurred, out=after, where=lit & (blurred > 0))
+    return [PatchTransport, WindowTransport]
 
 
 def _save(path: Path, array: npt.NDArray[Any]) -> None:
@@ -261,7 +221,8 @@ def _wrong_size(what: str, got: tuple[int, ...], wanted: tuple[int, ...]) -> Usa
     )
 
 
-def _check(calibration: Calibration) -> None:
+def check_calibration(calibration: Calibration) -> None:
+    """Raise UsageError("calibration-inconsistent") when sizes differ or an image is not finite."""
     shape = (*calibration.object_mask.shape, 3)
     problem = None
     if not calibration.projectors:
@@ -276,6 +237,11 @@ def _check(calibration: Calibration) -> None:
             )
         elif not _consistent(metapixels):
             problem = f"the metapixels of {projector.name} differ in size"
+        elif projector.phase_map is not None and not (
+            projector.phase_map.projector_px.shape == (*shape[:2], 2)
+            and projector.phase_map.spread_px2.shape == (*metapixels.valid.shape, 3)
+        ):
+            problem = f"the phase map of {projector.name} has another size than its pictures"
     if problem is not None:
         raise UsageError(
             "calibration-inconsistent",

@@ -1,0 +1,117 @@
+"""A Bayer camera's own part of the light transport: one colour a site, the other two interpolated, and the transpose.
+
+The interpolation is that of ``capture.raw``: a site's own colour as measured, the others as the mean of those sites of
+the 3x3 around that have them. So pictures are linear in the sites, and what a site sees has no camera colours to mix.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from controller.arrays import FloatImage
+from controller.compiled import compiled
+
+BORDER: Final = 2
+"""Rows and columns whose neighbours, or neighbours' neighbours, may lie outside."""
+GREEN: Final = 1
+
+Colours = npt.NDArray[np.int64]
+"""(2, 2): 0 red, 1 green, 2 blue at even and odd rows and columns."""
+
+
+@compiled()
+def _count(colours: Colours, y: int, x: int, colour: int, rows: int, columns: int) -> int:
+    n = 0
+    for r in range(max(y - 1, 0), min(y + 2, rows)):
+        for c in range(max(x - 1, 0), min(x + 2, columns)):
+            n += colours[r & 1, c & 1] == colour
+    return n
+
+
+@compiled()
+def _interpolate_one(sites: FloatImage, colours: Colours, y: int, x: int, out: FloatImage) -> None:
+    rows, columns = sites.shape
+    for colour in range(3):
+        if colours[y & 1, x & 1] == colour:
+            out[colour, y, x] = sites[y, x]
+            continue
+        total = np.float32(0)
+        n = 0
+        for r in range(max(y - 1, 0), min(y + 2, rows)):
+            for c in range(max(x - 1, 0), min(x + 2, columns)):
+                if colours[r & 1, c & 1] == colour:
+                    total += sites[r, c]
+                    n += 1
+        out[colour, y, x] = total / np.float32(max(n, 1))
+
+
+@compiled()
+def _collect_one(planes: FloatImage, colours: Colours, y: int, x: int, out: FloatImage) -> None:
+    _, rows, columns = planes.shape
+    own = colours[y & 1, x & 1]
+    total = planes[own, y, x]
+    for r in range(max(y - 1, 0), min(y + 2, rows)):
+        for c in range(max(x - 1, 0), min(x + 2, columns)):
+            if colours[r & 1, c & 1] != own:
+                total += planes[own, r, c] / np.float32(_count(colours, r, c, own, rows, columns))
+    out[y, x] = total
+
+
+@compiled(fastmath=True)
+def _interpolate_row(
+    above: FloatImage, here: FloatImage, below: FloatImage, at: int, own: FloatImage, green: FloatImage, far: FloatImage
+) -> None:
+    """One inner row, whose colours are green and one other, the latter at columns of parity ``at``."""
+    half, quarter = np.float32(0.5), np.float32(0.25)
+    for x in range(BORDER, here.size - BORDER):
+        across, down = here[x - 1] + here[x + 1], above[x] + below[x]
+        corners = above[x - 1] + above[x + 1] + below[x - 1] + below[x + 1]
+        other = (x & 1) == at
+        own[x] = here[x] if other else half * across
+        green[x] = quarter * (across + down) if other else here[x]
+        far[x] = quarter * corners if other else half * down
+
+
+@compiled(fastmath=True)
+def _collect_row(own: FloatImage, green: FloatImage, y: int, at: int, out: FloatImage) -> None:
+    """The transpose: ``own`` and ``green`` (rows, columns) are the two planes of the row's colours."""
+    half, quarter = np.float32(0.5), np.float32(0.25)
+    a, h, b = own[y - 1], own[y], own[y + 1]
+    ga, gh, gb = green[y - 1], green[y], green[y + 1]
+    for x in range(BORDER, out.size - BORDER):
+        edges, corners = h[x - 1] + h[x + 1] + a[x] + b[x], a[x - 1] + a[x + 1] + b[x - 1] + b[x + 1]
+        greens = gh[x] + quarter * (gh[x - 1] + gh[x + 1] + ga[x] + gb[x])
+        out[x] = h[x] + half * edges + quarter * corners if (x & 1) == at else greens
+
+
+@compiled(parallel=True)
+def interpolate(sites: FloatImage, colours: Colours, out: FloatImage) -> None:
+    """Write the picture (3, rows, columns) that a camera makes of its ``sites`` (rows, columns)."""
+    rows, columns = sites.shape
+    for y in prange(rows):
+        inner = BORDER <= y < rows - BORDER
+        if inner:
+            at = 1 if colours[y & 1, 0] == GREEN else 0
+            own = colours[y & 1, at]
+            _interpolate_row(sites[y - 1], sites[y], sites[y + 1], at, out[own, y], out[GREEN, y], out[2 - own, y])
+        for x in range(columns):
+            if not (inner and BORDER <= x < columns - BORDER):
+                _interpolate_one(sites, colours, y, x, out)
+
+
+@compiled(parallel=True)
+def collect(planes: FloatImage, colours: Colours, out: FloatImage) -> None:
+    """The transpose of ``interpolate``: (3, rows, columns) to sites (rows, columns)."""
+    _, rows, columns = planes.shape
+    for y in prange(rows):
+        inner = BORDER <= y < rows - BORDER
+        if inner:
+            at = 1 if colours[y & 1, 0] == GREEN else 0
+            _collect_row(planes[colours[y & 1, at]], planes[GREEN], y, at, out[y])
+        for x in range(columns):
+            if not (inner and BORDER <= x < columns - BORDER):
+                _collect_one(planes, colours, y, x, out)

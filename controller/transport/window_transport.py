@@ -1,0 +1,123 @@
+"""The light transport by camera samples: each has its own shares of the projector's pixels around where it looks.
+
+T_n p = D ( w_n (.) G_n (p M_n') ). A row of G_n is the projector's blur around the phase map phi at one sample of the
+camera: exp(-1/2 (phi - v)' S^-1 (phi - v)) over the projector pixels v, divided by its sum. w_n is the white image as
+sampled, and D the interpolation of the camera's colours, exactly as the pictures were made (docs/decisions/0010).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.arrays import FloatImage
+from controller.calibrate.values import Calibration, PhaseMap
+from controller.transport.light import FAINTEST, LightTransport
+from controller.transport.mosaic import collect, interpolate
+from controller.transport.planes import image_planes
+from controller.transport.profiles import Profiles, build_profiles
+from controller.transport.window_products import adjoint_sites, forward_sites, share_sums
+from controller.transport.windows import Windows, build_windows
+
+WHOLE: Final = 0.998
+"""A camera pixel is lit by a projector where the samples it is made of have windows for this part of its white."""
+SMALLEST_MOSAIC: Final = 2
+_OWN: Final = ("mixing", "lit", "per_weight", "colours")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowTransport(LightTransport):
+    """T by camera samples.
+
+    ``windows``: each sample's shares; ``table``: the profiles they are made of
+    ``colours`` (2, 2) int64 of the camera's samples, or (0, 0) where each pixel has three of its own
+    """
+
+    windows: Windows
+    table: Profiles
+    colours: npt.NDArray[np.int64]
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration) -> WindowTransport:
+        """Build T from phase maps; the calibration is consistent, and every projector has one."""
+        parts = calibration.projectors
+        mask = calibration.object_mask
+        mosaic = calibration.mosaic is not None and min(mask.shape) >= SMALLEST_MOSAIC
+        colours = np.asarray(calibration.mosaic, np.int64) if mosaic else np.zeros((0, 0), np.int64)
+        # a pixel of the object is made of samples beside it, too
+        near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if mosaic else mask
+        maps: tuple[PhaseMap, ...] = tuple(part.phase_map for part in parts if part.phase_map is not None)
+        bright = tuple(near & (part.white.max(axis=2) > FAINTEST * part.white.max(initial=0)) for part in parts)
+        windows = build_windows(maps, tuple(part.white for part in parts), colours, bright)
+        sizes = tuple((int(rows), int(columns)) for rows, columns in windows.size)
+        mixing = np.stack([part.radiometry.mixing for part in parts]).astype(np.float32)
+        lit = np.zeros((len(parts), *mask.shape), np.bool_)
+        pixels = int(windows.start[-1])
+        made = cls(mixing, lit, np.ones(pixels, np.float32), sizes, windows, build_profiles(), colours)
+        light = np.empty((3, *mask.shape), np.float32)
+        plain = np.broadcast_to(np.eye(3, dtype=np.float32), mixing.shape).copy()
+        for n, part in enumerate(parts):
+            made._products(np.ones((3, pixels), np.float32), plain, (n, n + 1), light)
+            lit[n] = mask & bright[n] & np.all(light >= np.float32(WHOLE) * made._sampled(part.white), axis=0)
+        total = made._sums(np.ones((1, *mask.shape), np.float32), (0, len(parts)))[0]
+        per_weight = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
+        return cls(mixing, lit, per_weight, sizes, windows, made.table, colours)
+
+    def _products(self, p: FloatImage, mixing: FloatImage, projectors: tuple[int, int], out: FloatImage) -> None:
+        if not self.colours.size:
+            forward_sites(self.windows, self.table, mixing, p, projectors, out.reshape(-1))
+            return
+        sites = np.empty(self.shape, np.float32)
+        forward_sites(self.windows, self.table, mixing, p, projectors, sites.reshape(-1))
+        interpolate(sites, self.colours, out)
+
+    def _sampled(self, white: FloatImage) -> FloatImage:
+        """(3, rows, columns): a picture again as it is made of its own samples."""
+        planes = image_planes(white)
+        if not self.colours.size:
+            return planes
+        sites = np.empty(self.shape, np.float32)
+        for row in range(2):
+            for column in range(2):
+                sites[row::2, column::2] = planes[self.colours[row, column], row::2, column::2]
+        interpolate(sites, self.colours, planes)
+        return planes
+
+    def _sums(self, image: FloatImage, projectors: tuple[int, int]) -> FloatImage:
+        out = np.zeros((image.shape[0], self.pixels), np.float32)
+        share_sums(self.windows, self.table, image.reshape(image.shape[0], -1), projectors, out)
+        return out
+
+    def forward_planes(
+        self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
+    ) -> FloatImage:
+        out = np.empty((3, *self.shape), np.float32) if out is None else out
+        self._products(p, self.mixing, projectors or (0, len(self.sizes)), out)
+        return out
+
+    def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
+        out = np.empty((3, self.pixels), np.float32) if out is None else out
+        sites = r
+        if self.colours.size:
+            sites = np.empty(self.shape, np.float32)
+            collect(r, self.colours, sites)
+        adjoint_sites(self.windows, self.table, self.mixing, np.ascontiguousarray(sites).reshape(-1), out)
+        return out
+
+    def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
+        means = self._sums(np.ascontiguousarray(image), projectors or (0, len(self.sizes)))
+        means *= self.per_weight
+        return means
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return self.windows._asdict() | {name: getattr(self, name) for name in _OWN}
+
+    @classmethod
+    def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> WindowTransport:
+        windows = Windows(*(arrays[name] for name in Windows._fields))
+        mixing, lit, per_weight, colours = (arrays[name] for name in _OWN)
+        return cls(mixing, lit, per_weight, sizes, windows, build_profiles(), colours)
