@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
-from hal.ptp import Operation, broken, parse_handles
+from hal.ptp import Operation, Property, broken, parse_handles
 from hal.ptp_datasets import ObjectInfo, StorageInfo
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
 from plugins.ptp_files import PendingFile, kind_of
@@ -29,12 +29,21 @@ class Channel:
     ``exposing_until_s``: when, on the monotonic clock, an exposure will be over that nobody waits for any more.
     """
 
-    def __init__(self, link: PtpLink, operations: frozenset[int], timing: Timing, diary: Diary) -> None:
+    def __init__(
+        self,
+        link: PtpLink,
+        timing: Timing,
+        diary: Diary,
+        *,
+        operations: frozenset[int],
+        properties: frozenset[int] = frozenset(),
+    ) -> None:
         self.link = link
         self.timing = timing
         self.diary = diary
         self.exposing_until_s = 0.0
         self._operations = operations
+        self._properties = properties
 
     def patience(self, deadline: Deadline) -> Deadline:
         """Until when a busy camera is asked again: beyond any exposure that goes on without us."""
@@ -104,6 +113,13 @@ class Channel:
         """Every object on every card."""
         reply = self.ask(Operation.GET_OBJECT_HANDLES, _EVERY_STORE, 0, 0, doing="list its pictures", deadline=deadline)
         return frozenset(parse_handles(reply.data))
+
+    def battery_percent(self, deadline: Deadline) -> int | None:
+        """The standard battery level; None where the camera has none."""
+        if Property.BATTERY_LEVEL not in self._properties:
+            return None
+        reply = self.once(Operation.GET_PROPERTY, Property.BATTERY_LEVEL, deadline=deadline)
+        return min(100, reply.data[0]) if reply.ok and reply.data else None
 
     def status(self, battery_percent: int | None, warnings: list[str], deadline: Deadline) -> CameraStatus:
         """The card, with what else is known."""

@@ -166,7 +166,8 @@ class EosBody:
         self._talk.drain(deadline)
         changed, self._target_changed = self._target_changed, False
         warnings = self._state.warnings() + ["target-changed"] * changed
-        return self._channel.status(self._state.battery_percent(), warnings, deadline)
+        battery = self._channel.battery_percent(deadline)
+        return self._channel.status(self._state.battery_percent() if battery is None else battery, warnings, deadline)
 
     def live_view(self, *, deadline: Deadline) -> bytes:
         return self._view.frame(deadline)

@@ -154,11 +154,7 @@ class GenericBody:
         self._channel.once(Operation.GET_STORAGE_IDS, deadline=deadline)
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
-        battery = None
-        if Property.BATTERY_LEVEL in self._info.properties:
-            reply = self._channel.once(Operation.GET_PROPERTY, Property.BATTERY_LEVEL, deadline=deadline)
-            battery = reply.data[0] if reply.ok and reply.data else None
-        return self._channel.status(battery, [], deadline)
+        return self._channel.status(self._channel.battery_percent(deadline), [], deadline)
 
     def live_view(self, *, deadline: Deadline) -> bytes:
         raise no_live_view()

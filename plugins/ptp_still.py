@@ -236,13 +236,15 @@ class PtpCamera:
             return self._body
         give_up = deadline.within(patience_s)
         pause_s = 0.05
+        gone: DeviceGone | None = None
         while True:
             try:
                 return self._reopen(deadline, after_break=True)
-            except (DeviceGone, DeviceBusy, DeviceTimeout, ProtocolError):
+            except (DeviceGone, DeviceBusy, DeviceTimeout, ProtocolError) as error:
                 # A camera that restarts refuses connections at first, or still holds the lost one.
+                gone = error if isinstance(error, DeviceGone) else gone
                 if give_up.passed:
-                    raise
+                    raise gone or error from None
                 give_up.sleep(pause_s)
                 pause_s = min(1.0, 2 * pause_s)
 
@@ -254,13 +256,15 @@ class PtpCamera:
             self._channel.link.close()
         link = self._connect(deadline)
         try:
-            self._channel = Channel(link, frozenset({Operation.GET_DEVICE_INFO}), self._timing, self._diary)
+            self._channel = Channel(link, self._timing, self._diary, operations=frozenset({Operation.GET_DEVICE_INFO}))
             reply = self._channel.once(Operation.OPEN_SESSION, _SESSION, deadline=deadline)
             if not reply.ok and reply.code != Answer.SESSION_ALREADY_OPEN:
                 raise refused(reply, "open a session")
             info = self._device_info(deadline)
             self._check_serial(info)
-            self._channel = Channel(link, info.operations, self._timing, self._diary)
+            self._channel = Channel(
+                link, self._timing, self._diary, operations=info.operations, properties=info.properties
+            )
             self._channel.exposing_until_s = self._exposing_until_s
             body = self._choose_body(info)
             body.prepare(after_break=after_break, deadline=deadline)

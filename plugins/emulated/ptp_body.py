@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -105,7 +106,9 @@ class EmulatedBody:
         self.card = Card(card_bytes)
         self.battery_percent = 90
         self.exposures = 0
+        self.last_exposure_s = 0.0
         self.exposing = False
+        self.answered: Counter[int] = Counter()
         self.stopped = threading.Event()
         self.on_event: Callable[[int, tuple[int, ...]], None] = lambda code, parameters: None
         self.on_drop: Callable[[], None] = lambda: None
@@ -125,6 +128,7 @@ class EmulatedBody:
     def answer(self, code: int, parameters: tuple[int, ...], data: bytes) -> Outcome:
         """Do one operation. Raises Gone where a fault ends the connection."""
         with self.lock:
+            self.answered[code] += 1
             if code not in self._common and code not in self.operations:
                 return Outcome(NOT_SUPPORTED)
             if not self._open and code not in (0x1001, 0x1002):
@@ -209,6 +213,7 @@ class EmulatedBody:
             self.stopped.wait(min(left_s, 1.0))
         if self.stopped.is_set():
             return
+        self.last_exposure_s = exposed.settings.exposure_s
         try:
             files = self._expose(exposed.settings)
         except BaseException:

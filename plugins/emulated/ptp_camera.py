@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Final, Literal, Self
 
 from hal.errors import DeviceError
-from plugins.emulated.ptp_body import JPEG, CameraFaults, CameraNames
+from plugins.emulated.ptp_body import JPEG, CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.ptp_eos import EosBody, OldEosBody
 from plugins.emulated.ptp_generic import GenericBody
 from plugins.emulated.ptp_wire import (
@@ -78,7 +78,7 @@ class EmulatedPtpCamera:
     ) -> None:
         self.faults = faults or CameraFaults()
         self.names = names or NAMES[flavour]
-        self._body = BODIES[flavour](
+        self._body: EmulatedBody = BODIES[flavour](
             expose,
             names=self.names,
             time_scale=time_scale,
@@ -102,6 +102,11 @@ class EmulatedPtpCamera:
     def address(self) -> str:
         """``ptpip:HOST:COMMANDPORT:EVENTPORT``, once started."""
         return f"ptpip:{self._host}:{self._ports[0]}:{self._ports[1]}"
+
+    @property
+    def body(self) -> EmulatedBody:
+        """What is behind the connection: card, battery, settings."""
+        return self._body
 
     @property
     def exposures(self) -> int:

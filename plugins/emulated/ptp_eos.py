@@ -91,6 +91,20 @@ class EosBody(EmulatedBody):
         self._pressed = 0
         self._view_at = 0.0
 
+    def shutter_codes(self, codes: tuple[int, ...] = ()) -> tuple[int, ...]:
+        """The shutter codes that can be set, bulb left out; ``codes`` replaces them."""
+        with self.lock:
+            kept = tuple(code for code in self._lists[0xD102] if code == _BULB)
+            if codes:
+                self._lists[0xD102] = (*kept, *codes)
+                self._report_list(0xD102)
+            return self._lists[0xD102][len(kept) :]
+
+    def falls_asleep_soon(self) -> None:
+        """Warn the computer, as a body does before it switches itself off."""
+        with self.lock:
+            self._report(0xC18D, b"")
+
     def disconnected(self) -> None:
         super().disconnected()
         with self.lock:
@@ -160,6 +174,11 @@ class EosBody(EmulatedBody):
         if outcome.code == STORE_FULL:
             return Outcome(parameters=(_FULL_REASON,))
         return Outcome(outcome.code, outcome.parameters or ((0,) if outcome.code == OK else ()))
+
+    def _battery_code(self) -> int:
+        return next(
+            code for least, code in ((88, 2), (63, 4), (38, 1), (15, 5), (0, 0)) if self.battery_percent >= least
+        )
 
     def _view(self) -> Outcome:
         """A frame of live view: a record of type 1 with a JPEG, after one of a type that is of no interest here."""
@@ -234,18 +253,22 @@ class EosBody(EmulatedBody):
     def _report_everything(self, *, on: bool) -> Outcome:
         self._reporting = on
         self._reports.clear()
-        for code, value in self._values.items():
+        for code, value in {**self._values, 0xD111: self._battery_code()}.items():
             self._report(0xC189, struct.pack("<II", code, value))
         self._report(0xC189, struct.pack("<I", 0xD120) + _format_bytes(self._format))
         self._report(0xC189, struct.pack("<I", 0xD1AF) + self.names.serial.encode("ascii", "replace") + b"\0")
-        for code, values in self._lists.items():
-            self._report(0xC18A, struct.pack("<III", code, 3, len(values)) + b"".join(u32s(v)[4:] for v in values))
+        for code in self._lists:
+            self._report_list(code)
         formats = b"".join(_format_bytes(one) for one in _FORMATS)
         self._report(0xC18A, struct.pack("<III", 0xD120, 3, len(_FORMATS)) + formats)
         self._report(0xC18B, struct.pack("<I", int(self.exposing)))
         if on:
             self._reports += [_new_object(stored, waiting=True) for stored in self.card.waiting.values()]
         return Outcome()
+
+    def _report_list(self, code: int) -> None:
+        values = self._lists[code]
+        self._report(0xC18A, struct.pack(f"<III{len(values)}I", code, 3, len(values), *values))
 
     def _report(self, code: int, body: bytes) -> None:
         if self._reporting:

@@ -115,6 +115,14 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
     def pictures_on_card(self) -> int:
         return sum(bool(stored.data) for stored in self.body.card.objects.values())
 
+    def last_exposure_s(self) -> float:
+        """How long the shutter was open for the last picture."""
+        return self.body.last_exposure_s
+
+    def camera_off_and_on(self) -> None:
+        """Its switch: settings are as after that, the card keeps its pictures."""
+        self.body.power_on()
+
     def plugged(self) -> None:
         """Power of the bus, or a reset: a new life, though the card and the shutter go on."""
         super().plugged()

@@ -1,0 +1,125 @@
+"""Debian's gphoto2 against the emulated camera, over PTP/IP and over emulated USB, fifty captures in a row.
+
+    python -m tests.campaigns.camera_peers [CAPTURES]
+
+Prints one line for each of six cameras, and ends with 0 where each picture came byte for byte, and none twice.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
+from plugins.emulated.ptp_usb_camera import numbered_files
+from plugins.emulated.shot import ShotFiles, ShotSettings
+from plugins.emulated.usb_bus import environment
+from plugins.emulated.usb_bus_process import UsbBusProcess
+
+__all__ = ["FLAVOURS", "SIZE", "Flavour", "Peer", "Way", "network_peer", "usb_peer"]
+
+FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old")
+SIZE: Final = 150_000
+_TIME_SCALE: Final = 0.01
+_PATIENCE_S: Final = 60.0
+
+
+@dataclass
+class Peer:
+    """An emulated camera and the gphoto2 that talks to it."""
+
+    port: str
+    folder: Path
+    exposures: Callable[[], int]
+    surroundings: dict[str, str]
+
+    def gphoto2(self, *arguments: str, patience_s: float = _PATIENCE_S) -> str:
+        """Run gphoto2 with a configuration of its own; return what it said. Raises AssertionError where it fails."""
+        program = shutil.which("gphoto2")
+        assert program, "gphoto2 is not installed: run `make test`, whose set-up installs it (Debian package gphoto2)"
+        done = subprocess.run(
+            [program, "--port", self.port, *arguments],
+            cwd=self.folder,
+            env={"HOME": str(self.folder / "home"), "PATH": os.environ["PATH"], "LC_ALL": "C", **self.surroundings},
+            capture_output=True,
+            text=True,
+            timeout=patience_s,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "*** Error" not in done.stdout + done.stderr, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    def picture(self, number: int, *, raw: bool = False) -> bytes:
+        """The bytes of the ``number``-th exposure."""
+        files = numbered_files(number, SIZE, ShotSettings(1, 100, 8, raw=raw, jpeg=not raw))
+        return (files.raw if raw else files.jpeg) or b""
+
+    def captures(self, count: int) -> None:
+        """So many in a row, each the right one."""
+        every = ("--frames", str(count), "--interval", "1")
+        self.gphoto2(*every, "--capture-image-and-download", "--filename", "%n.jpg", patience_s=_PATIENCE_S + 4 * count)
+        for number in range(1, count + 1):
+            assert (self.folder / f"{number}.jpg").read_bytes() == self.picture(number), number
+
+
+Way = Callable[[Flavour], AbstractContextManager[Peer]]
+
+
+@contextmanager
+def network_peer(flavour: Flavour) -> Iterator[Peer]:
+    """The camera on PTP/IP."""
+    made: list[EmulatedPtpCamera] = []
+
+    def expose(shot: ShotSettings) -> ShotFiles:
+        return numbered_files(made[0].exposures, SIZE, shot)
+
+    made.append(EmulatedPtpCamera(expose, flavour=flavour, time_scale=_TIME_SCALE))
+    with _folder() as folder, made[0] as camera:
+        yield Peer(camera.address, folder, lambda: camera.exposures, {})
+
+
+@contextmanager
+def usb_peer(flavour: Flavour) -> Iterator[Peer]:
+    """The camera on the emulated USB bus, which gphoto2's own libusb finds."""
+    with _folder() as folder, _folder() as bus_folder, UsbBusProcess(bus_folder) as bus:
+        bus.add("camera", "camera", flavour=flavour, size=SIZE, time_scale=_TIME_SCALE)
+        yield Peer("usb:", folder, lambda: int(bus.get("camera", "exposures")), environment(bus_folder))
+
+
+@contextmanager
+def _folder() -> Iterator[Path]:
+    # A unix socket's path is short, and pytest's own folders are not.
+    with tempfile.TemporaryDirectory(prefix="peer", dir="/tmp") as name:
+        (Path(name) / "home").mkdir()
+        yield Path(name)
+
+
+def main() -> int:
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 50
+    holds = True
+    for name, way in (("network", network_peer), ("usb", usb_peer)):
+        for flavour in FLAVOURS:
+            started = time.monotonic()
+            with way(flavour) as peer:
+                try:
+                    peer.captures(count)
+                    word = "holds" if peer.exposures() == count else f"EXPOSED {peer.exposures()} TIMES"
+                except (AssertionError, subprocess.TimeoutExpired) as error:
+                    word = f"FAILED: {error}"
+            holds = holds and word == "holds"
+            print(f"{name:<8} {flavour:<8} {count} captures, {time.monotonic() - started:.0f} s: {word}")
+    return 0 if holds else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

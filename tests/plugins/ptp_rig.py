@@ -1,0 +1,83 @@
+"""A PTP camera driver on an emulated camera on loopback, for the tests here."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from hal.deadline import in_seconds
+from hal.values import ExposureSettings
+from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
+from plugins.emulated.shot import ShotFiles, ShotSettings
+from plugins.ptp_shot import Timing
+from plugins.ptp_still import PtpCamera
+from plugins.ptpip import PtpIpLink
+from plugins.ptpip_wire import PtpIpAddress
+
+FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old")
+QUICK = Timing(answer_s=1.0, busy_s=0.6, margin_s=0.5, grace_s=0.1, come_back_s=0.3, reconnect_s=3.0, keep_alive_s=0.05)
+SHORT = ExposureSettings(0.125, 200, 8.0, raw=False)
+
+
+class Studio:
+    """Makes each exposure's files, all different, and remembers what was asked of it."""
+
+    def __init__(self, size: int = 300_000) -> None:
+        self.shots: list[ShotSettings] = []
+        self.size = size
+
+    def expose(self, settings: ShotSettings) -> ShotFiles:
+        self.shots.append(settings)
+        return ShotFiles(
+            raw=b"II*\0" + self.content() if settings.raw else None,
+            jpeg=b"\xff\xd8" + self.content() + b"\xff\xd9" if settings.jpeg else None,
+        )
+
+    def content(self) -> bytes:
+        stamp = b"%08d" % len(self.shots)
+        return stamp * (self.size // len(stamp))
+
+
+class Rig:
+    """A driver on an emulated camera."""
+
+    def __init__(self, emulator: EmulatedPtpCamera, studio: Studio, driver: PtpCamera) -> None:
+        self.emulator = emulator
+        self.studio = studio
+        self.driver = driver
+
+    def capture(self, folder: Path, name: str = "shot", *, seconds: float = 10.0) -> bytes:
+        files = self.driver.capture(folder / name, deadline=in_seconds(seconds))
+        assert len(files) == 1
+        return files[0].path.read_bytes()
+
+    def latest(self) -> bytes:
+        """The bytes of the last JPEG that was exposed."""
+        return b"\xff\xd8" + self.studio.content() + b"\xff\xd9"
+
+
+def connect(emulator: EmulatedPtpCamera, **options: object) -> PtpCamera:
+    address = PtpIpAddress.parse(emulator.address)
+    return PtpCamera(
+        lambda until: PtpIpLink.connect(address, deadline=until),
+        deadline=in_seconds(5),
+        **{"timing": QUICK, **options},  # type: ignore[arg-type]
+    )
+
+
+@contextlib.contextmanager
+def running(flavour: Flavour, *, studio: Studio | None = None, **options: object) -> Iterator[Rig]:
+    studio = studio or Studio()
+    time_scale = float(str(options.pop("time_scale", 0.2)))
+    with EmulatedPtpCamera(studio.expose, flavour=flavour, time_scale=time_scale) as emulator:
+        driver = connect(emulator, **options)
+        driver.configure(SHORT, deadline=in_seconds(5))
+        try:
+            yield Rig(emulator, studio, driver)
+        finally:
+            driver.close()
+
+
+def left_behind(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
