@@ -20,6 +20,9 @@ import typer
 
 from controller import console
 from controller.commands import bundle as bundle_commands
+from controller.commands import camera as camera_commands
+from controller.commands.drift import drift
+from controller.commands.export import export
 from controller.commands.keys import keys
 from controller.commands.report import report
 from controller.commands.running import Json, StageFolder, group, work
@@ -120,10 +123,12 @@ def play(
 COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     demo,
     calibrate,
+    drift,
     appearance,
     play,
     keys,
     emulate,
+    export,
     report,
     states,
 )
@@ -131,6 +136,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
 
 GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
     "bundle": (bundle_commands.SUMMARY, bundle_commands.COMMANDS),
+    "camera": (camera_commands.SUMMARY, camera_commands.COMMANDS),
 }
 """Commands of two words: the first word, what the group is for, and its commands."""
 

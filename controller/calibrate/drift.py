@@ -7,6 +7,7 @@ paint and all patterns alike; an object that moved shifts the paint, and pattern
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import math
 from collections.abc import Mapping, Sequence
@@ -162,7 +163,7 @@ def find_drift(light: Light, calibration: Calibration, frames: Sequence[FloatIma
         camera = _camera(calibration, found, seen)
         culprit = _culprit(camera, found, light, calibration)
     share, ratio = _ambient(calibration, seen)
-    return Drift(tuple(found), camera, culprit, share, ratio)
+    return Drift(tuple(found), _backwards(camera), culprit, share, ratio)
 
 
 def _explained_by_projectors(camera: Motion, found: Sequence[ProjectorDrift]) -> bool:
@@ -288,6 +289,18 @@ def _camera(calibration: Calibration, found: Sequence[ProjectorDrift], seen: See
     whole = _shrunk(known.astype(np.float32), factor) > 0.99
     motion = register(_shrunk(pictures[0], factor), _shrunk(pictures[1], factor), whole.astype(np.float32))
     return motion if factor == 1 else _enlarged(motion, factor)
+
+
+def _backwards(motion: Motion) -> Motion:
+    """How the object's picture moved, from where in the calibration's picture a pixel now looks."""
+    if not motion.found:
+        return motion
+    matrix = np.linalg.inv(motion.matrix)
+    x, y = motion.shift_px
+    return dataclasses.replace(
+        motion, matrix=matrix / matrix[2, 2], shift_px=(-x, -y), rotation_deg=-motion.rotation_deg,
+        scale=1 / motion.scale,
+    )  # fmt: skip
 
 
 def _shrunk(image: FloatImage, factor: int) -> FloatImage:
