@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,9 +19,11 @@ from controller.config import Stage, check_driver_settings, load_stage
 from controller.config.models import CameraTable, OpenTable
 from controller.errors import UsageError
 from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover, start_player
+from controller.session.darkness import Darkness, dark_before
 from controller.session.journal import Journal
 from controller.session.lamps import LampFile
 from controller.session.machine import Event, Machine
+from controller.session.mains import Circuit, close_circuits, open_circuits
 from controller.session.power import light, power_down, steady
 from controller.session.progress import Level, Reporter
 from controller.session.rig import Rig, RigProjector
@@ -30,7 +32,7 @@ from controller.session.safety import LampGuard
 from controller.storage import clear_unfinished_writes, exclusive, runtime_folder
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, PluginError
-from hal.interfaces import Camera, Display, Projector
+from hal.interfaces import Camera, Display, LightSensor, PowerSwitch, Projector
 from hal.registry import Driver, Drivers, OpenContext, load_drivers
 
 OPEN_S = 20.0
@@ -49,6 +51,8 @@ class Checked:
     projectors: tuple[tuple[Driver, dict[str, Any]], ...]
     camera: tuple[Driver, dict[str, Any]]
     display: tuple[Driver, dict[str, Any]]
+    relays: tuple[tuple[Driver, dict[str, Any]], ...] = ()
+    light_sensor: tuple[Driver, dict[str, Any]] | None = None
 
     @property
     def prior(self) -> CameraPrior:
@@ -103,18 +107,26 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
         projectors=tuple(checked("projector", table, table.driver) for table in tables.projectors),
         camera=checked("camera", tables.camera, tables.camera.driver),
         display=checked("display", tables.display, tables.display.driver),
-    )
+        relays=tuple(checked("power_switch", table, table.driver) for table in tables.relays),
+        light_sensor=(
+            None if tables.light_sensor is None
+            else checked("light_sensor", tables.light_sensor, tables.light_sensor.driver)
+        ),
+    )  # fmt: skip
 
 
 @contextlib.contextmanager
 def opened(checked: Checked, *, deadline: Deadline) -> Iterator[Rig]:
     """Open every device of the stage and start the player; close them, and end the player, on leaving.
 
-    Lamps are left as they are: switching them is ``lit``'s.
+    Mains relays are closed first. They and the lamps are left as they are: switching them off is ``lit``'s.
     """
     stage = checked.stage
     context = OpenContext(stage=stage.folder, runtime=runtime_folder(stage.folder))
     with contextlib.ExitStack() as stack:
+        darkness = _darkness(checked, context, stack, deadline)
+        circuits = _circuits(checked, context, stack, deadline)
+        close_circuits(circuits, deadline=deadline)
         guards = []
         ledger = LampFile(stage.folder / LampFile.NAME)
         at_least = stage.tables.safety.at_least()
@@ -131,7 +143,32 @@ def opened(checked: Checked, *, deadline: Deadline) -> Iterator[Rig]:
         driver, settings = checked.display
         display = cast("Display", _device(stage.tables.display, driver, settings, context, deadline))
         stack.callback(display.close)
-        yield _rig(stage, guards, camera, display)
+        yield replace(_rig(stage, guards, camera, display), circuits=circuits, darkness=darkness)
+
+
+def _circuits(
+    checked: Checked, context: OpenContext, stack: contextlib.ExitStack, deadline: Deadline
+) -> tuple[Circuit, ...]:
+    circuits = []
+    for table, (driver, settings) in zip(checked.stage.tables.relays, checked.relays, strict=True):
+        switch = cast("PowerSwitch", _device(table, driver, settings, context, deadline))
+        stack.callback(switch.close)
+        circuits += [
+            Circuit(f"{table.name} {mains.channel}", mains.channel, mains.feeds, table.boot_s, switch)
+            for mains in table.mains
+        ]
+    return tuple(circuits)
+
+
+def _darkness(
+    checked: Checked, context: OpenContext, stack: contextlib.ExitStack, deadline: Deadline
+) -> Darkness | None:
+    table = checked.stage.tables.light_sensor
+    if table is None or checked.light_sensor is None:
+        return None
+    sensor = cast("LightSensor", _device(table, *checked.light_sensor, context, deadline))
+    stack.callback(sensor.close)
+    return Darkness(sensor, table.most_lux)
 
 
 def _device(
@@ -213,6 +250,7 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
             _tell(reporter, f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
         if machine.allows(Event.STOP):
             machine.handle(Event.STOP, "the lamps are switched off")
+        _cut_mains(rig, reporter)
         if not failures and machine.allows(Event.COOLED):
             machine.handle(Event.COOLED, "every lamp is off or cooling by itself")
     if failures:
@@ -222,6 +260,14 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
             what=f"The work is done, but {names} could not be switched off.",
             remedy="Switch off by the remote control, and leave the mains on until the fans stand still.",
         )
+
+
+def _cut_mains(rig: Rig, reporter: Reporter) -> None:
+    if not rig.circuits:
+        return
+    _tell(reporter, "Waiting until the lamps have cooled, to cut their mains.")
+    for stuck in open_circuits(rig.circuits, rig.guards):
+        _tell(reporter, f"The mains of relay {stuck.circuit} stay on: {stuck.error}", Level.WARNING)
 
 
 def _tell(reporter: Reporter, text: str, level: Level = Level.INFO) -> None:
@@ -269,10 +315,12 @@ def run_on_stage(
     reporter: Reporter,
     cancel: threading.Event,
     around: contextlib.AbstractContextManager[object] | None = None,
+    dark: bool = False,
 ) -> Path:
     """Open the stage, run the steps of a new or unfinished run with the lamps on, and leave the lamps safe.
 
-    ``around`` is entered before the devices are opened and left when they are closed. Returns the run's folder.
+    ``around`` is entered before the devices are opened and left when they are closed; ``dark``: not in a bright room,
+    where the stage has a light sensor. Returns the run's folder.
     Raises what the steps raise; UsageError("already-running") if another program works on the stage.
     """
     stage = checked.stage
@@ -286,7 +334,8 @@ def run_on_stage(
     ):
         clear_unfinished_writes(journal.folder)
         machine = Machine(journal.record_change)
-        steps = [*power_steps(rig, power_up_s=safety.power_up_s), *make_steps(rig, journal.folder)]
+        first = dark_before(rig.darkness) if dark else []
+        steps = [*first, *power_steps(rig, power_up_s=safety.power_up_s), *make_steps(rig, journal.folder)]
         with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
             Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
         return journal.folder

@@ -14,6 +14,7 @@ from controller.config import Stage
 from controller.errors import UsageError
 from controller.session import costs
 from controller.session.calibrating import calibration_steps
+from controller.session.darkness import dark_after
 from controller.session.dotting import dot_steps
 from controller.session.journal import Journal
 from controller.session.machine import Event
@@ -46,6 +47,7 @@ def calibrate(
         name="calibrate",
         reporter=reporter,
         cancel=cancel,
+        dark=True,
     )
     return {"run": str(run)}
 
@@ -57,6 +59,7 @@ def calibrating(rig: Rig, *, checked: Checked, options: DotOptions | None = None
         marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
         *calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
         *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s),
+        *dark_after(rig.darkness, rig.display),
         marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
     ]
 

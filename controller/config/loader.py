@@ -199,6 +199,8 @@ def _check_agreement(tables: StageTables) -> None:
     _all_different(tables.projectors, "output")
     _all_different(tables.display.outputs, "name")
     _all_different(tables.appearances, "name")
+    _all_different(tables.relays, "name")
+    _check_mains(tables)
     outputs = [output.name for output in tables.display.outputs]
     if not outputs:
         return  # real windows: only the display itself knows its outputs
@@ -211,6 +213,20 @@ def _check_agreement(tables: StageTables) -> None:
         if projector.output not in outputs:
             problem = "is not an output of the display"
             raise projector.place.wrong_value("output", projector.output, problem, f"one of {listed}")
+
+
+def _check_mains(tables: StageTables) -> None:
+    """Relays feed projectors that there are, each through one relay at most: else nobody knows what cuts what."""
+    names = [projector.name for projector in tables.projectors]
+    fed: set[str] = set()
+    for board in tables.relays:
+        _all_different(board.mains, "channel")
+        for mains in board.mains:
+            for name in mains.feeds:
+                if name not in names or name in fed:
+                    problem = "is fed by another relay too" if name in fed else "is not a projector of this stage"
+                    raise mains.place.wrong_value("feeds", name, problem, f"one of {', '.join(names)}, each once")
+                fed.add(name)
 
 
 def _all_different(tables: tuple[Table, ...], key: str) -> None:

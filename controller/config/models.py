@@ -149,6 +149,33 @@ class SolveTable(Table):
     )
 
 
+class MainsTable(Table):
+    """One relay of a board, and whose mains go through it."""
+
+    channel: int = Field(ge=1, le=64, description="the relay's number on its board, from 1")
+    feeds: Annotated[tuple[Name, ...], Field(strict=False, min_length=1, max_length=32)] = Field(
+        description="a list of names of the projectors whose mains go through this relay"
+    )
+
+
+class RelaysTable(OpenTable):
+    name: Name = Field(description="a name for people, different for every relay board, 1 to 64 printable characters")
+    driver: Name = Field(description='the name of a power_switch driver, e.g. "usb-relay"')
+    boot_s: Annotated[float, Field(ge=0, le=600)] = Field(
+        default=10.0, description="seconds from mains on until a projector can be spoken to, 0 to 600"
+    )
+    mains: Annotated[tuple[MainsTable, ...], Field(strict=False, min_length=1, max_length=64)] = Field(
+        description="a list of [[relays.mains]] tables with channel and feeds"
+    )
+
+
+class LightSensorTable(OpenTable):
+    driver: Name = Field(description='the name of a light_sensor driver, e.g. "colorhug-als"')
+    most_lux: float = Field(
+        default=5.0, gt=0, le=100_000, description="lux at the object above which calibration is refused, above 0"
+    )
+
+
 class SafetyTable(Table):
     power_up_s: Seconds = Field(
         default=1800.0, description="seconds that lamps may take until they are steady, 0 to 86400"
@@ -201,6 +228,10 @@ class StageTables(Table):
     object: ObjectTable = Field(default_factory=ObjectTable, description="the table [object]")
     capture: CaptureTable = Field(default_factory=CaptureTable, description="the table [capture]")
     solve: SolveTable = Field(default_factory=SolveTable, description="the table [solve]")
+    relays: Annotated[tuple[RelaysTable, ...], Field(strict=False, max_length=16)] = Field(
+        default=(), description="a list of [[relays]] tables, one a relay board"
+    )
+    light_sensor: LightSensorTable | None = Field(default=None, description="the table [light_sensor]")
     safety: SafetyTable = Field(default_factory=SafetyTable, description="the table [safety]")
     bundle: BundleTable = Field(default_factory=BundleTable, description="the table [bundle]")
     appearances: Annotated[tuple[AppearanceTable, ...], Field(strict=False)] = Field(

@@ -10,6 +10,8 @@ import numpy as np
 
 from controller.arrays import ByteImage
 from controller.capture.acquire import Acquirer
+from controller.session.darkness import Darkness
+from controller.session.mains import Circuit
 from controller.session.power import ANSWER_S
 from controller.session.safety import LampGuard, faulty
 from hal.deadline import Deadline
@@ -41,6 +43,8 @@ class Rig:
     camera: Camera
     display: Display
     acquirer: Acquirer
+    circuits: tuple[Circuit, ...] = ()
+    darkness: Darkness | None = None
 
     @property
     def guards(self) -> tuple[LampGuard, ...]:

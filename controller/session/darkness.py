@@ -1,0 +1,71 @@
+"""Darkness as a condition of calibration: the room's light is in every photograph, and it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from controller.session.progress import Level
+from controller.session.runner import Context, Step
+from hal.deadline import Deadline
+from hal.errors import DeviceRefused
+from hal.interfaces import Display, LightSensor
+
+ANSWER_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Darkness:
+    """A light sensor at the object, and the illuminance in lux above which nobody should calibrate."""
+
+    sensor: LightSensor
+    most_lux: float
+
+    def require(self, *, deadline: Deadline) -> float:
+        """The illuminance now. Raises DeviceRefused("room-not-dark"), and what the sensor raises."""
+        lux = self.sensor.illuminance_lux(deadline=deadline.within(ANSWER_S))
+        if lux > self.most_lux:
+            raise DeviceRefused(
+                "room-not-dark",
+                what=f"There are {lux:.2f} lux at the object, and calibration needs at most {self.most_lux:g}.",
+                remedy="Switch the lights off and close the blinds, or raise most_lux under [light_sensor].",
+            )
+        return lux
+
+    def warning(self, *, deadline: Deadline) -> str | None:
+        """What to tell the technician if it is no longer dark; None if it is."""
+        try:
+            self.require(deadline=deadline)
+        except DeviceRefused as error:
+            if error.code != "room-not-dark":
+                raise
+            return f"{error.what} What was just measured holds for this light only: calibrate again in the dark."
+        return None
+
+
+def dark_before(darkness: Darkness | None) -> list[Step]:
+    """The step that refuses a bright room, for before the lamps are struck: their light must not count."""
+    if darkness is None:
+        return []
+
+    def look(context: Context) -> Sequence[Path]:
+        lux = darkness.require(deadline=context.deadline)
+        context.reporter.say(f"The room is dark: {lux:.2f} lux at the object.")
+        return ()
+
+    return [Step("dark-before", look, title="Looking whether the room is dark", weight=0.1, always=True)]
+
+
+def dark_after(darkness: Darkness | None, display: Display) -> list[Step]:
+    """The step that warns of light that came on meanwhile; the projectors show black for it."""
+    if darkness is None:
+        return []
+
+    def look(context: Context) -> Sequence[Path]:
+        display.show({}, deadline=context.deadline.within(ANSWER_S))
+        if (warning := darkness.warning(deadline=context.deadline)) is not None:
+            context.reporter.say(warning, Level.WARNING)
+        return ()
+
+    return [Step("dark-after", look, title="Looking whether the room stayed dark", weight=0.1)]
