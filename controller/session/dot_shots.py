@@ -37,7 +37,7 @@ def of_sinusoids(folder: Path, projector: str) -> Metapixels:
 
 
 def spacing_of(options: DotOptions, known: Metapixels, *, share: float = 0.95) -> int:
-    """The dots' spacing: as asked for, or r >= 6.5 sigma by the blur of ``share`` of the pixels, at most the paper's."""
+    """The dots' spacing: as asked for, or r >= 6.5 sigma by the blur of a ``share`` of pixels, at most 16."""
     return options.spacing_px or min(dot_spacing(largest_sigma_px(known, share)), PAPER_SPACING_PX)
 
 

@@ -27,7 +27,7 @@ from controller.session.dot_shots import (
     spacing_of,
     take_in_batches,
 )
-from controller.session.edging import edge_steps
+from controller.session.edging import edge_steps, terms_step
 from controller.session.modes import DotOptions, mode_step
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
@@ -47,7 +47,8 @@ def dot_steps(rig: Rig, options: DotOptions, *, longest_exposure_s: float) -> li
         if options.mode == "paper":
             steps.append(_capture_step(rig, projector, options, longest_exposure_s))
             steps.append(_fit_step(projector, number, options))
-    return [*steps, mode_step(options, [step.name for step in steps])]
+    steps.append(mode_step(options, [step.name for step in steps]))
+    return [*steps, terms_step(rig)] if options.mode == "auto" else steps
 
 
 def _capture_step(rig: Rig, projector: RigProjector, options: DotOptions, longest_s: float) -> Step:

@@ -14,7 +14,7 @@ from controller.arrays import load_arrays, save_arrays
 from controller.calibrate.edges import EdgeShares, edge_frame, edge_patterns, edge_pixels, measure_shares
 from controller.calibrate.masks import reasons, summary
 from controller.session import costs
-from controller.session.calibrating import read_correspondence
+from controller.session.calibrating import read_calibration, read_correspondence
 from controller.session.dot_shots import (
     check_disk,
     dot_exposure_s,
@@ -28,7 +28,10 @@ from controller.session.modes import DotOptions, mode_of
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
 from controller.storage import write_atomically
+from controller.transport import LightTransport
+from controller.transport.edge_terms import edge_term, term_arrays, terms_from, with_terms
 
+TERMS: Final = "edge-terms.npz"
 EXPECTED_SHOTS: Final = 36
 TYPICAL: Final = 0.5
 """Of the pixels whose blur sets the spacing: no ellipse is fitted here, so a few dots that meet do less harm."""
@@ -105,10 +108,39 @@ def _measure(projector: RigProjector, context: Context) -> Sequence[Path]:
     return [path, figures]
 
 
-def read_edges(folder: Path, projectors: Sequence[str]) -> tuple[EdgeShares, ...] | None:
-    """What was measured at the depth edges of each projector; None where the run's mode is another."""
+def terms_step(rig: Rig) -> Step:
+    """Compare what was measured with what the transport's model says, once, so that no solve has to."""
+    names = [projector.name for projector in rig.projectors]
+    return Step(
+        "edge-terms",
+        partial(_compare, names),
+        after=tuple(f"{step}-{name}" for name in names for step in ("radiometry", "pixels", "edges")),
+        title="Correcting the light transport at depth edges",
+        weight=3 * costs.scale(projector.size_px for projector in rig.projectors),
+    )
+
+
+def _compare(names: Sequence[str], context: Context) -> Sequence[Path]:
+    calibration = read_calibration(context.folder, names)
+    model = LightTransport.build(calibration)
+    terms = []
+    for n, (part, measured) in enumerate(zip(calibration.projectors, read_edges(context.folder, names), strict=True)):
+        context.advance(n / len(names), part.name)
+        terms.append(edge_term(model, n, measured, part.white))
+    path = context.folder / TERMS
+    save_arrays(path, term_arrays(terms))
+    return [path]
+
+
+def edged(model: LightTransport, folder: Path) -> LightTransport:
+    """The run's transport: in the automatic mode, ``model`` with what dots say at depth edges; else ``model``."""
     if mode_of(folder) != "auto":
-        return None
+        return model
+    return with_terms(model, terms_from(load_arrays(folder / TERMS), model.sizes))
+
+
+def read_edges(folder: Path, projectors: Sequence[str]) -> tuple[EdgeShares, ...]:
+    """What the steps ``edges-NAME`` measured at the depth edges of each projector."""
     found = []
     for name in projectors:
         arrays = load_arrays(folder / f"edges-{name}.npz")

@@ -18,6 +18,7 @@ from controller.capture.patterns import Pattern, PatternKind, frame, plan_patter
 from controller.errors import WorkError
 from controller.session import costs
 from controller.session.calibrating import read_calibration
+from controller.session.edging import edged
 from controller.session.runner import Context, Step
 from controller.session.shots import read_index
 from controller.solve.appearance import Base, Mode, base_image, make_appearance, prepare_base, solve_base
@@ -35,13 +36,16 @@ from controller.transport import LightTransport
 class Wish:
     """An appearance to be made: ``target`` gives its picture, reflectance-like, and where it says something.
 
-    ``inputs`` are the hashes of what the target is made from.
+    ``inputs`` are the hashes of what the target is made from; ``prepare``, where there is one, is a step's work before
+    the solving, for targets that take long, and ``prepare_s`` what it costs.
     """
 
     name: str
     title: str
     target: Callable[[], Target]
     inputs: dict[str, str]
+    prepare: Callable[[Context], Sequence[Path]] | None = None
+    prepare_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +89,7 @@ class Calibrated:
     @property
     def transport(self) -> LightTransport:
         if self._transport is None:
-            self._transport = LightTransport.build(self.calibration)
+            self._transport = edged(LightTransport.build(self.calibration), self.folder)
         return self._transport
 
     @property
@@ -135,12 +139,25 @@ def solve_steps(
         ),
     ]
     for wish in wishes:
+        before = (*after, "base")
+        if wish.prepare is not None:
+            steps.append(
+                Step(
+                    f"target-{wish.name}",
+                    wish.prepare,
+                    inputs=wish.inputs,
+                    after=tuple(after),
+                    title=f"Rendering {wish.title}",
+                    weight=wish.prepare_s * scale,
+                )
+            )
+            before = (*before, f"target-{wish.name}")
         steps.append(
             Step(
                 f"appearance-{wish.name}",
                 partial(_solve_appearance, calibrated, wish, options),
                 inputs={**options.inputs(), **wish.inputs},
-                after=(*after, "base"),
+                after=before,
                 title=f"Solving {wish.title}",
                 weight=costs.APPEARANCE_S * scale,
             )

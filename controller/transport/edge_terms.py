@@ -1,0 +1,175 @@
+"""A light transport that tells at depth edges what was measured there, whatever its model of a projector pixel.
+
+T p gains W_n (.) E_n (M_n p_n) for each projector. E_n is sparse: measured share less the model's, of the few projector
+pixels that fall on two surfaces, at the camera pixels that see them. Its rows sum to 0, so T_n 1 stays the white image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from controller.arrays import FloatImage
+from controller.calibrate.edges import EdgeShares
+from controller.transport.light import LightTransport
+from controller.transport.planes import image_planes
+
+NOISES: Final = 2.0
+"""Differences of this many standard deviations of their noise are halved; smaller ones vanish, larger ones stay."""
+MOST: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeTerm:
+    """E of one projector.
+
+    ``differences`` (camera pixels that have some, projector's pixels) float32; ``camera`` (n,) their row-major indices;
+    ``white`` (3, n) float32
+    """
+
+    differences: sp.csr_matrix[np.float32]
+    camera: npt.NDArray[np.int64]
+    white: FloatImage
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgedTransport(LightTransport):
+    """A light transport, ``model``, with a term at depth edges for each projector."""
+
+    model: LightTransport
+    terms: tuple[EdgeTerm, ...]
+
+    def forward_planes(
+        self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
+    ) -> FloatImage:
+        """T p on planes, as ``LightTransport.forward_planes``."""
+        light = self.model.forward_planes(p, projectors=projectors, out=out)
+        flat = light.reshape(3, -1)
+        for n in range(*(projectors or (0, len(self.terms)))):
+            term = self.terms[n]
+            shown = self.mixing[n] @ p[:, self.span(n)]
+            for c in range(3):
+                flat[c, term.camera] += term.white[c] * (term.differences @ shown[c])
+        return light
+
+    def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
+        """T' r on planes, as ``LightTransport.adjoint_planes``."""
+        back = self.model.adjoint_planes(r, out=out)
+        flat = r.reshape(3, -1)
+        for n, term in enumerate(self.terms):
+            seen = np.stack([term.differences.T @ (term.white[c] * flat[c, term.camera]) for c in range(3)])
+            back[:, self.span(n)] += self.mixing[n].T @ seen.astype(np.float32)
+        return back
+
+    def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
+        """The model's."""
+        return self.model.gaussian_mean_planes(image, projectors=projectors)
+
+    def with_absolute_mixing(self) -> Self:
+        """T with magnitudes for its entries; the terms' too."""
+        terms = tuple(dataclasses.replace(term, differences=abs(term.differences)) for term in self.terms)
+        model = self.model.with_absolute_mixing()
+        return dataclasses.replace(self, mixing=model.mixing, model=model, terms=terms)
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Everything that ``restored`` needs, by name."""
+        of_model = {f"model-{name}": array for name, array in self.model.arrays().items()}
+        return {**of_model, "model": np.array(kinds().index(type(self.model))), **term_arrays(self.terms)}
+
+    @classmethod
+    def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> EdgedTransport:
+        """From ``arrays``. Raises KeyError where one is missing."""
+        of_model = {name.removeprefix("model-"): a for name, a in arrays.items() if name.startswith("model-")}
+        return with_terms(kinds()[int(arrays["model"])].restored(of_model, sizes), terms_from(arrays, sizes))
+
+
+_PARTS: Final = ("data", "indices", "indptr", "camera", "white")
+
+
+def kinds() -> list[type[LightTransport]]:
+    """What a model may be; the place in the list is stored."""
+    from controller.transport.patch_transport import PatchTransport
+    from controller.transport.window_transport import WindowTransport
+
+    return [PatchTransport, WindowTransport]
+
+
+def term_arrays(terms: Sequence[EdgeTerm]) -> dict[str, npt.NDArray[Any]]:
+    """Terms as plain arrays by name."""
+    found: dict[str, npt.NDArray[Any]] = {}
+    for n, term in enumerate(terms):
+        matrix = term.differences
+        parts: list[npt.NDArray[Any]] = [matrix.data, matrix.indices, matrix.indptr, term.camera, term.white]
+        found |= {f"edges-{n}-{name}": part for name, part in zip(_PARTS, parts, strict=True)}
+    return found
+
+
+def terms_from(arrays: Mapping[str, npt.NDArray[Any]], sizes: Sequence[tuple[int, int]]) -> tuple[EdgeTerm, ...]:
+    """Terms from ``term_arrays``; ``sizes`` (rows, columns) of the projectors. Raises KeyError where one is missing."""
+    terms = []
+    for n, (rows, columns) in enumerate(sizes):
+        data, indices, indptr, camera, white = (arrays[f"edges-{n}-{name}"] for name in _PARTS)
+        matrix = sp.csr_matrix((data, indices, indptr), shape=(len(camera), rows * columns))
+        terms.append(EdgeTerm(matrix, camera, white))
+    return tuple(terms)
+
+
+def with_terms(model: LightTransport, terms: tuple[EdgeTerm, ...]) -> EdgedTransport:
+    """``model`` with what was measured at depth edges; one term a projector."""
+    return EdgedTransport(model.mixing, model.lit, model.per_weight, model.sizes, model, terms)
+
+
+def edge_term(model: LightTransport, n: int, measured: EdgeShares, white: FloatImage) -> EdgeTerm:
+    """The term of projector ``n``; it belongs to this very model.
+
+    ``measured``: without measurements the term is empty; ``white`` (rows, columns, 3) its white image, finite
+    """
+    rows, columns = measured.pattern.shape
+    lit = model.lit[n].ravel()[measured.camera]
+    camera, projector, share = (part[lit] for part in (measured.camera, measured.projector, measured.share))
+    difference = share - _modelled(model, n, measured.pattern, camera, projector, white)
+    difference = _shrunk(np.clip(difference, -MOST, MOST))
+    own, row = np.unique(camera, return_inverse=True)
+    # The rows' sums are taken back where light was measured, in proportion to it.
+    weight = np.maximum(share, 0)
+    sums, weights = (np.bincount(row, weights=part, minlength=own.size) for part in (difference, weight))
+    back = np.divide(sums, weights, out=np.zeros(own.size), where=weights > 0)
+    difference = np.where(weights[row] > 0, difference - back[row] * weight, 0).astype(np.float32)
+    matrix = sp.csr_matrix((difference, (row, projector)), shape=(own.size, rows * columns), dtype=np.float32)
+    return EdgeTerm(matrix, own.astype(np.int64), image_planes(white).reshape(3, -1)[:, own])
+
+
+def _modelled(
+    transport: LightTransport,
+    n: int,
+    pattern: npt.NDArray[np.int16],
+    camera: npt.NDArray[np.int32],
+    projector: npt.NDArray[np.int32],
+    white: FloatImage,
+) -> npt.NDArray[np.float32]:
+    """The model's share for each measurement: its own pictures of the dots, divided by white."""
+    found = np.zeros(camera.size, np.float32)
+    full = white.sum(axis=2).ravel()
+    shown_in = pattern.ravel()[projector]
+    for number in range(int(pattern.max(initial=-1)) + 1):
+        mine = shown_in == number
+        if mine.any():
+            lit = np.repeat((pattern == number).astype(np.float32)[..., None], 3, axis=2)
+            light = transport.project_one(n, lit).sum(axis=2).ravel()
+            found[mine] = light[camera[mine]] / full[camera[mine]]
+    return found
+
+
+def _shrunk(difference: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Without what is no more than noise, whose size the many small differences tell."""
+    if not difference.size:
+        return difference
+    noise = 1.4826 * float(np.median(np.abs(difference)))
+    power = difference.astype(np.float64) ** 2
+    return np.asarray(difference * power / (power + (NOISES * noise) ** 2 + 1e-12), np.float32)
