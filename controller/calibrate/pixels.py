@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import numpy.typing as npt
 
 from controller.arrays import FloatImage, Mask
 from controller.calibrate.blur import measure_blur
 from controller.calibrate.captures import Captures
 from controller.calibrate.decode import frame_margin_px
 from controller.calibrate.inversion import Inversion, invert_map
-from controller.calibrate.values import Correspondence, Metapixels
+from controller.calibrate.mosaic import find_mosaic
+from controller.calibrate.phase_map import make_phase_map
+from controller.calibrate.values import Correspondence, Metapixels, PhaseMap
 from controller.capture.patterns import PatternPlan
 
 
@@ -23,12 +28,43 @@ def fit_metapixels(captures: Captures, plan: PatternPlan, correspondence: Corres
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
+    return fit_pixels(captures, plan, correspondence).metapixels
+
+
+@dataclass(frozen=True, slots=True)
+class FittedPixels:
+    """One projector's metapixels, and its phase map for the light transport.
+
+    ``mosaic`` (2, 2): the colours of the camera's samples, as ``Calibration.mosaic``; None where they are not known
+    """
+
+    metapixels: Metapixels
+    phase_map: PhaseMap
+    mosaic: npt.NDArray[np.int64] | None
+
+
+def fit_pixels(captures: Captures, plan: PatternPlan, correspondence: Correspondence) -> FittedPixels:
+    """Metapixels and phase map from the same measurements; parameters and errors as ``fit_metapixels``."""
     inverse = invert_map(correspondence, plan.size_px)
     blur, blur_valid = measure_blur(captures, plan, correspondence)
     valid = inverse.valid & blur_valid
     covariance = carry_covariance(inverse.jacobian, blur)
     margin = int(np.ceil(frame_margin_px(correspondence.modulation[correspondence.valid])))
-    return _extend_to_frame(inverse, covariance, valid, margin)
+    metapixels = _extend_to_frame(inverse, covariance, valid, margin)
+    single = captures[plan.sinusoids("blur-x")[0].name]
+    mosaic = find_mosaic(single)
+    phase_map = make_phase_map(
+        correspondence, inverse, blur, blur_valid, light=_channels(single), interpolated=mosaic is not None
+    )
+    return FittedPixels(metapixels, phase_map, mosaic)
+
+
+def _channels(image: FloatImage) -> tuple[float, float, float]:
+    """Mean light of the three channels; alike for a grey image or none at all."""
+    if image.ndim != 3:
+        return 1.0, 1.0, 1.0
+    red, green, blue = (max(float(np.nanmean(image[..., c])), 0.0) for c in range(3))
+    return (red, green, blue) if red + green + blue > 0 else (1.0, 1.0, 1.0)
 
 
 def _extend_to_frame(inverse: Inversion, covariance: FloatImage, valid: Mask, margin: int) -> Metapixels:
