@@ -9,17 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.arrays import Float64, FloatImage, Mask, load_arrays, save_arrays
 from controller.calibrate.decode import decode
 from controller.calibrate.geometry import reconstruct
-from controller.calibrate.pixels import fit_metapixels
+from controller.calibrate.pixels import fit_pixels
 from controller.calibrate.radiometry import measure_radiometry
 from controller.calibrate.reconstruction import CameraPrior
 from controller.calibrate.values import (
     Calibration,
     Correspondence,
     Geometry,
+    PhaseMap,
     Pinhole,
     ProjectorCalibration,
     Radiometry,
@@ -31,7 +33,7 @@ from controller.errors import CalibrationError
 from controller.session import costs
 from controller.session.camera_steps import camera_step
 from controller.session.capturing import capture_steps, code_step
-from controller.session.modes import read_metapixels
+from controller.session.modes import mode_of, read_metapixels
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context, Step
 from controller.session.shots import Developed, Taken, read_index
@@ -142,7 +144,8 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
             remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
         )
     context.advance(0.4, "correspondences")
-    metapixels = fit_metapixels(captures, plan, correspondence)
+    fitted = fit_pixels(captures, plan, correspondence)
+    metapixels = fitted.metapixels
     path = context.folder / f"pixels-{projector.name}.npz"
     save_arrays(
         path,
@@ -153,6 +156,9 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
             "centre_px": metapixels.centre_px,
             "covariance_px2": metapixels.covariance_px2,
             "valid": metapixels.valid,
+            "shown_px": fitted.phase_map.projector_px,
+            "spread_px2": fitted.phase_map.spread_px2,
+            "mosaic": np.zeros((0, 2), np.int64) if fitted.mosaic is None else fitted.mosaic,
         },
     )
     valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
@@ -232,12 +238,22 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
         light = load_arrays(folder / f"radiometry-{name}.npz")
         metapixels = read_metapixels(folder, name)
         radiometry = Radiometry(light["response"], light["mixing"])
-        parts.append(ProjectorCalibration(name, metapixels, radiometry, np.nan_to_num(light["white"])))
+        phase_map, mosaic = read_phase_map(folder, name)
+        parts.append(ProjectorCalibration(name, metapixels, radiometry, np.nan_to_num(light["white"]), phase_map))
     black = np.nan_to_num(light["black"])
     camera_to_xyz: Float64 = light["camera_to_xyz"]
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)
-    return Calibration(tuple(parts), black, object_mask(parts), camera_to_xyz, camera_blur_px)
+    return Calibration(tuple(parts), black, object_mask(parts), camera_to_xyz, camera_blur_px, mosaic)
+
+
+def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.NDArray[np.int64] | None]:
+    """A projector's phase map and the camera's mosaic; None where the run has none, or its metapixels are from dots."""
+    pixels = load_arrays(folder / f"pixels-{projector}.npz")
+    if mode_of(folder) == "paper" or "spread_px2" not in pixels:
+        return None, None
+    mosaic = pixels["mosaic"] if pixels["mosaic"].size else None
+    return PhaseMap(pixels["shown_px"], pixels["spread_px2"]), mosaic
 
 
 def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:
