@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +19,7 @@ __all__ = [
     "Merged",
     "choose_brackets",
     "choose_exposure",
+    "least_level",
     "merge_brackets",
 ]
 
@@ -28,9 +30,15 @@ LIT_SHARE = 0.05
 TOO_DARK = 0.1
 """Below it a percentile says more of the noise than of the light."""
 BRACKET_CEILING = 0.8
-BRACKET_DARK = 0.2
-BRACKET_STEP = 8.0
-"""Three stops: neighbours overlap where both are well above noise."""
+DARK_SHARE = 0.01
+"""Of the brightest: what is darker than this is hardly lit, and its noise hardly matters."""
+DARK_PERCENTILE = 2
+RELATIVE_NOISE = 0.02
+"""Of one sample; a metapixel is a mean of many."""
+BEFORE_CLIPPING = 0.9
+"""Of full scale: up to here a longer exposure is surely not clipped."""
+FEWEST_WHITES = 2
+"""One exposure alone would tell neither the camera's noise nor whether it is linear."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +147,12 @@ class BracketChoice:
     settled: bool
 
 
+def least_level(noise: CameraNoise, relative: float = RELATIVE_NOISE) -> float:
+    """The full-scale value from which noise is below ``relative`` of it: (relative v)^2 = shot v + read^2."""
+    root = math.sqrt(noise.shot**2 + 4 * relative**2 * noise.read**2)
+    return (noise.shot + root) / (2 * relative**2)
+
+
 def choose_brackets(
     image: FloatImage,
     exposure_s: float,
@@ -146,24 +160,39 @@ def choose_brackets(
     *,
     lit: Mask | None = None,
     most: int = 4,
+    noise: CameraNoise | None = None,
 ) -> BracketChoice:
-    """Exposures that measure the brightest lit pixels unsaturated and the darkest well above noise.
+    """As few exposures as measure the brightest lit pixels unsaturated and the darkest well above noise; two at least.
 
-    ``image`` as in ``choose_exposure``, in which the bright end is measured; the dark end is the 2nd percentile of
-    the lit pixels and is brought to a fifth of full scale, as far as ``most`` exposures reach in steps of three stops.
+    The bright end is measured in ``image``, which is as in ``choose_exposure``. The dark end is the 2nd percentile of
+    the pixels above 1 % of the brightest (of those in ``lit``): the longest exposure brings it to ``least_level``.
+    Neighbours are as far apart as they may be: what is just clipped in one has to be at ``least_level`` in the one
+    before. With a 12-bit camera that is a factor of ten, and two exposures span almost two decades of light.
     """
+    noise = noise or CameraNoise()
     first = choose_exposure(image, exposure_s, available_s, lit=lit, target=BRACKET_CEILING / 1.07)
     if not first.settled:
         return BracketChoice((first.exposure_s,), False)
     exposures = _ascending(available_s)
-    grey = np.nanmax(np.where(np.isfinite(image), image, 1.0), axis=2)
-    chosen = grey[lit] if lit is not None else grey[grey > LIT_SHARE * max(_brightest(image, None) or 1.0, 1e-6)]
-    dark = float(np.percentile(chosen, 2)) if chosen.size else BRACKET_DARK
-    longest = _at_most(exposures, exposure_s * BRACKET_DARK / max(dark, 1e-4))
+    level = min(least_level(noise), BRACKET_CEILING / 2)
+    dark = _darkest(image, lit)
+    needed = level * exposure_s / max(dark, 1e-5) / first.exposure_s
+    step = BEFORE_CLIPPING / level
+    count = 1 if needed <= 1 else 1 + math.ceil(math.log(needed) / math.log(step) - 1e-6)
+    count = max(min(count, most), min(FEWEST_WHITES, most))
+    each = min(max(needed ** (1 / max(count - 1, 1)), 2.0), step)
     taken = [first.exposure_s]
-    while taken[-1] < longest and len(taken) < most:
-        taken.append(max(_at_most(exposures, min(taken[-1] * BRACKET_STEP, longest)), _next(exposures, taken[-1])))
+    while len(taken) < count and taken[-1] < exposures[-1]:
+        taken.append(max(_at_most(exposures, taken[-1] * each), _next(exposures, taken[-1])))
     return BracketChoice(tuple(taken), True)
+
+
+def _darkest(image: FloatImage, lit: Mask | None) -> float:
+    """2nd percentile of the grey of what is lit, in ``image``'s full scale."""
+    finite = np.where(np.isfinite(image), image, 1.0)
+    strongest, grey = finite.max(axis=2), finite.mean(axis=2)
+    chosen = lit if lit is not None else strongest > DARK_SHARE * max(_brightest(image, None) or 1.0, 1e-6)
+    return float(np.percentile(grey[chosen], DARK_PERCENTILE)) if np.any(chosen) else 1.0
 
 
 def _ascending(available_s: Sequence[float]) -> list[float]:
