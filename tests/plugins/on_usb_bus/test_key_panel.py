@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
 import pytest
 from StreamDeck.DeviceManager import DeviceManager
 
+from controller.session.keys import KeyService, key_picture, technicians_keys
+from controller.session.machine import Event, Machine, State
 from hal.conformance import ButtonPanelConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
@@ -132,3 +135,37 @@ def test_without_a_panel_the_error_says_what_to_check(bus: UsbBusProcess) -> Non
     with pytest.raises(DeviceGone) as caught:
         StreamDeckPanel(deadline=in_seconds(5))
     assert "udev" in caught.value.remedy
+
+
+def test_keys_of_the_panel_command_a_stage(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
+    machine, pressed = Machine(), queue.SimpleQueue[str]()
+    for event in (Event.START, Event.LAMPS_LIT, Event.LAMPS_STABLE):
+        machine.handle(event)
+
+    def command(name: str, event: Event) -> Callable[[], None]:
+        def press() -> None:
+            machine.handle(event)
+            pressed.put(name)
+
+        return press
+
+    commands = technicians_keys(
+        command("play", Event.PLAY), command("stop", Event.STOP), command("recalibrate", Event.RECALIBRATE)
+    )
+    service = KeyService(panel, commands, state=lambda: machine.state)
+    service.start()
+    try:
+        bus.call("keys", "press", 1)
+        assert pressed.get(timeout=10) == "play"
+        bus.call("keys", "press", 2)
+        assert pressed.get(timeout=10) == "stop"
+        bus.call("keys", "press", 3)  # not possible while the lamps cool
+        assert machine.state is State.COOLING
+        wanted = key_picture(commands[0], State.COOLING, (72, 72))
+        wait_until = time.monotonic() + 10
+        while np.abs(on_key(bus, 0).astype(int) - wanted).mean() > 8 and time.monotonic() < wait_until:
+            time.sleep(0.05)
+        assert np.abs(on_key(bus, 0).astype(int) - wanted).mean() < 8
+        assert pressed.empty()
+    finally:
+        service.stop()
