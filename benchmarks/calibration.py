@@ -21,11 +21,11 @@ from controller.calibrate.decode import decode
 from controller.calibrate.pixels import fit_metapixels
 from controller.capture.patterns import plan_patterns
 from controller.errors import VelaturaError
-from controller.session.calibrating import read_calibration
-from controller.session.shots import Developed, read_index
+from controller.session.calibrating import read_calibration, read_captures
+from controller.session.shots import Developed
 
 STAGES = {"small": 5, "medium": 3, "paper": 1}
-CODES = ("gray-", "phase-")
+CODES = ("gray-", "phase-", "blur-")
 
 
 @dataclass(slots=True)
@@ -72,7 +72,7 @@ def _judge(stage: CalibratedStage, found: Found) -> None:
 def _timed(run: Path, name: str) -> dict[str, float]:
     """Seconds of decoding and of the metapixels, compiled by the calibration before; photographs are read meanwhile."""
     light = load_arrays(run / f"radiometry-{name}.npz")
-    taken = {key.removeprefix(f"{name}-"): item for key, item in read_index(run, f"codes-{name}").items()}
+    taken = read_captures(run, name)
     ready: dict[str, FloatImage] = {"black": light["black"], "white": light["white"] + light["black"]}
     captures = Developed(taken, ready)
     rows, columns = load_arrays(run / f"pixels-{name}.npz")["valid"].shape
@@ -110,7 +110,9 @@ def _rows(found: Found, stages: int, *, paper: bool) -> list[Row]:
     def at_paper(goal: float) -> float | None:
         return goal if paper else None
 
-    worst("captures a projector", "captures", at_paper(36), unit="", more="brackets, ramp and random pattern included")
+    worst(
+        "captures a projector", "captures", at_paper(36), unit="", more="brackets, mosaics and random pattern included"
+    )
     worst("correspondences, in focus, head-on", "map in focus px", 0.05, unit="projector px rms")
     worst("correspondences, all", "map px", None, unit="projector px rms", more="without those off by more than 1 px")
     worst("correspondences off by more than 1 px", "map gross", None, unit="%", scale=100)

@@ -1,6 +1,7 @@
-"""Gray code and phase shift to correspondences: where on the projector's image each camera pixel looks.
+"""Gray code and sinusoids to correspondences: where on the projector's image each camera pixel looks.
 
-Gray-code cells of 8 px tell which period of the 16-px sinusoid a camera pixel is in, the sinusoid's phase where in it.
+Gray-code cells of 12 px tell which period of the 24-px sinusoid a camera pixel is in, that sinusoid's phase which
+fringe of the fine ones, and these where in it. Photographs are asked for one at a time and added up at once.
 """
 
 from __future__ import annotations
@@ -8,134 +9,198 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
+import numpy.typing as npt
 
 from controller.arrays import FloatImage, Mask
 from controller.calibrate.captures import Captures, grey
-from controller.calibrate.smoothing import fit_planes
+from controller.calibrate.fringes import CODED, CONTRADICTED, FINE, WAVES, locate_pixel
+from controller.calibrate.gray import decode_cells
+from controller.calibrate.smoothing import correct_for_paint, fit_planes
 from controller.calibrate.values import Correspondence
-from controller.capture.patterns import CELL_PX, PERIOD_PX, PatternPlan
+from controller.capture.patterns import BLUR_FREQUENCIES, CELL_PX, PERIOD_PX, PHASE_STEPS, PatternPlan
+from controller.compiled import compiled
 from controller.errors import CalibrationError
 
 LEAST_MODULATION = 0.12
 MOST_MODULATION = 1.4
 DARKEST_SHARE = 0.004
 """Of the brightest amplitude (99th percentile): below it, light from elsewhere outweighs the projector's own."""
-WORST_NOISE_PX = 0.35
-"""One camera pixel's noise, before the plane fit."""
-WEAK_BIT = 0.25
-CELL_SLACK_PX = 1.5
+WORST_NOISE_PX = 0.6
+"""One camera pixel's noise by the coarse phase alone; a fringe is 5 px wide."""
 LEAST_CONSISTENT = 0.6
 LEAST_STEADY = 0.75
+LEAST_UNCONTRADICTED = 0.5
 BRIGHT_SHARE = 0.1
 NOISE_WINDOW = (7, 7)
 FEWEST_PIXELS = 100
+FINE_TO_COARSE = (BLUR_FREQUENCIES["x"][0] * PERIOD_PX) ** -2
+"""A Gaussian blur that lowers the fine contrast to M lowers the coarse one to M to the power of this."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Axis:
-    """One coordinate: its position, NaN where unknown; the sinusoid's amplitude and mean; squared noise of both."""
+class _Sums:
+    """All sinusoids of a projector, added up.
 
-    position_px: FloatImage
-    amplitude: FloatImage
+    ``waves`` (10, rows, columns): cosine and sine amplitude of each of WAVES; ``mean`` (rows, columns) of the coarse
+    ones' photographs; ``noise`` (rows, columns): standard deviation of one photograph around each pixel
+    """
+
+    waves: FloatImage
     mean: FloatImage
-    noise_squared: FloatImage
-    consistent: Mask
+    noise: FloatImage
 
 
-def decode(captures: Captures, plan: PatternPlan, *, refine: bool = True) -> Correspondence:
-    """Decode one projector's Gray-code and phase captures.
+def decode(
+    captures: Captures, plan: PatternPlan, *, refine: bool = True, camera_blur_px: float = 0.0
+) -> Correspondence:
+    """Decode one projector's Gray-code and sinusoid captures.
 
     Parameters
     ----------
-    captures : linear photographs by pattern name, (rows, columns) or (rows, columns, 3); needs ``black``, ``gray-*``
-        and ``phase-*``
+    captures : linear photographs by pattern name, (rows, columns) or (rows, columns, 3); needs ``black``, ``gray-*``,
+        ``phase-*`` and ``blur-*``; each is asked for once and not kept
     refine : replace each pixel by the plane through its neighbours on the same surface, and drop pixels that are
         not on it, such as those that see two surfaces at once
+    camera_blur_px : standard deviation of the camera's own blur, camera px; where known, positions are freed of the
+        pull towards the paler paint within a camera pixel's reach
 
     Returns
     -------
-    Correspondence; nothing is valid where the projector casts no light, nor at the border of its frame
+    Correspondence; nothing is valid where the projector casts no light, nor at the border of its frame. The modulation
+    is that of the coarse sinusoid, worked out from the fine one's where that one can be seen.
 
     Raises
     ------
     CalibrationError("capture-missing"), CalibrationError("capture-shape-wrong")
-    CalibrationError("captures-inconsistent")  code and phase contradict each other: photographs in the wrong order
+    CalibrationError("captures-inconsistent")  code and phases contradict each other: photographs in the wrong order
     """
     black = grey(captures, "black")
-    axes = tuple(_decode_axis(captures, plan, axis, black) for axis in range(2))
-    white = (axes[0].mean + axes[1].mean) - 2 * black  # two means of half the light each
-    amplitude = np.minimum(axes[0].amplitude, axes[1].amplitude)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        modulation = np.sqrt(axes[0].amplitude * axes[1].amplitude) / (0.5 * white)
-        lit = _lit(axes, amplitude, modulation)
-    consistent = axes[0].consistent & axes[1].consistent
-    bright = _bright(white, axes)
-    _check_order(lit | bright, lit & consistent, axes)
-    position = np.stack([axis.position_px for axis in axes], axis=2)
-    valid = lit & consistent & _inside(position, plan.size_px, 0.0)
+    sums = _add_up(captures, plan, black.shape)
+    half = sums.mean - black
+    axes = tuple(decode_cells(captures, plan, axis, sums.mean, half) for axis in range(2))
+    lit = _lit(sums, half)
+    position = np.full((*black.shape, 2), np.nan, np.float32)
+    modulation, state = np.zeros(black.shape, np.float32), np.zeros(black.shape, np.uint8)
+    wanted = (lit | _bright(sums, half)) & axes[0].sure & axes[1].sure
+    _locate(sums.waves, axes[0].cell, axes[1].cell, wanted, half, sums.noise, position, modulation, state)
+    _check_order(lit | _bright(sums, half), lit, state, position)
+    valid = lit & ((state & CODED) > 0) & ((state & CONTRADICTED) == 0)
+    del sums, axes
+    valid &= _inside(position, plan.size_px, 0.0)
     valid &= _inside(position, plan.size_px, frame_margin_px(modulation[valid]))
+    if camera_blur_px > 0:
+        position = correct_for_paint(position, valid, half, camera_blur_px**2)
     if refine:
         position, valid = fit_planes(position, valid)
     position[~valid] = np.nan
     return Correspondence(position, np.where(valid, modulation, 0).astype(np.float32), valid)
 
 
-def _decode_axis(captures: Captures, plan: PatternPlan, axis: int, black: FloatImage) -> _Axis:
-    shape = black.shape
-    steps: list[FloatImage] = [
-        grey(captures, pattern.name, shape) for pattern in plan.sinusoids(("phase-x", "phase-y")[axis])
-    ]
-    cosine, sine = (steps[0] - steps[2]) / 2, (steps[1] - steps[3]) / 2
-    mean = np.asarray((steps[0] + steps[1] + steps[2] + steps[3]) / 4, np.float32)
-    # four steps, three unknowns: what is left over is noise
-    noise_squared = np.asarray(((steps[0] + steps[2] - steps[1] - steps[3]) / 2) ** 2, np.float32)
-    del steps
-    amplitude = np.hypot(cosine, sine)
-    within_px = np.arctan2(sine, cosine) * np.float32(PERIOD_PX / (2 * np.pi))
-    cell, weak = _decode_gray(captures, plan, axis, mean, black)
-    middle_px = cell * np.float32(CELL_PX) + np.float32((CELL_PX - 1) / 2)
-    position = within_px + PERIOD_PX * np.round((middle_px - within_px) / PERIOD_PX)
-    consistent = (np.abs(position - middle_px) <= CELL_PX / 2 + CELL_SLACK_PX) & (weak <= 1)
-    return _Axis(position.astype(np.float32), amplitude, mean, noise_squared, consistent)
+def _add_up(captures: Captures, plan: PatternPlan, shape: tuple[int, ...]) -> _Sums:
+    waves = np.zeros((2 * len(WAVES), *shape), np.float32)
+    first, total, square = (np.zeros(shape, np.float32) for _ in range(3))
+    mean = np.zeros(shape, np.float32)
+    for number, prefix in enumerate(WAVES):
+        light = np.zeros(shape, np.float32)
+        steps = plan.sinusoids(prefix)
+        for pattern in steps:
+            image = grey(captures, pattern.name, shape)
+            cosine, sine = np.cos(pattern.phase_rad), np.sin(pattern.phase_rad)
+            _add(image, cosine, sine, len(steps), waves[2 * number], waves[2 * number + 1], light)
+        if number == 0:
+            first[:] = light
+        if number < 2:
+            mean += light / 2
+        # every sinusoid has the same mean: what differs is noise
+        _add_difference(light, first, total, square)
+    count = len(WAVES)
+    variance = np.maximum(square - total * total / count, 0) * np.float32(PHASE_STEPS / (count - 1))
+    noise = np.sqrt(np.maximum(cv2.boxFilter(variance, -1, NOISE_WINDOW), 0))
+    return _Sums(waves, mean, np.asarray(noise, np.float32))
 
 
-def _decode_gray(
-    captures: Captures, plan: PatternPlan, axis: int, mean: FloatImage, black: FloatImage
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int32]], np.ndarray[tuple[int, ...], np.dtype[np.uint8]]]:
-    """The cell of each camera pixel, and how many bits were near the threshold (at most one is: at a cell's border)."""
-    cell = np.zeros(black.shape, np.int32)
-    bit = np.zeros(black.shape, np.bool_)
-    weak = np.zeros(black.shape, np.uint8)
-    half = np.abs(mean - black)
-    for pattern in plan.gray(axis):
-        above = grey(captures, pattern.name, black.shape) - mean
-        bit ^= above > 0
-        cell = (cell << 1) | bit
-        weak += ~(np.abs(above) >= WEAK_BIT * half)
-    return cell, weak
+@compiled(parallel=True)
+def _add(
+    image: FloatImage,
+    cosine: float,
+    sine: float,
+    steps: int,
+    along: FloatImage,
+    across: FloatImage,
+    light: FloatImage,
+) -> None:
+    a, b, one = np.float32(2 * cosine / steps), np.float32(2 * sine / steps), np.float32(1 / steps)
+    for row in numba.prange(image.shape[0]):
+        for column in range(image.shape[1]):
+            value = image[row, column]
+            along[row, column] += a * value
+            across[row, column] += b * value
+            light[row, column] += one * value
 
 
-def _noise(axes: tuple[_Axis, ...]) -> FloatImage:
-    """Standard deviation of one photograph's value around each camera pixel."""
-    both = np.nan_to_num(axes[0].noise_squared + axes[1].noise_squared) / 2
-    return np.asarray(np.sqrt(np.maximum(cv2.boxFilter(both, -1, NOISE_WINDOW), 0)), np.float32)
+@compiled(parallel=True)
+def _add_difference(light: FloatImage, first: FloatImage, total: FloatImage, square: FloatImage) -> None:
+    for row in numba.prange(light.shape[0]):
+        for column in range(light.shape[1]):
+            difference = light[row, column] - first[row, column]
+            if np.isfinite(difference):
+                total[row, column] += difference
+                square[row, column] += difference * difference
 
 
-def _lit(axes: tuple[_Axis, ...], amplitude: FloatImage, modulation: FloatImage) -> Mask:
+@compiled(parallel=True)
+def _locate(
+    waves: FloatImage,
+    cell_x: npt.NDArray[np.int32],
+    cell_y: npt.NDArray[np.int32],
+    wanted: Mask,
+    half: FloatImage,
+    noise: FloatImage,
+    position: FloatImage,
+    modulation: FloatImage,
+    state: npt.NDArray[np.uint8],
+) -> None:
+    rows, columns = wanted.shape
+    for row in numba.prange(rows):
+        work = np.zeros((5, 3))
+        for column in range(columns):
+            if not wanted[row, column]:
+                continue
+            x, y, light = cell_x[row, column], cell_y[row, column], half[row, column]
+            found = locate_pixel(waves, row, column, x, y, float(CELL_PX), light, noise[row, column], work)
+            state[row, column] = found
+            position[row, column, 0], position[row, column, 1] = work[0, 0], work[0, 1]
+            first = 4 if found & FINE else 0
+            strong = np.hypot(waves[first, row, column], waves[first + 1, row, column])
+            strong *= np.hypot(waves[first + 2, row, column], waves[first + 3, row, column])
+            contrast = np.sqrt(strong) / light
+            modulation[row, column] = min(contrast, 1.0) ** FINE_TO_COARSE if found & FINE else contrast
+
+
+def _coarse_amplitude(sums: _Sums) -> FloatImage:
+    """The smaller of both axes'."""
+    axes = [np.hypot(sums.waves[2 * axis], sums.waves[2 * axis + 1]) for axis in range(2)]
+    return np.asarray(np.minimum(axes[0], axes[1]), np.float32)
+
+
+def _lit(sums: _Sums, half: FloatImage) -> Mask:
     """Where the sinusoids stand out of the noise and of stray light. NaN anywhere is not lit."""
-    noise_px = _noise(axes) / (np.sqrt(2) * amplitude) * (PERIOD_PX / (2 * np.pi))
-    lit = (amplitude > DARKEST_SHARE * _brightest(amplitude)) & (noise_px < WORST_NOISE_PX)
-    return np.asarray(lit & (modulation > LEAST_MODULATION) & (modulation < MOST_MODULATION))
+    amplitude = _coarse_amplitude(sums)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        noise_px = sums.noise / amplitude * np.float32(np.sqrt(2 / PHASE_STEPS) * PERIOD_PX / (2 * np.pi))
+        lit = (amplitude > DARKEST_SHARE * _brightest(amplitude)) & (noise_px < WORST_NOISE_PX)
+        return np.asarray(lit & (amplitude > LEAST_MODULATION * half) & (amplitude < MOST_MODULATION * half))
 
 
-def _bright(white: FloatImage, axes: tuple[_Axis, ...]) -> Mask:
+def _bright(sums: _Sums, half: FloatImage) -> Mask:
     """Where this projector plainly casts light, whether or not the phases make sense.
 
     Phases in the wrong order look like noise as strong as the pattern; real noise vanishes in a neighbourhood's mean.
     """
-    around = cv2.boxFilter(np.nan_to_num(white), -1, NOISE_WINDOW)
-    return np.asarray((around > BRIGHT_SHARE * _brightest(white)) & (around > _noise(axes)) & np.isfinite(white))
+    around = 2 * cv2.boxFilter(np.nan_to_num(half), -1, NOISE_WINDOW)
+    return np.asarray((around > BRIGHT_SHARE * _brightest(2 * half)) & (around > sums.noise) & np.isfinite(half))
 
 
 def _brightest(image: FloatImage) -> float:
@@ -143,18 +208,21 @@ def _brightest(image: FloatImage) -> float:
     return float(np.percentile(finite[:: max(1, finite.size // 100_000)], 99)) if finite.size else 0.0
 
 
-def _check_order(seen: Mask, agreeing: Mask, axes: tuple[_Axis, ...]) -> None:
-    """Refuse captures that contradict each other: code against phase, or a code that jumps at every other cell."""
+def _check_order(seen: Mask, lit: Mask, state: npt.NDArray[np.uint8], position: FloatImage) -> None:
+    """Refuse captures that contradict each other: code against phase, fine phases against coarse, jumping codes."""
     pixels = int(np.count_nonzero(seen))
     if pixels < FEWEST_PIXELS:
         return
-    share = np.count_nonzero(agreeing) / pixels
-    steady = min(_steady_share(axis.position_px, agreeing) for axis in axes)
-    if share < LEAST_CONSISTENT or steady < LEAST_STEADY:
+    agreeing = lit & ((state & CODED) > 0)
+    agree = int(np.count_nonzero(agreeing))
+    contradicted = int(np.count_nonzero(agreeing & ((state & CONTRADICTED) > 0)))
+    share, uncontradicted = agree / pixels, 1 - contradicted / max(agree, 1)
+    steady = min(_steady_share(position[:, :, axis], agreeing) for axis in range(2))
+    if share < LEAST_CONSISTENT or steady < LEAST_STEADY or uncontradicted < LEAST_UNCONTRADICTED:
         raise CalibrationError(
             "captures-inconsistent",
-            what=f"Gray code and phase agree at {100 * share:.0f} % of the lit camera pixels, and {100 * steady:.0f} % "
-            "of the steps from cell to cell go to the next one.",
+            what=f"Gray code and phase agree at {100 * share:.0f} % of the lit camera pixels, coarse and fine phases "
+            f"at {100 * uncontradicted:.0f} %, and {100 * steady:.0f} % of the steps from cell to cell go to the next.",
             remedy="A photograph shows another pattern than it should, or something moved: check the delay between "
             "display and camera and that nothing moves, and take the photographs again.",
         )

@@ -1,47 +1,63 @@
-"""A projector's response and colour mixing from flat pictures (idea of Raij 2003), and whether the camera is linear."""
+"""A projector's response and colour mixing from mosaics (idea of Raij 2003), and whether the camera is linear.
+
+Every tile of a mosaic shows a triple of device values of its own, so that two photographs hold some hundreds to
+thousands of measurements: M r(levels), with M the mixing and r the three responses, divided by white. Both are fitted
+together, each with the other held, until neither changes; tiles that do not fit are left out.
+"""
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicSpline
 
-from controller.arrays import Float64, FloatImage, Mask
+from controller.arrays import Float64, FloatImage
 from controller.calibrate.captures import Captures, coloured
+from controller.calibrate.tiles import Tiles, measure_tiles
 from controller.calibrate.values import Radiometry
+from controller.capture.patterns import PatternPlan
 from controller.errors import CalibrationError
 
-PRIMARIES = ("red", "green", "blue")
-LIT_SHARE = 0.15
-"""Of the 99th percentile of white, in every camera channel: darker pixels add noise and stray light."""
+FEWEST_TILES = 60
 FEWEST_PIXELS = 50
-FEWEST_LEVELS = 4
-MOST_PIXELS = 200_000
+KNOTS = 16
+FIRST_GAMMA = 2.2
+ROUNDS = 40
+ROUGH_ROUNDS = 5
+"""In which no tile is left out, and nothing counts as stray light yet."""
+CONVERGED = 1e-5
+OUTLIER = 3.0
+WORST_SCATTER = 0.05
 WORST_ADDITIVITY = 0.08
+LEAST_INDEPENDENCE = 0.01
+MOST_STRAY = 0.3
+STIFFNESS = 1e-3
+WORST_FALL = 0.03
 
 
 @dataclass(frozen=True, slots=True)
 class RadiometryReport:
     """What the measurement was worth.
 
-    ``pixels`` used; ``additivity`` largest relative difference between white and red + green + blue over the camera's
-    channels; ``scatter`` median absolute deviation of the ramp's ratios between pixels, of full scale
+    ``pixels`` camera pixels used; ``tiles`` that were measured, of all mosaics together; ``scatter`` median absolute
+    deviation of the tiles from the fit, of full scale; ``stray`` share of a tile's white that comes from other tiles;
+    ``additivity`` largest relative difference between white and what the tiles say of it, over the camera's channels
     """
 
     pixels: int
-    additivity: float
+    tiles: int
     scatter: float
+    stray: float
+    additivity: float
 
 
-def measure_radiometry(captures: Captures) -> tuple[Radiometry, RadiometryReport]:
+def measure_radiometry(captures: Captures, plan: PatternPlan) -> tuple[Radiometry, RadiometryReport]:
     """Response and mixing of one projector.
 
     Parameters
     ----------
-    captures : linear RGB photographs in one unit: ``black white red green blue`` and ``ramp-NNN`` with NNN the
-        device value, at least four of them; NaN where saturated
+    captures : linear RGB photographs in one unit: ``black white``, ``gray-*`` and ``mosaic-*``; NaN where saturated
 
     Returns
     -------
@@ -50,121 +66,167 @@ def measure_radiometry(captures: Captures) -> tuple[Radiometry, RadiometryReport
     Raises
     ------
     CalibrationError("capture-missing"), CalibrationError("capture-shape-wrong")
-    CalibrationError("projector-dark")  too few pixels are lit by this projector
-    CalibrationError("colours-do-not-add")  white is not the sum of red, green and blue
+    CalibrationError("projector-dark")  too few tiles of the mosaics are seen
+    CalibrationError("colours-do-not-add")  the tiles do not follow from three responses and a mixing
     CalibrationError("colours-alike")  the primaries can't be told apart
-    CalibrationError("response-falls")  a higher value gives less light by far more than noise
     """
     black = coloured(captures, "black")
-    white = coloured(captures, "white", black.shape[:2]) - black
-    lit = _lit(white)
-    black_lit, white_lit = black[lit], white[lit]
-    columns = [_ratio(captures, name, lit, black_lit, white_lit)[0] for name in PRIMARIES]
-    mixing, additivity = _mixing(np.stack(columns, axis=1))
-    levels = ramp_levels(captures)
-    light, scatter = np.empty((len(levels), 3)), 0.0
-    for index, level in enumerate(levels):
-        seen, spread = _ratio(captures, f"ramp-{level:03d}", lit, black_lit, white_lit)
-        light[index] = np.linalg.solve(mixing, seen)
-        scatter = max(scatter, spread)
-    response = np.stack([response_curve(np.array(levels), light[:, channel]) for channel in range(3)])
-    return Radiometry(response, mixing), RadiometryReport(len(white_lit), additivity, scatter)
-
-
-def ramp_levels(captures: Captures) -> list[int]:
-    """Device values of the ramp among the captures' names, rising. CalibrationError("capture-missing") below four."""
-    levels = sorted(int(name[5:]) for name in captures if re.fullmatch(r"ramp-\d{3}", name))
-    levels = [level for level in levels if 0 < level < 255]
-    if len(levels) < FEWEST_LEVELS:
-        raise CalibrationError(
-            "capture-missing",
-            what=f"Only {len(levels)} photographs of the grey ramp are there; {FEWEST_LEVELS} are needed.",
-            remedy="Start the calibration again; it takes only the photographs that are missing.",
-        )
-    return levels
-
-
-def _lit(white: FloatImage) -> Mask:
-    bright = np.nanpercentile(white, 99, axis=(0, 1)) if np.isfinite(white).any() else np.zeros(3)
-    lit = np.all(white > LIT_SHARE * bright, axis=2) & np.all(bright > 0)
-    pixels = int(np.count_nonzero(lit))
-    if pixels < FEWEST_PIXELS:
+    tiles = measure_tiles(captures, plan, black, coloured(captures, "white", black.shape[:2]) - black)
+    if tiles.ratio.shape[0] < FEWEST_TILES:
         raise CalibrationError(
             "projector-dark",
-            what=f"Only {pixels} camera pixels see this projector's white.",
+            what=f"Only {tiles.ratio.shape[0]} tiles of the mosaics are seen lit by this projector.",
             remedy="Check that its lamp is lit, its shutter open and its picture on the object, then calibrate again.",
         )
-    every = -(-pixels // MOST_PIXELS)
-    chosen = np.zeros(lit.size, np.bool_)
-    chosen[np.flatnonzero(lit)[::every]] = True
-    return chosen.reshape(lit.shape)
-
-
-def _ratio(captures: Captures, name: str, lit: Mask, black: FloatImage, white: FloatImage) -> tuple[Float64, float]:
-    """(3,) light of a flat picture per camera channel, white being 1, and how much the pixels differ."""
-    seen = coloured(captures, name, lit.shape)[lit] - black
-    ratios, spreads = np.zeros(3), np.zeros(3)
-    for channel in range(3):
-        finite = np.isfinite(seen[:, channel]) & np.isfinite(white[:, channel])
-        of, over = seen[finite, channel].astype(np.float64), white[finite, channel].astype(np.float64)
-        if of.size < FEWEST_PIXELS:
-            raise CalibrationError(
-                "projector-dark",
-                what=f"Too few camera pixels measured pattern {name}.",
-                remedy="Choose an exposure at which white is not saturated, and calibrate again.",
-            )
-        ratio = of / over
-        middle = np.median(ratio)
-        spreads[channel] = 1.4826 * np.median(np.abs(ratio - middle))
-        kept = np.abs(ratio - middle) <= 3 * spreads[channel] + 1e-9
-        # shot noise grows with the light: the plain ratio of sums is then the best weighting
-        ratios[channel] = of[kept].sum() / over[kept].sum()
-    return ratios, float(spreads.max())
-
-
-def _mixing(columns: Float64) -> tuple[Float64, float]:
-    sums = columns.sum(axis=1)
-    additivity = float(np.max(np.abs(sums - 1)))
-    if additivity > WORST_ADDITIVITY:
+    fit = _fit(tiles)
+    scatter = float(1.4826 * np.median(np.abs(fit.residual)))
+    if scatter > WORST_SCATTER or fit.fall > WORST_FALL or fit.additivity > WORST_ADDITIVITY:
         raise CalibrationError(
             "colours-do-not-add",
-            what=f"White differs by {100 * additivity:.0f} % from red, green and blue together.",
-            remedy="Switch off the projector's brilliant-colour, white-boost and dynamic modes, and calibrate again.",
+            what=f"The mosaics' colours differ by {100 * scatter:.0f} % from any three responses and their sums, and "
+            f"white by {100 * fit.additivity:.0f} %.",
+            remedy="Switch off the projector's brilliant-colour, white-boost and dynamic modes, check that every "
+            "photograph shows the pattern it should, and calibrate again.",
         )
-    mixing = columns / sums[:, None]
-    if np.linalg.cond(mixing) > 100:
+    stray = float(fit.stray.mean())
+    report = RadiometryReport(tiles.pixels, tiles.ratio.shape[0], scatter, stray, fit.additivity)
+    return Radiometry(fit.response, fit.mixing), report
+
+
+@dataclass(slots=True)
+class _Fit:
+    """``response`` (3, 256), ``mixing`` (3, 3), ``stray`` (3,), ``residual`` (tiles, 3); ``fall``: how far r fell."""
+
+    response: Float64
+    mixing: Float64
+    stray: Float64
+    residual: Float64
+    fall: float = 0.0
+    additivity: float = 0.0
+
+
+def _fit(tiles: Tiles) -> _Fit:
+    """Mixing with the responses held, responses with the mixing held, weights anew, until nothing changes."""
+    x = np.arange(256) / 255
+    gamma = np.full(3, FIRST_GAMMA)
+    fit = _Fit(np.stack([x**FIRST_GAMMA] * 3), np.eye(3), np.zeros(3), np.zeros_like(tiles.ratio))
+    weight = tiles.weight.copy()
+    for number in range(ROUNDS):
+        before = fit.response.copy()
+        rough = number < ROUGH_ROUNDS
+        _fit_mixing(tiles, weight, fit, with_stray=not rough)
+        _fit_responses(tiles, weight, gamma, fit)
+        if rough:
+            gamma = _gamma_of(fit.response)
+            continue
+        weight = tiles.weight * _kept(fit.residual)
+        if np.max(np.abs(fit.response - before)) < CONVERGED:
+            break
+    # white itself takes no part in this: what the tiles say that white should be
+    white = _solve(tiles, weight, gamma, fit, white_known=False)[:, -1]
+    fit.additivity = float(np.max(np.abs(fit.mixing @ white - 1)))
+    return fit
+
+
+def _shown(tiles: Tiles, response: Float64) -> Float64:
+    """(tiles, 3) light of each tile's levels per projector channel."""
+    return np.stack([response[channel][tiles.levels[:, channel]] for channel in range(3)], axis=1)
+
+
+def _fit_mixing(tiles: Tiles, weight: Float64, fit: _Fit, *, with_stray: bool) -> None:
+    """Per camera channel: ratio = (1 - e) m . r + e mean(m . r), the three of m adding up to 1."""
+    shown = _shown(tiles, fit.response)
+    mean = shown.mean(axis=0)
+    for channel in range(3):
+        root = np.sqrt(weight[:, channel])
+        seen = tiles.ratio[:, channel]
+        around = float(fit.mixing[channel] @ mean)
+        direct = (seen - fit.stray[channel] * around) / (1 - fit.stray[channel])
+        # the third share is what the two others leave
+        equations = (shown[:, :2] - shown[:, 2:]) * root[:, None]
+        shares = np.linalg.lstsq(equations, (direct - shown[:, 2]) * root, rcond=None)[0]
+        fit.mixing[channel] = [*shares, 1 - shares.sum()]
+        own = shown @ fit.mixing[channel]
+        towards = around - own
+        stray = np.sum(weight[:, channel] * towards * (seen - own)) / np.sum(weight[:, channel] * towards**2)
+        fit.stray[channel] = np.clip(stray, 0.0, MOST_STRAY) if with_stray else 0.0
+    if not np.all(np.isfinite(fit.mixing)) or abs(np.linalg.det(fit.mixing)) < LEAST_INDEPENDENCE:
         raise CalibrationError(
             "colours-alike",
             what="The camera can't tell the projector's red, green and blue apart.",
             remedy="Check the colour mode of camera and projector and that every colour's picture was shown.",
         )
-    return np.asarray(mixing), additivity
 
 
-def response_curve(levels: np.ndarray[tuple[int, ...], np.dtype[np.int64]], light: Float64) -> Float64:
-    """(256,) light of every device value through the measured ones, monotone, 0 at 0 and 1 at 255.
+def _fit_responses(tiles: Tiles, weight: Float64, gamma: Float64, fit: _Fit) -> None:
+    around = fit.mixing @ _shown(tiles, fit.response).mean(axis=0)
+    curves = _solve(tiles, weight, gamma, fit, white_known=True)
+    fit.fall = float(np.max(np.maximum.accumulate(curves, axis=1) - curves))
+    fit.response = np.stack([_rising(curve) for curve in curves])
+    own = _shown(tiles, fit.response) @ fit.mixing.T
+    fit.residual = tiles.ratio - (own + fit.stray * (around - own))
 
-    Interpolated over a power of the device value that makes the curve nearly straight, so that few levels suffice.
+
+def _solve(tiles: Tiles, weight: Float64, gamma: Float64, fit: _Fit, *, white_known: bool) -> Float64:
+    """(3, 256): all three curves at once, splines over a power of the device value.
+
+    They are 0 at black, and 1 at white if ``white_known``.
     """
-    known = np.concatenate([[0.0], light, [1.0]])
-    drop = float(np.max(np.maximum.accumulate(known) - known))
-    if drop > 0.05 or not np.all(np.isfinite(known)):
-        raise CalibrationError(
-            "response-falls",
-            what=f"A brighter device value gives less light (by {100 * drop:.0f} % of full scale).",
-            remedy="Check that the photographs show the patterns they should and that the light is steady.",
-        )
-    known = _rising(known)
-    at = np.concatenate([[0.0], levels / 255, [1.0]])
-    middle = (known > 0.02) & (known < 0.98)
-    gamma = float(np.clip(np.median(np.log(known[middle]) / np.log(at[middle])), 0.3, 4)) if middle.any() else 1.0
-    curve = PchipInterpolator(at**gamma, known)((np.arange(256) / 255) ** gamma)
-    curve[0], curve[-1] = 0.0, 1.0
-    return np.asarray(np.maximum.accumulate(np.clip(curve, 0, 1)), np.float64)
+    bases = [_basis(power) for power in gamma]
+    last = KNOTS - 1 if white_known else KNOTS
+    fixed = np.zeros(KNOTS)
+    fixed[-1] = float(white_known)
+    around = fit.mixing @ _shown(tiles, fit.response).mean(axis=0)
+    equations, values = [], []
+    for channel in range(3):
+        root = np.sqrt(weight[:, channel])
+        direct = (tiles.ratio[:, channel] - fit.stray[channel] * around[channel]) / (1 - fit.stray[channel])
+        parts = []
+        for primary, basis in enumerate(bases):
+            rows = basis[tiles.levels[:, primary]] * fit.mixing[channel, primary]
+            direct = direct - rows @ fixed
+            parts.append(rows[:, 1:last])
+        equations.append(np.concatenate(parts, axis=1) * root[:, None])
+        values.append(direct * root)
+    # where no tile shows a level, the curve is as straight as it can be over that power
+    bend = np.diff(np.eye(KNOTS), 2, axis=0) * np.sqrt(STIFFNESS * weight.sum())
+    for primary in range(3):
+        rows = np.zeros((len(bend), 3 * (last - 1)))
+        rows[:, primary * (last - 1) : (primary + 1) * (last - 1)] = bend[:, 1:last]
+        equations.append(rows)
+        values.append(-bend @ fixed)
+    every, wanted = np.concatenate(equations), np.concatenate(values)
+    solved = np.linalg.solve(every.T @ every, every.T @ wanted).reshape(3, last - 1)
+    knots = np.tile(fixed, (3, 1))
+    knots[:, 1:last] = solved
+    return np.stack([basis @ own for basis, own in zip(bases, knots, strict=True)])
+
+
+def _basis(power: float) -> Float64:
+    """(256, KNOTS): the natural cubic spline through values at knots equally far apart in x^power."""
+    at = (np.arange(256) / 255) ** power
+    return np.asarray(CubicSpline(np.linspace(0, 1, KNOTS), np.eye(KNOTS), bc_type="natural")(at), np.float64)
+
+
+def _gamma_of(response: Float64) -> Float64:
+    """The power that each response is nearest to."""
+    x = np.arange(256) / 255
+    found = np.full(3, FIRST_GAMMA)
+    for channel, curve in enumerate(response):
+        middle = (curve > 0.02) & (curve < 0.98)
+        if middle.any():
+            found[channel] = np.clip(np.median(np.log(curve[middle]) / np.log(x[middle])), 0.5, 4)
+    return found
+
+
+def _kept(residual: Float64) -> Float64:
+    """Tukey's weights: 1 where a tile fits, 0 where it is off by several times the usual."""
+    scale = OUTLIER * 1.4826 * np.median(np.abs(residual), axis=0) + 1e-6
+    return np.asarray(np.clip(1 - (residual / (1.6 * scale)) ** 2, 0, None) ** 2)
 
 
 def _rising(values: Float64) -> Float64:
-    """Pool adjacent violators: the closest sequence that never falls; its ends stay 0 and 1."""
+    """Pool adjacent violators: the closest sequence that never falls, from 0 to 1."""
     groups: list[tuple[float, int]] = []
     for value in np.clip(values, 0, 1):
         mean, size = float(value), 1

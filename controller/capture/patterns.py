@@ -1,8 +1,9 @@
 """What is shown to one projector during a calibration: a plan of named patterns, and their images.
 
 Everything is a pure function of the projector's size. Cells and phases fit together so that no camera pixel is
-ambiguous: the Gray code counts cells of half the phase's period, so a pixel whose cell is read one off, which
-happens only at the border of two cells, still lies 4 px inside the period it is given.
+ambiguous: the Gray code counts cells of half the coarse phase's period, so a pixel whose cell is read one off, which
+happens only at the border of two cells, still lies 6 px inside the period it is given. The coarse phase in turn only
+chooses among the fringes of the fine sinusoids, which tell the position and, by the contrast they lose, the blur.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ import cv2
 import numpy as np
 
 from controller.arrays import ByteImage, FloatImage
-from controller.capture.encoding import device_flat, encode_frame
+from controller.capture.encoding import encode_frame
 from controller.errors import UsageError
 
 __all__ = [
+    "BLUR_FREQUENCIES",
     "CELL_PX",
+    "MOSAICS",
     "PERIOD_PX",
     "Pattern",
     "PatternKind",
@@ -28,25 +31,30 @@ __all__ = [
     "device_frame",
     "encode_frame",
     "frame",
+    "mosaic_levels",
     "plan_patterns",
 ]
 
-CELL_PX = 8
-PERIOD_PX = 16
-PHASE_STEPS = 4
+CELL_PX = 12
+"""Seven bits tell 1536 px: both sides of 1400x1050 take seven."""
+PERIOD_PX = 24
+PHASE_STEPS = 3
 BLUR_STEPS = 3
 BLUR_FREQUENCIES = {"x": (1 / 5, 0.0), "y": (0.0, 1 / 5), "d": (1 / 7, 1 / 7)}
-"""Cycles per projector pixel of the three sinusoids from which the blur is measured."""
-RAMP_LEVELS = (24, 56, 88, 120, 152, 184, 220)
-"""Device values of the grey ramp, beside 0 and 255."""
+"""Cycles per projector pixel of the three fine sinusoids: position within their fringe, and blur."""
+MOSAICS = 2
+FEW_CELLS = 1000
+"""With fewer Gray cells on the whole frame, one mosaic more is shown."""
+MOST_TILES = 4000
+"""With more Gray cells than this, a mosaic's tiles are 2x2 of them: wider, so that defocus takes less of each."""
 
 
 class PatternKind(enum.Enum):
     """How a pattern is generated."""
 
     FLAT = "flat"
-    RAMP = "ramp"
     GRAY = "gray"
+    MOSAIC = "mosaic"
     SINUSOID = "sinusoid"
     RANDOM = "random"
 
@@ -55,18 +63,18 @@ class PatternKind(enum.Enum):
 class Pattern:
     """One picture of the plan.
 
-    ``colour`` (FLAT) fraction of full light per channel; ``level`` (RAMP) device value 0..255; ``axis`` (GRAY) 0 for
-    x, 1 for y; ``bit`` (GRAY) 0 is the coarsest of ``bits``; ``frequency`` (SINUSOID) x and y in cycles per projector
-    pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (RANDOM).
+    ``colour`` (FLAT) fraction of full light per channel; ``axis`` (GRAY) 0 for x, 1 for y; ``bit`` (GRAY) 0 is the
+    coarsest of ``bits``; ``tile_cells`` (MOSAIC) Gray cells along a tile's side; ``frequency`` (SINUSOID) x and y in
+    cycles per projector pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (MOSAIC, RANDOM).
     """
 
     name: str
     kind: PatternKind
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    level: int = 0
     axis: int = 0
     bit: int = 0
     bits: int = 0
+    tile_cells: int = 1
     frequency: tuple[float, float] = (0.0, 0.0)
     phase_rad: float = 0.0
     seed: int = 0
@@ -105,13 +113,11 @@ class PatternPlan:
         return tuple(p for p in self.of_kind(PatternKind.SINUSOID) if p.name.rpartition("-")[0] == prefix)
 
 
-def plan_patterns(
-    size_px: tuple[int, int], *, ramp_levels: tuple[int, ...] = RAMP_LEVELS, random_patterns: int = 1
-) -> PatternPlan:
+def plan_patterns(size_px: tuple[int, int], *, random_patterns: int = 1) -> PatternPlan:
     """The plan for a projector of ``size_px`` (width, height).
 
-    Names: ``black white red green blue``, ``ramp-024``.., ``gray-x-0``.., ``gray-y-0``.., ``phase-x-0..3``,
-    ``phase-y-0..3``, ``blur-x-0..2``, ``blur-y-0..2``, ``blur-d-0..2``, ``random-0``...
+    Names: ``black white``, ``gray-x-0``.., ``gray-y-0``.., ``mosaic-0``.., ``phase-x-0..2``, ``phase-y-0..2``,
+    ``blur-x-0..2``, ``blur-y-0..2``, ``blur-d-0..2``, ``random-0``...
 
     Raises UsageError("projector-too-small") below 2 cells a side.
     """
@@ -123,10 +129,11 @@ def plan_patterns(
             remedy=f"Give its true size in stage.toml; at least {2 * CELL_PX} pixels a side are needed.",
         )
     patterns = [
-        *_flats(),
-        *(Pattern(f"ramp-{level:03d}", PatternKind.RAMP, level=level) for level in ramp_levels),
+        Pattern("black", PatternKind.FLAT, colour=(0.0, 0.0, 0.0)),
+        Pattern("white", PatternKind.FLAT),
         *_gray_bits("x", 0, width),
         *_gray_bits("y", 1, height),
+        *_mosaics(size_px),
         *_steps("phase-x", (1 / PERIOD_PX, 0.0), PHASE_STEPS),
         *_steps("phase-y", (0.0, 1 / PERIOD_PX), PHASE_STEPS),
     ]
@@ -136,15 +143,32 @@ def plan_patterns(
     return PatternPlan(size_px, tuple(patterns))
 
 
-def _flats() -> list[Pattern]:
-    colours = {
-        "black": (0.0, 0.0, 0.0),
-        "white": (1.0, 1.0, 1.0),
-        "red": (1.0, 0.0, 0.0),
-        "green": (0.0, 1.0, 0.0),
-        "blue": (0.0, 0.0, 1.0),
-    }
-    return [Pattern(name, PatternKind.FLAT, colour=colour) for name, colour in colours.items()]
+def _mosaics(size_px: tuple[int, int]) -> list[Pattern]:
+    across, down = cells_of_frame(size_px)
+    number = MOSAICS + (across * down < FEW_CELLS)
+    tile_cells = 2 if across * down > MOST_TILES else 1
+    return [Pattern(f"mosaic-{n}", PatternKind.MOSAIC, tile_cells=tile_cells, seed=n) for n in range(number)]
+
+
+def cells_of_frame(size_px: tuple[int, int]) -> tuple[int, int]:
+    """Gray cells along the width and the height of a projector of ``size_px``, those cut by its border included."""
+    return math.ceil(size_px[0] / CELL_PX), math.ceil(size_px[1] / CELL_PX)
+
+
+def mosaic_levels(pattern: Pattern, size_px: tuple[int, int]) -> ByteImage:
+    """(cells down, cells across, 3) uint8: the device values of a MOSAIC in each Gray cell.
+
+    In each channel every level comes equally often (0 and 255 a little more), in an order of its own: no channel
+    tells of another, and the mosaic's mean light is the same wherever one looks.
+    """
+    across, down = cells_of_frame(size_px)
+    side = pattern.tile_cells
+    tiles = (-(-down // side), -(-across // side))
+    random = np.random.default_rng(pattern.seed + 104729)
+    number = tiles[0] * tiles[1]
+    even = np.clip(np.rint(np.linspace(-8, 263, number)), 0, 255).astype(np.uint8)
+    levels = np.stack([random.permutation(even) for _ in range(3)], axis=-1).reshape(*tiles, 3)
+    return np.repeat(np.repeat(levels, side, axis=0), side, axis=1)[:down, :across]
 
 
 def _gray_bits(letter: str, axis: int, pixels: int) -> list[Pattern]:
@@ -166,7 +190,7 @@ def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
     -------
     float32 in [0, 1], (rows, columns) where the pattern is grey, (rows, columns, 3) where it is coloured
 
-    Raises UsageError("ramp-has-no-light") for a RAMP pattern, whose light is what is to be measured.
+    Raises UsageError("mosaic-has-no-light") for a MOSAIC, whose light is what is to be measured.
     """
     width, height = size_px
     x, y = np.arange(width, dtype=np.float64)[None, :], np.arange(height, dtype=np.float64)[:, None]
@@ -182,9 +206,9 @@ def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
             return (0.5 + 0.5 * np.cos(angle)).astype(np.float32)
         case PatternKind.RANDOM:
             return _random_image(pattern.seed, size_px)
-        case PatternKind.RAMP:
+        case PatternKind.MOSAIC:
             raise UsageError(
-                "ramp-has-no-light",
+                "mosaic-has-no-light",
                 what=f"Pattern {pattern.name} is given in device values; its light is not known.",
                 remedy="Use device_frame for it.",
             )
@@ -200,8 +224,9 @@ def device_frame(
     ``response`` (3, 256) is needed only where ``pattern.needs_response``; without it UsageError("response-missing").
     """
     width, height = size_px
-    if pattern.kind is PatternKind.RAMP:
-        return device_flat((pattern.level,) * 3, size_px)
+    if pattern.kind is PatternKind.MOSAIC:
+        cells = mosaic_levels(pattern, size_px)
+        return np.repeat(np.repeat(cells, CELL_PX, axis=0), CELL_PX, axis=1)[:height, :width].copy()
     light = frame(pattern, size_px)
     if light.ndim == 2:
         light = np.broadcast_to(light[:, :, None], (height, width, 3))
@@ -211,7 +236,7 @@ def device_frame(
         raise UsageError(
             "response-missing",
             what=f"Pattern {pattern.name} can't be shown before the projector's response is measured.",
-            remedy="Capture the grey ramp first.",
+            remedy="Capture the mosaics first.",
         )
     return encode_frame(np.ascontiguousarray(light), response)
 

@@ -105,7 +105,7 @@ def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) ->
     white = _merge(brackets)
     context.advance(0.5)
     captures = Developed(_unprefixed(taken, projector.name), {"black": black, "white": white})
-    radiometry, report = measure_radiometry(captures)
+    radiometry, report = measure_radiometry(captures, plan)
     path = context.folder / f"radiometry-{projector.name}.npz"
     matrix = brackets[0].read().camera_to_xyz
     save_arrays(
@@ -131,12 +131,18 @@ def _unprefixed(taken: dict[str, Taken], projector: str) -> dict[str, Taken]:
     return {name.removeprefix(f"{projector}-"): item for name, item in taken.items()}
 
 
+def read_captures(folder: Path, projector: str) -> dict[str, Taken]:
+    """All photographs of one projector's patterns, by the pattern's name."""
+    both = {**read_index(folder, f"light-{projector}"), **read_index(folder, f"codes-{projector}")}
+    return _unprefixed(both, projector)
+
+
 def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
     light = load_arrays(context.folder / f"radiometry-{projector.name}.npz")
     black = light["black"]
-    taken = _unprefixed(read_index(context.folder, f"codes-{projector.name}"), projector.name)
+    taken = read_captures(context.folder, projector.name)
     captures = Developed(taken, {"black": black, "white": light["white"] + black})
-    correspondence = decode(captures, plan)
+    correspondence = decode(captures, plan, camera_blur_px=float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5))
     if not correspondence.valid.any():
         raise CalibrationError(
             "projector-reaches-nothing",
@@ -186,7 +192,7 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
     )
     geometry = found.geometry
     arrays, figures = context.folder / "geometry.npz", context.folder / "geometry.json"
-    save_arrays(arrays, {"points_m": geometry.points_m, "normals": geometry.normals})
+    save_arrays(arrays, {"points_m": geometry.points_m, "normals": geometry.normals, "sigma_m": found.sigma_m})
     poses = {
         "camera": _pinhole(geometry.camera),
         "projectors": {p.name: _pinhole(q) for p, q in zip(rig.projectors, geometry.projectors, strict=True)},
@@ -195,6 +201,9 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
         "noise_px": found.noise_px,
         "shape_rel_sigma": found.shape_rel_sigma,
         "inlier_share": found.inlier_share,
+        "scale_rel_sigma": found.scale_rel_sigma if geometry.scale_known else None,
+        "parameters": list(found.parameter_names),
+        "covariance": found.covariance.tolist(),
     }
     write_atomically(figures, json.dumps(poses, indent=1).encode())
     return [arrays, figures]

@@ -1,4 +1,4 @@
-"""The steps that photograph patterns: exposure, black, white and response, then the codes."""
+"""The steps that photograph patterns: exposure, black, white, Gray code and mosaics, then what needs the response."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plans_of(rig: Rig) -> dict[str, PatternPlan]:
 
 
 def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
-    """All capture steps but the codes, which wait for the radiometry (see ``code_step``)."""
+    """All capture steps but the sinusoids, which wait for the radiometry (see ``code_step``)."""
     inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
     plans = plans_of(rig)
     a_shot_s = _shot_s(rig)
@@ -70,16 +70,16 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
                 inputs=inputs,
                 after=("exposure", "delay"),
                 title=f"Photographing the light of {projector.name}",
-                weight=a_shot_s * (WHITE_EXPOSURES + 3 + len(plan.of_kind(PatternKind.RAMP))),
+                weight=a_shot_s * (WHITE_EXPOSURES + len(_before_response(plan))),
             )
         )
     return steps
 
 
 def code_step(rig: Rig, projector: RigProjector) -> Step:
-    """The step that photographs the codes, sinusoids and the random pattern; after ``radiometry-NAME``."""
+    """The step that photographs the sinusoids and the random pattern; after ``radiometry-NAME``."""
     plan = plan_patterns(projector.size_px)
-    coded = [pattern for pattern in plan if pattern.kind is PatternKind.GRAY or pattern.needs_response]
+    coded = [pattern for pattern in plan if pattern.needs_response]
     return Step(
         f"codes-{projector.name}",
         lambda context: _photograph_codes(rig, projector, plan, coded, context),
@@ -166,9 +166,13 @@ def _photograph_light(rig: Rig, projector: RigProjector, plan: PatternPlan, cont
         _planned(projector, _named(plan, "white"), exposure_s, None, suffix=f"-{number}")
         for number, exposure_s in enumerate(exposures.white_s)
     ]
-    shown = [_named(plan, colour) for colour in ("red", "green", "blue")] + list(plan.of_kind(PatternKind.RAMP))
-    planned += [_planned(projector, pattern, exposures.base_s, None) for pattern in shown]
+    planned += [_planned(projector, pattern, exposures.base_s, None) for pattern in _before_response(plan)]
     return take_all(rig, context, planned, index=f"light-{projector.name}")
+
+
+def _before_response(plan: PatternPlan) -> tuple[Pattern, ...]:
+    """What the response is measured with: the Gray code finds the mosaics' tiles."""
+    return plan.of_kind(PatternKind.GRAY) + plan.of_kind(PatternKind.MOSAIC)
 
 
 def _photograph_codes(

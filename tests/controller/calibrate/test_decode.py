@@ -84,7 +84,7 @@ def test_a_depth_edge_neither_mixes_surfaces_nor_spreads() -> None:
     assert np.mean(found.valid[inside & ~near]) > 0.99
 
 
-@pytest.mark.parametrize("name", ["black", "gray-x-2", "phase-y-3"])
+@pytest.mark.parametrize("name", ["black", "gray-x-2", "phase-y-2", "blur-d-1"])
 def test_a_missing_capture_is_named(name: str) -> None:
     captures = changed()
     del captures[name]
@@ -100,7 +100,14 @@ def test_a_capture_of_another_size_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "lag", [["gray-x-0", "gray-x-1", "gray-x-2"], ["phase-x-0", "phase-x-1"], ["gray-y-1", "gray-y-3"]]
+    "lag",
+    [
+        ["gray-x-0", "gray-x-1", "gray-x-2"],
+        ["phase-x-0", "phase-x-1"],
+        ["gray-y-0", "gray-y-2"],
+        ["blur-x-0", "blur-x-1"],
+        ["blur-y-0", "blur-d-0"],
+    ],
 )
 def test_captures_in_the_wrong_order_are_refused(lag: list[str]) -> None:
     captures = changed()

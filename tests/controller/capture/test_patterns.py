@@ -12,6 +12,7 @@ from controller.capture.patterns import (
     device_frame,
     encode_frame,
     frame,
+    mosaic_levels,
     plan_patterns,
 )
 from controller.errors import UsageError
@@ -20,7 +21,7 @@ RESPONSE = np.stack([(np.arange(256) / 255) ** gamma for gamma in (2.2, 2.0, 1.8
 
 
 @pytest.mark.parametrize(
-    ("size_px", "most"), [((280, 210), 41), ((700, 526), 44), ((1400, 1050), 46), ((1920, 1080), 46)]
+    ("size_px", "most"), [((280, 210), 31), ((700, 526), 32), ((1400, 1050), 34), ((1920, 1080), 35)]
 )
 def test_a_plan_is_short_at_every_resolution_and_waits_with_what_needs_the_response(
     size_px: tuple[int, int], most: int
@@ -33,7 +34,7 @@ def test_a_plan_is_short_at_every_resolution_and_waits_with_what_needs_the_respo
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(16, 900), st.integers(16, 900))
+@given(st.integers(24, 900), st.integers(24, 900))
 def test_gray_code_and_phase_together_name_every_pixel_even_one_cell_off(width: int, height: int) -> None:
     plan = plan_patterns((width, height))
     for axis, pixels in enumerate((width, height)):
@@ -48,7 +49,8 @@ def test_gray_code_and_phase_together_name_every_pixel_even_one_cell_off(width: 
         np.testing.assert_array_equal(cell, x // CELL_PX)
         steps = [frame(p, plan.size_px) for p in plan.sinusoids(("phase-x", "phase-y")[axis])]
         steps = [image[0] if axis == 0 else image[:, 0] for image in steps]
-        within = np.arctan2(steps[1] - steps[3], steps[0] - steps[2]) * PERIOD_PX / (2 * np.pi)
+        turns = np.exp(2j * np.pi * np.arange(len(steps)) / len(steps))
+        within = np.angle(np.tensordot(turns, steps, axes=1)) * PERIOD_PX / (2 * np.pi)
         border = ((x % CELL_PX == CELL_PX - 1).astype(int)) - (x % CELL_PX == 0)
         for misread in (cell, cell + border):
             middle = misread * CELL_PX + (CELL_PX - 1) / 2
@@ -65,8 +67,8 @@ def test_adjacent_cells_differ_in_one_bit() -> None:
 def test_every_frame_is_finite_light_between_black_and_white() -> None:
     plan = plan_patterns((61, 47))
     for pattern in plan:
-        if pattern.kind is PatternKind.RAMP:
-            assert set(np.unique(device_frame(pattern, plan.size_px))) == {pattern.level}
+        if pattern.kind is PatternKind.MOSAIC:
+            assert device_frame(pattern, plan.size_px).shape == (47, 61, 3)
             continue
         image = frame(pattern, plan.size_px)
         assert image.dtype == np.float32
@@ -74,6 +76,26 @@ def test_every_frame_is_finite_light_between_black_and_white() -> None:
         assert image.min() >= 0
         assert image.max() <= 1
         assert device_frame(pattern, plan.size_px, RESPONSE).shape == (47, 61, 3)
+
+
+@pytest.mark.parametrize("size_px", [(280, 210), (1400, 1050)])
+def test_a_mosaic_shows_every_level_in_every_channel_and_no_channel_tells_of_another(size_px: tuple[int, int]) -> None:
+    mosaics = plan_patterns(size_px).of_kind(PatternKind.MOSAIC)
+    levels = np.concatenate([mosaic_levels(pattern, size_px).reshape(-1, 3) for pattern in mosaics]).astype(float)
+    for channel in range(3):
+        shown = np.unique(levels[:, channel])
+        assert shown[0] == 0
+        assert shown[-1] == 255
+        assert np.max(np.diff(shown)) <= 2
+    assert np.max(np.abs(np.corrcoef(levels.T) - np.eye(3))) < 0.1
+
+
+@pytest.mark.parametrize("size_px", [(61, 47), (1400, 1050)])
+def test_a_mosaics_tiles_lie_on_the_gray_codes_cells(size_px: tuple[int, int]) -> None:
+    pattern = plan_patterns(size_px).of_kind(PatternKind.MOSAIC)[-1]
+    image = device_frame(pattern, size_px)
+    y, x = np.mgrid[0 : size_px[1], 0 : size_px[0]] // CELL_PX
+    np.testing.assert_array_equal(image, mosaic_levels(pattern, size_px)[y, x])
 
 
 def test_the_random_pattern_is_the_same_every_time_and_differs_by_seed() -> None:
@@ -90,12 +112,12 @@ def test_patterns_between_black_and_white_need_the_response() -> None:
         device_frame(plan.sinusoids("phase-x")[0], plan.size_px)
     assert caught.value.code == "response-missing"
     with pytest.raises(UsageError, match="device values"):
-        frame(plan.of_kind(PatternKind.RAMP)[0], plan.size_px)
+        frame(plan.of_kind(PatternKind.MOSAIC)[0], plan.size_px)
 
 
 def test_a_projector_of_a_few_pixels_is_refused() -> None:
     with pytest.raises(UsageError) as caught:
-        plan_patterns((15, 400))
+        plan_patterns((23, 400))
     assert caught.value.code == "projector-too-small"
 
 
