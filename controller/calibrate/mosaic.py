@@ -50,7 +50,7 @@ def _brightest(image: FloatImage) -> FloatImage:
 
 
 def _off(image: npt.NDArray[np.float64], colours: npt.NDArray[np.int64]) -> float:
-    """How far red and blue samples' other two colours are from their neighbours' means: the median, of the light.
+    """How far red and blue samples' other two colours are from their neighbours' means, relative to the light.
 
     Green comes from the four beside. The third colour comes from the corners; it tells patterns with green in common
     apart.
@@ -58,12 +58,12 @@ def _off(image: npt.NDArray[np.float64], colours: npt.NDArray[np.int64]) -> floa
     green = image[:, :, 1]
     beside = (green[:-2, 1:-1] + green[2:, 1:-1] + green[1:-1, :-2] + green[1:-1, 2:]) / 4 - green[1:-1, 1:-1]
     corners = (image[:-2, :-2] + image[:-2, 2:] + image[2:, :-2] + image[2:, 2:]) / 4 - image[1:-1, 1:-1]
-    found = []
+    medians = []
     for row, column in np.argwhere(colours != 1):
         # the first row and column have been cut off
         sites = slice(1 - row, None, 2), slice(1 - column, None, 2)
-        found += [beside[sites].ravel(), corners[..., 2 - colours[row, column]][sites].ravel()]
-    difference = np.abs(np.concatenate(found))
-    difference = difference[np.isfinite(difference)]
+        for difference in (beside[sites], corners[..., 2 - colours[row, column]][sites]):
+            finite = np.abs(difference[np.isfinite(difference)])
+            medians.append(float(np.median(finite)) if finite.size else np.inf)
     light = float(np.nanmean(np.abs(image))) if np.isfinite(image).any() else 0.0
-    return float(np.median(difference)) / light if difference.size and light > 0 else np.inf
+    return max(medians) / light if light > 0 else np.inf
