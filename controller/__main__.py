@@ -30,6 +30,10 @@ from controller.errors import UsageError, VelaturaError
 
 __all__ = ["COMMANDS", "GROUPS", "Json", "StageFolder", "application", "main", "run", "work"]
 
+AcceptGrade = Annotated[
+    bool, typer.Option("--accept-grade", help="Accept a calibration that is worse than stage.toml asks for.")
+]
+
 DONE, FAILED, WRONG_USE, DEVICE_FAILED, STOPPED = 0, 1, 2, 3, 130
 
 SUMMARY: Final = "Gives a physical object a new appearance with light from several superimposed projectors."
@@ -93,10 +97,18 @@ def calibrate(
     dot_spacing: Annotated[
         str | None, typer.Option(help='Projector pixels between dots, or "auto" for what the blur needs.')
     ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Look what has changed, and repeat only that.")] = False,
+    accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
     """Photograph patterns and calibrate the stage; goes on with an unfinished calibration."""
-    work("controller.services:calibrate", as_json=as_json, stage=stage, mode=mode, dot_spacing=dot_spacing)
+    if quick:
+        work("controller.drift_services:recalibrate", as_json=as_json, stage=stage, accept_grade=accept_grade)
+        return
+    work(
+        "controller.services:calibrate", as_json=as_json,
+        stage=stage, mode=mode, dot_spacing=dot_spacing, accept_grade=accept_grade,
+    )  # fmt: skip
 
 
 def appearance(
@@ -104,10 +116,18 @@ def appearance(
     names: Annotated[
         list[str] | None, typer.Argument(help="Names from stage.toml; all of them if none is given.")
     ] = None,
+    blender: Annotated[
+        list[str] | None,
+        typer.Option(help="Instead, a scene that Blender renders: builtin:marble, ..., or a .blend file."),
+    ] = None,
+    accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
     """Solve appearances on the last calibration and publish them in a signed bundle."""
-    work("controller.services:make_appearances", as_json=as_json, stage=stage, names=tuple(names or ()))
+    work(
+        "controller.services:make_appearances", as_json=as_json,
+        stage=stage, names=tuple(names or ()), scenes=tuple(blender or ()), accept_grade=accept_grade,
+    )  # fmt: skip
 
 
 def play(

@@ -16,11 +16,22 @@ from controller.session import costs
 from controller.session.calibrating import calibration_steps
 from controller.session.darkness import dark_after
 from controller.session.dotting import dot_steps
+from controller.session.grading import FILE as GRADED
+from controller.session.grading import (
+    accept,
+    below_grade,
+    compare_with_last,
+    gate_step,
+    grade_figures,
+    passes,
+    verify_step,
+)
 from controller.session.journal import Journal
 from controller.session.machine import Event
 from controller.session.modes import DotOptions, dot_options
-from controller.session.progress import Reporter
+from controller.session.progress import Level, Reporter
 from controller.session.publishing import bundle_display, publish_step
+from controller.session.rendering import scene_wish
 from controller.session.rig import Rig
 from controller.session.runner import Context, Runner, Step
 from controller.session.solving import Calibrated, SolveOptions, solve_steps
@@ -33,7 +44,13 @@ KEY_FILE = "keys/stage.key"
 
 
 def calibrate(
-    *, stage: Path, reporter: Reporter, cancel: threading.Event, mode: str = "fast", dot_spacing: str | None = None
+    *,
+    stage: Path,
+    reporter: Reporter,
+    cancel: threading.Event,
+    mode: str = "fast",
+    dot_spacing: str | None = None,
+    accept_grade: bool = False,
 ) -> Mapping[str, Any]:
     """Calibrate the stage, going on with an unfinished calibration; returns where the results lie.
 
@@ -41,48 +58,71 @@ def calibrate(
     """
     options = dot_options(mode, dot_spacing)
     checked = check_stage(stage)
+    last = next(iter(finished_calibrations(checked.stage.folder)), None)
     run = run_on_stage(
         checked,
-        lambda rig, _: calibrating(rig, checked=checked, options=options),
+        lambda rig, run: calibrating(rig, run, checked=checked, options=options),
         name="calibrate",
         reporter=reporter,
         cancel=cancel,
         dark=True,
     )
-    return {"run": str(run)}
+    tell_grade(checked, run, last, reporter, accept_grade=accept_grade)
+    return {"run": str(run), **grade_figures(run)}
 
 
-def calibrating(rig: Rig, *, checked: Checked, options: DotOptions | None = None) -> Sequence[Step]:
-    """The calibration's steps between their state markers."""
+def calibrating(
+    rig: Rig, run: Path, *, checked: Checked, options: DotOptions | None = None, calibrated: Calibrated | None = None
+) -> Sequence[Step]:
+    """The calibration's steps, its grading the last, between their state markers.
+
+    ``calibrated``: what reads the calibration of ``run``, where the caller needs it too.
+    """
     longest_s = checked.stage.tables.capture.longest_exposure_s
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+             *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s)]  # fmt: skip
     return [
         marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
-        *calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
-        *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s),
+        *steps,
+        verify_step(calibrated or Calibrated(run, checked.names), [step.name for step in steps], scale),
         *dark_after(rig.darkness, rig.display),
         marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
     ]
 
 
 def make_appearances(
-    *, stage: Path, names: Sequence[str], reporter: Reporter, cancel: threading.Event
+    *,
+    stage: Path,
+    names: Sequence[str],
+    scenes: Sequence[str] = (),
+    reporter: Reporter,
+    cancel: threading.Event,
+    accept_grade: bool = False,
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml on the last calibration, and install them as the stage's bundle.
 
+    ``scenes``: Blender scenes to render besides ``names``, or alone if no names are given.
+    ``accept_grade``: publish whatever the calibration's grade.
+
     No device is touched: the projectors may be off, or playing.
-    Raises UsageError with code "not-calibrated", and what ``wishes_of`` and the steps raise.
+    Raises what ``usable_calibration`` raises, and what ``wishes_of`` and the steps raise.
     """
     checked = check_stage(stage)
     folder = checked.stage.folder
     with exclusive(folder / LOCK, what_is_running="Velatura"):
-        run = finished_calibration(folder)
+        run = usable_calibration(checked, reporter, accept_grade=accept_grade)
         calibrated = Calibrated(run, checked.names)
-        wishes = wishes_of(checked.stage, calibrated, names)
+        wishes = wishes_of(checked.stage, calibrated, names) if names or not scenes else []
+        wishes += [scene_wish(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve
         options = SolveOptions(table.exposure_share, table.smoothness, table.mode)
         outputs = output_sizes(checked)
+        scale = costs.scale(size for _, size in outputs.values())
         steps = [
-            *solve_steps(calibrated, wishes, options, (), costs.scale(size for _, size in outputs.values())),
+            *([] if (run / GRADED).exists() else [verify_step(calibrated, (), scale)]),
+            gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
+            *solve_steps(calibrated, wishes, options, (), scale),
             publish_step(folder, outputs, [wish.name for wish in wishes],
                          stage=checked.stage.tables.stage.name, calibration=run.name, key=signing_key(checked)),
         ]  # fmt: skip
@@ -128,19 +168,58 @@ def stage_trust(stage: Stage) -> Trust:
     return Trust(keys, table.allow_unsigned, revoked)
 
 
-def finished_calibration(stage: Path) -> Path:
-    """The newest run folder whose calibration is complete. Raises UsageError("not-calibrated")."""
+def finished_calibrations(stage: Path) -> list[Path]:
+    """The run folders whose calibration is complete, the newest first."""
+    found = []
     for folder in sorted((stage / "runs").glob("*"), reverse=True):
         if not (folder / Journal.FILE).exists():
             continue
         with Journal(folder) as journal:
             if "calibrated" in journal.steps():
-                return folder
+                found.append(folder)
+    return found
+
+
+def finished_calibration(stage: Path) -> Path:
+    """The newest run folder whose calibration is complete. Raises UsageError("not-calibrated")."""
+    found = finished_calibrations(stage)
+    if found:
+        return found[0]
     raise UsageError(
         "not-calibrated",
         what="This stage has no finished calibration.",
         remedy="Run `velatura calibrate` on it first.",
     )
+
+
+def worst_grade(checked: Checked) -> float:
+    """The largest error, in per cent, with which the stage publishes."""
+    return checked.stage.tables.calibration.worst_grade
+
+
+def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bool = False) -> Path:
+    """The newest calibration, if it passes the gate.
+
+    An older one is never taken in its stead: the stage may have changed since. ``accept_grade`` lets it pass, loudly.
+    Raises UsageError("not-calibrated") and CalibrationError("calibration-below-grade").
+    """
+    run, worst = finished_calibration(checked.stage.folder), worst_grade(checked)
+    if accept_grade:
+        accept(run, reporter, worst)
+    if not passes(run, worst):
+        raise below_grade(run, worst)
+    return run
+
+
+def tell_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:
+    """After a calibration: say it when it is worse than the last one, or not good enough to publish."""
+    worst = worst_grade(checked)
+    compare_with_last(run, last, reporter)
+    if accept_grade:
+        accept(run, reporter, worst)
+    if not passes(run, worst):
+        error = below_grade(run, worst)
+        reporter.say(f"{error.what} {error.remedy}", Level.WARNING)
 
 
 def output_sizes(checked: Checked) -> dict[str, tuple[str, tuple[int, int]]]:

@@ -135,6 +135,16 @@ class CaptureTable(Table):
     )
 
 
+class CalibrationTable(Table):
+    worst_grade: float = Field(
+        default=8.0,
+        gt=0,
+        le=1000,
+        description="the largest error of a prediction, in per cent, with which a calibration may be published, "
+        "above 0, at most 1000",
+    )
+
+
 class SolveTable(Table):
     exposure_share: float = Field(
         default=0.9, gt=0, le=1, description="the share of the reachable light that targets may use, above 0, at most 1"
@@ -227,6 +237,7 @@ class StageTables(Table):
     display: DisplayTable = Field(description="the table [display]")
     object: ObjectTable = Field(default_factory=ObjectTable, description="the table [object]")
     capture: CaptureTable = Field(default_factory=CaptureTable, description="the table [capture]")
+    calibration: CalibrationTable = Field(default_factory=CalibrationTable, description="the table [calibration]")
     solve: SolveTable = Field(default_factory=SolveTable, description="the table [solve]")
     relays: Annotated[tuple[RelaysTable, ...], Field(strict=False, max_length=16)] = Field(
         default=(), description="a list of [[relays]] tables, one a relay board"

@@ -13,8 +13,9 @@ from controller.arrays import save_arrays
 from controller.demo.bench_process import BenchProcess
 from controller.demo.report import write_demo_report
 from controller.demo.stage import prepare
-from controller.services import calibrating, output_sizes, signing_key
+from controller.services import calibrating, output_sizes, signing_key, worst_grade
 from controller.session import costs
+from controller.session.grading import gate_step
 from controller.session.machine import Event
 from controller.session.progress import Reporter
 from controller.session.publishing import photograph_hdr, photograph_step, photographs_s, playback_step, publish_step
@@ -65,7 +66,8 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     after = [name for projector in checked.names for name in (f"radiometry-{projector}", f"pixels-{projector}")]
     longest_s = stage.tables.capture.longest_exposure_s
     return [
-        *calibrating(rig, checked=checked),
+        *calibrating(rig, run, checked=checked, calibrated=calibrated),
+        gate_step(worst_grade(checked), accepted=False),
         marker("solving", "Solving", enter=Event.SOLVE),
         *solve_steps(calibrated, wishes, options, [*after, "geometry"], costs.scale(p.size_px for p in rig.projectors)),
         marker("solved", "Solved", leave=Event.SOLVED),

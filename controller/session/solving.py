@@ -1,4 +1,4 @@
-"""The steps from a calibration to frames: transport, its grade, the base, and every appearance."""
+"""The steps from a calibration to frames: transport, the base, and every appearance."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ import numpy as np
 
 from controller.arrays import ByteImage, FloatImage, Mask, load_arrays, save_arrays
 from controller.calibrate.values import Calibration
-from controller.calibrate.verify import verify
-from controller.capture.patterns import Pattern, PatternKind, frame, plan_patterns
+from controller.capture.patterns import Pattern, PatternKind, plan_patterns
 from controller.errors import WorkError
 from controller.session import costs
 from controller.session.calibrating import read_calibration
 from controller.session.edging import edged
 from controller.session.runner import Context, Step
-from controller.session.shots import read_index
 from controller.solve.appearance import Base, Mode, base_image, make_appearance, prepare_base, solve_base
 from controller.solve.bounded import Solution
 from controller.solve.dither import to_device
@@ -117,18 +115,11 @@ class Calibrated:
 def solve_steps(
     calibrated: Calibrated, wishes: Sequence[Wish], options: SolveOptions, after: Sequence[str], scale: float = 1.0
 ) -> list[Step]:
-    """Grade the calibration, solve the base, then each wish.
+    """Solve the base, then each wish.
 
     ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``session.costs``.
     """
     steps = [
-        Step(
-            "verify",
-            partial(_verify, calibrated),
-            after=tuple(after),
-            title="Grading the calibration",
-            weight=costs.VERIFY_S * scale,
-        ),
         Step(
             "base",
             partial(_solve_base, calibrated, options),
@@ -163,31 +154,6 @@ def solve_steps(
             )
         )
     return steps
-
-
-def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
-    """Predict each projector's random pattern and compare with its photograph."""
-    calibration, transport = calibrated.calibration, calibrated.transport
-    figures = {}
-    maps = {}
-    for n, part in enumerate(calibration.projectors):
-        context.advance(n / len(calibration.projectors), part.name)
-        rows, columns = part.metapixels.valid.shape
-        pattern = random_pattern((columns, rows))
-        predicted = transport.project_one(n, frame(pattern, (columns, rows))) + calibration.black
-        taken = read_index(context.folder, f"codes-{part.name}")[f"{part.name}-{pattern.name}"]
-        found = verify(predicted, taken.per_second(), calibration.black, transport.lit[n])
-        figures[part.name] = {
-            "relative_rms": found.relative_rms,
-            "without_gain_rms": found.without_gain_rms,
-            "gain": found.gain,
-            "grade": found.grade.value,
-        }
-        maps[part.name] = found.error_map
-    arrays, path = context.folder / "verification.npz", context.folder / "verification.json"
-    save_arrays(arrays, maps)
-    write_atomically(path, json.dumps(figures, indent=1).encode())
-    return [path, arrays]
 
 
 def random_pattern(size_px: tuple[int, int]) -> Pattern:

@@ -1,0 +1,207 @@
+"""The grade of a run's calibration, where it is bad and why, and the gate before anything that uses it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.arrays import ByteImage, save_arrays
+from controller.calibrate.reasons import Blame, blame, blame_picture, ranked
+from controller.calibrate.verify import Verification, verify
+from controller.capture.patterns import Pattern, frame
+from controller.errors import CalibrationError
+from controller.session import costs
+from controller.session.capturing import exposures_of
+from controller.session.drifting import shown_frames
+from controller.session.progress import Level, Reporter
+from controller.session.rig import Rig
+from controller.session.runner import Context, Step
+from controller.session.shots import Planned, Taken, read_index, take_all
+from controller.session.solving import Calibrated, random_pattern
+from controller.storage import write_atomically
+
+FILE, PICTURE, ACCEPTED = "verification.json", "verification.png", "accepted.json"
+INDEX = "verification-photographs"
+WORSE = 1.25
+"""A calibration this many times worse than the one before it is told of, though it passes the gate."""
+
+
+def verify_step(calibrated: Calibrated, after: Sequence[str], scale: float) -> Step:
+    """Predict each projector's random pattern and compare with its photograph."""
+    return Step(
+        "verify",
+        partial(_verify, calibrated),
+        after=tuple(after),
+        title="Grading the calibration",
+        weight=costs.VERIFY_S * scale,
+    )
+
+
+def verification_photographs_step(rig: Rig, calibrated: Calibrated, after: Sequence[str]) -> Step:
+    """Photograph the random pattern anew, for a calibration that was corrected."""
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    return Step(
+        INDEX,
+        partial(_photograph, rig, calibrated),
+        after=tuple(after),
+        title="Photographing the pattern to grade by",
+        weight=costs.shot_s(scale) * len(rig.projectors),
+    )
+
+
+def _photograph(rig: Rig, calibrated: Calibrated, context: Context) -> Sequence[Path]:
+    exposures = exposures_of(context.folder)
+    plan = []
+    for projector in rig.projectors:
+        image = shown_frames(calibrated, random_pattern(projector.size_px))[projector.name]
+        shown = partial(_one, projector.name, image)
+        plan.append(Planned(f"verify-{projector.name}", shown, exposures[projector.name].base_s))
+    return take_all(rig, context, plan, index=INDEX)
+
+
+def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
+    return {name: image}
+
+
+def _taken(folder: Path, projector: str, pattern: Pattern) -> Taken:
+    if (folder / f"{INDEX}.json").exists():
+        return read_index(folder, INDEX)[f"verify-{projector}"]
+    return read_index(folder, f"codes-{projector}")[f"{projector}-{pattern.name}"]
+
+
+def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
+    calibration, transport = calibrated.calibration, calibrated.transport
+    figures, pictures = {}, []
+    maps: dict[str, npt.NDArray[Any]] = {}
+    for n, part in enumerate(calibration.projectors):
+        context.advance(n / len(calibration.projectors), part.name)
+        rows, columns = part.metapixels.valid.shape
+        pattern = random_pattern((columns, rows))
+        light = transport.project_one(n, frame(pattern, (columns, rows)))
+        taken = _taken(context.folder, part.name, pattern)
+        seen = taken.per_second()
+        found = verify(light + calibration.black, seen, calibration.black, transport.lit[n])
+        why = blame(transport, calibration, n, frame(pattern, (columns, rows)), seen, exposure_s=taken.exposure_s)
+        figures[part.name] = _figures(found, why)
+        maps[part.name], maps[f"{part.name}-reasons"] = found.error_map, why.labels
+        pictures.append(blame_picture(why, calibration, part.name))
+    arrays, path = context.folder / "verification.npz", context.folder / FILE
+    picture = context.folder / PICTURE
+    save_arrays(arrays, maps)
+    write_atomically(picture, _png(pictures))
+    write_atomically(path, json.dumps(figures, indent=1).encode())
+    return [path, arrays, picture]
+
+
+def _figures(found: Verification, why: Blame) -> dict[str, object]:
+    return {
+        "relative_rms": found.relative_rms,
+        "without_gain_rms": found.without_gain_rms,
+        "gain": found.gain,
+        "grade": found.grade.value,
+        "reasons": ranked(why),
+    }
+
+
+def _png(pictures: Sequence[ByteImage]) -> bytes:
+    ok, data = cv2.imencode(".png", np.concatenate(list(pictures), axis=0)[..., ::-1])
+    if not ok:
+        raise ValueError("the map of the errors cannot be encoded")
+    return bytes(data.tobytes())
+
+
+def graded(folder: Path) -> dict[str, float] | None:
+    """Per cent of relative error by projector; None for a run that was not graded."""
+    path = folder / FILE
+    if not path.exists():
+        return None
+    return {name: 100 * float(row["relative_rms"]) for name, row in json.loads(path.read_text()).items()}
+
+
+def grade_figures(folder: Path) -> dict[str, str]:
+    """For a command's result: each projector's error, and the map of where it is bad."""
+    figures = graded(folder) or {}
+    text = ", ".join(f"{name} {percent:.2f} %" for name, percent in figures.items())
+    return {"error": text, "map": str(folder / PICTURE)} if figures else {}
+
+
+def worst_of(folder: Path) -> tuple[str, float] | None:
+    """The projector with the largest error, in per cent; None for a run that was not graded."""
+    figures = graded(folder)
+    return max(figures.items(), key=lambda item: item[1]) if figures else None
+
+
+def passes(folder: Path, worst_grade: float) -> bool:
+    """Whether a run's calibration may be used: good enough, accepted by a person, or graded only later."""
+    worst = worst_of(folder)
+    return worst is None or not worst[1] > worst_grade or (folder / ACCEPTED).exists()
+
+
+def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
+    """Let a calibration below the set grade pass, and say so loudly; harmless for one that passes anyway."""
+    worst = worst_of(folder)
+    if worst is None or passes(folder, worst_grade):
+        return
+    write_atomically(folder / ACCEPTED, json.dumps({"projector": worst[0], "percent": worst[1]}).encode())
+    reporter.say(
+        f"ACCEPTED ON REQUEST although it is below the set grade: {worst[0]} is predicted with {worst[1]:.1f} % error, "
+        f"and {worst_grade:g} % is the limit. What is made from it will look wrong where {PICTURE} shows colour.",
+        Level.WARNING,
+    )
+
+
+def below_grade(folder: Path, worst_grade: float) -> CalibrationError:
+    """The error for a calibration that does not pass."""
+    name, percent = worst_of(folder) or ("", float("nan"))
+    rows = json.loads((folder / FILE).read_text())
+    reasons = rows[name].get("reasons", [])
+    because = f" {reasons[0]['sentence']}" if reasons else ""
+    return CalibrationError(
+        "calibration-below-grade",
+        what=f"The calibration {folder.name} is not good enough to be published: projector {name} is predicted with "
+        f"{percent:.1f} % error, and {worst_grade:g} % is the limit (worst_grade under [calibration]).{because}",
+        remedy=f"Look at {folder / PICTURE}, mend what it shows and calibrate again; or publish all the same with "
+        "--accept-grade.",
+    )
+
+
+def gate_step(worst_grade: float, *, accepted: bool, reporter: Reporter | None = None) -> Step:
+    """Refuse to go on with a calibration below the set grade. Raises CalibrationError("calibration-below-grade")."""
+
+    def run(context: Context) -> Sequence[Path]:
+        require(context.folder, worst_grade, accepted=accepted, reporter=reporter or context.reporter)
+        return ()
+
+    return Step("gate", run, title="Comparing the grade with what is asked", weight=0.01, always=True)
+
+
+def require(folder: Path, worst_grade: float, *, accepted: bool, reporter: Reporter) -> None:
+    """The gate itself. Raises CalibrationError("calibration-below-grade")."""
+    if accepted:
+        accept(folder, reporter, worst_grade)
+    if not passes(folder, worst_grade):
+        raise below_grade(folder, worst_grade)
+
+
+def compare_with_last(folder: Path, last: Path | None, reporter: Reporter) -> None:
+    """Say it when a new calibration is worse than the one that it replaces."""
+    now, then = worst_of(folder), None if last is None else worst_of(last)
+    if last is not None and now is not None and then is not None and now[1] > WORSE * then[1]:
+        reporter.say(
+            f"This calibration is worse than the last: {now[1]:.1f} % error ({now[0]}) against {then[1]:.1f} % "
+            f"({then[0]}) in {last.name}. {PICTURE} in {folder.name} shows where.",
+            Level.WARNING,
+        )
+
+
+__all__ = [
+    "accept", "below_grade", "compare_with_last", "gate_step", "grade_figures", "graded", "passes", "random_pattern",
+    "require", "verification_photographs_step", "verify_step", "worst_of",
+]  # fmt: skip
