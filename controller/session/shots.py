@@ -134,7 +134,9 @@ def _take(
     if known is not None:
         return Taken(planned.name, known.path, confirmed_exposure(known.path)), None
     shot = Shot(planned.name, frames, planned.exposure_s)
-    file, exposure_s = rig.acquirer.take(shot, folder, deadline=context.deadline)
+    # Each photograph is compared with the one before, so the first of a row has to be right for certain.
+    wait_s = max(LONGEST_S, rig.acquirer.wait_s) if rig.acquirer.protected and before is None else None
+    file, exposure_s = rig.acquirer.take(shot, folder, deadline=context.deadline, wait_s=wait_s)
     path, shows = file.path, None
     if rig.acquirer.protected:
         shows = thumbprint(path, exposure_s)
