@@ -119,6 +119,8 @@ class GenericBody:
             complete = self._follow_events(shot, deadline) or complete
             if not shot.found and (complete or shot.age_s() >= listing_due_s):
                 self._look_at(shot, self._channel.handles(deadline), deadline)
+                if shot.found and not shot.recovering:
+                    self._channel.diary.add("camera-event-lost", "The camera did not tell of a picture that it has.")
                 listing_due_s = shot.age_s() + _LISTING_EVERY_S
             if len(shot.found) > before:
                 newest_s = shot.age_s()

@@ -1,0 +1,251 @@
+"""Thousands of captures on cameras that are busy, slow, lose events, leave and come back, and lie about lengths.
+
+    python -m tests.campaigns.camera_faults [CAPTURES] [SEED]
+
+Half of the cameras are on PTP/IP, half on the emulated USB bus. Prints one line for each camera, and ends with 0 where
+no picture was lost or taken twice, none was another one than the newest, every call ended in time, and the driver told
+of every fault that it had to mend.
+"""
+
+from __future__ import annotations
+
+import collections
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from hal.deadline import in_seconds
+from hal.errors import DeviceError
+from hal.values import ExposureSettings
+from plugins.emulated.ptp_camera import EmulatedPtpCamera
+from plugins.emulated.ptp_usb_camera import numbered_files
+from plugins.emulated.shot import ShotFiles, ShotSettings
+from plugins.emulated.usb_bus import environment
+from plugins.emulated.usb_bus_process import UsbBusProcess
+from plugins.ptp_link import PtpLink
+from plugins.ptp_shot import Timing
+from plugins.ptp_still import PtpCamera
+from plugins.ptpip import PtpIpLink
+from plugins.ptpip_wire import PtpIpAddress
+
+FLAVOURS: Final = ("generic", "eos-new", "eos-old")
+CAMERAS: Final = tuple(f"{bus} {flavour}" for bus in ("network", "usb") for flavour in FLAVOURS)
+SIZE: Final = 40_000
+SLOW_S: Final = 0.06
+DEADLINE_S: Final = 12.0
+HANG_S: Final = 1.0
+"""A call may end that much after its deadline on a busy machine."""
+TIMING: Final = Timing(
+    answer_s=2.0, busy_s=3.0, margin_s=1.5, grace_s=0.1, come_back_s=3.0, reconnect_s=6.0, slow_s=SLOW_S / 2
+)
+_MENDED: Final = {
+    "busy": {"camera-busy"},
+    "slow_s": {"camera-slow"},
+    "lost_events": {"camera-event-lost"},
+    "drop_after_exposure": {"camera-disconnected"},
+    "drop_in_transfer": {"camera-disconnected", "camera-protocol"},
+    "drop_before_exposure": {"camera-shot-lost", "camera-disconnected"},
+    "wrong_lengths": {"camera-protocol"},
+}
+"""Each fault, and the codes under which the driver may tell of it."""
+
+
+class Bench(Protocol):
+    """The emulated camera of one campaign."""
+
+    def connect(self) -> Callable[[Any], PtpLink]: ...
+
+    def fault(self, name: str, value: float) -> None: ...
+
+    def left(self, name: str) -> float:
+        """What has not been used up of a fault."""
+
+    def exposures(self) -> int: ...
+
+
+@dataclass
+class Outcome:
+    """What came of one camera's captures."""
+
+    camera: str
+    captures: int = 0
+    pictures: int = 0
+    faults: int = 0
+    told: int = 0
+    late_s: float = 0.0
+    errors: dict[str, int] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+
+    @property
+    def holds(self) -> bool:
+        return not self.wrong and self.late_s <= HANG_S
+
+
+class NetworkBench:
+    def __init__(self, flavour: str) -> None:
+        self.camera = EmulatedPtpCamera(self._expose, flavour=flavour, time_scale=0.0)  # type: ignore[arg-type]
+
+    def _expose(self, shot: ShotSettings) -> ShotFiles:
+        return numbered_files(self.camera.exposures, SIZE, shot)
+
+    def connect(self) -> Callable[[Any], PtpLink]:
+        address = PtpIpAddress.parse(self.camera.address)
+        return lambda until: PtpIpLink.connect(address, deadline=until)
+
+    def fault(self, name: str, value: float) -> None:
+        setattr(self.camera.faults, name, value)
+
+    def left(self, name: str) -> float:
+        return float(getattr(self.camera.faults, name))
+
+    def exposures(self) -> int:
+        return self.camera.exposures
+
+
+class UsbBench:
+    def __init__(self, bus: UsbBusProcess, flavour: str) -> None:
+        self._bus = bus
+        bus.add("camera", "camera", flavour=flavour, size=SIZE, time_scale=0.0)
+        bus.set("camera", "pipe_faults.away_s", 0.02)
+
+    def connect(self) -> Callable[[Any], PtpLink]:
+        from plugins.ptp_usb_bus import UsbAddress, UsbFinder
+
+        return UsbFinder(UsbAddress()).connect
+
+    def fault(self, name: str, value: float) -> None:
+        self._bus.set("camera", f"camera_faults.{name}", value)
+
+    def left(self, name: str) -> float:
+        return float(self._bus.get("camera", f"camera_faults.{name}"))
+
+    def exposures(self) -> int:
+        return int(self._bus.get("camera", "exposures"))
+
+
+@contextmanager
+def _bench(camera: str) -> Iterator[Bench]:
+    bus, flavour = camera.split()
+    with ExitStack() as stack:
+        if bus == "usb":
+            process = stack.enter_context(UsbBusProcess(Path(os.environ["UMOCKDEV_DIR"])))
+            yield UsbBench(process, flavour)
+        else:
+            made = NetworkBench(flavour)
+            stack.enter_context(made.camera)
+            yield made
+
+
+def campaign(camera: str, captures: int, seed: int, folder: Path) -> Outcome:
+    """So many captures of one camera, about half of them with a fault."""
+    outcome = Outcome(camera)
+    dice = random.Random(f"{seed} {camera}")
+    with _bench(camera) as bench:
+        driver = PtpCamera(bench.connect(), timing=TIMING, deadline=in_seconds(20))
+        try:
+            driver.configure(ExposureSettings(1 / 60, 100, raw=False), deadline=in_seconds(20))
+            driver.troubles()
+            for _ in range(captures):
+                _capture(driver, bench, dice, outcome, folder)
+        finally:
+            driver.close()
+    return outcome
+
+
+def _capture(driver: PtpCamera, bench: Bench, dice: random.Random, outcome: Outcome, folder: Path) -> None:
+    """One capture: the newest picture, or an error and nothing that was exposed and lost in silence."""
+    fault = dice.choice((*_MENDED, *[""] * len(_MENDED)))
+    if fault:
+        bench.fault(fault, SLOW_S if fault == "slow_s" else dice.choice((1, 1, 2)) if fault == "busy" else 1)
+    before, started = bench.exposures(), time.monotonic()
+    codes: list[str] = []
+    outcome.captures += 1
+    try:
+        files = driver.capture(folder / "shot", deadline=in_seconds(DEADLINE_S))
+    except DeviceError as error:
+        codes.append(error.code)
+        outcome.errors[error.code] = outcome.errors.get(error.code, 0) + 1
+        fired = bench.exposures() - before
+        if fired:
+            outcome.wrong.append(f"a picture was lost: {error.code} after {fault or 'no fault'}")
+    else:
+        fired = bench.exposures() - before
+        outcome.pictures += 1
+        right = numbered_files(before + 1, SIZE, ShotSettings(1, 1, 1, raw=False, jpeg=True)).jpeg
+        if fired != 1:
+            outcome.wrong.append(f"exposed {fired} times after {fault or 'no fault'}")
+        if [file.path.read_bytes() for file in files] != [right]:
+            outcome.wrong.append(f"another picture than the newest after {fault or 'no fault'}")
+    outcome.late_s = max(outcome.late_s, time.monotonic() - started - DEADLINE_S)
+    codes += [code for code, _ in driver.troubles()]
+    if fault:
+        used = fault == "slow_s" or bench.left(fault) == 0
+        outcome.faults += used
+        outcome.told += used and bool(_MENDED[fault] & set(codes))
+        if used and not _MENDED[fault] & set(codes):
+            outcome.wrong.append(f"{fault} was not told: {sorted(set(codes))}")
+        bench.fault(fault, 0)
+
+
+def run(captures: int, seed: int = 1) -> list[Outcome]:
+    """``captures`` shared among all cameras; those on USB each in a process that sees its own emulated bus."""
+    outcomes: list[Outcome] = []
+
+    def network(camera: str) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            outcomes.append(campaign(camera, captures // len(CAMERAS), seed, Path(folder)))
+
+    def usb(camera: str) -> None:
+        with tempfile.TemporaryDirectory(prefix="usb", dir="/tmp") as bus:
+            done = subprocess.run(
+                [sys.executable, "-m", __spec__.name, "one", camera, str(captures // len(CAMERAS)), str(seed)],
+                env={**os.environ, **environment(Path(bus))},
+                cwd=Path(__file__).parents[2],
+                stdout=subprocess.PIPE,
+                check=True,
+            )
+        outcomes.append(Outcome(**json.loads(done.stdout)))
+
+    threads = [
+        threading.Thread(target=network if camera.startswith("network") else usb, args=(camera,)) for camera in CAMERAS
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return sorted(outcomes, key=lambda outcome: outcome.camera)
+
+
+def main() -> int:
+    if sys.argv[1:2] == ["one"]:
+        with tempfile.TemporaryDirectory() as folder:
+            outcome = campaign(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), Path(folder))
+        print(json.dumps(asdict(outcome)))
+        return 0
+    captures = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000
+    started = time.monotonic()
+    outcomes = run(captures, int(sys.argv[2]) if len(sys.argv) > 2 else 1)
+    print(f"{'camera':<16} {'captures':>8} {'pictures':>8} {'faults':>7} {'told':>7} {'late s':>7}  errors")
+    for outcome in outcomes:
+        errors = ", ".join(f"{name} {count}" for name, count in sorted(outcome.errors.items()))
+        numbers = f"{outcome.captures:>8} {outcome.pictures:>8} {outcome.faults:>7} {outcome.told:>7}"
+        print(f"{outcome.camera:<16} {numbers} {max(0.0, outcome.late_s):>7.2f}  {errors}")
+        for wrong, count in collections.Counter(outcome.wrong).items():
+            print(f"{'':<16} WRONG: {wrong} ({count} times)")
+    holds = len(outcomes) == len(CAMERAS) and all(outcome.holds for outcome in outcomes)
+    print(f"{'holds' if holds else 'DOES NOT HOLD'}, {time.monotonic() - started:.0f} s")
+    return 0 if holds else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
