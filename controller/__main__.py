@@ -120,13 +120,16 @@ def appearance(
         list[str] | None,
         typer.Option(help="Instead, a scene that Blender renders: builtin:marble, ..., or a .blend file."),
     ] = None,
+    base: Annotated[
+        str | None, typer.Option(help="The base image: minimum, white or high-pass; else as stage.toml says.")
+    ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
     """Solve appearances on the last calibration and publish them in a signed bundle."""
     work(
         "controller.services:make_appearances", as_json=as_json,
-        stage=stage, names=tuple(names or ()), scenes=tuple(blender or ()), accept_grade=accept_grade,
+        stage=stage, names=tuple(names or ()), scenes=tuple(blender or ()), accept_grade=accept_grade, base=base,
     )  # fmt: skip
 
 

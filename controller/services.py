@@ -34,7 +34,7 @@ from controller.session.publishing import bundle_display, publish_step
 from controller.session.rendering import scene_wish
 from controller.session.rig import Rig
 from controller.session.runner import Context, Runner, Step
-from controller.session.solving import Calibrated, SolveOptions, solve_steps
+from controller.session.solving import Calibrated, SolveOptions, base_choice, solve_steps
 from controller.session.wishes import wishes_of
 from controller.storage import exclusive
 from hal.deadline import in_seconds
@@ -99,15 +99,17 @@ def make_appearances(
     reporter: Reporter,
     cancel: threading.Event,
     accept_grade: bool = False,
+    base: str | None = None,
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml on the last calibration, and install them as the stage's bundle.
 
     ``scenes``: Blender scenes to render besides ``names``, or alone if no names are given.
-    ``accept_grade``: publish whatever the calibration's grade.
+    ``accept_grade``: publish whatever the calibration's grade. ``base``: the base image, instead of stage.toml's.
 
     No device is touched: the projectors may be off, or playing.
     Raises what ``usable_calibration`` raises, and what ``wishes_of`` and the steps raise.
     """
+    chosen = None if base is None else base_choice(base)
     checked = check_stage(stage)
     folder = checked.stage.folder
     with exclusive(folder / LOCK, what_is_running="Velatura"):
@@ -116,7 +118,7 @@ def make_appearances(
         wishes = wishes_of(checked.stage, calibrated, names) if names or not scenes else []
         wishes += [scene_wish(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve
-        options = SolveOptions(table.exposure_share, table.smoothness, table.mode)
+        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or table.base)
         outputs = output_sizes(checked)
         scale = costs.scale(size for _, size in outputs.values())
         steps = [

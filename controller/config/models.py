@@ -157,6 +157,11 @@ class SolveTable(Table):
         description='"full" (a solve for every appearance), "scale" (base image x scale image), or "auto" (full where '
         "the target has finer detail than scaling can show)",
     )
+    base: Literal["minimum", "white", "high-pass"] = Field(
+        default="minimum",
+        description='the base image: "minimum" (at each pixel the darkest projector\'s white), "white" (even light), or '
+        '"high-pass" (the fine detail of each target, with a solve for each)',
+    )
 
 
 class MainsTable(Table):

@@ -8,18 +8,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from controller.arrays import ByteImage, FloatImage, Mask, load_arrays, save_arrays
 from controller.calibrate.values import Calibration
 from controller.capture.patterns import Pattern, PatternKind, plan_patterns
-from controller.errors import WorkError
+from controller.errors import UsageError, WorkError
 from controller.session import costs
 from controller.session.calibrating import read_calibration
 from controller.session.edging import edged
 from controller.session.runner import Context, Step
-from controller.solve.appearance import Base, Mode, base_image, make_appearance, prepare_base, solve_base
+from controller.solve.appearance import (
+    Base,
+    BaseChoice,
+    Mode,
+    base_image,
+    high_pass_base,
+    make_appearance,
+    prepare_base,
+    solve_base,
+)
 from controller.solve.bounded import Solution
 from controller.solve.dither import to_device
 from controller.solve.drive import Drive
@@ -48,14 +58,29 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class SolveOptions:
-    """``share`` of the object's pixels that each target's exposure makes reachable; ``smoothness`` of eq. 3."""
+    """``share`` of the object's pixels that each target's exposure makes reachable; ``smoothness`` of eq. 3.
+
+    ``base``: the base image; with "high-pass" each appearance solves one of its own.
+    """
 
     share: float
     smoothness: float
     mode: Mode = "auto"
+    base: BaseChoice = "minimum"
 
     def inputs(self) -> dict[str, str]:
-        return {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode}
+        return {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode, "base": self.base}
+
+
+def base_choice(name: str) -> BaseChoice:
+    """The base image that a person typed. Raises UsageError("base-unknown")."""
+    known: tuple[BaseChoice, ...] = get_args(BaseChoice)
+    for choice in known:
+        if choice == name:
+            return choice
+    raise UsageError(
+        "base-unknown", what=f"There is no base image called {name}.", remedy=f"Choose one of {', '.join(known)}."
+    )
 
 
 class Calibrated:
@@ -163,7 +188,7 @@ def random_pattern(size_px: tuple[int, int]) -> Pattern:
 
 def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context) -> Sequence[Path]:
     black = calibrated.calibration.black
-    image = base_image(calibrated.calibration)
+    image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
     base = solve_base(
         calibrated.transport, image, black, smoothness=options.smoothness, progress=_watched(context)
     )  # fmt: skip
@@ -197,9 +222,13 @@ def _solve_appearance(calibrated: Calibrated, wish: Wish, options: SolveOptions,
     target = target_radiance(picture, black, exposure)
     possible = feasibility(transport, wanted, black, drive=drive)
     solve_began_s = time.perf_counter()
+    base = calibrated.base
+    if options.base == "high-pass":
+        image = high_pass_base(transport, base.image, target, black)
+        base = solve_base(transport, image, black, smoothness=options.smoothness, progress=_watched(context))
     made = make_appearance(
         transport,
-        calibrated.base,
+        base,
         target,
         black,
         mode=options.mode,

@@ -22,6 +22,7 @@ from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
 
 BaseKind = Literal["minimum", "white"]
+BaseChoice = Literal["minimum", "white", "high-pass"]
 Mode = Literal["auto", "scale", "full"]
 
 FAINTEST_BASE: Final = 1e-2
@@ -77,6 +78,23 @@ def base_image(calibration: Calibration, kind: BaseKind = "white") -> FloatImage
     reach = (whites.sum(axis=0) + calibration.black)[mask].min(axis=1)
     level = HEADROOM * float(np.quantile(reach, 0.05)) if reach.size else 0.0
     return np.where(mask[..., None], np.maximum(calibration.black, np.float32(level)), calibration.black)
+
+
+def high_pass_base(transport: LightTransport, level: FloatImage, target: FloatImage, black: FloatImage) -> FloatImage:
+    """A base image for one target: ``level`` with the target's detail above one projector's frequency limit.
+
+    The scale image that remains is smooth, so that the product keeps all of the target (paper 3.3, Fig. 12).
+
+    Parameters
+    ----------
+    level : (rows, columns, 3) an even base image (``base_image(calibration, "white")``), with the black image
+    target, black : (rows, columns, 3) radiance
+    """
+    even = np.maximum(level - black, 0)
+    scale = np.divide(np.maximum(target - black, 0), even, out=np.zeros_like(even), where=even > 0)
+    low = _low_pass(transport, scale, (even > 0).astype(np.float32))
+    detail = np.divide(scale, low, out=np.zeros_like(scale), where=low > 0)
+    return np.asarray(black + even * detail, np.float32)
 
 
 def solve_base(
@@ -135,18 +153,22 @@ def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black
 
     F is half a cycle a projector pixel, whose pitch in the camera is the root of camera pixels by projector pixels.
     """
-    pitch = max((_pitch(transport, n) for n in range(len(transport.sizes))), default=1.0)
     light = np.maximum(target - black, 0)
     inverse = plane_image(base.inverse)
     scale = light * inverse
-    # A Gaussian that halves the amplitude at F: exp(-2 (pi sigma F)^2) = 1/2 with F = 1 / (2 pitch).
-    sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi
-    present = (inverse > 0).astype(np.float32)
-    blurred, weight = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (scale, present))
-    low = np.divide(blurred, weight, out=np.zeros_like(blurred), where=weight > 0)
+    low = _low_pass(transport, scale, (inverse > 0).astype(np.float32))
     fine = np.divide(scale - low, inverse, out=np.zeros_like(scale), where=inverse > 0)
     whole = float((light[transport.object_mask].astype(np.float64) ** 2).sum())
     return float(np.sqrt((fine[transport.object_mask].astype(np.float64) ** 2).sum() / whole)) if whole > 0 else 0.0
+
+
+def _low_pass(transport: LightTransport, image: FloatImage, present: FloatImage) -> FloatImage:
+    """The image below the frequency limit of the coarsest projector, where ``present`` (both (rows, columns, 3))."""
+    pitch = max((_pitch(transport, n) for n in range(len(transport.sizes))), default=1.0)
+    # A Gaussian that halves the amplitude at F: exp(-2 (pi sigma F)^2) = 1/2 with F = 1 / (2 pitch).
+    sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi
+    blurred, weight = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (image, present))
+    return np.divide(blurred, weight, out=np.zeros_like(blurred), where=weight > 0)
 
 
 def _pitch(transport: LightTransport, n: int) -> float:

@@ -5,18 +5,27 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 
+import cv2
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from controller.arrays import Float64, FloatImage
 from controller.calibrate.decode import decode
-from controller.calibrate.dots import WIDEST_CUT, fit_dots
+from controller.calibrate.dots import WIDEST_CUT, fit_dots, largest_sigma_px, peak_share
 from controller.calibrate.guess import guess_metapixels, modelled_correspondence
-from controller.calibrate.values import Geometry, Metapixels, Pinhole
+from controller.calibrate.values import (
+    Calibration,
+    Geometry,
+    Metapixels,
+    Pinhole,
+    ProjectorCalibration,
+    Radiometry,
+)
 from controller.capture.dots import dot_frame, dot_patterns
 from controller.capture.patterns import plan_patterns
 from controller.errors import CalibrationError
+from controller.transport import LightTransport
 from tests.controller.calibrate.simulator import Scene, Stage, photographed
 
 SMALL = Scene(camera_px=(120, 96), projector_px=(48, 40))
@@ -167,6 +176,53 @@ def test_a_few_saturated_camera_pixels_do_no_harm() -> None:
     assert report.failed < 0.01 * report.fitted
     use = inside(scene) & whole.valid
     assert np.sqrt(np.mean((found.centre_px - whole.centre_px)[use] ** 2)) < 0.05
+
+
+def test_the_transport_of_fitted_dots_gives_the_white_image_where_it_is_lit() -> None:
+    scene, r = SCENES["in focus"]
+    captures, white = dots_of(scene, r)
+    found, _ = fit_dots(captures, white, guess_of(scene), r)
+    white = np.maximum(white, 0)
+    radiometry = Radiometry(np.tile(np.linspace(0, 1, 256), (3, 1)), np.array(scene.mixing))
+    lit = white.min(axis=2) > 0.05 * white.max()
+    part = ProjectorCalibration("left", found, radiometry, white)
+    transport = LightTransport.build(Calibration((part,), np.zeros_like(white), lit, np.eye(3)))
+    seen = transport.project_one(0, np.ones((*found.valid.shape, 3), np.float32))
+    near = np.zeros(lit.shape, bool)
+    x, y = np.round(found.centre_px[found.valid]).astype(int).T
+    inside_picture = (x >= 0) & (y >= 0) & (x < lit.shape[1]) & (y < lit.shape[0])
+    near[y[inside_picture], x[inside_picture]] = True
+    near = cv2.dilate(near.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert transport.lit[0][lit & near].mean() > 0.99
+    use = lit & near
+    assert np.sqrt(np.mean((seen - white)[use] ** 2)) < 0.01 * np.sqrt(np.mean(white[use] ** 2))
+
+
+def test_where_a_fit_fails_the_models_guess_is_taken_if_there_is_one() -> None:
+    scene, r = SCENES["in focus"]
+    captures, white = dots_of(scene, r)
+    guess = guess_of(scene)
+    model = Metapixels(guess.centre_px + np.float32(0.25), guess.covariance_px2, guess.valid.copy())
+    model.valid[:20] = False
+    dark = {**captures, "dot-02-03": captures["black"]}
+    found, _ = fit_dots(dark, white, guess, r, fallback=model)
+    rows = np.arange(3, scene.projector_px[1], r)
+    np.testing.assert_array_equal(found.centre_px[rows[rows < 20], 2::r], guess.centre_px[rows[rows < 20], 2::r])
+    np.testing.assert_array_equal(found.centre_px[rows[rows >= 20], 2::r], model.centre_px[rows[rows >= 20], 2::r])
+
+
+def test_blur_and_brightness_of_dots_are_known_before_any_is_shown() -> None:
+    for scene, r in SCENES.values():
+        captures, white = dots_of(scene, r)
+        found, _ = fit_dots(captures, white, guess_of(scene), r)
+        spread = scene.projector_blur_px**2 + (scene.lit_share_of_pixel / 10) ** 2 / 12
+        camera = (scene.camera_blur_px**2 + 1 / 12) / scene.scale**2
+        wanted = np.sqrt(spread + camera)
+        assert largest_sigma_px(found) == pytest.approx(wanted, rel=0.25)
+        grey = (captures[f"dot-{20 % r:02d}-{18 % r:02d}"] - captures["black"]).sum(axis=2)
+        x, y = np.round(found.centre_px[18, 20]).astype(int)
+        brightest = (grey / white.sum(axis=2))[y - 2 : y + 3, x - 2 : x + 3].max()
+        assert peak_share(found) == pytest.approx(brightest, rel=0.3)
 
 
 def test_a_missing_picture_and_one_of_another_size_are_refused() -> None:
