@@ -1,5 +1,6 @@
 # make demo   the whole job on an emulated stage, ending in demo/report.html
 # make test   every test
+# make blender   Blender, for targets that it renders
 # Both do their own set-up.
 
 SIZE ?= small
@@ -8,14 +9,18 @@ SEED ?= 1
 OBJECT ?=
 NAME ?=
 
-.PHONY: demo test lint bench lock clean
+.PHONY: demo blender test lint bench lock clean
 
 demo:
 	@.ci/setup demo
 	@.venv/bin/velatura demo --size $(SIZE) --out $(OUT) --seed $(SEED) $(if $(OBJECT),--object "$(OBJECT)")
 
+blender:
+	@.ci/setup-blender
+
 test:
 	@.ci/setup test
+	@.ci/setup-blender
 	@.ci/system-packages
 	.venv/bin/python -m pytest $(TESTS)
 
@@ -34,4 +39,4 @@ lock:
 	.ci/lock
 
 clean:
-	rm -rf .venv build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-blender build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

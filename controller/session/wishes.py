@@ -15,6 +15,7 @@ from controller.config.arguments import allowed, checked_arguments
 from controller.config.models import AppearanceTable
 from controller.errors import UsageError
 from controller.session.calibrating import read_geometry
+from controller.session.rendering import blender_wish
 from controller.session.solving import Calibrated, Wish
 from controller.solve import targets
 from controller.solve.pieces import on_each
@@ -28,6 +29,7 @@ TITLES: Mapping[str, str] = {
     "gloss": "A gloss",
     "recolour": "Recoloured",
     "picture": "A picture as seen from the camera",
+    "blender": "Rendered by Blender",
 }
 """Every kind of appearance, as a person calls it."""
 
@@ -64,6 +66,8 @@ def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
     if file is not None:
         _check_picture(table, file, calibrated.camera_px)
     inputs = {"kind": table.kind, "settings": repr(sorted(options.items()))}
+    if table.kind == "blender":
+        return blender_wish(table.name, calibrated, options, inputs, folder=stage.folder)
     if file is not None:
         inputs["file"] = sha256_of(file)
 
@@ -86,6 +90,8 @@ def _options(kind: str) -> dict[str, Any]:
     """The settings of a kind with their types: the keyword arguments of what makes it."""
     if kind == "recolour":
         return {"tint": targets.Colour}
+    if kind == "blender":
+        return {"scene": str, "samples": int, "seed": int}
     if kind not in _MAKERS:
         return {}
     types = get_type_hints(_MAKERS[kind])

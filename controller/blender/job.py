@@ -1,0 +1,206 @@
+"""What Blender is given to render, as files: the reconstructed object in the calibrated camera's view."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from controller.arrays import Float64, FloatImage, Mask, save_arrays
+from controller.calibrate.surface import grid_mesh
+from controller.calibrate.values import Geometry, Pinhole
+from controller.errors import WorkError
+from controller.solve.relight import smooth_normals
+from controller.solve.targets_values import Target
+from controller.storage import write_atomically
+
+BUILTIN: Final = ("marble", "gold", "glazed", "lowered-head")
+"""The scenes of ``scenes.py``."""
+MOST_VERTICES: Final = 400_000
+THICKNESS: Final = 0.2
+"""Of the object behind what the camera sees, as a share of its size: light that goes in must not come out there."""
+FURTHEST_FILL_PX: Final = 8.0
+"""Seams between parts at different depths are filled from as far away."""
+BRIGHTEST_PERCENT: Final = 97.0
+SMOOTHING_PX: Final = 2.0
+"""Standard deviation of the smoothing of the normals, whose noise would glitter in a glaze."""
+
+
+@dataclass(frozen=True, slots=True)
+class RenderSettings:
+    """``samples`` a pixel at most (noise decides); ``threads`` 0 takes all cores; ``seed`` of the sampling."""
+
+    samples: int = 96
+    seed: int = 1
+    denoise: bool = True
+    threads: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The picture that is rendered: the calibrated camera without distortion, wider by ``margin_px`` on every side.
+
+    ``size_px`` (width, height) with the margins
+    """
+
+    size_px: tuple[int, int]
+    margin_px: int
+
+
+def write_job(
+    folder: Path,
+    geometry: Geometry,
+    mask: Mask,
+    light: FloatImage,
+    *,
+    builtin: str | None,
+    scene_file: Path | None,
+    settings: RenderSettings,
+) -> View:
+    """Write ``job.json`` and ``mesh.npz`` into ``folder``.
+
+    Parameters
+    ----------
+    mask : (camera rows, columns), the object
+    light : (camera rows, columns, 3), what the camera sees under the white of all projectors; from it and the known
+        places of the projectors comes the object's own paint
+
+    Raises WorkError("target-no-geometry") when too little of the object's shape is known.
+    """
+    normals, _, known = smooth_normals(geometry, mask, SMOOTHING_PX, reach_px=0)
+    shape = dataclasses.replace(geometry, normals=np.where(known[..., None], normals, np.nan).astype(np.float32))
+    step = max(1, math.ceil(math.sqrt(np.count_nonzero(known) / MOST_VERTICES)))
+    mesh = grid_mesh(shape, step=step)
+    if len(mesh.triangles) == 0:
+        raise WorkError(
+            "target-no-geometry",
+            what="Too little of the object's shape is known to render it.",
+            remedy="Calibrate again with better overlap of the projectors, or give a finished picture as the target.",
+        )
+    rows, columns = mask.shape
+    column, row = np.round(mesh.camera_px).astype(int).T
+    paint = own_paint(geometry, light)[row, column]
+    save_arrays(
+        folder / "mesh.npz",
+        {
+            "vertices_m": upright(np.concatenate([mesh.vertices_m, _behind(mesh.vertices_m)])),
+            "normals": upright(np.concatenate([mesh.normals, -mesh.normals])),
+            "triangles": solid(mesh.triangles, len(mesh.vertices_m)),
+            "uv": np.tile(np.stack([(column + 0.5) / columns, 1 - (row + 0.5) / rows], axis=1), (2, 1)),
+            "reflectance": np.tile(paint, (2, 1)),
+        },
+    )
+    margin = _margin_px(geometry.camera)
+    view = View((columns + 2 * margin, rows + 2 * margin), margin)
+    distance = mesh.vertices_m[:, 2]
+    matrix = geometry.camera.matrix
+    job = {
+        "builtin": builtin,
+        "scene_file": None if scene_file is None else str(scene_file.resolve()),
+        "camera": {
+            "size_px": view.size_px,
+            "fx": float(matrix[0, 0]),
+            "fy": float(matrix[1, 1]),
+            "cx": float(matrix[0, 2]) + margin,
+            "cy": float(matrix[1, 2]) + margin,
+            "near_m": float(distance.min()) * 0.2,
+            "far_m": float(distance.max()) * 20,
+        },
+        **dataclasses.asdict(settings),
+    }
+    write_atomically(folder / "job.json", json.dumps(job, indent=1).encode())
+    return view
+
+
+def upright(vectors: FloatImage) -> FloatImage:
+    """(..., 3) from the camera's frame (x right, y down, z away) to one with z up: x right, y away."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    return np.ascontiguousarray(np.stack([x, z, -y], axis=-1), dtype=np.float32)
+
+
+def _behind(vertices_m: FloatImage) -> FloatImage:
+    """The back's vertices: each on its own line of sight, so that the front hides the whole back."""
+    low, high = np.percentile(vertices_m, [2, 98], axis=0)
+    thickness = THICKNESS * float(np.max(high - low))
+    distance = np.linalg.norm(vertices_m, axis=1, keepdims=True)
+    return np.asarray(vertices_m * (1 + thickness / np.maximum(distance, 1e-9)), np.float32)
+
+
+def solid(triangles: npt.NDArray[np.int32], vertices: int) -> npt.NDArray[np.int32]:
+    """Close a surface: ``triangles`` (n, 3) of the front, the same of the back (vertex + ``vertices``, turned round),
+    and walls between them along every edge that only one triangle has."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+    key = edges.min(axis=1) * vertices + edges.max(axis=1)
+    _, first, count = np.unique(key, return_index=True, return_counts=True)
+    a, b = edges[first[count == 1]].T
+    walls = [np.stack([b, a, a + vertices], axis=1), np.stack([b, a + vertices, b + vertices], axis=1)]
+    return np.concatenate([triangles, triangles[:, ::-1] + vertices, *walls]).astype(np.int32)
+
+
+def own_paint(geometry: Geometry, light: FloatImage) -> FloatImage:
+    """(rows, columns, 3) reflectance in [0.02, 0.95]: the light that comes back over the light that arrives.
+
+    What arrives is taken as falling with the square of the distance and the cosine (Lambert), the same from every
+    projector, which is right but for one factor; the palest places are given 0.9.
+    """
+    arrives = np.zeros(light.shape[:2], np.float32)
+    for projector in geometry.projectors:
+        centre = (-projector.rotation.T @ projector.translation_m).astype(np.float32)
+        towards = centre - geometry.points_m
+        distance = np.linalg.norm(towards, axis=2)
+        cosine = np.sum(towards * geometry.normals, axis=2) / np.maximum(distance, 1e-6)
+        arrives += np.nan_to_num(np.maximum(cosine, 0) / np.maximum(distance, 1e-6) ** 2)
+    known = arrives > 0.05 * arrives.max(initial=0)
+    ratio = np.where(known[..., None], light / np.maximum(arrives, 1e-9)[..., None], 0)
+    palest = np.percentile(ratio[known], 98) if known.any() else 1.0
+    paint: FloatImage = np.clip(0.9 * ratio / max(float(palest), 1e-9), 0.02, 0.95).astype(np.float32)
+    return paint
+
+
+def _margin_px(camera: Pinhole) -> int:
+    """How far distortion moves the picture's edge, in pixels, and two more for the interpolation."""
+    if not np.any(camera.distortion):
+        return 0
+    width, height = camera.size_px
+    edge = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
+    moved = _ideal_px(camera, edge)
+    outwards = max(float(-moved.min()), float((moved - (width - 1, height - 1)).max()), 0.0)
+    return math.ceil(outwards) + 2
+
+
+def _ideal_px(camera: Pinhole, seen_px: Float64) -> Float64:
+    """Where the camera without its distortion would see what it sees at ``seen_px`` (n, 2)."""
+    distortion = np.array([*camera.distortion, 0.0, 0.0])
+    moved = cv2.undistortPoints(seen_px.reshape(-1, 1, 2), camera.matrix, distortion, P=camera.matrix)
+    return np.asarray(moved, np.float64).reshape(-1, 2)
+
+
+def as_seen(picture: FloatImage, view: View, camera: Pinhole, mask: Mask) -> Target:
+    """The rendered picture (rows, columns, 4; transparent where no object is) as the calibrated camera sees it.
+
+    The picture is scaled so that all but its highlights lie below 1, and clipped at 1.5; the exposure is the solver's.
+    """
+    rows, columns = mask.shape
+    if view.margin_px:
+        y, x = np.mgrid[0:rows, 0:columns]
+        where = _ideal_px(camera, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)) + view.margin_px
+        maps = where.reshape(rows, columns, 2).astype(np.float32)
+        picture = np.asarray(cv2.remap(picture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR), np.float32)
+    covered = picture[..., 3] > 0.5
+    # Alpha is premultiplied in a rendering; at silhouettes the object's own light is what counts.
+    colour = np.where(covered[..., None], picture[..., :3] / np.maximum(picture[..., 3:], 0.5), 0)
+    colour = np.where(np.isfinite(colour), np.maximum(colour, 0), 0)
+    scale = float(np.percentile(colour[mask & covered].max(axis=1), BRIGHTEST_PERCENT)) if covered[mask].any() else 1.0
+    distance, nearest = ndimage.distance_transform_edt(~(covered & mask), return_indices=True)
+    filled = mask & (distance <= FURTHEST_FILL_PX)
+    # Where a bent shape leaves the object bare, there is nothing to be seen: black.
+    image = np.where(filled[..., None], np.minimum(colour[tuple(nearest)] / max(scale, 1e-9), 1.5), 0)
+    return Target(np.ascontiguousarray(image, np.float32), mask)
