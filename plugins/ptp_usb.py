@@ -240,9 +240,13 @@ class PtpUsbLink:
         while more or received < length:
             buffer = self._buffer(len(self._block) if length < 0 else length - received)
             count, late = self._read(buffer, deadline)
+            if length >= 0 and count > length - received:
+                # Some send the response behind the data, without a packet's end between them.
+                self._spare = buffer[length - received : count].tobytes()
+                count = length - received
             received += count
-            if received > (most if length < 0 else length):
-                raise broken(f"{received} bytes of data where {length if length >= 0 else most} were allowed")
+            if received > most:
+                raise broken(f"{received} bytes of data where at most {most} were expected")
             if count:
                 take(memoryview(buffer)[:count])
             if length < 0:

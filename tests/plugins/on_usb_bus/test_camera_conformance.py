@@ -1,0 +1,40 @@
+"""The shared suite for cameras, on the emulated USB bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar
+
+import pytest
+
+from hal.conformance import CameraConformance
+from hal.deadline import in_seconds
+from hal.registry import OpenContext
+from plugins.emulated.usb_bus_process import UsbBusProcess
+from plugins.ptp_camera import open_camera
+from plugins.ptp_still import PtpCamera
+
+
+class EveryFlavour(CameraConformance):
+    flavour: ClassVar[str]
+    patience_s = 20.0
+
+    @pytest.fixture
+    def camera(self, bus: UsbBusProcess, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PtpCamera]:
+        bus.add("camera", "camera", flavour=self.flavour, size=50_000, time_scale=0.01)
+        context = OpenContext(tmp_path_factory.mktemp("stage"), transcripts=tmp_path_factory.mktemp("transcripts"))
+        camera = open_camera({"address": "usb:"}, context, in_seconds(5))
+        yield camera
+        camera.close()
+
+
+class TestGeneric(EveryFlavour):
+    flavour = "generic"
+
+
+class TestEosNew(EveryFlavour):
+    flavour = "eos-new"
+
+
+class TestEosOld(EveryFlavour):
+    flavour = "eos-old"
