@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from controller.arrays import Float64, FloatImage, Mask
-from controller.calibrate.values import Metapixels
+from controller.calibrate.values import Metapixels, PhaseMap
 
 CUT = 3.0
 """Gaussians end at this Mahalanobis distance."""
@@ -37,6 +37,36 @@ def gaussian_weights(metapixels: Metapixels, camera_shape: tuple[int, int]) -> s
             parts.append(((y * columns + x)[ok], which[ok], np.exp(-0.5 * squared[ok])))
     row, column, value = (np.concatenate(part) for part in zip(*parts, strict=True))
     return sp.csr_matrix((value, (row, column)), shape=(rows * columns, metapixels.valid.size))
+
+
+def phase_map_shares(phase_map: PhaseMap) -> sp.csr_matrix[np.float64]:
+    """Each camera pixel's normalised Gaussian over the projector's pixels, cut at four standard deviations.
+
+    The blur is that of the projector pixel nearest to where the camera pixel looks. The plain form of what
+    ``controller.transport.windows`` keeps, without the camera's colours.
+    """
+    rows, columns = phase_map.spread_px2.shape[:2]
+    position = phase_map.projector_px.reshape(-1, 2).astype(np.float64)
+    x, y = position.T
+    with np.errstate(invalid="ignore"):
+        which = np.flatnonzero((x >= -2) & (y >= -2) & (x < columns + 1) & (y < rows + 1))
+    x, y = position[which].T
+    near = np.clip(np.floor(y + 0.5), 0, rows - 1).astype(int), np.clip(np.floor(x + 0.5), 0, columns - 1).astype(int)
+    xx, xy, yy = phase_map.spread_px2[near].astype(np.float64).T
+    with np.errstate(invalid="ignore"):
+        good = (xx > 0) & (yy > 0) & (xx * yy > xy * xy)
+    which, x, y, xx, xy, yy = which[good], x[good], y[good], xx[good], xy[good], yy[good]
+    reach_x, reach_y = (int(np.ceil(4 * np.sqrt(v.max(initial=0)) + 1)) for v in (xx, yy))
+    parts = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
+    for dy in range(-reach_y, reach_y + 1):
+        for dx in range(-reach_x, reach_x + 1):
+            column, row = np.round(x).astype(np.int64) + dx, np.round(y).astype(np.int64) + dy
+            u, v = x - column, y - row
+            squared = (yy * u * u - 2 * xy * u * v + xx * v * v) / (xx * yy - xy * xy)
+            ok = (squared <= 16) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+            parts.append((which[ok], (row * columns + column)[ok], np.exp(-0.5 * squared[ok])))
+    at, to, value = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return normalised(sp.csr_matrix((value, (at, to)), shape=(position.shape[0], rows * columns)))
 
 
 def normalised(weights: sp.csr_matrix[np.float64]) -> sp.csr_matrix[np.float64]:
