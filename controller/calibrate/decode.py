@@ -83,9 +83,10 @@ def decode(
     lit = _lit(sums, half)
     position = np.full((*black.shape, 2), np.nan, np.float32)
     modulation, state = np.zeros(black.shape, np.float32), np.zeros(black.shape, np.uint8)
-    wanted = (lit | _bright(sums, half)) & axes[0].sure & axes[1].sure
+    seen = lit | _bright(sums, half)
+    wanted = seen & axes[0].sure & axes[1].sure
     _locate(sums.waves, axes[0].cell, axes[1].cell, wanted, half, sums.noise, position, modulation, state)
-    _check_order(lit | _bright(sums, half), lit, state, position)
+    _check_order(seen, lit, state, position)
     valid = lit & ((state & CODED) > 0) & ((state & CONTRADICTED) == 0)
     del sums, axes
     valid &= _inside(position, plan.size_px, 0.0)
@@ -173,9 +174,9 @@ def _locate(
             state[row, column] = found
             position[row, column, 0], position[row, column, 1] = work[0, 0], work[0, 1]
             first = 4 if found & FINE else 0
-            strong = np.hypot(waves[first, row, column], waves[first + 1, row, column])
-            strong *= np.hypot(waves[first + 2, row, column], waves[first + 3, row, column])
-            contrast = np.sqrt(strong) / light
+            strong = waves[first, row, column] ** 2 + waves[first + 1, row, column] ** 2
+            strong *= waves[first + 2, row, column] ** 2 + waves[first + 3, row, column] ** 2
+            contrast = strong**0.25 / light
             modulation[row, column] = min(contrast, 1.0) ** FINE_TO_COARSE if found & FINE else contrast
 
 

@@ -61,6 +61,17 @@ def _fringe(
     y0 = _nearest(fine[1], FRINGE_PX, coarse[1]) if use_y else coarse[1]
     variance_d = FINE_SYSTEMATIC_PX**2 + (noise[2] ** 2 if use_d else 0.0)
     variance_d += min(noise[0], spread[0]) ** 2 + min(noise[1], spread[1]) ** 2
+    x_off, y_off = (x0 - coarse[0]) ** 2 / spread[0] ** 2, (y0 - coarse[1]) ** 2 / spread[1] ** 2
+    best[0], best[1] = x0, y0
+    first = x_off + y_off
+    if use_d:
+        best[2] = _nearest(fine[2], DIAGONAL_PX, x0 + y0)
+        first += (x0 + y0 - best[2]) ** 2 / variance_d
+    # what another fringe costs in coarse phase alone; nearly every pixel is settled by this
+    x_other = (FRINGE_PX - abs(x0 - coarse[0])) ** 2 / spread[0] ** 2 - x_off if use_x else np.inf
+    y_other = (FRINGE_PX - abs(y0 - coarse[1])) ** 2 / spread[1] ** 2 - y_off if use_y else np.inf
+    if first <= WORST_FIT and min(x_other, y_other) + x_off + y_off - first >= SURE_BY:
+        return True
     for i in range(-1 if use_x else 0, 2 if use_x else 1):
         for j in range(-1 if use_y else 0, 2 if use_y else 1):
             x, y = x0 + i * FRINGE_PX, y0 + j * FRINGE_PX
@@ -128,13 +139,13 @@ def locate_pixel(
             np.arctan2(b, a) * (PERIOD_PX / (2 * np.pi)), cell_x if axis == 0 else cell_y, cell_px
         )
         agree = agree and near
-        spread[axis] = PHASE_NOISE * sigma / np.hypot(a, b) * (PERIOD_PX / (2 * np.pi))
+        spread[axis] = PHASE_NOISE * sigma / np.sqrt(a * a + b * b) * (PERIOD_PX / (2 * np.pi))
         best[axis] = coarse[axis]
     if not agree:
         return DARK
     for k in range(3):
         a, b = waves[4 + 2 * k, row, column], waves[5 + 2 * k, row, column]
-        amplitude = np.hypot(a, b)
+        amplitude = np.sqrt(a * a + b * b)
         per_rad = (DIAGONAL_PX if k == 2 else FRINGE_PX) / (2 * np.pi)
         fine[k] = np.arctan2(b, a) * per_rad
         noise[k] = PHASE_NOISE * sigma / amplitude * per_rad if amplitude > LEAST_FINE_CONTRAST * half else np.inf

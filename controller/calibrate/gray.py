@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from controller.arrays import FloatImage, Mask
 from controller.calibrate.captures import Captures, grey
 from controller.capture.patterns import PatternPlan
+from controller.compiled import compiled
 
 WEAK_BIT = 0.25
 """Of half the white's light: nearer to the threshold, a bit is not to be relied on."""
@@ -46,11 +48,24 @@ def decode_cells(captures: Captures, plan: PatternPlan, axis: int, threshold: Fl
     cell = np.zeros(threshold.shape, np.int32)
     bit = np.zeros(threshold.shape, np.bool_)
     weak = np.zeros(threshold.shape, np.uint8)
-    limit = np.float32(WEAK_BIT) * np.abs(half)
     for pattern in plan.gray(axis):
-        above = grey(captures, pattern.name, threshold.shape)
-        above = above - threshold
-        bit ^= above > 0
-        cell = (cell << 1) | bit
-        weak += ~(np.abs(above) >= limit)  # not a number is weak
+        _add_bit(grey(captures, pattern.name, threshold.shape), threshold, half, bit, cell, weak)
     return Cells(cell, weak)
+
+
+@compiled(parallel=True)
+def _add_bit(
+    image: FloatImage,
+    threshold: FloatImage,
+    half: FloatImage,
+    bit: Mask,
+    cell: npt.NDArray[np.int32],
+    weak: npt.NDArray[np.uint8],
+) -> None:
+    for row in numba.prange(image.shape[0]):
+        for column in range(image.shape[1]):
+            above = image[row, column] - threshold[row, column]
+            bit[row, column] ^= above > 0
+            cell[row, column] = 2 * cell[row, column] + bit[row, column]
+            if not abs(above) >= WEAK_BIT * abs(half[row, column]):  # not a number is weak
+                weak[row, column] += 1
