@@ -159,7 +159,7 @@ class SolveTable(Table):
     )
     base: Literal["minimum", "white", "high-pass"] = Field(
         default="minimum",
-        description='the base image: "minimum" (at each pixel the darkest projector\'s white), "white" (even light), or '
+        description='the base image: "minimum" (at each pixel the darkest white image), "white" (even light), or '
         '"high-pass" (the fine detail of each target, with a solve for each)',
     )
 

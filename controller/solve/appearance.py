@@ -33,6 +33,10 @@ FINE_DETAIL: Final = 0.02
 """Share of a target's light above one projector's frequency limit from which a full solve is advised."""
 
 
+WELL_BELOW: Final = 0.5
+"""Of the frequency limit: a high-pass base keeps what is above, so that the scale has nothing near the limit."""
+
+
 @dataclass(frozen=True, slots=True)
 class Base:
     """A solved base image, ready to be scaled.
@@ -92,7 +96,7 @@ def high_pass_base(transport: LightTransport, level: FloatImage, target: FloatIm
     """
     even = np.maximum(level - black, 0)
     scale = np.divide(np.maximum(target - black, 0), even, out=np.zeros_like(even), where=even > 0)
-    low = _low_pass(transport, scale, (even > 0).astype(np.float32))
+    low = _low_pass(transport, scale, (even > 0).astype(np.float32), of_limit=WELL_BELOW)
     detail = np.divide(scale, low, out=np.zeros_like(scale), where=low > 0)
     return np.asarray(black + even * detail, np.float32)
 
@@ -162,11 +166,13 @@ def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black
     return float(np.sqrt((fine[transport.object_mask].astype(np.float64) ** 2).sum() / whole)) if whole > 0 else 0.0
 
 
-def _low_pass(transport: LightTransport, image: FloatImage, present: FloatImage) -> FloatImage:
-    """The image below the frequency limit of the coarsest projector, where ``present`` (both (rows, columns, 3))."""
+def _low_pass(
+    transport: LightTransport, image: FloatImage, present: FloatImage, *, of_limit: float = 1.0
+) -> FloatImage:
+    """The image below that part of the coarsest projector's frequency limit, where ``present``; (rows, columns, 3)."""
     pitch = max((_pitch(transport, n) for n in range(len(transport.sizes))), default=1.0)
     # A Gaussian that halves the amplitude at F: exp(-2 (pi sigma F)^2) = 1/2 with F = 1 / (2 pitch).
-    sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi
+    sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi / of_limit
     blurred, weight = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (image, present))
     return np.divide(blurred, weight, out=np.zeros_like(blurred), where=weight > 0)
 

@@ -16,6 +16,7 @@ from controller.solve.appearance import (
     BaseKind,
     base_image,
     fine_detail,
+    high_pass_base,
     make_appearance,
     prepare_base,
     scale_frames,
@@ -93,6 +94,20 @@ def test_a_smooth_target_is_left_to_the_scale(stage: Stage) -> None:
     calibration = stage()
     transport, base = based(calibration)
     target = scaled(base, calibration.black, smooth_scale(transport.shape))
+    assert make_appearance(transport, base, target, calibration.black).mode == "scale"
+
+
+def test_a_high_pass_base_takes_the_fine_detail_and_leaves_a_smooth_scale(stage: Stage) -> None:
+    calibration = stage()
+    transport, white = based(calibration)
+    stripes = 0.7 + 0.3 * (np.arange(transport.shape[1]) % 4 < 2)
+    fine = np.broadcast_to(stripes.astype(np.float32)[None, :, None], (*transport.shape, 3))
+    target = scaled(white, calibration.black, 0.6 * smooth_scale(transport.shape) * fine)
+    image = high_pass_base(transport, white.image, target, calibration.black)
+    base = solve_base(transport, image, calibration.black)
+    before = fine_detail(transport, white, target, calibration.black)
+    assert before > 0.1
+    assert fine_detail(transport, base, target, calibration.black) < 0.1 * before
     assert make_appearance(transport, base, target, calibration.black).mode == "scale"
 
 
