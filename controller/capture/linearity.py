@@ -10,14 +10,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import Float64
+from controller.arrays import Float64, Mask
 from controller.capture.demosaic import SensorLevels
 
-WELL_LIT = (0.08, 0.6)
+WELL_LIT = (0.2, 0.7)
 """Shares of full scale between which a ratio of exposures is taken: above noise, below every limit."""
 BINS = 40
 FEWEST = 200
 FEWEST_IN_BIN = 40
+GLARING, GLARE_PX = 0.8, 5
+BENDS_FROM = 0.4
+"""Of full scale: no sensor bends below; what deviates there moved or flickered."""
+FEWEST_BENT = 2
 TOLERANCE = 0.01
 """A level counts as linear while the median of its samples is within 1 % of what the shorter exposure predicts."""
 PILED = 1.15
@@ -79,8 +83,17 @@ def check_series(series: Sequence[Exposed], levels: SensorLevels) -> Linearity:
         limit, deviation = _limits(shorter, longer, levels, ratio)
         limits.append(limit)
         worst = max(worst, deviation)
-    clip = np.minimum.reduce(limits) if limits else np.full((2, 2), np.inf)
-    return Linearity(tuple(ratios), tuple(nominal), clip, worst)
+    return Linearity(tuple(ratios), tuple(nominal), common_limit(limits), worst)
+
+
+def common_limit(limits: Sequence[Float64]) -> Float64:
+    """(2, 2) limit of each site from several findings, inf where none found one.
+
+    The highest: a sensor's limit is the same every time, and what something else made look like one is lower.
+    """
+    found = np.stack([np.full((2, 2), -np.inf), *(np.where(np.isfinite(one), one, -np.inf) for one in limits)])
+    highest = found.max(axis=0)
+    return np.where(np.isfinite(highest), highest, np.inf)
 
 
 def exposure_ratio(shorter: Exposed, longer: Exposed, levels: SensorLevels) -> float:
@@ -89,12 +102,14 @@ def exposure_ratio(shorter: Exposed, longer: Exposed, levels: SensorLevels) -> f
     tops, bottoms = 0.0, 0.0
     for row, column in np.ndindex(2, 2):
         x, y = (_site(one, levels, row, column) for one in (shorter, longer))
-        good = (y > WELL_LIT[0]) & (y < WELL_LIT[1]) & (x > 0)
+        # A clipped sample's neighbours may hold some of its light (glare, or a picture that was made smaller).
+        good = (y > WELL_LIT[0]) & (y < WELL_LIT[1]) & (x > 0) & ~_near(y > GLARING)
         if np.count_nonzero(good) < FEWEST:
             continue
         # Samples at an edge or a highlight that something moved are left out; then the ratio of the sums.
         each = y[good] / x[good]
-        near = np.abs(each / np.median(each) - 1) < 0.5
+        off = np.abs(each / np.median(each) - 1)
+        near = off < max(3 * 1.4826 * float(np.median(off)), TOLERANCE)
         tops += float(y[good][near].sum(dtype=np.float64))
         bottoms += float(x[good][near].sum(dtype=np.float64))
     return tops / bottoms if bottoms > 0 else told
@@ -102,7 +117,7 @@ def exposure_ratio(shorter: Exposed, longer: Exposed, levels: SensorLevels) -> f
 
 def _site(one: Exposed, levels: SensorLevels, row: int, column: int) -> npt.NDArray[np.float32]:
     black, white = levels.black[row, column], levels.white[row, column]
-    site = one.samples[row::2, column::2].ravel().astype(np.float32)
+    site = one.samples[row::2, column::2].astype(np.float32)
     return np.asarray((site - np.float32(black)) / np.float32(white - black))
 
 
@@ -138,7 +153,8 @@ def _limits(shorter: Exposed, longer: Exposed, levels: SensorLevels, ratio: floa
     limits, worst = np.full((2, 2), np.inf), 0.0
     for row, column in np.ndindex(2, 2):
         x, y = (_site(one, levels, row, column) for one in (shorter, longer))
-        limit, deviation = _limit(x * np.float32(ratio), y)
+        alone = ~_near(y > 0.98 * float(y.max()))
+        limit, deviation = _limit(x.ravel() * np.float32(ratio), y.ravel(), alone.ravel())
         worst = max(worst, deviation)
         if limit is not None:
             black, white = levels.black[row, column], levels.white[row, column]
@@ -146,31 +162,47 @@ def _limits(shorter: Exposed, longer: Exposed, levels: SensorLevels, ratio: floa
     return limits, worst
 
 
-def _limit(predicted: npt.NDArray[np.float32], seen: npt.NDArray[np.float32]) -> tuple[float | None, float]:
-    """Of one site: the level from which it is not linear (None: none found), and the largest deviation below it."""
+def _near(chosen: Mask) -> Mask:
+    """The samples chosen, and those round them, which may hold some of their light."""
+    spread: Mask = cv2.dilate(chosen.astype(np.uint8), np.ones((GLARE_PX, GLARE_PX), np.uint8)) > 0
+    return spread
+
+
+def _limit(
+    predicted: npt.NDArray[np.float32], seen: npt.NDArray[np.float32], alone: Mask
+) -> tuple[float | None, float]:
+    """Of one site: the level from which it is not linear (None: none found), and the largest deviation below it.
+
+    ``alone``: samples without a clipped one near.
+    """
     ceiling = None
     certain = seen[predicted > PILED * max(1.0, float(np.percentile(seen, 99.99)))]
     if certain.size >= FEWEST:
         # Noise spreads a ceiling that lies below the converter's own; its low end is where trust ends.
         ceiling = float(np.percentile(certain, 1))
+    bins = _deviations(predicted[alone], seen[alone], ceiling if ceiling is not None else np.inf)
+    # Falling behind means: from some level in the upper half on, and all the way up. Anything else is no ceiling.
+    behind = list(itertools.takewhile(lambda one: one[1] < -TOLERANCE and one[0] >= BENDS_FROM, reversed(bins)))
+    bent = behind[-1][0] if len(behind) >= FEWEST_BENT else None
+    worst = max((abs(deviation) for level, deviation in bins if bent is None or level < bent), default=0.0)
+    found = [level for level in (ceiling, bent) if level is not None]
+    return (min(found) * (1 - TOLERANCE / 2) if found else None), worst
+
+
+def _deviations(
+    predicted: npt.NDArray[np.float32], seen: npt.NDArray[np.float32], top: float
+) -> list[tuple[float, float]]:
+    """Lower edge of each well-filled bin of predicted levels below ``top``, rising, and how far its samples deviate."""
     edges = np.linspace(WELL_LIT[0], 1.0, BINS + 1)
-    top = ceiling if ceiling is not None else np.inf
-    worst, bent, behind = 0.0, None, 0
     which = np.digitize(predicted, edges)
+    found = []
     for number in range(1, BINS + 1):
         inside = which == number
         if edges[number] > 0.995 * top or np.count_nonzero(inside) < FEWEST_IN_BIN:
             continue
-        deviation = float(np.mean(seen[inside], dtype=np.float64) / np.mean(predicted[inside], dtype=np.float64) - 1)
-        if abs(deviation) > TOLERANCE:
-            behind += 1
-            if behind == 2 and bent is None:
-                bent = float(edges[number - 2])
-        else:
-            behind = 0
-            worst = max(worst, abs(deviation)) if bent is None else worst
-    found = [level for level in (ceiling, bent) if level is not None]
-    return (min(found) * (1 - TOLERANCE / 2) if found else None), worst
+        ratio = np.mean(seen[inside], dtype=np.float64) / np.mean(predicted[inside], dtype=np.float64)
+        found.append((float(edges[number - 1]), float(ratio) - 1))
+    return found
 
 
 def black_offset(series: Sequence[Exposed], levels: SensorLevels) -> Float64:

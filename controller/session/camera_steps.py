@@ -15,7 +15,14 @@ from controller.arrays import ByteImage, FloatImage
 from controller.capture.acquire import Shot
 from controller.capture.jpeg_response import measure_response, nominal_response
 from controller.capture.latency import LONGEST_S, measure_latency
-from controller.capture.linearity import Exposed, black_offset, check_series, find_hot, true_exposures
+from controller.capture.linearity import (
+    Exposed,
+    black_offset,
+    check_series,
+    common_limit,
+    find_hot,
+    true_exposures,
+)
 from controller.capture.noise import measure_noise
 from controller.capture.profile import CameraProfile
 from controller.capture.raw import RawMosaic, is_jpeg, read_jpeg_values, read_mosaic, read_photograph
@@ -164,7 +171,6 @@ def _of_raw(
     hot = find_hot([one for _, one in dark], levels)
     profile = CameraProfile(black_offset=offset, bad_px=hot)
     levels = replace(levels, black=levels.black + offset)
-    clip = np.full((2, 2), np.inf)
     found, ratios = [], []
     pairs = [tuple(_samples(one, profile) for one in black[:2])] if len(black) > 1 else []
     for number, series in enumerate(whites):
@@ -173,10 +179,10 @@ def _of_raw(
             continue
         checked = check_series([_exposed(one)[1] for one in series], levels)
         found.append(checked)
-        clip = np.minimum(clip, checked.clip)
         ratios.append((sorted(one.exposure_s for one in series), checked.ratios))
         ordered = sorted(series, key=lambda one: one.exposure_s)
         pairs.append((_samples(ordered[0], profile), _samples(ordered[1], profile)))
+    clip = common_limit([one.clip for one in found])
     noise = measure_noise([(first, second) for first, second in pairs])
     profile = replace(profile, clip=clip, exposures=true_exposures(ratios))
     if noise is not None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.capture.linearity import black_offset, check_series, find_hot
+from controller.capture.linearity import black_offset, check_series, common_limit, find_hot, true_exposures
 from tests.controller.capture.sensor_model import SensorModel, textured
 
 LIGHT = textured()
@@ -71,3 +71,21 @@ def test_hot_samples_are_found_and_edges_grain_and_single_hits_are_not() -> None
     found = find_hot(series, model.levels)
     assert {tuple(px) for px in found.tolist()} == {tuple(px) for px in hot.tolist()}
     assert not len(find_hot([], model.levels))
+
+
+def test_only_exposures_that_are_told_noticeably_wrong_are_corrected() -> None:
+    told = [1 / 30, 1 / 8, 1 / 4]
+    right = [((told[0], told[1]), (1.0, 30 / 8 * 1.004)), ((told[1], told[2]), (1.0, 2.0))]
+    assert not len(true_exposures(right))
+    wrong = [((told[0], told[1]), (1.0, 4.0)), ((told[1], told[2]), (1.0, 2.0))]
+    corrected = true_exposures(wrong)
+    np.testing.assert_allclose(corrected[:, 0], told)
+    np.testing.assert_allclose(corrected[1:, 1] / corrected[:-1, 1], (4.0, 2.0))
+    assert np.prod(corrected[:, 1] / corrected[:, 0]) == pytest.approx(1.0)
+
+
+def test_a_limit_seen_once_too_low_does_not_count() -> None:
+    high, low, none = np.full((2, 2), 4000.0), np.full((2, 2), 1700.0), np.full((2, 2), np.inf)
+    np.testing.assert_array_equal(common_limit([low, high, none]), high)
+    np.testing.assert_array_equal(common_limit([none]), none)
+    np.testing.assert_array_equal(common_limit([]), none)

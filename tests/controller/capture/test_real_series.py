@@ -1,0 +1,62 @@
+"""Real photographs of a colour chart at seven exposures; collected only where VELATURA_DATA names their folder."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+import tifffile
+
+from controller.arrays import Float64
+from controller.capture.demosaic import SensorLevels
+from controller.capture.jpeg_response import measure_response
+from controller.capture.linearity import Exposed, check_series
+from controller.capture.noise import measure_noise
+
+LEVELS = SensorLevels(np.array([[0, 1], [1, 2]]), np.zeros((2, 2)), np.full((2, 2), 255.0), np.full((2, 2), 250.0))
+"""8-bit samples, made smaller: what lies near a clipped one holds some of its light."""
+
+
+def series(filter_nm: int) -> list[Exposed]:
+    folder = Path(os.environ["VELATURA_DATA"]) / "linear_bllanos" / "color_checker"
+    paths = sorted((int(path.name.split("_")[3][:-2]), path) for path in folder.glob(f"*_{filter_nm}nm_*.tif"))
+    return [Exposed(tifffile.imread(path).astype(np.uint16), ms / 1000) for ms, path in paths]
+
+
+@pytest.mark.parametrize("filter_nm", [400, 450, 500, 550, 600, 650, 700])
+def test_every_exposure_ratio_is_measured_as_told(filter_nm: int) -> None:
+    found = check_series(series(filter_nm), LEVELS)
+    for (a, b), (told_a, told_b) in zip(
+        itertools.pairwise(found.ratios), itertools.pairwise(found.nominal), strict=True
+    ):
+        assert b / a == pytest.approx(told_b / told_a, rel=0.025)
+
+
+def shape(table: npt.NDArray[Any]) -> Float64:
+    """How a response differs from a linear one below the values that clipped neighbours have changed; 1 at 150."""
+    values = np.arange(20, 171)
+    return np.asarray(table[values] / values / (table[150] / 150), np.float64)
+
+
+@pytest.mark.parametrize("filter_nm", [450, 600])
+def test_the_response_of_a_linear_camera_is_found_linear_better_than_by_opencv(filter_nm: int) -> None:
+    photographs = series(filter_nm)
+    images = [np.repeat(one.samples.astype(np.uint8)[:, :, None], 3, axis=2) for one in photographs]
+    times = np.array([one.exposure_s for one in photographs], np.float32)
+    ours = shape(measure_response(images, times.tolist()).table[0])
+    theirs = shape(cv2.createCalibrateDebevec(samples=400, lambda_=10.0).process(images, times)[:, 0, 0])
+    assert np.abs(ours - 1).max() < 0.05
+    assert np.abs(ours - 1).mean() < np.abs(theirs - 1).mean()
+
+
+def test_real_noise_is_explained_by_shot_and_read_noise() -> None:
+    samples = [np.where(one.samples < 250, one.samples, np.nan) / 255 for one in series(450)[3:5]]
+    found = measure_noise([(samples[0].astype(np.float32), samples[1].astype(np.float32))])
+    assert found is not None
+    assert 0.7 < found.misfit < 1.3
