@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.app import Checked, check_stage, run_on_stage
-from controller.services import finished_calibration
+from controller.app import Checked, check_stage, marker, run_on_stage
+from controller.services import finished_calibration, worst_grade
+from controller.session.calibrating import calibration_steps
+from controller.session.darkness import dark_after
+from controller.session.dotting import dot_steps
 from controller.session.drifting import FILE, drift_steps
+from controller.session.grading import accept, below_grade, compare_with_last, grade_figures, passes
 from controller.session.journal import Journal
+from controller.session.machine import Event
+from controller.session.modes import MODES, CalibrationMode, DotOptions, mode_of
 from controller.session.progress import Level, Reporter
+from controller.session.quick import quick_steps
 from controller.session.rig import Rig
-from controller.session.runner import Step
+from controller.session.runner import Context, Step
 from controller.session.solving import Calibrated
 
 
@@ -36,6 +44,56 @@ def check_drift(*, stage: Path, details: bool, reporter: Reporter, cancel: threa
     with Journal(run) as journal:
         content["seconds"] = journal.steps()["drift-photographs"]
     return {"run": str(run), **(content if details else {"advice": content["advice"]})}
+
+
+def recalibrate(
+    *, stage: Path, reporter: Reporter, cancel: threading.Event, accept_grade: bool = False
+) -> Mapping[str, Any]:
+    """Bring the last calibration up to date, repeating only what has changed; goes on with an unfinished one.
+
+    Raises UsageError("not-calibrated"), CalibrationError("projector-dark"), CalibrationError("calibration-below-grade")
+    for a result that may not replace the last calibration, and what the devices raise.
+    """
+    checked = check_stage(stage)
+    last = finished_calibration(checked.stage.folder)
+    calibrated = Calibrated(last, checked.names)
+
+    def steps(rig: Rig, run: Path) -> Sequence[Step]:
+        longest_s = _longest_s(checked)
+        mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
+        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+                *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
+        return [
+            marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
+            *quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s),
+            *dark_after(rig.darkness, rig.display),
+            _take_over_step(worst_grade(checked), reporter, accept_grade=accept_grade),
+            marker("recalibrated", "Recalibrated", leave=Event.CALIBRATED),
+        ]
+
+    run = run_on_stage(checked, steps, name="recalibrate", reporter=reporter, cancel=cancel, dark=True)
+    compare_with_last(run, last, reporter)
+    if not passes(run, worst_grade(checked)):
+        raise below_grade(run, worst_grade(checked))
+    content = json.loads((run / FILE).read_text())
+    with Journal(run) as journal:
+        seconds = sum(value for name, value in journal.steps().items() if name.endswith("photographs"))
+        shots = journal.shot_count()
+    return {"run": str(run), **grade_figures(run), "advice": content["advice"], "photographs": shots,
+            "check_and_grade_seconds": seconds}  # fmt: skip
+
+
+def _take_over_step(worst: float, reporter: Reporter, *, accept_grade: bool) -> Step:
+    """Only a result that passes the gate counts as a finished calibration, and takes the last one's place."""
+
+    def run(context: Context) -> Sequence[Path]:
+        if accept_grade:
+            accept(context.folder, reporter, worst)
+        if passes(context.folder, worst):
+            context.journal.complete("calibrated", {}, (), began_at_s=time.time())
+        return ()
+
+    return Step("take-over", run, title="Comparing the grade with what is asked", weight=0.01, always=True)
 
 
 def _longest_s(checked: Checked) -> float:

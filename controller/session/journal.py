@@ -129,6 +129,15 @@ class Journal:
         artefacts = tuple(Artefact(self._absolute(path), size, digest) for path, size, digest in kept)
         return artefacts if all(map(_still_matches, artefacts)) else None
 
+    def latest(self, name: str) -> tuple[Artefact, ...] | None:
+        """The artefacts of a step, whatever it was done from; None if it was not done or its files do not match."""
+        rows = self._read("SELECT id FROM steps WHERE name = ?", name)
+        if not rows:
+            return None
+        kept = self._read("SELECT path, size, sha256 FROM artefacts WHERE step = ? ORDER BY id", rows[0][0])
+        artefacts = tuple(Artefact(self._absolute(path), size, digest) for path, size, digest in kept)
+        return artefacts if all(map(_still_matches, artefacts)) else None
+
     def complete(self, name: str, inputs: Inputs, paths: Sequence[Path], *, began_at_s: float) -> tuple[Artefact, ...]:
         """Make the artefacts durable, then write their row. Raises JournalError("artefact-missing")."""
         artefacts = tuple(_durable(path.absolute()) for path in paths)
