@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from hal.deadline import in_seconds
 from hal.values import ExposureSettings
@@ -18,8 +22,26 @@ from plugins.ptp_still import PtpCamera
 from plugins.ptp_usb_bus import UsbAddress, UsbFinder
 
 SIZE = 300_000
+NAMES = ("camera", "other", "relay", "a", "b")
+"""Of the devices in these tests."""
 QUICK = Timing(answer_s=1.5, busy_s=1.0, margin_s=0.6, grace_s=0.1, come_back_s=1.0, reconnect_s=5.0, keep_alive_s=0.05)
 SHORT = ExposureSettings(0.125, 200, 8.0, raw=False)
+
+
+@pytest.fixture(scope="module")
+def lasting_bus() -> Iterator[UsbBusProcess]:
+    """One process for a whole module: starting one takes longer than most tests."""
+    with UsbBusProcess(Path(os.environ["UMOCKDEV_DIR"])) as bus:
+        yield bus
+
+
+@pytest.fixture
+def bus(lasting_bus: UsbBusProcess) -> Iterator[UsbBusProcess]:
+    """An emulated USB bus without devices, which this very process sees."""
+    yield lasting_bus
+    for name in NAMES:
+        with contextlib.suppress(RuntimeError):
+            lasting_bus.forget(name)
 
 
 @dataclass

@@ -13,6 +13,9 @@ from hal.registry import OpenContext
 from plugins.emulated.usb_bus_process import UsbBusProcess
 from plugins.ptp_camera import open_camera
 from plugins.ptp_still import PtpCamera
+from tests.plugins.on_usb_bus.camera_rig import bus, lasting_bus
+
+__all__ = ["bus", "lasting_bus"]
 
 
 class EveryFlavour(CameraConformance):

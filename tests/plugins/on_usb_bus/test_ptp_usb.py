@@ -16,7 +16,9 @@ from hal.values import ExposureSettings, FileKind
 from plugins.emulated.usb_bus_process import UsbBusProcess
 from plugins.ptp_camera import open_camera
 from plugins.ptp_usb_bus import UsbAddress, UsbFinder, usb_cameras
-from tests.plugins.on_usb_bus.camera_rig import SHORT, SIZE, Rig, running
+from tests.plugins.on_usb_bus.camera_rig import SHORT, SIZE, Rig, bus, lasting_bus, running
+
+__all__ = ["bus", "lasting_bus"]
 
 FLAVOURS = ("generic", "eos-new", "eos-old")
 
