@@ -133,8 +133,8 @@ def _compare(names: Sequence[str], context: Context) -> Sequence[Path]:
 
 
 def edged(model: LightTransport, folder: Path) -> LightTransport:
-    """The run's transport: in the automatic mode, ``model`` with what dots say at depth edges; else ``model``."""
-    if mode_of(folder) != "auto":
+    """The run's transport: ``model``, with what dots say at depth edges where the automatic mode has measured them."""
+    if mode_of(folder) != "auto" or not (folder / TERMS).exists():
         return model
     return with_terms(model, terms_from(load_arrays(folder / TERMS), model.sizes))
 
