@@ -7,10 +7,13 @@ neighbours that exist.
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -18,6 +21,9 @@ from controller.arrays import Float64, FloatImage, Mask
 from controller.compiled import compiled
 
 GREEN = 1
+WORTH_THREADS = 1 << 20
+"""Samples; below, a single thread is done before others have begun."""
+STRIP_ROWS = 128
 NEVER = 1 << 20
 """A clipping limit above every 16-bit sample."""
 
@@ -78,28 +84,48 @@ def demosaic(mosaic: npt.NDArray[np.uint16], levels: SensorLevels, *, gain: floa
     scale = (gain / (levels.white - levels.black)).astype(np.float32)
     black = levels.black.astype(np.float32)
     limits = np.array([[_limit(value) for value in row] for row in levels.clip], np.int64)
-    _interpolate_inside(mosaic, levels.colours, black, scale, image)
+    rows = mosaic.shape[0]
+
+    def strip(first: int, last: int) -> None:
+        _interpolate_inside(mosaic, levels.colours, black, scale, image, first, last)
+        _mark_clipped(mosaic, limits, saturated, first, last)
+
+    if mosaic.size < WORTH_THREADS:
+        strip(0, rows)
+    else:
+        edges = [*range(0, rows, STRIP_ROWS), rows]
+        for done in [_pool().submit(strip, first, last) for first, last in itertools.pairwise(edges)]:
+            done.result()
     _interpolate_edge(mosaic, levels.colours, black, scale, image)
-    _mark_clipped(mosaic, limits, saturated)
     return image, saturated
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    """Threads on strips, and no parallel loop: its threads wait for each other by spinning, which on a busy machine costs
+    more than the work, and it can't be entered from two threads at once.
+    """
+    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), thread_name_prefix="demosaic")
 
 
 def _limit(clip: float) -> int:
     return math.ceil(clip) if math.isfinite(clip) else NEVER
 
 
-@compiled(parallel=True)
+@compiled()
 def _interpolate_inside(
     mosaic: npt.NDArray[np.uint16],
     colours: npt.NDArray[np.int64],
     black: FloatImage,
     scale: FloatImage,
     image: FloatImage,
+    first: int,
+    last: int,
 ) -> None:
     """All but the outermost rows and columns. Sums of samples of one site are whole numbers, so they are exact."""
     rows, columns = mosaic.shape
     quarter, half = np.float32(0.25), np.float32(0.5)
-    for row in numba.prange(1, rows - 1):
+    for row in range(max(first, 1), min(last, rows - 1)):
         own, next_to = row & 1, 1 - (row & 1)
         green = 0 if colours[own, 0] == GREEN else 1
         along, across = colours[own, 1 - green], 2 - colours[own, 1 - green]
@@ -153,21 +179,23 @@ def _interpolate_edge(
             image[row, column, colours[row & 1, column & 1]] = own
 
 
-@compiled(parallel=True)
-def _mark_clipped(mosaic: npt.NDArray[np.uint16], limits: npt.NDArray[np.int64], saturated: Mask) -> None:
+@compiled()
+def _mark_clipped(
+    mosaic: npt.NDArray[np.uint16], limits: npt.NDArray[np.int64], saturated: Mask, first: int, last: int
+) -> None:
     """A pixel is marked by any clipped sample of its 3x3. Most rows have none: those are only looked through."""
     rows, columns = mosaic.shape
     lowest = min(limits[0, 0], limits[0, 1], limits[1, 0], limits[1, 1])
-    for row in numba.prange(rows):
-        first, last = max(row - 1, 0), min(row + 2, rows)
-        for r in range(first, last):
-            brightest = mosaic[r, 0]
+    # A strip writes its own rows alone, and so looks at one row more on both sides.
+    for r in range(max(first - 1, 0), min(last + 1, rows)):
+        brightest = mosaic[r, 0]
+        for c in range(columns):
+            brightest = max(brightest, mosaic[r, c])
+        if brightest >= lowest:
             for c in range(columns):
-                brightest = max(brightest, mosaic[r, c])
-            if brightest >= lowest:
-                for c in range(columns):
-                    if mosaic[r, c] >= limits[r & 1, c & 1]:
-                        saturated[row, max(c - 1, 0) : min(c + 2, columns)] = True
+                if mosaic[r, c] >= limits[r & 1, c & 1]:
+                    low, high = max(r - 1, first), min(r + 2, last)
+                    saturated[low:high, max(c - 1, 0) : min(c + 2, columns)] = True
 
 
 def fill_bad(mosaic: npt.NDArray[np.uint16], bad_px: npt.NDArray[np.int64]) -> npt.NDArray[np.uint16]:

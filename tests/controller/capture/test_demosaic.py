@@ -6,7 +6,7 @@ import numpy.typing as npt
 import pytest
 
 from controller.arrays import Float64
-from controller.capture.demosaic import SensorLevels, bayer_kernels, demosaic, fill_bad
+from controller.capture.demosaic import WORTH_THREADS, SensorLevels, bayer_kernels, demosaic, fill_bad
 
 ORDERS = {"RGGB": [[0, 1], [1, 2]], "BGGR": [[2, 1], [1, 0]], "GRBG": [[1, 0], [2, 1]], "GBRG": [[1, 2], [0, 1]]}
 CODES = {
@@ -89,3 +89,18 @@ def test_bad_samples_are_filled_from_good_ones_of_their_own_colour() -> None:
     broken[bad[:, 1], bad[:, 0]] = 4095
     np.testing.assert_array_equal(fill_bad(broken, np.vstack((bad, [[40, 40], [-1, 3]]))), site)
     assert broken[4, 5] == 4095
+
+
+def test_an_image_made_in_strips_is_the_same_as_one_made_whole() -> None:
+    mosaic = np.tile(random_mosaic(74, 128), (15, 8))
+    mosaic[np.arange(0, 1100, 127), 500] = 4095
+    mosaic[np.arange(0, 1100, 128), 700] = 4095
+    assert mosaic.size > WORTH_THREADS
+    image, saturated = demosaic(mosaic, levels_of("GBRG", clip=4095))
+    rows = 0
+    for first in range(0, mosaic.shape[0] - 140, 140):
+        part, marked = demosaic(mosaic[first : first + 142], levels_of("GBRG", clip=4095))
+        np.testing.assert_array_equal(image[first + 1 : first + 141], part[1:141])
+        np.testing.assert_array_equal(saturated[first + 1 : first + 141], marked[1:141])
+        rows += 140
+    assert rows > 128
