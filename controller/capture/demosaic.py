@@ -94,16 +94,18 @@ def demosaic(mosaic: npt.NDArray[np.uint16], levels: SensorLevels, *, gain: floa
         strip(0, rows)
     else:
         edges = [*range(0, rows, STRIP_ROWS), rows]
-        for done in [_pool().submit(strip, first, last) for first, last in itertools.pairwise(edges)]:
+        for done in [_pool(os.getpid()).submit(strip, first, last) for first, last in itertools.pairwise(edges)]:
             done.result()
     _interpolate_edge(mosaic, levels.colours, black, scale, image)
     return image, saturated
 
 
 @functools.cache
-def _pool() -> ThreadPoolExecutor:
-    """Threads on strips, and no parallel loop: its threads wait for each other by spinning, which on a busy machine costs
-    more than the work, and it can't be entered from two threads at once.
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Threads of this process (a forked one has none of its parent's) that work on strips.
+
+    The threads of a parallel loop wait for each other by spinning, which on a busy machine costs more than the work,
+    and such a loop can't be entered from two threads at once.
     """
     return ThreadPoolExecutor(len(os.sched_getaffinity(0)), thread_name_prefix="demosaic")
 
