@@ -13,7 +13,8 @@ import numpy as np
 
 from controller.arrays import Float64, FloatImage
 
-BLURS_PX = (4.0, 1.5, 0.0)
+BLURS_PX = (4.0, 1.5, 0.8)
+"""The last is smooth enough for linear interpolation; OpenCV's cubic one shifts pictures by up to 0.05 px."""
 ROUNDS = 12
 SEARCH_SHARE = 0.2
 """The first guess looks for shifts up to this share of the picture's sides."""
@@ -180,16 +181,19 @@ def _step(pair: _Blurred, frame: _Frame, p: Float64) -> tuple[Float64, _Fit]:
     x, y = (flat % columns).astype(np.float64), (flat // columns).astype(np.float64)
     at = _mapped(frame.matrix(p), x, y)
     w: Float64 = np.asarray(pair.inside.ravel()[flat] * _sampled(pair.inside, at, cv2.INTER_NEAREST)[:, 0], np.float64)
-    guess = _sampled(pair.reference, at, cv2.INTER_CUBIC)
+    guess = _sampled(pair.reference, at, cv2.INTER_LINEAR)
     seen = np.asarray(pair.seen.reshape(-1, pair.seen.shape[2])[flat], np.float64)
     if np.count_nonzero(w) < LEAST_PIXELS:
         return np.full(8, np.nan), _Fit(np.ones(guess.shape[1]), np.full((8, 8), np.nan), 0.0)
+    gx, gy, tangents = _sampled(pair.dx, at, 1), _sampled(pair.dy, at, 1), _tangents(frame, p, x, y)
+    # OpenCV rounds places to a 32nd of a pixel: the slopes say what that left out.
+    left_out = at - np.rint(at * 32) / 32
+    guess += gx * left_out[0, :, None] + gy * left_out[1, :, None]
     gain: Float64 = (w @ (guess * seen)) / np.maximum(w @ guess**2, 1e-30)
     error = seen - gain * guess
     spread = 1.4826 * np.median(np.abs(error[w > 0])) + 1e-9
     weight = w[:, None] * np.maximum(1 - (error / (OUTLIER_SIGMAS * spread)) ** 2, 0) ** 2
     block = (y * BLOCKS // rows).astype(np.int64) * BLOCKS + (x * BLOCKS // columns).astype(np.int64)
-    gx, gy, tangents = _sampled(pair.dx, at, 1), _sampled(pair.dy, at, 1), _tangents(frame, p, x, y)
     normal, right = np.zeros((8, 8)), np.zeros((BLOCKS * BLOCKS, 8))
     for c in range(guess.shape[1]):
         slope = gain[c] * frame.half * (gx[:, c] * tangents[0] + gy[:, c] * tangents[1])
@@ -201,7 +205,7 @@ def _step(pair: _Blurred, frame: _Frame, p: Float64) -> tuple[Float64, _Fit]:
 
 
 def _sampled(image: FloatImage, at: Float64, flags: int) -> Float64:
-    """(pixels, channels) of an image at (2, pixels) places; OpenCV rounds them to a 32nd of a pixel."""
+    """(pixels, channels) of an image at (2, pixels) places."""
     here = at.astype(np.float32)
     parts = [
         cv2.remap(image, here[0, None, i : i + MAP_WIDTH], here[1, None, i : i + MAP_WIDTH], flags, borderValue=0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
 from controller.arrays import Float64, FloatImage
 from controller.calibrate.values import Radiometry
@@ -66,8 +66,10 @@ def _taken(array: npt.NDArray[Any], at: Float64, *, extend: bool) -> npt.NDArray
 
 
 def _sampled(image: FloatImage, at: Float64) -> FloatImage:
-    here = at.astype(np.float32)
-    return np.asarray(cv2.remap(image, here[:, :, 0], here[:, :, 1], cv2.INTER_LINEAR), np.float32)
+    # OpenCV would round the places to a 32nd of a pixel, which is too coarse for centres.
+    places = [at[:, :, 1], at[:, :, 0]]
+    channels = [map_coordinates(image[:, :, c], places, order=1, mode="nearest") for c in range(image.shape[2])]
+    return np.stack(channels, axis=2).astype(np.float32)
 
 
 def dimmed_radiometry(radiometry: Radiometry, gain: tuple[float, float, float]) -> Radiometry:
