@@ -1,0 +1,126 @@
+"""A calibrated stage is bumped, and Velatura says what has happened and mends what it can."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.drift_services import check_drift, recalibrate
+from controller.errors import CalibrationError
+from controller.services import calibrate, finished_calibration, make_appearances
+from controller.session.grading import graded
+from controller.session.journal import Journal
+from controller.session.progress import Silent
+from plugins.emulated.bumps import Bump, write_bumps
+from tests.end_to_end.program import REPOSITORY
+
+LEFT = Bump("projector", "left", shift_px=(1.2, -0.7))
+
+
+@dataclass(slots=True)
+class Bumpy:
+    """A calibrated stage whose bench follows ``bump``."""
+
+    stage: Path
+    bench: subprocess.Popen[str]
+    first: Path
+
+    def bump(self, *bumps: Bump) -> None:
+        """On return they count."""
+        write_bumps(self.stage, *bumps)
+        self.until("bumps")
+
+    def until(self, key: str) -> None:
+        assert self.bench.stdout is not None
+        assert any(key in json.loads(line) for line in self.bench.stdout), "the bench ended"
+
+    def drift(self) -> dict[str, Any]:
+        return dict(check_drift(stage=self.stage, details=True, reporter=Silent(), cancel=threading.Event()))
+
+    def recalibrate(self) -> Path:
+        return Path(recalibrate(stage=self.stage, reporter=Silent(), cancel=threading.Event())["run"])
+
+
+@pytest.fixture(scope="module")
+def bumpy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bumpy]:
+    from controller.demo.job import demo
+
+    out = tmp_path_factory.mktemp("bumpy")
+    demo(
+        size="small", object_file=None, out=out, seed=4, prepare_only=True, reporter=Silent(), cancel=threading.Event()
+    )
+    stage = out / "stage"
+    bench = subprocess.Popen(
+        [sys.executable, "-m", "controller", "emulate", str(stage), "--json", "--until-input-ends"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY, start_new_session=True,
+    )  # fmt: skip
+    made = Bumpy(stage, bench, stage)
+    try:
+        made.until("ready")
+        made.first = Path(calibrate(stage=stage, reporter=Silent(), cancel=threading.Event())["run"])
+        yield made
+    finally:
+        bench.communicate(timeout=20)
+
+
+def test_each_bump_is_told_from_the_others_and_measured(bumpy: Bumpy) -> None:
+    bumpy.bump(LEFT, Bump("projector", "above", dim=0.1, dim_channels=(0.0, 0.0, 0.1)))
+    found = bumpy.drift()
+    left, right, above = (found["projectors"][name] for name in ("left", "right", "above"))
+    assert (found["culprit"], found["advice"], found["photographs"]) == ("nobody", "quick", 5)
+    assert left["shift_px"] == pytest.approx((1.2, -0.7), abs=0.06)
+    assert above["gain"] == pytest.approx((0.9, 0.9, 0.81), abs=0.006)
+    assert (left["moved"], left["dimmed"]) == (True, False)
+    assert (above["moved"], above["dimmed"]) == (False, True)
+    assert (right["moved"], right["dimmed"]) == (False, False)
+
+
+def test_a_turned_projector_is_corrected_without_new_codes_as_well_as_it_was(bumpy: Bumpy) -> None:
+    bumpy.bump(LEFT)
+    run = bumpy.recalibrate()
+    now, then = graded(run), graded(bumpy.first)
+    assert now is not None
+    assert then is not None
+    for name, percent in now.items():
+        assert percent < 1.2 * then[name], (now, then)
+    with Journal(run) as journal:
+        assert journal.shot_count() <= 5 + 3 + 4 + 3
+    assert finished_calibration(bumpy.stage) == run
+    assert (run / "verification.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("bump", "culprit"),
+    [(Bump("camera", shift_px=(2.0, 1.0)), "camera"), (Bump("object", move_mm=(2.0, 0.0, 1.0)), "object")],
+)
+def test_camera_and_object_are_told_apart_and_ask_for_a_full_calibration(
+    bumpy: Bumpy, bump: Bump, culprit: str
+) -> None:
+    # On top of what the last test left: it has been calibrated since.
+    bumpy.bump(LEFT, bump)
+    found = bumpy.drift()
+    assert (found["culprit"], found["advice"]) == (culprit, "full")
+    if culprit == "camera":
+        assert found["camera"]["shift_px"] == pytest.approx((2.0, 1.0), abs=0.1)
+
+
+def test_nothing_is_published_below_the_set_grade_unless_a_person_accepts_it(bumpy: Bumpy) -> None:
+    settings = bumpy.stage / "stage.toml"
+    before = settings.read_text()
+    settings.write_text(before + "\n[calibration]\nworst_grade = 0.1\n")
+    try:
+        with pytest.raises(CalibrationError) as caught:
+            make_appearances(stage=bumpy.stage, names=["checkerboard"], reporter=Silent(), cancel=threading.Event())
+        assert caught.value.code == "calibration-below-grade"
+        assert "--accept-grade" in caught.value.remedy
+        assert not (bumpy.stage / "bundles").exists()
+    finally:
+        settings.write_text(before)
