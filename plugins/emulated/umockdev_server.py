@@ -25,6 +25,7 @@ _DONE, _PEEK, _POKE = 3, 5, 6
 _MESSAGE: Final = struct.Struct("<QQQ")
 _FAILED: Final = (1 << 64) - 1
 _LONGEST_SOCKET_PATH: Final = 107
+_LINGER_S: Final = 1.0
 _LARGEST: Final = 16 << 20
 """Bytes of a program's memory that one call may touch."""
 
@@ -124,12 +125,22 @@ class Node:
                 return
             self._alive = False
             self._device.unlink(missing_ok=True)
+            os.close(self._master)
+            os.close(self._slave)
+        # Not yet: the preload library ends a program that is just opening the node and finds no socket.
+        hang_up = threading.Timer(_LINGER_S, self.hang_up)
+        hang_up.daemon = True
+        hang_up.start()
+
+    def hang_up(self) -> None:
+        """Accept no further program; after ``remove``."""
+        with self._lock:
+            if self._listener.fileno() < 0:
+                return
             Path(self._listener.getsockname()).unlink(missing_ok=True)
             with contextlib.suppress(OSError):
                 self._listener.shutdown(socket.SHUT_RDWR)
             self._listener.close()
-            os.close(self._master)
-            os.close(self._slave)
 
     def _accept(self) -> None:
         while True:
@@ -200,6 +211,7 @@ class UmockdevServer:
     def close(self) -> None:
         for node in self._nodes:
             node.remove()
+            node.hang_up()
         self._nodes.clear()
 
     def __enter__(self) -> Self:
