@@ -89,13 +89,13 @@ def by_colmap(problem: ba.Problem, start: ba.State) -> ba.State:
         image = pycolmap.Image(name=str(number), keypoints=px[points], camera_id=number, image_id=number)
         pose = pycolmap.Rigid3d(np.hstack([turn, (-turn @ centre)[:, None]]))
         whole.add_image_with_trivial_frame(image, pose)
-        for place, point in enumerate(points):
+        for place, point in enumerate(points.tolist()):
             tracks[point].append((number, place))
-    for point, track in enumerate(tracks):
+    for index, track in enumerate(tracks):
         made = pycolmap.Track()
         for image_id, place in track:
             made.add_element(image_id, place)
-        whole.add_point3D(rays[point] / start.inverse_depth[point], made)
+        whole.add_point3D(rays[index] / start.inverse_depth[index], made)
     config = pycolmap.BundleAdjustmentConfig()
     for number in range(1, 5):
         config.add_image(number)
