@@ -74,7 +74,9 @@ def _projector(
     metapixels = Metapixels(centre.astype(np.float32), packed.astype(np.float32), valid)
     white = (albedo * falloff[..., None]).astype(np.float32)
     phase_map = _phase_map(n, size, camera, mask)
-    return ProjectorCalibration(("left", "middle", "right")[n], metapixels, Radiometry(response, mixing), white, phase_map)
+    return ProjectorCalibration(
+        ("left", "middle", "right")[n], metapixels, Radiometry(response, mixing), white, phase_map
+    )
 
 
 def _phase_map(n: int, size: tuple[int, int], camera: tuple[int, int], mask: Mask) -> PhaseMap:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, cast
 
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.extending import intrinsic
@@ -18,7 +19,8 @@ from controller.transport.profiles import LANES
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _LANE = ir.IntType(32)
 _WHICH = ir.VectorType(_LANE, LANES)
-Rows = tuple[int, int, int, int]
+Index = int | np.signedinteger[Any]
+Rows = tuple[Index, Index, Index, Index]
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
@@ -116,18 +118,18 @@ def _small_add(_: Any, sums: Any, at: Any, side: Any, table: Any, across: Any, d
     return types.void(sums, types.int64, types.int64, table, types.int64, types.int64, types.float32), generate
 
 
-small_sum = cast("Callable[[FloatImage, int, int, FloatImage, int, int], float]", intrinsic(_small_sum))
+small_sum = cast("Callable[[FloatImage, Index, Index, FloatImage, Index, Index], float]", intrinsic(_small_sum))
 """``small_sum(light, at, side, table, across, down)``: sum of the four by four of ``light`` from ``at`` on, ``side`` a
 row, times table[across:] along and table[down:] down."""
 
-small_add = cast("Callable[[FloatImage, int, int, FloatImage, int, int, float], None]", intrinsic(_small_add))
+small_add = cast("Callable[[FloatImage, Index, Index, FloatImage, Index, Index, float], None]", intrinsic(_small_add))
 """``small_add(sums, at, side, table, across, down, value)``: its transpose."""
 
-window_sum = cast("Callable[[FloatImage, Rows, FloatImage, Rows, int], float]", intrinsic(_window_sum))
+window_sum = cast("Callable[[FloatImage, Rows, FloatImage, Rows, Index], float]", intrinsic(_window_sum))
 """``window_sum(light, at, table, shares, down)``: sum of four rows of four, light[at[k]:] times table[shares[k]:] times
 table[down + k]."""
 
-window_add = cast("Callable[[FloatImage, Rows, FloatImage, Rows, int, float], None]", intrinsic(_window_add))
+window_add = cast("Callable[[FloatImage, Rows, FloatImage, Rows, Index, float], None]", intrinsic(_window_add))
 """``window_add(sums, at, table, shares, down, value)``: the transpose; adds ``value`` times the weights to the sums.
 
 In both the arrays are flat and indices unchecked.

@@ -39,9 +39,9 @@ TURNS: Final = 12
 class Windows(NamedTuple):
     """The windows of all projectors, by cell.
 
-    ``site`` (windows,) int32: camera site; ``at`` uint16: first pixel in the cell's buffer; ``across``, ``down`` uint16:
-    the table's row for x and y, kind times PHASES plus position between two pixels; ``shear`` int8: how far each row is
-    moved along x; ``gain`` float32: white light at the site over the sum of its shares
+    ``site`` (windows,) int32: camera site; ``at`` uint16: first pixel in the cell's buffer; ``across``, ``down``
+    uint16: the table's row for x and y, kind times PHASES plus position between two pixels; ``shear``
+    int8: how far each row is moved along x; ``gain`` float32: white light at the site over the sum of its shares
     ``first`` (cells + 1,) int64: each cell's windows; ``place`` (cells, 4) int64: projector, colour, top, left
     ``turn`` (cells,) int64: the cells by turn; ``turn_first`` (TURNS + 1,) int64
     ``start`` (projectors + 1,) int64: first pixel of each projector; ``size`` (projectors, 2) int64: rows, columns

@@ -89,7 +89,9 @@ def expected(calibration: Calibration, frames: list[Floats]) -> Floats:
     for part, frame in zip(calibration.projectors, frames, strict=True):
         assert part.phase_map is not None
         shares = phase_map_shares(part.phase_map)
-        light = (shares @ (frame.reshape(-1, 3).astype(np.float64) @ part.radiometry.mixing.T)).reshape(*shape, 3)
+        light = np.asarray(shares @ (frame.reshape(-1, 3).astype(np.float64) @ part.radiometry.mixing.T)).reshape(
+            *shape, 3
+        )
         total += part.white * light
     if calibration.mosaic is None:
         return total.astype(np.float32)
@@ -228,8 +230,11 @@ def test_the_mean_over_a_projector_pixel_uses_its_normalised_shares(stage: Stage
     phase_map = calibration.projectors[0].phase_map
     assert phase_map is not None
     bright = calibration.projectors[0].white.max(axis=2) > 0
-    shares = sp.csr_matrix(sp.diags_array(bright.ravel().astype(np.float64)) @ phase_map_shares(phase_map))
-    wanted = (shares.T @ image.reshape(-1, 3)) / np.maximum(shares.sum(axis=0), 1e-9).reshape(-1, 1)
+    shares = phase_map_shares(phase_map)
+    shares = sp.csr_matrix(sp.diags_array(bright.ravel().astype(np.float64)) @ shares)
+    wanted = (
+        np.asarray(shares.T @ image.reshape(-1, 3)) / np.maximum(np.asarray(shares.sum(axis=0)).ravel(), 1e-9)[:, None]
+    )
     means = transport.gaussian_mean(image, 0).reshape(-1, 3)
     np.testing.assert_allclose(means, wanted, atol=0.02)
     np.testing.assert_allclose(transport.gaussian_mean(np.ones_like(image), 0), 1, rtol=1e-5)
@@ -246,7 +251,7 @@ def test_a_part_written_out_as_a_matrix_is_the_same_transport(
     light = transport.forward_planes(p)
     for box in ((0, 0, 12, 9), (30, 100, 41, 117), (60, 290, 70, 300)):
         rows = box_rows(transport, box, everything, (0, 1, 2))
-        got = (rows @ p.astype(np.float64).ravel()).reshape(3, box[2] - box[0], box[3] - box[1])
+        got = np.asarray(rows @ p.astype(np.float64).ravel()).reshape(3, box[2] - box[0], box[3] - box[1])
         np.testing.assert_allclose(got, light[:, box[0] : box[2], box[1] : box[3]], rtol=1e-4, atol=1e-5)
 
 
