@@ -17,7 +17,7 @@ from controller.session import costs
 from controller.session.capturing import bracket
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
-from controller.session.shots import Planned, read_index, take_all
+from controller.session.shots import Planned, inherit_camera, read_index, take_all
 from controller.session.solving import Calibrated
 from controller.storage import write_atomically
 
@@ -76,6 +76,7 @@ def shown_frames(calibrated: Calibrated, pattern: Pattern) -> dict[str, ByteImag
 
 
 def _photograph(rig: Rig, calibrated: Calibrated, longest_s: float, context: Context) -> Sequence[Path]:
+    inherit_camera(calibrated.folder, context.folder)
     calibration, available = calibrated.calibration, rig.acquirer.exposures_s()
     frames = shown_frames(calibrated, PATTERN)
     plan = []

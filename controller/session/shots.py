@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from controller.capture.latency import (
     same_picture,
     thumbprint,
 )
-from controller.capture.profile import CameraProfile, load_profile
+from controller.capture.profile import FILE_NAME, CameraProfile, load_profile
 from controller.capture.raw import Photograph, read_photograph
 from controller.session.progress import Level
 from controller.session.rig import Rig
@@ -117,6 +117,16 @@ def use_delay(rig: Rig, folder: Path) -> None:
         rig.acquirer.set_delay(max(map(float, waits)))
 
 
+def inherit_camera(calibrated: Path, folder: Path) -> None:
+    """Give the run in ``folder`` what the one in ``calibrated`` measured of its camera and of the stage's delay.
+
+    What the run has measured itself stays.
+    """
+    for name in (FILE_NAME, DELAY_FILE, RAISED):
+        if (calibrated / name).exists() and not (folder / name).exists():
+            write_atomically(folder / name, (calibrated / name).read_bytes())
+
+
 @dataclass(frozen=True, slots=True)
 class _Before:
     """The photograph that was taken last: what it should show, and what it shows."""
@@ -177,14 +187,16 @@ def take_photograph(
     rig: Rig, context: Context, name: str, exposure_s: float, *, shown_at_s: float, of: Mapping[str, str]
 ) -> Taken:
     """Photograph what is shown since ``shown_at_s``; ``of`` says what that is, for the journal."""
+    use_delay(rig, context.folder)
+    profile = load_profile(context.folder)
     settings = {"exposure_s": repr(exposure_s), **of}
     known = context.journal.shot(name, settings)
     if known is not None:
-        return Taken(name, known.path, confirmed_exposure(known.path))
+        return Taken(name, known.path, confirmed_exposure(known.path), profile=profile)
     file, confirmed_s = rig.acquirer.photograph(
         name, exposure_s, context.folder / "captures", shown_at_s=shown_at_s, deadline=context.deadline
     )
-    return _journalled(context, name, settings, file.path, confirmed_s)
+    return replace(_journalled(context, name, settings, file.path, confirmed_s), profile=profile)
 
 
 def _journalled(context: Context, name: str, settings: Mapping[str, str], path: Path, exposure_s: float) -> Taken:

@@ -17,6 +17,7 @@ import pytest
 from controller.arrays import ByteImage
 from controller.capture import latency
 from controller.capture.acquire import Acquirer
+from controller.capture.profile import CameraNoise, CameraProfile
 from controller.capture.raw import read_jpeg_values
 from controller.session import camera_steps, shots
 from controller.session.camera_steps import delay_step
@@ -25,7 +26,7 @@ from controller.session.progress import Silent
 from controller.session.rig import Rig, RigProjector
 from controller.session.runner import Context
 from controller.session.safety import LampGuard
-from controller.session.shots import Planned, take_all
+from controller.session.shots import Planned, inherit_camera, read_index, take_all
 from hal.deadline import Deadline, in_seconds
 from hal.values import (
     CameraCapabilities,
@@ -196,3 +197,24 @@ def test_pictures_that_look_alike_to_the_camera_cost_one_photograph_more_and_no_
 
 def _flat(value: int) -> dict[str, ByteImage]:
     return {"left": np.full((SIZE_PX[1], SIZE_PX[0], 3), value, np.uint8)}
+
+
+def test_a_later_run_takes_over_the_camera_and_the_delay_but_not_over_its_own(
+    rig: Rig, context: Context, tmp_path: Path
+) -> None:
+    calibrated = tmp_path / "calibrated"
+    calibrated.mkdir()
+    response = np.tile(np.linspace(0, 1, 256), (3, 1))
+    CameraProfile(CameraNoise(0.1, 0.2), exposures=np.array([[0.02, 0.021]]), response=response).save(calibrated)
+    (calibrated / "delay.json").write_text(json.dumps({"wait_s": 0.4}))
+    inherit_camera(calibrated, context.folder)
+    take_all(rig, context, plan(1), index="stripes")
+    assert rig.acquirer.wait_s == pytest.approx(0.4)
+    (taken,) = read_index(context.folder, "stripes").values()
+    assert taken.exposure_s == pytest.approx(0.021)
+    assert taken.profile is not None
+    assert taken.profile.noise == CameraNoise(0.1, 0.2)
+    assert np.max(taken.per_second()) == pytest.approx((255 // 2 + 10) / 255 / 0.021, rel=0.1)
+    (context.folder / "delay.json").write_text(json.dumps({"wait_s": 0.2}))
+    inherit_camera(calibrated, context.folder)
+    assert json.loads((context.folder / "delay.json").read_text())["wait_s"] == 0.2
