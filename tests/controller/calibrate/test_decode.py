@@ -148,3 +148,38 @@ def test_any_smooth_warp_is_decoded(scale: float, bend: float, blur: float, seed
     stage = Stage(scene)
     found = decode(stage.captures(), stage.plan())
     assert rms((found.projector_px - positions(scene))[found.valid]) < 0.04
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene(projector_blur_px=2.0, electrons=3000.0),
+        Scene(projector_blur_px=3.0),
+        Scene(exposure=0.2, electrons=3000.0, read_electrons=12.0),
+    ],
+    ids=["defocused and noisy", "hardly a fringe left", "dark"],
+)
+def test_no_pixel_is_ever_a_fringe_off(scene: Scene) -> None:
+    found = decode(photographed(scene), PLAN)
+    assert np.mean(found.valid) > 0.3
+    assert np.max(np.abs(found.projector_px - positions(scene))[found.valid]) < 1.5
+
+
+def test_pixels_whose_fine_fringes_were_saturated_keep_what_the_other_waves_tell() -> None:
+    hurt = photographed(Scene())["blur-x-1"].copy()
+    hurt[60:80, 100:130] = np.nan
+    found = decode(changed(blur_x_1=hurt), PLAN)
+    assert found.valid[60:80, 100:130].mean() > 0.95
+    error = (found.projector_px - positions(Scene()))[60:80, 100:130]
+    assert rms(error[np.isfinite(error)]) < 0.1
+
+
+def test_a_known_blur_of_the_camera_frees_positions_from_the_pull_of_pale_paint() -> None:
+    scene = Scene(scale=1.5, seed=5)
+    blur_px = float(np.hypot(scene.camera_blur_px, np.sqrt(1 / 12)))
+    as_seen = decode(photographed(scene), PLAN)
+    freed = decode(photographed(scene), PLAN, camera_blur_px=blur_px)
+    both = as_seen.valid & freed.valid
+    assert np.mean(both) > 0.35
+    errors = [rms((found.projector_px - positions(scene))[both]) for found in (as_seen, freed)]
+    assert errors[1] < 0.6 * errors[0]
