@@ -34,6 +34,8 @@ from controller.session.runner import Context, Step
 from controller.session.shots import Developed
 from controller.storage import write_atomically
 
+CLEAR_GAIN: Final = 0.2
+"""Of regularity, for which a fitted centre is moved; below it, folds and noise are moved and centres get worse."""
 EXPECTED_SPACING_PX: Final = 7
 """For the time left, before the blur is measured."""
 
@@ -113,7 +115,7 @@ def _fit(projector: RigProjector, number: int, context: Context) -> Sequence[Pat
         fallback=model,
         progress=lambda share: context.advance(0.95 * share, "dots"),
     )
-    found, moves = regularize(fitted)
+    found, moves = regularize(fitted, least_gain=CLEAR_GAIN)
     return _save(folder, name, found, report, light["white"], {"spacing_px": spacing, "moved": moves})
 
 
