@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 from typing import Final
 
 from plugins.emulated.usb_bus_device import Stall, UsbNames
 from plugins.emulated.usb_bus_hid import FEATURE, INPUT, EmulatedHidDevice
 
+LUX_AT_WHITE: Final = 400.0
+"""Illuminance for one unit of the bench's linear light: projectors of this class at white, at a metre."""
 _LUX_UNIT: Final = 0.01
 _READY, _CHANGED = 2, 2
 """State of a sensor that works, and the event "data has changed"."""
@@ -42,6 +45,18 @@ class EmulatedLightSensor(EmulatedHidDevice):
         self._lux = lux
         if self.settings[2] == _FULL_POWER:
             self.input(self._reading())
+
+    def follow(self, stage: str) -> float:
+        """See the ambient light of an emulated stage, with its bumps, as it is now; the lux. Raises DeviceError."""
+        # Here: the bench's geometry is slow to load, and few who have a bus have a bench.
+        from plugins.emulated.bumps import FILE, bumped, read_bumps
+        from plugins.emulated.truth import read_truth
+
+        folder = Path(stage)
+        set_up = read_truth(folder)
+        truth = bumped(set_up, read_bumps(folder / FILE, set_up))
+        self.lux = LUX_AT_WHITE * sum(truth.ambient) / len(truth.ambient)
+        return self.lux
 
     def plugged(self) -> None:
         super().plugged()

@@ -72,6 +72,10 @@ class UsbBusProcess:
         """Unplug a device for good."""
         self._ask({"do": "forget", "name": name})
 
+    def clear(self) -> None:
+        """Unplug every device for good."""
+        self._ask({"do": "clear", "name": ""})
+
     def set(self, name: str, knob: str, value: Any) -> None:
         """Turn a knob, e.g. ``faults.silent`` or ``lux``."""
         self._ask({"do": "set", "name": name, "knob": knob, "value": value})
@@ -134,11 +138,16 @@ class _Commands:
 
     def obey(self, command: Mapping[str, Any]) -> Any:
         name = command["name"]
-        if command["do"] == "add":
+        if command["do"] == "clear":
+            self._clear()
+        elif command["do"] == "add":
             self._devices[name] = _kind(command["kind"])(**command["settings"])
             self._bus.plug(self._devices[name])
-            return None
-        device = self._devices[name]
+        else:
+            return self._obey(command, name, self._devices[name])
+        return None
+
+    def _obey(self, command: Mapping[str, Any], name: str, device: EmulatedUsbDevice) -> Any:
         match command["do"]:
             case "play":
                 self._play(name, device, command["scenario"])
@@ -164,6 +173,13 @@ class _Commands:
             case unknown:
                 raise ValueError(f"no command {unknown}")
         return None
+
+    def _clear(self) -> None:
+        self.close()
+        self._scenarios.clear()
+        for device in self._devices.values():
+            self._bus.unplug(device)
+        self._devices.clear()
 
     def _play(self, name: str, device: EmulatedUsbDevice, text: str) -> None:
         if name in self._scenarios:

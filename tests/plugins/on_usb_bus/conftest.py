@@ -13,8 +13,14 @@ from plugins.emulated.usb_bus_process import UsbBusProcess
 collect_ignore_glob = [] if "UMOCKDEV_DIR" in os.environ else ["test_*.py"]
 
 
-@pytest.fixture
-def bus() -> Iterator[UsbBusProcess]:
-    """An emulated USB bus without devices, which this very process sees."""
+@pytest.fixture(scope="session")
+def bus_process() -> Iterator[UsbBusProcess]:
     with UsbBusProcess(Path(os.environ["UMOCKDEV_DIR"])) as bus:
         yield bus
+
+
+@pytest.fixture
+def bus(bus_process: UsbBusProcess) -> Iterator[UsbBusProcess]:
+    """An emulated USB bus without devices, which this very process sees."""
+    yield bus_process
+    bus_process.clear()

@@ -8,13 +8,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from controller.session.darkness import Darkness
 from hal.conformance import LightSensorConformance, PowerSwitchConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
+from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.usb_bus_process import UsbBusProcess
 from plugins.hid_light_sensor import ColorHugLightSensor
 from plugins.hid_link import BACKENDS
@@ -93,6 +96,22 @@ def test_light_follows_the_room(bus: UsbBusProcess, backend: str) -> None:
     for lux in (0.0, 0.37, 500.0, 20_000.0):
         bus.set("light", "lux", lux)
         assert sensor.illuminance_lux(deadline=in_seconds(5)) == pytest.approx(lux, abs=0.005)
+    sensor.close()
+
+
+def test_the_sensor_sees_the_ambient_light_of_an_emulated_stage(bus: UsbBusProcess, tmp_path: Path) -> None:
+    EmulatedBench().prepare(tmp_path, size="small", object_file=None, seed=1)
+    bus.add("light", "light")
+    sensor = ColorHugLightSensor(deadline=in_seconds(10))
+    bus.call("light", "follow", str(tmp_path))
+    dark_lux = sensor.illuminance_lux(deadline=in_seconds(5))
+    assert 0.3 < dark_lux < 1.2
+    (tmp_path / "bench" / "bumps.toml").write_text('[[bump]]\nwhat = "ambient"\nfactor = 50.0\n')
+    bus.call("light", "follow", str(tmp_path))
+    assert sensor.illuminance_lux(deadline=in_seconds(5)) == pytest.approx(50 * dark_lux, rel=0.02)
+    with pytest.raises(DeviceRefused) as caught:
+        Darkness(sensor, 5.0).require(deadline=in_seconds(5))
+    assert caught.value.code == "room-not-dark"
     sensor.close()
 
 
