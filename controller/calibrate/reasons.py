@@ -260,7 +260,8 @@ def _legend(why: Blame, name: str, width: int) -> ByteImage:
     size = width / 1500
     line, per_line = int(44 * size), 4
     reasons = [reason for reason in COLOURS if np.any(why.labels == reason)]
-    band = np.full((line * (1 + math.ceil(len(reasons) / per_line)) + int(16 * size), width, 3), 24, np.uint8)
+    # As high for every projector, so that panels of one run can be told apart by their height.
+    band = np.full((line * (1 + math.ceil(len(COLOURS) / per_line)) + int(16 * size), width, 3), 24, np.uint8)
     thick = max(1, round(2 * size))
     ascii_name = name.encode("ascii", "replace").decode()
     cv2.putText(band, f"projector {ascii_name}", (int(20 * size), int(34 * size)), cv2.FONT_HERSHEY_SIMPLEX,

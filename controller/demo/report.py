@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from controller.app import Checked, check_stage
@@ -18,6 +19,7 @@ from controller.errors import UsageError
 from controller.report.page import Goal, Page, Picture, Row, write_report
 from controller.report.pictures import Crop, crop_around, error_picture, fitted, to_screen
 from controller.session.calibrating import read_calibration
+from controller.session.grading import PICTURE
 from controller.session.journal import Journal
 from controller.session.solving import Solved, read_solved
 from controller.solve.metrics import Comparison, compare
@@ -53,7 +55,7 @@ def write_demo_report(out: Path, run: Path, checked: Checked) -> tuple[Path, Pat
     with Journal(run) as journal:
         steps, shots = journal.steps(), journal.shot_count()
     figures = _figures(run, checked.names, judged, steps, shots)
-    return write_report(out, _page(checked, calibration, judged, figures, steps), figures)
+    return write_report(out, _page(run, checked, calibration, judged, figures, steps), figures)
 
 
 def report_again(run: Path, out: Path) -> Mapping[str, str]:
@@ -148,6 +150,7 @@ def _appearance_figures(one: Judged) -> dict[str, Any]:
 
 
 def _page(
+    run: Path,
     checked: Checked,
     calibration: Calibration,
     judged: Sequence[Judged],
@@ -166,7 +169,7 @@ def _page(
         f" on {machine['cores']} cores.",
         goals=_goals(judged, figures),
         rows=rows,
-        galleries=(_frames_gallery(judged, checked),),
+        galleries=(*_verification_gallery(run, figures), _frames_gallery(judged, checked)),
         steps=tuple(steps.items()),
         facts=_facts(checked, calibration, figures),
     )
@@ -228,6 +231,28 @@ def _goals(judged: Sequence[Judged], figures: Mapping[str, Any]) -> tuple[Goal, 
         ),
         Goal("Bundle", f"{bundle['bytes'] / 1e6:.2f} MB", note=f"{bundle['ratio']:.1f} x smaller, signed"),
     )  # fmt: skip
+
+
+def _verification_gallery(run: Path, figures: Mapping[str, Any]) -> tuple[tuple[str, str, tuple[Picture, ...]], ...]:
+    """Where each projector's prediction errs, and why; nothing for a run from before there was such a map."""
+    verification = figures["verification"]
+    whole = cv2.imread(str(run / PICTURE))
+    if whole is None:
+        return ()
+    panels = np.split(np.asarray(whole[..., ::-1], np.uint8), len(verification), axis=0)
+    pictures = tuple(
+        Picture(
+            f"{name}: {100 * row['relative_rms']:.2f} % error.",
+            np.ascontiguousarray(panel),
+            " ".join(reason["sentence"] for reason in row.get("reasons", [])[:3]),
+        )
+        for (name, row), panel in zip(verification.items(), panels, strict=True)
+    )
+    text = (
+        "A random pattern was predicted and photographed. Colours show where the two differ by more than 5 % of the "
+        "light around, and the reason that the data give; grey is fine."
+    )
+    return (("Where the calibration is not good, and why", text, pictures),)
 
 
 def _frames_gallery(judged: Sequence[Judged], checked: Checked) -> tuple[str, str, tuple[Picture, ...]]:
