@@ -23,6 +23,7 @@ from controller.transport.planes import image_planes
 NOISES: Final = 2.0
 """Differences of this many standard deviations of their noise are halved; smaller ones vanish, larger ones stay."""
 MOST: Final = 1.0
+LEAST_SHARE: Final = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +135,10 @@ def edge_term(model: LightTransport, n: int, measured: EdgeShares, white: FloatI
     lit = model.lit[n].ravel()[measured.camera]
     camera, projector, share = (part[lit] for part in (measured.camera, measured.projector, measured.share))
     difference = share - _modelled(model, n, measured.pattern, camera, projector, white)
-    difference = _shrunk(np.clip(difference, -MOST, MOST))
+    difference, noise = _shrunk(np.clip(difference, -MOST, MOST))
+    # What is neither different nor much of the light only costs time in every product.
+    kept = (np.abs(difference) > noise) | (share > LEAST_SHARE)
+    camera, projector, share, difference = (part[kept] for part in (camera, projector, share, difference))
     own, row = np.unique(camera, return_inverse=True)
     # The rows' sums are taken back where light was measured, in proportion to it.
     weight = np.maximum(share, 0)
@@ -166,10 +170,10 @@ def _modelled(
     return found
 
 
-def _shrunk(difference: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Without what is no more than noise, whose size the many small differences tell."""
+def _shrunk(difference: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], float]:
+    """Without what is no more than noise, and the size of that, which the many small differences tell."""
     if not difference.size:
-        return difference
+        return difference, 0.0
     noise = 1.4826 * float(np.median(np.abs(difference)))
     power = difference.astype(np.float64) ** 2
-    return np.asarray(difference * power / (power + (NOISES * noise) ** 2 + 1e-12), np.float32)
+    return np.asarray(difference * power / (power + (NOISES * noise) ** 2 + 1e-12), np.float32), noise
