@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ from controller.capture.acquire import Shot
 from controller.capture.brackets import choose_brackets, choose_exposure
 from controller.capture.jpeg_response import nominal_response
 from controller.capture.latency import LONGEST_S
-from controller.capture.patterns import Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
+from controller.capture.patterns import CELL_PX, Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
 from controller.capture.raw import read_photograph
 from controller.errors import CalibrationError
 from controller.session import costs
@@ -67,7 +68,7 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
             Step(
                 f"light-{projector.name}",
                 partial(_photograph_light, rig, projector, plan),
-                inputs=inputs,
+                inputs={**inputs, "patterns": _patterns(plan)},
                 after=("exposure", "delay"),
                 title=f"Photographing the light of {projector.name}",
                 weight=a_shot_s * (WHITE_EXPOSURES + len(_before_response(plan))),
@@ -83,7 +84,7 @@ def code_step(rig: Rig, projector: RigProjector) -> Step:
     return Step(
         f"codes-{projector.name}",
         lambda context: _photograph_codes(rig, projector, plan, coded, context),
-        inputs={"sizes": _sizes(rig)},
+        inputs={"sizes": _sizes(rig), "patterns": _patterns(plan)},
         after=("exposure", f"radiometry-{projector.name}"),
         title=f"Photographing the patterns of {projector.name}",
         weight=_shot_s(rig) * len(coded),
@@ -195,6 +196,11 @@ def _planned(
 
 def _named(plan: PatternPlan, name: str) -> Pattern:
     return next(pattern for pattern in plan if pattern.name == name)
+
+
+def _patterns(plan: PatternPlan) -> str:
+    """Tells plans apart: a run that was begun with other patterns takes these anew."""
+    return hashlib.sha256(f"{CELL_PX} {plan}".encode()).hexdigest()[:16]
 
 
 def _sizes(rig: Rig) -> str:
