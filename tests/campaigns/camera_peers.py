@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,21 +105,29 @@ def _folder() -> Iterator[Path]:
         yield Path(name)
 
 
+def _campaign(way: Way, flavour: Flavour, count: int) -> str:
+    with way(flavour) as peer:
+        try:
+            peer.captures(count)
+        except (AssertionError, subprocess.TimeoutExpired) as error:
+            return f"FAILED: {error}"
+        return "holds" if peer.exposures() == count else f"EXPOSED {peer.exposures()} TIMES"
+
+
 def main() -> int:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 50
-    holds = True
-    for name, way in (("network", network_peer), ("usb", usb_peer)):
-        for flavour in FLAVOURS:
-            started = time.monotonic()
-            with way(flavour) as peer:
-                try:
-                    peer.captures(count)
-                    word = "holds" if peer.exposures() == count else f"EXPOSED {peer.exposures()} TIMES"
-                except (AssertionError, subprocess.TimeoutExpired) as error:
-                    word = f"FAILED: {error}"
-            holds = holds and word == "holds"
-            print(f"{name:<8} {flavour:<8} {count} captures, {time.monotonic() - started:.0f} s: {word}")
-    return 0 if holds else 1
+    started = time.monotonic()
+    ways: dict[str, Way] = {"network": network_peer, "usb": usb_peer}
+    with ThreadPoolExecutor(len(ways) * len(FLAVOURS)) as side_by_side:
+        found = {
+            (name, flavour): side_by_side.submit(_campaign, way, flavour, count)
+            for name, way in ways.items()
+            for flavour in FLAVOURS
+        }
+        for (name, flavour), word in found.items():
+            print(f"{name:<8} {flavour:<8} {count} captures: {word.result()}", flush=True)
+    print(f"{time.monotonic() - started:.0f} s")
+    return 0 if all(word.result() == "holds" for word in found.values()) else 1
 
 
 if __name__ == "__main__":
