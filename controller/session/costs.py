@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-RADIOMETRY_S: Final = 0.4
+RADIOMETRY_S: Final = 0.7
 """This and the following at size small; times ``scale`` elsewhere."""
-PIXELS_S: Final = 0.5
+PIXELS_S: Final = 0.8
 VERIFY_S: Final = 1.0
 BASE_S: Final = 3.0
 APPEARANCE_S: Final = 4.0
