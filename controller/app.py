@@ -22,16 +22,16 @@ from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover, 
 from controller.session.darkness import Darkness, dark_before
 from controller.session.journal import Journal
 from controller.session.lamps import LampFile
+from controller.session.lighting import lit, power_steps
 from controller.session.machine import Event, Machine
-from controller.session.mains import Circuit, close_circuits, open_circuits
-from controller.session.power import light, power_down, steady
-from controller.session.progress import Level, Reporter
+from controller.session.mains import Circuit, close_circuits
+from controller.session.progress import Reporter
 from controller.session.rig import Rig, RigProjector
-from controller.session.runner import Context, Runner, Step
+from controller.session.runner import Runner, Step
 from controller.session.safety import LampGuard
 from controller.storage import clear_unfinished_writes, exclusive, runtime_folder
 from hal.deadline import Deadline, in_seconds
-from hal.errors import DeviceError, PluginError
+from hal.errors import PluginError
 from hal.interfaces import Camera, Display, LightSensor, PowerSwitch, Projector
 from hal.registry import Driver, Drivers, OpenContext, load_drivers
 
@@ -231,71 +231,6 @@ def _rig(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: Dis
         settle_s=stage.tables.capture.settle_s,
     )
     return Rig(stage.folder, projectors, camera, display, acquirer)
-
-
-@contextlib.contextmanager
-def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) -> Iterator[None]:
-    """Whatever happens inside, the lamps are off or cooling afterwards.
-
-    A projector that can't be switched off is told to the technician. For that, DeviceError("lamp-still-lit") is raised,
-    unless the work itself failed: then its own error is.
-    """
-    try:
-        yield
-    finally:
-        _tell(reporter, "Switching the projectors off.")
-        # Before the machine is told: a listener that fails (a full disk under the journal) must not keep lamps lit.
-        failures = power_down(rig.guards, within_s=power_down_s)
-        for failure in failures:
-            _tell(reporter, f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
-        if machine.allows(Event.STOP):
-            machine.handle(Event.STOP, "the lamps are switched off")
-        _cut_mains(rig, reporter)
-        if not failures and machine.allows(Event.COOLED):
-            machine.handle(Event.COOLED, "every lamp is off or cooling by itself")
-    if failures:
-        names = ", ".join(failure.projector for failure in failures)
-        raise DeviceError(
-            "lamp-still-lit",
-            what=f"The work is done, but {names} could not be switched off.",
-            remedy="Switch off by the remote control, and leave the mains on until the fans stand still.",
-        )
-
-
-def _cut_mains(rig: Rig, reporter: Reporter) -> None:
-    if not rig.circuits:
-        return
-    _tell(reporter, "Waiting until the lamps have cooled, to cut their mains.")
-    for stuck in open_circuits(rig.circuits, rig.guards):
-        _tell(reporter, f"The mains of relay {stuck.circuit} stay on: {stuck.error}", Level.WARNING)
-
-
-def _tell(reporter: Reporter, text: str, level: Level = Level.INFO) -> None:
-    # A terminal that was closed, or a reader that went away, must not keep lamps lit.
-    with contextlib.suppress(OSError, ValueError):
-        reporter.say(text, level)
-
-
-def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
-    """Strike the lamps and wait for steady light. Never skipped: hardware is probed, not restored."""
-
-    def strike(context: Context) -> Sequence[Path]:
-        light(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance)
-        return ()
-
-    def settle(context: Context) -> Sequence[Path]:
-        steady(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance)
-        return ()
-
-    rules = [guard.capabilities.lamp_rules for guard in rig.guards]
-    light_s = max(rule.warm_up_s for rule in rules) + 0.5
-    steady_s = max(max(rule.stable_s for rule in rules) - light_s, 0.1)
-    return [
-        Step("strike", strike, title="Switching the projectors on", weight=light_s, enter=Event.START,
-             leave=Event.LAMPS_LIT, always=True),
-        Step("steady", settle, title="Waiting for steady light", weight=steady_s,
-             leave=Event.LAMPS_STABLE, always=True),
-    ]  # fmt: skip
 
 
 def marker(name: str, title: str, *, enter: Event | None = None, leave: Event | None = None) -> Step:
