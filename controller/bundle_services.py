@@ -16,7 +16,7 @@ from controller.bundle.signing import ANYONE, Trust, generate_key, load_public_k
 from controller.config import Stage, load_stage
 from controller.config.loader import FILE
 from controller.errors import BundleError, UsageError
-from controller.services import KEY_FILE, finished_calibration, output_sizes, signing_key, stage_trust
+from controller.services import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
 from controller.session.progress import Reporter
 from controller.session.publishing import next_revision, write_solved
 from controller.storage import exclusive
@@ -37,7 +37,7 @@ def build(
     checked = check_stage(stage)
     folder = checked.stage.folder
     with exclusive(folder / LOCK, what_is_running="Velatura"):
-        run = finished_calibration(folder)
+        run = usable_calibration(checked, reporter)
         chosen = tuple(dict.fromkeys(names)) or _solved(checked.stage, run)
         path, key = out or folder / "bundle.vel", signing_key(checked)
         reporter.say(f"Writing {len(chosen)} appearances.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -135,13 +136,13 @@ def grade_figures(folder: Path) -> dict[str, str]:
 def worst_of(folder: Path) -> tuple[str, float] | None:
     """The projector with the largest error, in per cent; None for a run that was not graded."""
     figures = graded(folder)
-    return max(figures.items(), key=lambda item: item[1]) if figures else None
+    return max(figures.items(), key=lambda item: math.inf if math.isnan(item[1]) else item[1]) if figures else None
 
 
 def passes(folder: Path, worst_grade: float) -> bool:
     """Whether a run's calibration may be used: good enough, accepted by a person, or graded only later."""
     worst = worst_of(folder)
-    return worst is None or not worst[1] > worst_grade or (folder / ACCEPTED).exists()
+    return worst is None or worst[1] <= worst_grade or (folder / ACCEPTED).exists()
 
 
 def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
