@@ -165,19 +165,21 @@ def adjoint_sites(windows: Windows, table: Profiles, mixing: FloatImage, r: Floa
     for t in range(TURNS):
         begin, end = windows.turn_first[t], windows.turn_first[t + 1]
         for i in prange(end - begin):
-            cell = windows.turn[begin + i]
-            first, last = windows.first[cell], windows.first[cell + 1]
-            if first == last:
-                continue
-            n, colour = windows.place[cell, 0], windows.place[cell, 1]
-            sums = np.zeros(side * side, np.float32)
-            _spread(windows, table, cell, side, r, True, sums)
+            tile = windows.turn[begin + i]
+            n = windows.place[tile, 0]
+            apart = (windows.cell_first[n + 1] - windows.cell_first[n]) // 3
             rows, columns = windows.size[n]
-            top, left = windows.place[cell, 2] - halo, windows.place[cell, 3] - halo
-            for c in range(3):
-                m = mixing[n, colour, c]
-                if m != 0:
-                    _pour(sums, m, windows.start[n], rows, columns, top, left, side, out[c])
+            top, left = windows.place[tile, 2] - halo, windows.place[tile, 3] - halo
+            for colour in range(3):
+                cell = tile + colour * apart
+                if windows.first[cell] == windows.first[cell + 1]:
+                    continue
+                sums = np.zeros(side * side, np.float32)
+                _spread(windows, table, cell, side, r, True, sums)
+                for c in range(3):
+                    m = mixing[n, colour, c]
+                    if m != 0:
+                        _pour(sums, m, windows.start[n], rows, columns, top, left, side, out[c])
 
 
 @compiled(parallel=True, fastmath=True)
@@ -195,15 +197,15 @@ def share_sums(
     for t in range(TURNS):
         begin, end = windows.turn_first[t], windows.turn_first[t + 1]
         for i in prange(end - begin):
-            cell = windows.turn[begin + i]
-            first, last = windows.first[cell], windows.first[cell + 1]
-            n = windows.place[cell, 0]
-            if first == last or n < projectors[0] or n >= projectors[1]:
+            tile = windows.turn[begin + i]
+            n = windows.place[tile, 0]
+            if n < projectors[0] or n >= projectors[1]:
                 continue
-            sums = np.zeros((planes, side * side), np.float32)
-            for c in range(planes):
-                _spread(windows, table, cell, side, image[c], False, sums[c])
+            apart = (windows.cell_first[n + 1] - windows.cell_first[n]) // 3
             rows, columns = windows.size[n]
-            top, left = windows.place[cell, 2] - halo, windows.place[cell, 3] - halo
+            top, left = windows.place[tile, 2] - halo, windows.place[tile, 3] - halo
             for c in range(planes):
-                _pour(sums[c], 1.0, windows.start[n], rows, columns, top, left, side, out[c])
+                sums = np.zeros(side * side, np.float32)
+                for colour in range(3):
+                    _spread(windows, table, tile + colour * apart, side, image[c], False, sums)
+                _pour(sums, 1.0, windows.start[n], rows, columns, top, left, side, out[c])

@@ -32,8 +32,8 @@ LEAST_INSIDE: Final = 0.05
 LEAST_SHEAR: Final = 3
 """Steps up to this are taken as none, because windows without are faster."""
 BEYOND: Final = 2
-TURNS: Final = 12
-"""Three colours by four kinds of tiles, even and odd: the cells of one turn never write to the same pixel."""
+TURNS: Final = 4
+"""Tiles of even and odd rows and columns: those of one turn never write to the same pixel."""
 
 
 class Windows(NamedTuple):
@@ -43,7 +43,7 @@ class Windows(NamedTuple):
     uint16: the table's row for x and y, kind times PHASES plus position between two pixels; ``shear``
     int8: how far each row is moved along x; ``gain`` float32: white light at the site over the sum of its shares
     ``first`` (cells + 1,) int64: each cell's windows; ``place`` (cells, 4) int64: projector, colour, top, left
-    ``turn`` (cells,) int64: the cells by turn; ``turn_first`` (TURNS + 1,) int64
+    ``turn`` (tiles,) int64: the tiles by turn, each by its cell of the first colour; ``turn_first`` (TURNS + 1,) int64
     ``start`` (projectors + 1,) int64: first pixel of each projector; ``size`` (projectors, 2) int64: rows, columns
     ``cell_first`` (projectors + 1,) int64: each projector's cells; ``halo`` (1,) int64: of the buffers
     """
@@ -123,9 +123,10 @@ def _joined(
     first = np.concatenate([count[:-1] + b for (count, _), b in zip(parts, before, strict=False)] + [before[-1:]])
     place = np.concatenate(places)
     cell_first = np.cumsum([0, *(p.shape[0] for p in places)]).astype(np.int64)
-    group = 4 * place[:, 1] + 2 * (place[:, 2] // TILE % 2) + place[:, 3] // TILE % 2
-    turn = np.argsort(group, kind="stable").astype(np.int64)
-    turn_first = np.searchsorted(group[turn], np.arange(TURNS + 1)).astype(np.int64)
+    tile = np.flatnonzero(place[:, 1] == 0)
+    group = 2 * (place[tile, 2] // TILE % 2) + place[tile, 3] // TILE % 2
+    order = np.argsort(group, kind="stable")
+    turn, turn_first = tile[order], np.searchsorted(group[order], np.arange(TURNS + 1)).astype(np.int64)
     for t in range(TURNS):
         # threads take the first and the second half: both get cells of all parts of the image
         mine = turn[turn_first[t] : turn_first[t + 1]].copy()
