@@ -117,7 +117,7 @@ def _codec() -> list[Row]:
     listing = timed(often(parse_handles, handles))
     control, bulk = timed(lambda: exchange(request)), timed(lambda: exchange(data), repeats=3)
     return [
-        at_most("codec, a header of PTP/IP", 1e6 * network.minimum / PACKETS, HEADER_US, unit="us", how="parsed; fastest of 5"),
+        at_most("codec, a header of PTP/IP", 1e6 * network.minimum / PACKETS, HEADER_US, unit="us", how="best of 5"),
         at_most("codec, a header of PTP on USB", 1e6 * usb.minimum / PACKETS, HEADER_US, unit="us", how="the same"),
         at_most("codec, 5000 object handles", 1e3 * listing.minimum / PACKETS, HANDLES_MS, unit="ms", how="the same"),
         at_most("codec, a request", 1e6 * control.median / PACKETS, None, unit="us", how="packed and parsed"),

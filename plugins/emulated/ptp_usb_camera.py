@@ -9,12 +9,13 @@ import queue
 import struct
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
 from typing import Final
 
 from plugins.emulated.ptp_body import CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.ptp_camera import BODIES, NAMES, Flavour
-from plugins.emulated.ptp_wire import OK, Gone, Outcome
+from plugins.emulated.ptp_wire import BUSY, OK, Gone, Outcome
 from plugins.emulated.shot import Expose, ShotFiles, ShotSettings
 from plugins.emulated.usb_bus_device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, Setup, Stall, UsbNames
 
@@ -39,8 +40,8 @@ class UsbCameraFaults:
 
     ``stall_in``, ``stall_out``: that many transfers end with a halted pipe; ``split_headers``: the header of data
     comes in a packet of its own; ``zero_packets``: transfers of whole packets end with an empty one, as they should;
-    ``unknown_lengths``: data containers say 0xFFFFFFFF; ``lost_interrupts``: that many events never come;
-    ``away_s``: how long the camera stays away when a fault drops it.
+    ``unready``: its status is busy until it is reset; ``unknown_lengths``: data containers say 0xFFFFFFFF;
+    ``lost_interrupts``: that many events never come; ``away_s``: how long it stays away when a fault drops it.
     """
 
     stall_in: int = 0
@@ -49,6 +50,7 @@ class UsbCameraFaults:
     zero_packets: bool = True
     unknown_lengths: bool = False
     lost_interrupts: int = 0
+    unready: bool = False
     away_s: float = 0.05
 
     def take(self, name: str) -> bool:
@@ -101,6 +103,7 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         self.body.on_drop = self.drop
         self._work: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
         self._life = 0
+        self._requests: Counter[int] = Counter()
         self._cancelled: int | None = None
         self._asked: tuple[int, int, tuple[int, ...]] | None = None
         self._received = bytearray()
@@ -142,17 +145,23 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
 
         threading.Thread(target=away, daemon=True).start()
 
+    def asked(self, request: int) -> int:
+        """How often a class request has come."""
+        return self._requests[request]
+
     def class_request(self, setup: Setup, data: bytes) -> bytes:
+        self._requests[setup.request] += 1
         match setup.request_type, setup.request:
             case 0x21, 0x64:
                 self._cancelled = struct.unpack("<HI", data)[1]
                 self.pipes[IN].clear()
                 return b""
             case 0x21, 0x66:
+                self.pipe_faults.unready = False
                 self.plugged()
                 return b""
             case 0xA1, 0x67:
-                return struct.pack("<HH", 4, OK)
+                return struct.pack("<HH", 4, BUSY if self.pipe_faults.unready else OK)
             case _:
                 raise Stall
 

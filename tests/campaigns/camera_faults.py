@@ -212,9 +212,10 @@ def run(captures: int, seed: int = 1) -> list[Outcome]:
                 env={**os.environ, **environment(Path(bus))},
                 cwd=Path(__file__).parents[2],
                 stdout=subprocess.PIPE,
-                check=True,
+                check=False,
             )
-        outcomes.append(Outcome(**json.loads(done.stdout)))
+        ended = f"its process ended with {done.returncode}"
+        outcomes.append(Outcome(**json.loads(done.stdout)) if not done.returncode else Outcome(camera, wrong=[ended]))
 
     threads = [
         threading.Thread(target=network if camera.startswith("network") else usb, args=(camera,)) for camera in CAMERAS

@@ -180,6 +180,24 @@ def test_work_stops_when_cancelled_and_the_camera_is_usable_afterwards(rig: Rig,
     assert rig.exposures() == 2
 
 
+def test_what_is_left_in_the_middle_is_cancelled_at_the_camera(rig: Rig) -> None:
+    rig.fault("camera_faults.silent", True)
+    with pytest.raises((DeviceTimeout, DeviceGone)):
+        rig.driver.identity(deadline=in_seconds(0.3))
+    assert rig.bus.call("camera", "asked", 0x64) == 1
+    rig.fault("camera_faults.silent", False)
+    assert rig.driver.identity(deadline=in_seconds(5)).serial
+
+
+def test_a_camera_that_another_program_left_unready_is_reset(bus: UsbBusProcess) -> None:
+    bus.add("camera", "camera", flavour="eos-new")
+    bus.set("camera", "pipe_faults.unready", True)
+    UsbFinder(UsbAddress()).connect(in_seconds(5)).close()
+    assert bus.call("camera", "asked", 0x66) == 1
+    UsbFinder(UsbAddress()).connect(in_seconds(5)).close()
+    assert bus.call("camera", "asked", 0x66) == 1
+
+
 def test_raw_and_jpeg_of_one_shot_come_together(bus: UsbBusProcess, tmp_path: Path) -> None:
     with running(bus, "eos-new", both=True) as rig:
         rig.driver.configure(ExposureSettings(0.125, 200, raw=True), deadline=in_seconds(5))
