@@ -25,6 +25,8 @@ BLOCKS = 8
 """The uncertainty is taken from how this many by this many parts of the picture disagree."""
 LEAST_BLOCKS = 4
 LEAST_PIXELS = 100
+MOST_PIXELS = 120_000
+"""More of them would hardly be more precise: what is left is the model's error."""
 MAP_WIDTH = 16_000
 """OpenCV takes maps of limited width only."""
 
@@ -135,7 +137,7 @@ class _Blurred:
     """Both pictures at one blur, with the reference's gradients."""
 
     def __init__(self, reference: FloatImage, seen: FloatImage, weight: FloatImage, blur_px: float) -> None:
-        self.weight = weight
+        self.blur_px = blur_px
         self.reference, self.seen = (_smooth(image, weight, blur_px) for image in (reference, seen))
         self.dx, self.dy = _slope(self.reference, 1, 0), _slope(self.reference, 0, 1)
         inside = cv2.erode((weight > 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0)
@@ -170,7 +172,7 @@ def _descend(pair: _Blurred, frame: _Frame, p: Float64) -> tuple[Float64, _Fit]:
         if not np.isfinite(step).all():
             return p, _Fit(fit.gain, fit.covariance, 0.0)
         p = p + step
-        if np.abs(step).max() * frame.half < 1e-3:
+        if np.abs(step).max() * frame.half < 2e-3 * max(1.0, 5 * pair.blur_px - 5):
             break
     return p, fit
 
@@ -178,6 +180,7 @@ def _descend(pair: _Blurred, frame: _Frame, p: Float64) -> tuple[Float64, _Fit]:
 def _step(pair: _Blurred, frame: _Frame, p: Float64) -> tuple[Float64, _Fit]:
     rows, columns = frame.shape
     flat = np.flatnonzero(pair.inside.ravel() > 0)
+    flat = flat[:: max(1, math.ceil(flat.size / MOST_PIXELS))]
     x, y = (flat % columns).astype(np.float64), (flat // columns).astype(np.float64)
     at = _mapped(frame.matrix(p), x, y)
     w: Float64 = np.asarray(pair.inside.ravel()[flat] * _sampled(pair.inside, at, cv2.INTER_NEAREST)[:, 0], np.float64)

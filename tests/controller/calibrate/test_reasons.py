@@ -12,7 +12,9 @@ from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibr
 from controller.capture.patterns import Pattern, PatternKind, frame
 
 ROWS, COLUMNS = 90, 120
-SHOWN = cv2.GaussianBlur(frame(Pattern("r", PatternKind.RANDOM, seed=2), (COLUMNS, ROWS)), (0, 0), 1.0)
+SHOWN: FloatImage = np.asarray(
+    cv2.GaussianBlur(frame(Pattern("r", PatternKind.RANDOM, seed=2), (COLUMNS, ROWS)), (0, 0), 1.0), np.float32
+)
 PATCH = (slice(30, 60), slice(40, 80))
 
 
