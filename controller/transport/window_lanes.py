@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from controller.arrays import FloatImage
@@ -117,6 +117,23 @@ def _small_add(_: Any, sums: Any, at: Any, side: Any, table: Any, across: Any, d
 
     return types.void(sums, types.int64, types.int64, table, types.int64, types.int64, types.float32), generate
 
+
+def _fetch(_: Any, values: Any, index: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, value=args[0]).data
+        byte = ir.IntType(8).as_pointer()
+        address = builder.bitcast(builder.gep(data, [args[1]]), byte)
+        kind = ir.FunctionType(ir.VoidType(), [byte, _LANE, _LANE, _LANE])
+        name = "llvm.prefetch.p0i8"
+        prefetch = cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
+        builder.call(prefetch, [address, *(ir.Constant(_LANE, value) for value in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(values, types.int64), generate
+
+
+fetch = cast("Callable[[FloatImage, Index], None]", intrinsic(_fetch))
+"""``fetch(values, index)``: bring values[index] to the cache, if there is such a place; costs next to nothing."""
 
 small_sum = cast("Callable[[FloatImage, Index, Index, FloatImage, Index, Index], float]", intrinsic(_small_sum))
 """``small_sum(light, at, side, table, across, down)``: sum of the four by four of ``light`` from ``at`` on, ``side`` a

@@ -6,14 +6,19 @@ channel by projector channel. Every site and every projector pixel is written in
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numba import prange
 
 from controller.arrays import FloatImage
 from controller.compiled import compiled
 from controller.transport.profiles import LANES, PHASE_BITS, PHASES, Profiles
-from controller.transport.window_lanes import small_add, small_sum, window_add, window_sum
+from controller.transport.window_lanes import fetch, small_add, small_sum, window_add, window_sum
 from controller.transport.windows import SHEAR_BITS, TILE, TURNS, Windows
+
+AHEAD: Final = 32
+"""Windows between asking for a site's memory and using it: runs of sites are too short for the processor to foresee."""
 
 # The two loops below are one function each, not one a window: a call with arrays costs more than a small window's sum.
 
@@ -26,6 +31,7 @@ def _see(windows: Windows, table: Profiles, cell: int, side: int, light: FloatIm
     across, downs, gain = windows.across[first:last], windows.down[first:last], windows.gain[first:last]
     shares, begins, sizes, small = table.table, table.first, table.size, table.small[0] * PHASES
     for e in range(site.size):
+        fetch(out, site[min(e + AHEAD, site.size - 1)])
         xs, ys, a, shear = np.int64(across[e]), np.int64(downs[e]), np.int64(at[e]), np.int64(shears[e])
         if shear == 0 and xs < small and ys < small:
             out[site[e]] += gain[e] * small_sum(light, a, side, shares, LANES * xs, LANES * ys)
@@ -65,6 +71,7 @@ def _spread(
     across, downs, gain = windows.across[first:last], windows.down[first:last], windows.gain[first:last]
     shares, begins, sizes, small = table.table, table.first, table.size, table.small[0] * PHASES
     for e in range(site.size):
+        fetch(values, site[min(e + AHEAD, site.size - 1)])
         if site[e] >= values.size:
             continue
         value = values[site[e]] * (gain[e] if weighted else np.float32(1))
