@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,8 @@ from scipy.ndimage import map_coordinates
 from controller.arrays import Float64, FloatImage
 from controller.calibrate.values import Radiometry
 
+ON_PROJECTOR: Final = ("projector_px", "shown_px")
+"""Where camera pixels look: the correspondences, and the phase map that the light transport is made from."""
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -20,7 +22,7 @@ def shifted_pixels(arrays: Arrays, matrix: Float64) -> dict[str, npt.NDArray[Any
 
     Parameters
     ----------
-    arrays : ``projector_px`` (camera rows, columns, 2) is mapped, and whatever is kept by projector pixel (the shape of
+    arrays : ``ON_PROJECTOR`` (camera rows, columns, 2) are mapped, and whatever is kept by projector pixel (the shape of
         ``centre_px``) is taken from where that pixel's light fell before; the rest stays as it is
     matrix : (3, 3), as ``registration.Motion.matrix``: from where a point lay in the projector's image to where it lies
     """
@@ -30,7 +32,7 @@ def shifted_pixels(arrays: Arrays, matrix: Float64) -> dict[str, npt.NDArray[Any
     before = _mapped(np.asarray(back, np.float64), np.stack([x, y], axis=2))
     found = {}
     for name, array in arrays.items():
-        if name == "projector_px":
+        if name in ON_PROJECTOR:
             found[name] = _mapped(matrix, array.astype(np.float64)).astype(array.dtype)
         elif array.shape[:2] == (rows, columns):
             found[name] = _taken(array, before, extend=name == "centre_px")

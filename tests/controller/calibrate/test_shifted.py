@@ -31,6 +31,7 @@ def pixels() -> dict[str, npt.NDArray[Any]]:
     grid = np.stack([x, y], axis=2)
     return {
         "projector_px": np.full((90, 150, 2), 7.0, np.float32),
+        "shown_px": np.full((90, 150, 2), 7.0, np.float32),
         "modulation": np.full((90, 150), 0.5, np.float32),
         "centre_px": camera_of(grid).astype(np.float32),
         "covariance_px2": np.full((ROWS, COLUMNS, 3), 0.4, np.float32),
@@ -53,7 +54,8 @@ def test_correspondences_are_mapped_and_what_is_kept_by_camera_pixel_stays(
     pixels: dict[str, npt.NDArray[Any]],
 ) -> None:
     found = shifted_pixels(pixels, TURN)
-    np.testing.assert_allclose(found["projector_px"][3, 5], moved(TURN, np.full(2, 7.0)), atol=1e-4)
+    for name in ("projector_px", "shown_px"):
+        np.testing.assert_allclose(found[name][3, 5], moved(TURN, np.full(2, 7.0)), atol=1e-4)
     np.testing.assert_array_equal(found["modulation"], pixels["modulation"])
 
 
