@@ -22,8 +22,8 @@ def shifted_pixels(arrays: Arrays, matrix: Float64) -> dict[str, npt.NDArray[Any
 
     Parameters
     ----------
-    arrays : ``ON_PROJECTOR`` (camera rows, columns, 2) are mapped, and whatever is kept by projector pixel (the shape of
-        ``centre_px``) is taken from where that pixel's light fell before; the rest stays as it is
+    arrays : ``ON_PROJECTOR`` (camera rows, columns, 2) are mapped, and whatever is kept by projector pixel (the shape
+        of ``centre_px``) is taken from where that pixel's light fell before; the rest stays as it is
     matrix : (3, 3), as ``registration.Motion.matrix``: from where a point lay in the projector's image to where it lies
     """
     rows, columns = arrays["centre_px"].shape[:2]
