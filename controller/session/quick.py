@@ -72,6 +72,8 @@ def _tell(context: Context) -> Sequence[Path]:
     for sentence in found[:-1] or found:
         context.reporter.say(sentence)
     if advice(drift) == "look":
+        for taken in read_index(context.folder, "drift-photographs").values():
+            taken.path.unlink(missing_ok=True)  # the same command looks again, once the projector has been seen to
         raise CalibrationError("projector-dark", what=found[0], remedy=found[-1])
     if advice(drift) == "full":
         context.reporter.say("All of it is measured again: nothing of the last calibration holds.", Level.WARNING)
