@@ -51,6 +51,7 @@ class PtpUsbLink:
         self._spare = b""
         self._in_transaction = False
         self._closed = False
+        self._released = False
         self._events: deque[LinkEvent] = deque(maxlen=_MOST_EVENTS)
         self._news = threading.Condition()
         self._ended: DeviceGone | None = None
@@ -129,7 +130,14 @@ class PtpUsbLink:
         if self._reader.is_alive():
             self._reader.join(3 * _SLICE_S)
         if not self._reader.is_alive():
-            self._pipes.close()  # never under the feet of a reader that a dead bus holds
+            self._release()
+
+    def _release(self) -> None:
+        """Close the pipes once: never under the feet of a reader that a dead bus holds; then the reader does it."""
+        with self._news:
+            released, self._released = self._released, True
+        if not released:
+            self._pipes.close()
 
     def _check_open(self) -> None:
         if self._ended is not None:
@@ -280,6 +288,13 @@ class PtpUsbLink:
             self._transcript.received(data[:_LONGEST_NOTE])
 
     def _read_events(self) -> None:
+        try:
+            self._read_until_stopped()
+        finally:
+            if self._stop.is_set():
+                self._release()
+
+    def _read_until_stopped(self) -> None:
         stalls = 0
         while not self._stop.is_set():
             try:
