@@ -24,6 +24,8 @@ NOISES: Final = 2.0
 """Differences of this many standard deviations of their noise are halved; smaller ones vanish, larger ones stay."""
 MOST: Final = 1.0
 LEAST_SHARE: Final = 0.03
+LEAST_CHANGE: Final = 0.04
+"""Of its light; a camera pixel none of whose shares changes by more is left to the model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +139,10 @@ def edge_term(model: LightTransport, n: int, measured: EdgeShares, white: FloatI
     difference = share - _modelled(model, n, measured.pattern, camera, projector, white)
     difference, noise = _shrunk(np.clip(difference, -MOST, MOST))
     # What is neither different nor much of the light only costs time in every product.
-    kept = (np.abs(difference) > noise) | (share > LEAST_SHARE)
+    _, row = np.unique(camera, return_inverse=True)
+    largest = np.zeros(int(row.max(initial=-1)) + 1, np.float32)
+    np.maximum.at(largest, row, np.abs(difference))
+    kept = ((np.abs(difference) > noise) | (share > LEAST_SHARE)) & (largest[row] > LEAST_CHANGE)
     camera, projector, share, difference = (part[kept] for part in (camera, projector, share, difference))
     own, row = np.unique(camera, return_inverse=True)
     # The rows' sums are taken back where light was measured, in proportion to it.
