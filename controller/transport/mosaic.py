@@ -98,9 +98,10 @@ def interpolate(sites: FloatImage, colours: Colours, out: FloatImage) -> None:
             at = 1 if colours[y & 1, 0] == GREEN else 0
             own = colours[y & 1, at]
             _interpolate_row(sites[y - 1], sites[y], sites[y + 1], at, out[own, y], out[GREEN, y], out[2 - own, y])
-        for x in range(columns):
-            if not (inner and BORDER <= x < columns - BORDER):
-                _interpolate_one(sites, colours, y, x, out)
+        for x in range(min(BORDER, columns) if inner else columns):
+            _interpolate_one(sites, colours, y, x, out)
+        for x in range(max(columns - BORDER, BORDER) if inner else columns, columns):
+            _interpolate_one(sites, colours, y, x, out)
 
 
 @compiled(parallel=True)
@@ -112,6 +113,7 @@ def collect(planes: FloatImage, colours: Colours, out: FloatImage) -> None:
         if inner:
             at = 1 if colours[y & 1, 0] == GREEN else 0
             _collect_row(planes[colours[y & 1, at]], planes[GREEN], y, at, out[y])
-        for x in range(columns):
-            if not (inner and BORDER <= x < columns - BORDER):
-                _collect_one(planes, colours, y, x, out)
+        for x in range(min(BORDER, columns) if inner else columns):
+            _collect_one(planes, colours, y, x, out)
+        for x in range(max(columns - BORDER, BORDER) if inner else columns, columns):
+            _collect_one(planes, colours, y, x, out)

@@ -7,6 +7,7 @@ sampled, and D the interpolation of the camera's colours, exactly as the picture
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -71,7 +72,7 @@ class WindowTransport(LightTransport):
         if not self.colours.size:
             forward_sites(self.windows, self.table, mixing, p, projectors, out.reshape(-1))
             return
-        sites = np.empty(self.shape, np.float32)
+        sites = _scratch(self.shape)
         forward_sites(self.windows, self.table, mixing, p, projectors, sites.reshape(-1))
         interpolate(sites, self.colours, out)
 
@@ -103,7 +104,7 @@ class WindowTransport(LightTransport):
         out = np.empty((3, self.pixels), np.float32) if out is None else out
         sites = r
         if self.colours.size:
-            sites = np.empty(self.shape, np.float32)
+            sites = _scratch(self.shape)
             collect(r, self.colours, sites)
         adjoint_sites(self.windows, self.table, self.mixing, np.ascontiguousarray(sites).reshape(-1), out)
         return out
@@ -121,3 +122,14 @@ class WindowTransport(LightTransport):
         windows = Windows(*(arrays[name] for name in Windows._fields))
         mixing, lit, per_weight, colours = (arrays[name] for name in _OWN)
         return cls(mixing, lit, per_weight, sizes, windows, build_profiles(), colours)
+
+
+_kept = threading.local()
+
+
+def _scratch(shape: tuple[int, int]) -> FloatImage:
+    """A sheet of samples for the length of one product; fresh memory would cost as much as the interpolation."""
+    sheet: FloatImage | None = getattr(_kept, "sheet", None)
+    if sheet is None or sheet.shape != shape:
+        sheet = _kept.sheet = np.empty(shape, np.float32)
+    return sheet
