@@ -67,25 +67,49 @@ def _interpolate_row(
 ) -> None:
     """One inner row, whose colours are green and one other, the latter at columns of parity ``at``."""
     half, quarter = np.float32(0.5), np.float32(0.25)
-    for x in range(BORDER, here.size - BORDER):
-        across, down = here[x - 1] + here[x + 1], above[x] + below[x]
-        corners = above[x - 1] + above[x + 1] + below[x - 1] + below[x + 1]
-        other = (x & 1) == at
-        own[x] = here[x] if other else half * across
-        green[x] = quarter * (across + down) if other else here[x]
-        far[x] = quarter * corners if other else half * down
+    # shifted views, because an index that might be negative can't be vectorised
+    n = here.size - 2 * BORDER
+    left, h, right = here[1:], here[BORDER:], here[BORDER + 1 :]
+    la, a, ra, lb, b, rb = (
+        above[1:],
+        above[BORDER:],
+        above[BORDER + 1 :],
+        below[1:],
+        below[BORDER:],
+        below[BORDER + 1 :],
+    )
+    own, green, far = own[BORDER:], green[BORDER:], far[BORDER:]
+    for i in range(n):
+        across, down, corners = left[i] + right[i], a[i] + b[i], la[i] + ra[i] + lb[i] + rb[i]
+        other = (i & 1) == at
+        own[i] = h[i] if other else half * across
+        green[i] = quarter * (across + down) if other else h[i]
+        far[i] = quarter * corners if other else half * down
 
 
 @compiled(fastmath=True)
 def _collect_row(own: FloatImage, green: FloatImage, y: int, at: int, out: FloatImage) -> None:
     """The transpose: ``own`` and ``green`` (rows, columns) are the two planes of the row's colours."""
     half, quarter = np.float32(0.5), np.float32(0.25)
-    a, h, b = own[y - 1], own[y], own[y + 1]
-    ga, gh, gb = green[y - 1], green[y], green[y + 1]
-    for x in range(BORDER, out.size - BORDER):
-        edges, corners = h[x - 1] + h[x + 1] + a[x] + b[x], a[x - 1] + a[x + 1] + b[x - 1] + b[x + 1]
-        greens = gh[x] + quarter * (gh[x - 1] + gh[x + 1] + ga[x] + gb[x])
-        out[x] = h[x] + half * edges + quarter * corners if (x & 1) == at else greens
+    n = out.size - 2 * BORDER
+    above, here, below = own[y - 1], own[y], own[y + 1]
+    left, h, right = here[1:], here[BORDER:], here[BORDER + 1 :]
+    la, a, ra, lb, b, rb = (
+        above[1:],
+        above[BORDER:],
+        above[BORDER + 1 :],
+        below[1:],
+        below[BORDER:],
+        below[BORDER + 1 :],
+    )
+    green_here = green[y]
+    gl, gh, gr = green_here[1:], green_here[BORDER:], green_here[BORDER + 1 :]
+    ga, gb, to = green[y - 1][BORDER:], green[y + 1][BORDER:], out[BORDER:]
+    for i in range(n):
+        edges, corners = left[i] + right[i] + a[i] + b[i], la[i] + ra[i] + lb[i] + rb[i]
+        others = h[i] + half * edges + quarter * corners
+        greens = gh[i] + quarter * (gl[i] + gr[i] + ga[i] + gb[i])
+        to[i] = others if (i & 1) == at else greens
 
 
 @compiled(parallel=True)
