@@ -65,6 +65,7 @@ class UsbCameraFaults:
 class _Request:
     """One operation, and in which life of the connection it was asked."""
 
+    number: int
     life: int
     code: int
     transaction: int
@@ -104,7 +105,7 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         self._work: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
         self._life = 0
         self._requests: Counter[int] = Counter()
-        self._cancelled: int | None = None
+        self._count = self._cancelled = 0
         self._asked: tuple[int, int, tuple[int, ...]] | None = None
         self._received = bytearray()
         threading.Thread(target=self._serve, daemon=True).start()
@@ -130,7 +131,6 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         """Power of the bus, or a reset: a new life, though the card and the shutter go on."""
         super().plugged()
         self._life += 1
-        self._cancelled = None
         self._asked = None
         self._received.clear()
         self._work.put(None)
@@ -153,7 +153,7 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         self._requests[setup.request] += 1
         match setup.request_type, setup.request:
             case 0x21, 0x64:
-                self._cancelled = struct.unpack("<HI", data)[1]
+                self._cancelled = self._count  # all that was asked so far; its transaction numbers will come again
                 self.pipes[IN].clear()
                 return b""
             case 0x21, 0x66:
@@ -193,7 +193,8 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
     def _put(self, data: bytes) -> None:
         assert self._asked is not None
         code, transaction, parameters = self._asked
-        self._work.put(_Request(self._life, code, transaction, parameters, data))
+        self._count += 1
+        self._work.put(_Request(self._count, self._life, code, transaction, parameters, data))
 
     def _serve(self) -> None:
         """The camera's processor: one request after another, away from the bus' own threads."""
@@ -244,7 +245,7 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
 
     def _offer(self, request: _Request, data: bytes | memoryview, *, whole: bool = True) -> None:
         with self.lock:
-            if request.life != self._life or request.transaction == self._cancelled:
+            if request.life != self._life or request.number <= self._cancelled:
                 return
             if self.pipe_faults.take("stall_in"):
                 self.pipes[IN].halted = True
