@@ -149,7 +149,9 @@ class LightTransport(ABC):
     @property
     def stored_bytes(self) -> int:
         """The size of what a product reads of T."""
-        return sum(array.nbytes for name, array in self.arrays().items() if name not in ("lit", "per_weight"))
+        return sum(
+            array.nbytes for name, array in self.arrays().items() if name not in ("lit", "per_weight", "per_sum")
+        )
 
     def reach_planes(self) -> FloatImage:
         """T 1 as (3, rows, columns)."""

@@ -163,44 +163,23 @@ def _pour(
 
 
 @compiled(parallel=True, fastmath=True)
-def adjoint_sites(windows: Windows, table: Profiles, mixing: FloatImage, r: FloatImage, out: FloatImage) -> None:
-    """Write the transpose of ``forward_sites`` for all projectors: ``r`` (sites,) to ``out`` (3, pixels)."""
+def adjoint_sites(
+    windows: Windows,
+    table: Profiles,
+    mixing: FloatImage,
+    r: FloatImage,
+    weighted: bool,
+    projectors: tuple[int, int],
+    out: FloatImage,
+) -> None:
+    """Write the transpose of ``forward_sites``: ``r`` (sites,) to ``out`` (3, pixels), 0 for other projectors.
+
+    ``weighted``: with the windows' gains; else every site counts alike.
+    """
     halo = windows.halo[0]
     side = TILE + 2 * halo
     for i in prange(out.shape[1] // 4096 + 1):
         out[:, 4096 * i : 4096 * (i + 1)] = 0
-    for t in range(TURNS):
-        begin, end = windows.turn_first[t], windows.turn_first[t + 1]
-        for i in prange(end - begin):
-            tile = windows.turn[begin + i]
-            n = windows.place[tile, 0]
-            apart = (windows.cell_first[n + 1] - windows.cell_first[n]) // 3
-            rows, columns = windows.size[n]
-            top, left = windows.place[tile, 2] - halo, windows.place[tile, 3] - halo
-            for colour in range(3):
-                cell = tile + colour * apart
-                if windows.first[cell] == windows.first[cell + 1]:
-                    continue
-                sums = np.zeros(side * side, np.float32)
-                _spread(windows, table, cell, side, r, True, sums)
-                for c in range(3):
-                    m = mixing[n, colour, c]
-                    if m != 0:
-                        _pour(sums, m, windows.start[n], rows, columns, top, left, side, out[c])
-
-
-@compiled(parallel=True, fastmath=True)
-def share_sums(
-    windows: Windows, table: Profiles, image: FloatImage, projectors: tuple[int, int], out: FloatImage
-) -> None:
-    """Add up ``image`` (planes, camera pixels) in the shares of each projector pixel; to ``out`` (planes, pixels).
-
-    Every camera pixel counts once, by the window of its one site, or of the first of its three.
-    """
-    halo = windows.halo[0]
-    side = TILE + 2 * halo
-    planes = image.shape[0]
-    out[:, windows.start[projectors[0]] : windows.start[projectors[1]]] = 0
     for t in range(TURNS):
         begin, end = windows.turn_first[t], windows.turn_first[t + 1]
         for i in prange(end - begin):
@@ -211,8 +190,13 @@ def share_sums(
             apart = (windows.cell_first[n + 1] - windows.cell_first[n]) // 3
             rows, columns = windows.size[n]
             top, left = windows.place[tile, 2] - halo, windows.place[tile, 3] - halo
-            for c in range(planes):
+            for colour in range(3):
+                cell = tile + colour * apart
+                if windows.first[cell] == windows.first[cell + 1]:
+                    continue
                 sums = np.zeros(side * side, np.float32)
-                for colour in range(3):
-                    _spread(windows, table, tile + colour * apart, side, image[c], False, sums)
-                _pour(sums, 1.0, windows.start[n], rows, columns, top, left, side, out[c])
+                _spread(windows, table, cell, side, r, weighted, sums)
+                for c in range(3):
+                    m = mixing[n, colour, c]
+                    if m != 0:
+                        _pour(sums, m, windows.start[n], rows, columns, top, left, side, out[c])

@@ -21,13 +21,13 @@ from controller.transport.light import FAINTEST, LightTransport
 from controller.transport.mosaic import collect, interpolate
 from controller.transport.planes import image_planes
 from controller.transport.profiles import Profiles, build_profiles
-from controller.transport.window_products import adjoint_sites, forward_sites, share_sums
+from controller.transport.window_products import adjoint_sites, forward_sites
 from controller.transport.windows import Windows, build_windows
 
 WHOLE: Final = 0.998
 """A camera pixel is lit by a projector where the samples it is made of have windows for this part of its white."""
 SMALLEST_MOSAIC: Final = 2
-_OWN: Final = ("mixing", "lit", "per_weight", "colours")
+_OWN: Final = ("mixing", "lit", "per_weight", "colours", "per_sum")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,11 +36,13 @@ class WindowTransport(LightTransport):
 
     ``windows``: each sample's shares; ``table``: the profiles they are made of
     ``colours`` (2, 2) int64 of the camera's samples, or (0, 0) where each pixel has three of its own
+    ``per_sum`` (3, pixels) float32: 1 / sum of a projector pixel's part in the picture, gains left out, or 0
     """
 
     windows: Windows
     table: Profiles
     colours: npt.NDArray[np.int64]
+    per_sum: FloatImage
 
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> WindowTransport:
@@ -58,15 +60,16 @@ class WindowTransport(LightTransport):
         mixing = np.stack([part.radiometry.mixing for part in parts]).astype(np.float32)
         lit = np.zeros((len(parts), *mask.shape), np.bool_)
         pixels = int(windows.start[-1])
-        made = cls(mixing, lit, np.ones(pixels, np.float32), sizes, windows, build_profiles(), colours)
+        none = np.zeros((3, pixels), np.float32)
+        made = cls(mixing, lit, none[0], sizes, windows, build_profiles(), colours, none)
         light = np.empty((3, *mask.shape), np.float32)
         plain = np.broadcast_to(np.eye(3, dtype=np.float32), mixing.shape).copy()
         for n, part in enumerate(parts):
             made._products(np.ones((3, pixels), np.float32), plain, (n, n + 1), light)
             lit[n] = mask & bright[n] & np.all(light >= np.float32(WHOLE) * made._sampled(part.white), axis=0)
-        total = made._sums(np.ones((1, *mask.shape), np.float32), (0, len(parts)))[0]
-        per_weight = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
-        return cls(mixing, lit, per_weight, sizes, windows, made.table, colours)
+        total = made._sums(np.ones((3, *mask.shape), np.float32), (0, len(parts)))
+        per_sum = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
+        return cls(mixing, lit, per_sum.max(axis=0), sizes, windows, made.table, colours, per_sum)
 
     def _products(self, p: FloatImage, mixing: FloatImage, projectors: tuple[int, int], out: FloatImage) -> None:
         if not self.colours.size:
@@ -89,9 +92,18 @@ class WindowTransport(LightTransport):
         return planes
 
     def _sums(self, image: FloatImage, projectors: tuple[int, int]) -> FloatImage:
-        out = np.zeros((image.shape[0], self.pixels), np.float32)
-        share_sums(self.windows, self.table, image.reshape(image.shape[0], -1), projectors, out)
+        out = np.empty((3, self.pixels), np.float32)
+        plain = np.broadcast_to(np.eye(3, dtype=np.float32), self.mixing.shape).copy()
+        adjoint_sites(self.windows, self.table, plain, self._samples(image), False, projectors, out)
         return out
+
+    def _samples(self, picture: FloatImage) -> FloatImage:
+        """The transpose of how a picture (3, rows, columns) is made of its samples, flat."""
+        sites = picture
+        if self.colours.size:
+            sites = _scratch(self.shape)
+            collect(picture, self.colours, sites)
+        return np.ascontiguousarray(sites).reshape(-1)
 
     def forward_planes(
         self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
@@ -102,16 +114,13 @@ class WindowTransport(LightTransport):
 
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         out = np.empty((3, self.pixels), np.float32) if out is None else out
-        sites = r
-        if self.colours.size:
-            sites = _scratch(self.shape)
-            collect(r, self.colours, sites)
-        adjoint_sites(self.windows, self.table, self.mixing, np.ascontiguousarray(sites).reshape(-1), out)
+        everyone = (0, len(self.sizes))
+        adjoint_sites(self.windows, self.table, self.mixing, self._samples(r), True, everyone, out)
         return out
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         means = self._sums(np.ascontiguousarray(image), projectors or (0, len(self.sizes)))
-        means *= self.per_weight
+        means *= self.per_sum
         return means
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
@@ -120,8 +129,8 @@ class WindowTransport(LightTransport):
     @classmethod
     def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> WindowTransport:
         windows = Windows(*(arrays[name] for name in Windows._fields))
-        mixing, lit, per_weight, colours = (arrays[name] for name in _OWN)
-        return cls(mixing, lit, per_weight, sizes, windows, build_profiles(), colours)
+        mixing, lit, per_weight, colours, per_sum = (arrays[name] for name in _OWN)
+        return cls(mixing, lit, per_weight, sizes, windows, build_profiles(), colours, per_sum)
 
 
 _kept = threading.local()
