@@ -23,6 +23,7 @@ from hal.errors import DeviceError
 from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.values import Power
+from plugins.emulated.board_sanyo import SanyoBoard
 from plugins.emulated.boards_binary import Ep910Board, NecBoard
 from plugins.emulated.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
 from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
@@ -42,6 +43,7 @@ BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {
     "nec": NecBoard,
     "optoma-ep910": Ep910Board,
     "panasonic": PanasonicBoard,
+    "sanyo": SanyoBoard,
 }
 FAMILIES = (*BOARDS, "pjlink")
 DEADLINE_S = 0.6

@@ -11,6 +11,7 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
+from plugins.emulated.board_sanyo import SanyoBoard
 from plugins.emulated.boards_binary import Ep910Board, NecBoard
 from plugins.emulated.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
@@ -29,6 +30,7 @@ BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {
     "nec": NecBoard,
     "optoma-ep910": Ep910Board,
     "panasonic": PanasonicBoard,
+    "sanyo": SanyoBoard,
 }
 """The emulated control board of each shipped profile but the first, Optoma's."""
 

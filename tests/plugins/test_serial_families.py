@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from hal.deadline import in_seconds
-from hal.errors import DeviceError, DeviceRefused, DeviceTimeout, ProtocolError
+from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power
+from plugins.emulated.board_sanyo import SanyoBoard
 from plugins.emulated.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.profile_files import shipped_profiles
@@ -236,3 +237,24 @@ def test_an_adapter_that_comes_back_as_another_tty_is_found_by_its_name(open_ser
     back: Callable[[], None] = pair.emulator.replug
     threading.Timer(0.2, back).start()
     assert pair.driver.status(deadline=in_seconds(SOON)).power is before
+
+
+def test_a_sanyo_with_two_lamps_tells_the_hours_of_the_first(open_serial: Any) -> None:
+    pair = open_serial(profile="sanyo", board=partial(SanyoBoard, lamps=2), edit=hasty)
+    burn(pair)
+    assert pair.driver.status(deadline=in_seconds(SOON)).lamp_hours == 1200
+
+
+def test_a_sanyo_that_can_take_no_command_is_busy_and_not_off(open_serial: Any) -> None:
+    pair = open_serial(profile="sanyo", board=partial(SanyoBoard, deaf=True), edit=hasty)
+    with pytest.raises(DeviceBusy):
+        pair.driver.switch_on(deadline=in_seconds(SOON))
+    assert pair.emulator.lamp.strikes == 0
+
+
+def test_a_sanyo_whose_lamp_failed_cools_and_then_reports_a_fault(open_serial: Any) -> None:
+    pair = open_serial(profile="sanyo", edit=hasty)
+    burn(pair)
+    pair.emulator.lamp.fail()
+    wait_for(pair.driver, Power.FAULT)
+    assert pair.driver.status(deadline=in_seconds(SOON)).faults == ("error-standby",)

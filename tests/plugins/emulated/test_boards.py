@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from plugins.emulated.board_sanyo import SanyoBoard
 from plugins.emulated.boards_binary import Ep910Board, NecBoard
 from plugins.emulated.boards_text import (
     BenqBoard,
@@ -138,3 +139,18 @@ def test_an_ep910_in_the_bytes_of_its_table(lamp: EmulatedLamp) -> None:
     lamp.warm_now()
     lamp.extinguish()
     assert board.feed(b"IR04002?") == [b"IR0500001"]
+
+
+def test_a_sanyos_evening(lamp: EmulatedLamp, clock: Clock) -> None:
+    board = SanyoBoard(lamp)
+    assert board.feed(b"CR0\r") == [b"80\r"]
+    assert board.feed(b"C00\r") == [b"\x06\r"]
+    assert board.feed(b"CR0\r") == [b"40\r"]
+    clock.now_s += 61
+    assert board.feed(b"CR0\rCR3\r") == [b"00\r", b"01500\r"]
+    assert board.feed(b"C0D\r") == [b"\x06\r"]
+    assert lamp.shutter_closed
+    assert board.feed(b"C01\r") == [b"\x06\r"]
+    assert board.feed(b"CR0\rC00\r") == [b"20\r", b"?\r"]
+    clock.now_s += 121
+    assert board.feed(b"CR0\rC99\r") == [b"80\r", b"?\r"]
