@@ -15,7 +15,7 @@ from controller.bundle.install import CURRENT
 from controller.bundle.signing import Trust, load_public_key
 from controller.errors import UsageError, VelaturaError
 from controller.play.commands import Commands
-from controller.play.frames import FrameFile, OutputSize, parse_outputs
+from controller.play.frames import FrameFile, OutputSize, parse_outputs, parse_where
 from controller.play.loop import Player
 from controller.play.outputs import MemoryOutput, Output
 from controller.play.protocol import MAX_RATE_HZ
@@ -39,6 +39,8 @@ def _parser() -> argparse.ArgumentParser:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--frames", type=Path, help="show in this file (machines without projectors)")
     where.add_argument("--windows", action="store_true", help="show in one window over all outputs")
+    parser.add_argument("--where", action="append", default=[], metavar="NAME=OUTPUT",
+                        help="connector or display serial number of an output, if that is not its name")  # fmt: skip
     parser.add_argument("--bundle", type=Path, help="bundle to have ready; a stage's bundles/current falls back")
     parser.add_argument("--trusted", type=Path, action="append", default=[], help="public key file; may be repeated")
     parser.add_argument("--revoked", type=Path, action="append", default=[], help="key file never to be trusted")
@@ -87,7 +89,7 @@ def _open_output(options: argparse.Namespace, sizes: tuple[OutputSize, ...]) -> 
     if options.windows:
         from controller.play.windows import WindowOutput
 
-        return WindowOutput(sizes)
+        return WindowOutput(sizes, parse_where(options.where, sizes))
     return MemoryOutput(options.frames, sizes)
 
 

@@ -16,6 +16,7 @@ CACHE_BYTES: Final = 64 * 1024 * 1024
 _FEWEST_SETS: Final = 3
 _MOST_SETS: Final = 64
 _DECODE_THREADS: Final = 2
+_SETS_AT_ONCE: Final = 2
 
 
 def check_fits(bundle: Bundle, outputs: Sequence[OutputSize]) -> None:
@@ -33,7 +34,8 @@ def check_fits(bundle: Bundle, outputs: Sequence[OutputSize]) -> None:
 class DecodedAhead:
     """Decodes what is wanted, in order, in the background; holds as many sets as its memory allows.
 
-    Called from the player's loop, except ``_work``. ``on_ready`` is called from the decoding thread.
+    Called from the player's loop, except ``_work``. ``on_ready`` is called from a decoding thread. Two sets are decoded
+    at once, so that no thread waits for the last stripe of one; the stripes of the sooner one come first.
     """
 
     def __init__(self, bundle: Bundle, outputs: Sequence[OutputSize], on_ready: Callable[[], None]) -> None:
@@ -47,9 +49,13 @@ class DecodedAhead:
         self._failed: dict[str, VelaturaError] = {}
         self._wanted: deque[str] = deque()
         self._pinned: frozenset[str] = frozenset()
-        self._decoding: str | None = None
+        self._held: tuple[FrameSet, ...] = ()
+        self._decoding: set[str] = set()
         self._ended = False
-        threading.Thread(target=self._work, name="decode", daemon=True).start()
+        self._pool = ThreadPoolExecutor(_DECODE_THREADS, thread_name_prefix="decode")
+        self._working = _SETS_AT_ONCE
+        for _ in range(_SETS_AT_ONCE):
+            threading.Thread(target=self._work, name="decode", daemon=True).start()
 
     @property
     def look_ahead(self) -> int:
@@ -64,15 +70,20 @@ class DecodedAhead:
         ordered = list(dict.fromkeys(names))[: self.look_ahead]
         with self._changed:
             self._pinned = frozenset(ordered)
-            self._wanted = deque(n for n in ordered if n not in self._decoded and n != self._decoding)
+            self._wanted = deque(n for n in ordered if n not in self._decoded and n not in self._decoding)
             for name in ordered:
                 self._failed.pop(name, None)
-            self._changed.notify()
+            self._changed.notify_all()
+
+    def hold(self, *sets: FrameSet) -> None:
+        """Leave the content of these sets as it is, until the next call."""
+        with self._changed:
+            self._held = sets
 
     def take(self, name: str) -> FrameSet | None:
         """The decoded set, or None while it is not ready. Raises the BundleError that its decoding raised.
 
-        The set is valid until ``want`` is called without its name and further sets are decoded: prepare it at once.
+        The set is valid while its name is among those wanted, or it is held.
         """
         with self._changed:
             if name in self._failed:
@@ -85,26 +96,30 @@ class DecodedAhead:
         """Stop decoding; the thread closes the bundle when it has ended. Does not wait."""
         with self._changed:
             self._ended = True
-            self._changed.notify()
+            self._changed.notify_all()
 
     def _work(self) -> None:
-        with ThreadPoolExecutor(_DECODE_THREADS, thread_name_prefix="decode") as pool:
-            while (job := self._next_job()) is not None:
-                name, frames = job
-                failure = None
-                try:
-                    buffers = {o.name: image for o, image in zip(self._outputs, frames.pixels, strict=True)}
-                    self.bundle.decode_into(name, buffers, pool)
-                except VelaturaError as error:
-                    failure = error
-                with self._changed:
-                    self._decoding = None
-                    if failure is None:
-                        self._decoded[name] = frames
-                    else:
-                        self._failed[name] = failure
-                self._on_ready()
-        self.bundle.close()
+        while (job := self._next_job()) is not None:
+            name, frames = job
+            failure = None
+            try:
+                buffers = {o.name: image for o, image in zip(self._outputs, frames.pixels, strict=True)}
+                self.bundle.decode_into(name, buffers, self._pool)
+            except VelaturaError as error:
+                failure = error
+            with self._changed:
+                self._decoding.remove(name)
+                if failure is None:
+                    self._decoded[name] = frames
+                else:
+                    self._failed[name] = failure
+            self._on_ready()
+        with self._changed:
+            self._working -= 1
+            last = self._working == 0
+        if last:
+            self._pool.shutdown()
+            self.bundle.close()
 
     def _next_job(self) -> tuple[str, FrameSet] | None:
         with self._changed:
@@ -112,13 +127,15 @@ class DecodedAhead:
                 self._changed.wait()
             if self._ended:
                 return None
-            self._decoding = self._wanted.popleft()
-            return self._decoding, self._free_set()
+            name = self._wanted.popleft()
+            frames = self._free_set()
+            self._decoding.add(name)
+            return name, frames
 
     def _free_set(self) -> FrameSet:
-        """A set to decode into: a new one while there is room, else the one longest unused that nobody waits for."""
-        if len(self._decoded) >= self._capacity:
-            for name in self._decoded:
-                if name not in self._pinned:
+        """A set to decode into: a new one while there is room, else the one longest unused that nobody needs."""
+        if len(self._decoded) + len(self._decoding) >= self._capacity:
+            for name, frames in self._decoded.items():
+                if name not in self._pinned and not any(frames is held for held in self._held):
                     return self._decoded.pop(name)
         return FrameSet.black(self._outputs)

@@ -11,6 +11,7 @@ from typing import Any
 from controller.errors import UsageError, VelaturaError
 from controller.play import protocol
 from controller.play.frames import FrameFile, FrameSet
+from controller.play.identification import identification
 from controller.play.loop import Player, Presented
 from controller.play.playlist import Playlist
 from controller.play.server import Client, Server
@@ -21,7 +22,8 @@ class Commands:
 
     def __init__(self, player: Player, server: Server, inbox: FrameFile) -> None:
         self._player, self._server, self._inbox = player, server, inbox
-        self._pattern = FrameSet.black(player.sizes)
+        # One may be shown, and be what the next picture fades from, while the other is read into.
+        self._patterns = [FrameSet.black(player.sizes), FrameSet.black(player.sizes)]
 
     def serve(self, timeout_s: float) -> None:
         """Wait at most ``timeout_s`` seconds for requests and carry out those that came."""
@@ -59,14 +61,15 @@ class Commands:
                 return self._player.status()
             case protocol.Show(sequence):
                 self._player.withdraw()  # the frames of an earlier show, not yet presented, are overwritten here
-                self._read_inbox(sequence)
-                self._player.show(self._pattern, told)
-            case protocol.Play(appearance):
-                self._player.play(Playlist(((appearance, 0.0),), repeat=1), told)
+                self._player.show(self._read_inbox(sequence), told)
+            case protocol.Play(appearance, fade_s):
+                self._player.play(Playlist(((appearance, 0.0, fade_s),), repeat=1), told)
             case protocol.Sequence(items, repeat, rate_hz):
                 self._player.play(Playlist(items, repeat), told, rate_hz=rate_hz)
-            case protocol.Stop():
-                self._player.stop(told)
+            case protocol.Stop(fade_s):
+                self._player.stop(told, fade_s=fade_s)
+            case protocol.Identify():
+                self._player.show(identification(self._player.sizes), told, showing="identification")
             case protocol.LoadBundle(path):
                 self._player.load_bundle(Path(path))
                 return {"bundle": self._player.bundle_identity}
@@ -75,20 +78,23 @@ class Commands:
                 return {}
         return None
 
-    def _read_inbox(self, sequence: int) -> None:
-        found = self._inbox.read(self._pattern)
+    def _read_inbox(self, sequence: int) -> FrameSet:
+        pattern = next(pattern for pattern in self._patterns if pattern is not self._player.shown)
+        found = self._inbox.read(pattern)
         if found != sequence:
             raise UsageError(
                 "inbox-sequence",
                 what=f"The inbox holds frames number {found}, not {sequence}.",
                 remedy="Let only one program write to the inbox, and ask for what it has written.",
             )
+        return pattern
 
     def _hello(self) -> dict[str, Any]:
         player = self._player
         return {
             "player": "velatura",
             "protocol": protocol.PROTOCOL,
+            "minor": protocol.MINOR,
             "pid": os.getpid(),
             "rate_hz": player.rate_hz,
             "outputs": [{"name": o.name, "width_px": o.width_px, "height_px": o.height_px} for o in player.sizes],

@@ -64,6 +64,15 @@ def parse_outputs(text: str) -> tuple[OutputSize, ...]:
     return tuple(outputs)
 
 
+def parse_where(texts: Sequence[str], outputs: Sequence[OutputSize]) -> dict[str, str]:
+    """Read ``P1=DP-1`` each: where to find the output of that name. Raises UsageError("outputs-wrong")."""
+    found = dict(text.partition("=")[::2] for text in texts)
+    unknown = found.keys() - {output.name for output in outputs}
+    if unknown or not all(found.values()) or len(found) != len(texts):
+        raise _outputs_wrong("--where is not NAME=OUTPUT with the name of an output, each once")
+    return found
+
+
 def _outputs_wrong(detail: str) -> UsageError:
     return UsageError(
         "outputs-wrong",

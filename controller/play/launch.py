@@ -12,7 +12,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
@@ -32,7 +32,8 @@ class PlayerSettings:
     """What a player is started with.
 
     ``outputs``: (name, width_px, height_px) in stage order; ``frames``: the memory output's file, None for windows;
-    ``trusted``, ``revoked``: public key files; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
+    ``where``: connector or display serial number by output name, where that is another; ``trusted``, ``revoked``:
+    public key files; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
     """
 
     outputs: Sequence[tuple[str, int, int]]
@@ -42,6 +43,7 @@ class PlayerSettings:
     allow_unsigned: bool = False
     rate_hz: float = 60.0
     revoked: Sequence[Path] = field(default=())
+    where: Mapping[str, str] = field(default_factory=dict)
 
 
 class PlayerProcess:
@@ -61,6 +63,7 @@ class PlayerProcess:
         command = [sys.executable, "-m", "controller.play", "--socket", str(self.socket)]
         command += ["--outputs", ",".join(f"{name}:{width}x{height}" for name, width, height in settings.outputs)]
         command += ["--windows"] if settings.frames is None else ["--frames", str(settings.frames)]
+        command += [word for name, place in settings.where.items() for word in ("--where", f"{name}={place}")]
         command += [] if settings.bundle is None else ["--bundle", str(settings.bundle)]
         command += [word for key in settings.trusted for word in ("--trusted", str(key))]
         command += [word for key in settings.revoked for word in ("--revoked", str(key))]

@@ -14,6 +14,7 @@ from controller.bundle.signing import Trust
 from controller.errors import BundleError, UsageError, VelaturaError
 from controller.play.cache import DecodedAhead, check_fits
 from controller.play.frames import FrameSet, OutputSize
+from controller.play.mixing import mix_sets
 from controller.play.notify import Notifier
 from controller.play.outputs import Output
 from controller.play.pacing import Grid, Intervals, sleep_until
@@ -40,7 +41,8 @@ Told: TypeAlias = Callable[[Presented | VelaturaError], None]
 class _Coming:
     """What is presented next, at a tick of the grid.
 
-    ``frames`` None: the appearance is taken from the cache once it is decoded.
+    ``frames`` None: the appearance is taken from the cache once it is decoded. ``fade_s``: it comes in over what is
+    shown, in ``steps``, the first at ``begun_tick``; ``share`` of it is shown already.
     """
 
     showing: str
@@ -48,6 +50,19 @@ class _Coming:
     frames: FrameSet | None
     tick: int
     told: Told | None
+    fade_s: float = 0.0
+    begun_tick: int | None = None
+    steps: int = 1
+    share: float = 0.0
+
+    def begin(self, steps: int) -> None:
+        """The first step is presented at ``tick``."""
+        self.begun_tick, self.steps = self.tick, steps
+
+    @property
+    def next_share(self) -> float:
+        """How much of it is shown at ``tick``: by the clock, so a slow machine leaves out steps and not time."""
+        return 1.0 if self.begun_tick is None else min(1.0, (self.tick - self.begun_tick + 1) / self.steps)
 
 
 class Player:
@@ -74,7 +89,7 @@ class Player:
         self._on_appearance = on_appearance
         self._notifier = Notifier()
         self._grid = Grid(rate_hz)
-        self._black = FrameSet.black(sizes)
+        self._black = self.shown = FrameSet.black(sizes)
         self._decoded: DecodedAhead | None = None
         self._coming: _Coming | None = None
         self._playlist: Playlist | None = None
@@ -108,14 +123,14 @@ class Player:
         """Show black and end soon; a signal handler may call it."""
         self._ending = True
 
-    def stop(self, told: Told | None) -> None:
+    def stop(self, told: Told | None, *, fade_s: float = 0.0) -> None:
         """Show black."""
-        self.show(self._black, told, showing="black")
+        self.show(self._black, told, showing="black", fade_s=fade_s)
 
-    def show(self, frames: FrameSet, told: Told | None, *, showing: str = "pattern") -> None:
-        """Show these frames; they must not change until ``told`` is called."""
+    def show(self, frames: FrameSet, told: Told | None, *, showing: str = "pattern", fade_s: float = 0.0) -> None:
+        """Show these frames; they must not change while they are the ``shown`` ones, or will be."""
         self.withdraw()
-        self._coming = _Coming(showing, None, frames, self._soon(), told)
+        self._coming = _Coming(showing, None, frames, self._soon(), told, fade_s)
 
     def play(self, playlist: Playlist, told: Told, *, rate_hz: float | None = None) -> None:
         """Play appearances in turn; ``told`` hears of the first. ``rate_hz``: the grid meanwhile.
@@ -135,12 +150,16 @@ class Player:
         self._playlist, self._intervals, self._late = playlist, Intervals(), 0
         playlist.look_ahead = self._decoded.look_ahead
         self._decoded.want(playlist.upcoming)
-        self._coming = _Coming("appearance", playlist.appearance, None, self._soon(), told)
+        self._coming = _Coming("appearance", playlist.appearance, None, self._soon(), told, playlist.fade_s)
 
     def withdraw(self) -> None:
         """Present nothing more, keep the picture; whoever waits for a presentation is told."""
         coming, self._coming, self._playlist = self._coming, None, None
         self._grid = Grid(self.rate_hz)
+        if coming is not None and coming.share > 0 and coming.frames is not None:
+            mixture = FrameSet.black(self.sizes)
+            mix_sets(self.shown, coming.frames, coming.share, mixture)
+            self._is_shown(mixture)
         if coming is not None and coming.told is not None:
             coming.told(
                 UsageError(
@@ -182,6 +201,8 @@ class Player:
             "swaps": self._last.sequence,
             "showing": self._showing,
             "appearance": self._appearance,
+            "fading": self._coming is not None and self._coming.share > 0,
+            "missing_outputs": list(self._output.missing()),
             "sequence_running": self._playlist is not None,
             "late": self._late,
             "skipped": self._skipped,
@@ -237,27 +258,52 @@ class Player:
         if not wait and time.monotonic() < due_s - self._prepare_s - 2 * _EARLY_S:
             return
         began_s = time.monotonic()
-        self._output.prepare(frames)
+        self._prepare(coming, frames)
         # Remember a slow preparation for a while, so that the next of its kind begins early enough.
         self._prepare_s = min(max(time.monotonic() - began_s, 0.9 * self._prepare_s), tick_s)
         sleep_until(due_s)
-        if time.monotonic() > due_s + tick_s:
+        if time.monotonic() > due_s + tick_s and coming.share == 0:
             self._late += self._playlist is not None and coming.told is None
             coming.tick = self._grid.after(time.monotonic()) - 1
-        self._coming = None
-        self._presented(coming, self._output.flip())
+            coming.begun_tick = None if coming.begun_tick is None else coming.tick
+        self._presented(coming, frames, self._output.flip())
 
-    def _presented(self, coming: _Coming, at_s: float) -> None:
+    def _prepare(self, coming: _Coming, frames: FrameSet) -> None:
+        """Prepare the set itself, or the next step on its way in."""
+        steps = self._grid.ticks(coming.fade_s)
+        if coming.begun_tick is None and steps > 1:
+            self._output.load_fade(self.shown, frames)
+            coming.begin(steps)
+        if coming.begun_tick is None:
+            self._output.prepare(frames)
+        else:
+            self._output.mix(coming.next_share)
+
+    def _presented(self, coming: _Coming, frames: FrameSet, at_s: float) -> None:
         self._last = Presented(self._last.sequence + 1, at_s)
         self._showing, self._appearance = coming.showing, coming.appearance
+        if self._playlist is not None:
+            self._intervals.presented(at_s)
+        coming.share = coming.next_share
+        if coming.share < 1:
+            last = (coming.begun_tick or 0) + coming.steps - 1
+            coming.tick = min(last, max(coming.tick + 1, self._grid.after(at_s + self._prepare_s)))
+            return
+        self._coming = None
+        self._is_shown(frames)
         if coming.appearance is not None and self._on_appearance is not None:
             self._on_appearance()
             self._on_appearance = None
         if self._playlist is not None:
-            self._intervals.presented(at_s)
-            self._go_on(coming.tick + self._grid.ticks(self._playlist.seconds))
+            began = coming.tick if coming.begun_tick is None else coming.begun_tick
+            self._go_on(began + self._grid.ticks(self._playlist.seconds))
         if coming.told is not None:
             coming.told(self._last)
+
+    def _is_shown(self, frames: FrameSet) -> None:
+        self.shown = frames
+        if self._decoded is not None:
+            self._decoded.hold(frames)
 
     def _go_on(self, tick: int) -> None:
         """Make the next item of the sequence coming, no sooner than ``tick``; end the sequence after its last."""
@@ -267,4 +313,4 @@ class Player:
             return
         assert self._decoded is not None
         self._decoded.want(playlist.upcoming)
-        self._coming = _Coming("appearance", playlist.appearance, None, tick, None)
+        self._coming = _Coming("appearance", playlist.appearance, None, tick, None, playlist.fade_s)

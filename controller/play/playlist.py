@@ -7,9 +7,9 @@ from itertools import islice
 
 
 class Playlist:
-    """Steps through (appearance, seconds) items, ``repeat`` times, or for ever if 0."""
+    """Steps through (appearance, seconds, fade_s) items, ``repeat`` times, or for ever if 0."""
 
-    def __init__(self, items: Sequence[tuple[str, float]], repeat: int) -> None:
+    def __init__(self, items: Sequence[tuple[str, float, float]], repeat: int) -> None:
         self._items = tuple(items)
         self._rounds_left = repeat if repeat else None
         self._at = 0
@@ -17,7 +17,7 @@ class Playlist:
 
     @property
     def names(self) -> frozenset[str]:
-        return frozenset(name for name, _ in self._items)
+        return frozenset(name for name, _, _ in self._items)
 
     @property
     def appearance(self) -> str:
@@ -26,8 +26,13 @@ class Playlist:
 
     @property
     def seconds(self) -> float:
-        """How long it stays."""
+        """How long it stays, its cross-fade included."""
         return self._items[self._at][1]
+
+    @property
+    def fade_s(self) -> float:
+        """For how long it comes in over the one before; 0: at once."""
+        return self._items[self._at][2]
 
     @property
     def upcoming(self) -> list[str]:

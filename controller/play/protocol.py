@@ -10,10 +10,13 @@ from typing import Any, Final, TypeAlias
 from controller.errors import UsageError, VelaturaError
 
 PROTOCOL: Final = 1
+MINOR: Final = 1
+"""Raised when something is added that a client of an earlier one need not know."""
 MAX_LINE_BYTES: Final = 256 * 1024
 MAX_ITEMS: Final = 4096
 MAX_RATE_HZ: Final = 1000.0
 MAX_SECONDS: Final = 7 * 24 * 3600.0
+MAX_FADE_S: Final = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,26 +33,35 @@ class Show:
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """Present an appearance of the loaded bundle."""
+    """Present an appearance of the loaded bundle, ``fade_s`` seconds long over what is shown."""
 
     appearance: str
+    fade_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """Present appearances in turn, (name, seconds) each, ``repeat`` times (0: for ever).
+    """Present appearances in turn, (name, seconds, fade_s) each, ``repeat`` times (0: for ever).
 
+    An item lasts ``seconds``, in the first ``fade_s`` of which it comes in over the one before.
     ``rate_hz``: the pictures change at multiples of 1 / rate_hz seconds meanwhile; None: at the player's own.
     """
 
-    items: tuple[tuple[str, float], ...]
+    items: tuple[tuple[str, float, float], ...]
     repeat: int
     rate_hz: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Present black."""
+    """Present black, ``fade_s`` seconds long over what is shown."""
+
+    fade_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Identify:
+    """Present each output's number, name and size, in a test pattern."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +81,7 @@ class Quit:
     """Present black and end."""
 
 
-Request: TypeAlias = Hello | Show | Play | Sequence | Stop | Status | LoadBundle | Quit
+Request: TypeAlias = Hello | Show | Play | Sequence | Stop | Identify | Status | LoadBundle | Quit
 
 
 def parse_request(line: bytes) -> tuple[Any, Request]:
@@ -136,22 +148,36 @@ def _show(*, sequence: Any) -> Show:
     return Show(_whole(sequence, "sequence", 2**64 - 1))
 
 
-def _play(*, appearance: Any) -> Play:
-    return Play(_text(appearance, "appearance"))
+def _play(*, appearance: Any, fade_s: Any = 0.0) -> Play:
+    return Play(_text(appearance, "appearance"), _fade(fade_s))
+
+
+def _stop(*, fade_s: Any = 0.0) -> Stop:
+    return Stop(_fade(fade_s))
+
+
+def _fade(value: Any) -> float:
+    return 0.0 if value == 0 and not isinstance(value, bool) else _number(value, "fade_s", MAX_FADE_S)
 
 
 def _sequence(*, items: Any, repeat: Any = 0, rate_hz: Any = None) -> Sequence:
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ITEMS:
         raise ValueError(f"items is not a list of 1 to {MAX_ITEMS}")
-    if not all(isinstance(item, list) and len(item) == 2 for item in items):
-        raise ValueError("an item is not [appearance, seconds]")
     return Sequence(
-        items=tuple(
-            (_text(name, "an item's appearance"), _number(s, "an item's seconds", MAX_SECONDS)) for name, s in items
-        ),
+        items=tuple(_item(item) for item in items),
         repeat=_whole(repeat, "repeat", 2**31),
         rate_hz=None if rate_hz is None else _number(rate_hz, "rate_hz", MAX_RATE_HZ),
     )
+
+
+def _item(item: Any) -> tuple[str, float, float]:
+    if not isinstance(item, list) or len(item) not in (2, 3):
+        raise ValueError("an item is neither [appearance, seconds] nor [appearance, seconds, fade_s]")
+    name, seconds, fade_s = (*item, 0.0)[:3]
+    found = _text(name, "an item's appearance"), _number(seconds, "an item's seconds", MAX_SECONDS), _fade(fade_s)
+    if found[2] > found[1]:
+        raise ValueError("an item's fade_s is longer than its seconds")
+    return found
 
 
 def _load_bundle(*, path: Any) -> LoadBundle:
@@ -163,7 +189,8 @@ _READERS: Final[dict[str, Any]] = {
     "show": _show,
     "play": _play,
     "sequence": _sequence,
-    "stop": Stop,
+    "stop": _stop,
+    "identify": Identify,
     "status": Status,
     "load-bundle": _load_bundle,
     "quit": Quit,

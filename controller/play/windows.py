@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import time
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pyglet
 
@@ -15,54 +14,77 @@ pyglet.options["shadow_window"] = False
 
 from pyglet import gl  # noqa: E402
 
-from controller.errors import UsageError, WorkError  # noqa: E402
+from controller.errors import WorkError  # noqa: E402
+from controller.play.drawing import Canvas  # noqa: E402
 from controller.play.frames import FrameSet, OutputSize  # noqa: E402
-
-_VERTEX: Final = """#version 330 core
-out vec2 place;
-void main() {
-    vec2 corner = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2);
-    place = vec2(corner.x, 1.0 - corner.y);
-    gl_Position = vec4(2.0 * corner - 1.0, 0.0, 1.0);
-}
-"""
-_FRAGMENT: Final = """#version 330 core
-in vec2 place;
-out vec4 colour;
-uniform sampler2D picture;
-void main() { colour = vec4(texture(picture, place).rgb, 1.0); }
-"""
+from controller.play.places import check_connectors, find_connectors, fits  # noqa: E402
+from controller.play.x11 import Connector, XServer  # noqa: E402
 
 
 class WindowOutput:
-    """Real outputs of an X server (or whatever window system pyglet finds).
+    """Real outputs of an X server.
 
-    Outputs whose names are connectors of the X server (``xrandr``: DP-1, HDMI-2) are placed where those are; if none
-    of the names is one, they lie side by side from the upper left corner, in stage order.
+    Outputs are found by their connector's name (``xrandr``: DP-1, HDMI-2) or their display's serial number. If none of
+    them is there, and none was asked for by ``where``, they lie side by side from the upper left corner, in stage
+    order. An output that goes away later, or changes its size, stays black; when it is back it shows what the others
+    show.
     """
 
-    def __init__(self, sizes: Sequence[OutputSize]) -> None:
-        """Open the window. Raises WorkError("display-gone"), UsageError("output-missing" or "output-size-differs")."""
+    def __init__(self, sizes: Sequence[OutputSize], where: Mapping[str, str] | None = None) -> None:
+        """Open the window. ``where``: connector or serial number by the output's name, where that is another.
+
+        Raises WorkError("display-gone", "display-unfit", "output-gamma" or "output-range"), UsageError as
+        ``find_connectors`` and ``check_connectors``.
+        """
+        self._sizes, self._where = tuple(sizes), dict(where or {})
+        self._server = XServer()
+        found, connectors = self._find()
+        self._beside = not found and not self._where
+        if not self._beside:
+            check_connectors(sizes, self._where, found, connectors)
+            for connector in found.values():
+                self._server.make_plain(connector)
+        self._missing: tuple[str, ...] = ()
+        self._places = self._placed(found)
         try:
-            display = pyglet.display.get_display()
-            screens = {str(getattr(screen, "name", "")): screen for screen in display.get_screens()}
-            places = _places(sizes, screens)
-            self._window = _open_window(places, sizes)
+            self._window = _open_window(self._extent())
         except (pyglet.display.xlib.NoSuchDisplayException, pyglet.window.NoSuchConfigException) as error:
             raise WorkError(
                 "display-gone",
                 what="The player found no display with OpenGL 3.3 to show its window on.",
                 remedy="Start the X server and set DISPLAY, or use --frames on a machine without one.",
             ) from error
+        self._server.keep_awake()
+        self._server.bypass_compositor(self._window._window)
         self._window.switch_to()
         self._window.set_vsync(True)
-        height = max(y + size.height_px for (_, y), size in zip(places, sizes, strict=True))
-        # OpenGL counts rows from below.
-        self._areas = [(x, height - y - s.height_px, s) for (x, y), s in zip(places, sizes, strict=True)]
-        self._program = _program()
-        self._textures = [_texture(size) for size in sizes]
+        self._canvas = Canvas(sizes)
+        self._share = 0.0
         self._damaged = False
         self._window.push_handlers(on_expose=self._on_expose, on_draw=self._on_expose, on_close=_stay)
+
+    def _find(self) -> tuple[dict[str, Connector], tuple[Connector, ...]]:
+        connectors = self._server.connectors()
+        return find_connectors(self._sizes, self._where, connectors), connectors
+
+    def _placed(self, found: Mapping[str, Connector]) -> tuple[tuple[int, int] | None, ...]:
+        """Upper left corner of each output on the X screen, None for one that is not there as it should be."""
+        if self._beside:
+            return tuple((sum(s.width_px for s in self._sizes[:number]), 0) for number in range(len(self._sizes)))
+        connectors = [found.get(size.name) for size in self._sizes]
+        return tuple(
+            (connector.x, connector.y) if connector is not None and fits(size, connector) else None
+            for size, connector in zip(self._sizes, connectors, strict=True)
+        )
+
+    def _extent(self) -> tuple[int, int]:
+        """Width and height of the window that reaches from the screen's corner over all outputs."""
+        ends = [
+            (place[0] + size.width_px, place[1] + size.height_px)
+            for place, size in zip(self._places, self._sizes, strict=True)
+            if place is not None
+        ]
+        return max((x for x, _ in ends), default=1), max((y for _, y in ends), default=1)
 
     def _on_expose(self) -> bool:
         self._damaged = True
@@ -70,29 +92,33 @@ class WindowOutput:
 
     def prepare(self, frames: FrameSet) -> None:
         self._window.switch_to()
-        for texture, (_, _, size), image in zip(self._textures, self._areas, frames.pixels, strict=True):
-            gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
-            pointer = image.ctypes.data_as(ctypes.c_void_p)
-            shape = (size.width_px, size.height_px)
-            gl.glTexSubImage2D(gl.GL_TEXTURE_2D, 0, 0, 0, *shape, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, pointer)
+        self._canvas.load(frames)
+        self._share = 0.0
+        self._draw()
+
+    def load_fade(self, before: FrameSet, after: FrameSet) -> None:
+        self._window.switch_to()
+        self._canvas.load_both(before, after)
+
+    def mix(self, share: float) -> None:
+        self._share = share
+        self._window.switch_to()
         self._draw()
 
     def _draw(self) -> None:
-        gl.glViewport(0, 0, *self._window.get_framebuffer_size())
-        gl.glClear(gl.GL_COLOR_BUFFER_BIT)
-        for texture, (x, y, size) in zip(self._textures, self._areas, strict=True):
-            gl.glViewport(x, y, size.width_px, size.height_px)
-            gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
-            gl.glDrawArrays(gl.GL_TRIANGLES, 0, 3)
-        # Drawn before the deadline, so that the flip itself has nothing to wait for.
-        gl.glFinish()
+        self._canvas.draw(self._places, self._window.get_framebuffer_size(), self._share)
 
     def flip(self) -> float:
         self._window.flip()
         gl.glFinish()
         return time.monotonic()
 
+    def missing(self) -> tuple[str, ...]:
+        return self._missing
+
     def pump(self) -> None:
+        if self._server.changed() and not self._beside:
+            self._follow()
         self._window.dispatch_events()
         if self._damaged:
             self._damaged = False
@@ -100,8 +126,25 @@ class WindowOutput:
             self._draw()
             self._window.flip()
 
+    def _follow(self) -> None:
+        """Outputs came, went or moved: place the window and the pictures anew."""
+        found, _ = self._find()
+        before, self._places = self._places, self._placed(found)
+        names = [size.name for size in self._sizes]
+        self._missing = tuple(name for name, place in zip(names, self._places, strict=True) if place is None)
+        for name, place in zip(names, self._places, strict=True):
+            if place is not None:
+                # A driver may give an output that returns its old gamma ramp back.
+                self._server.make_plain(found[name])
+        if self._places != before:
+            self._window.set_size(*self._extent())
+            self._window.set_location(0, 0)
+            self._server.keep_awake()
+            self._damaged = True
+
     def close(self) -> None:
         self._window.close()
+        self._server.close()
 
 
 def _stay() -> bool:
@@ -109,36 +152,12 @@ def _stay() -> bool:
     return True
 
 
-def _places(sizes: Sequence[OutputSize], screens: dict[str, Any]) -> list[tuple[int, int]]:
-    """Upper left corner of each output on the X screen."""
-    known = [screens.get(size.name) for size in sizes]
-    if all(screen is None for screen in known):
-        return [(sum(s.width_px for s in sizes[:number]), 0) for number in range(len(sizes))]
-    for size, screen in zip(sizes, known, strict=True):
-        if screen is None:
-            raise UsageError(
-                "output-missing",
-                what=f"The X server has no output {size.name}; it has {', '.join(screens)}.",
-                remedy="Check the cable and stage.toml, and force the output on if the projector is off.",
-            )
-        if (screen.width, screen.height) != (size.width_px, size.height_px):
-            raise UsageError(
-                "output-size-differs",
-                what=f"Output {size.name} is {screen.width}x{screen.height}; the stage says "
-                f"{size.width_px}x{size.height_px}.",
-                remedy="Set the output's mode with xrandr, or correct stage.toml and calibrate again.",
-            )
-    return [(screen.x, screen.y) for screen in known if screen is not None]
-
-
-def _open_window(places: Sequence[tuple[int, int]], sizes: Sequence[OutputSize]) -> Any:
-    width = max(x + size.width_px for (x, _), size in zip(places, sizes, strict=True))
-    height = max(y + size.height_px for (_, y), size in zip(places, sizes, strict=True))
+def _open_window(extent: tuple[int, int]) -> Any:
     config = gl.Config(  # type: ignore[abstract]
         double_buffer=True, red_size=8, green_size=8, blue_size=8, major_version=3, minor_version=3, depth_size=0
     )
     window = pyglet.window.Window(
-        width, height, caption="Velatura", style="borderless", vsync=True, visible=False, config=config
+        *extent, caption="Velatura", style="borderless", vsync=True, visible=False, config=config
     )
     window.set_location(0, 0)
     window.set_visible(True)
@@ -146,48 +165,3 @@ def _open_window(places: Sequence[tuple[int, int]], sizes: Sequence[OutputSize])
     window.set_location(0, 0)
     window.set_mouse_visible(False)
     return window
-
-
-def _program() -> Any:
-    """Make the drawing program current; it stays current, there is no other."""
-    program = gl.glCreateProgram()
-    for kind, text in ((gl.GL_VERTEX_SHADER, _VERTEX), (gl.GL_FRAGMENT_SHADER, _FRAGMENT)):
-        shader = gl.glCreateShader(kind)
-        source = ctypes.cast(ctypes.pointer(ctypes.c_char_p(text.encode())), ctypes.POINTER(ctypes.POINTER(gl.GLchar)))
-        gl.glShaderSource(shader, 1, source, None)
-        gl.glCompileShader(shader)
-        gl.glAttachShader(program, shader)
-    gl.glLinkProgram(program)
-    linked = gl.GLint()
-    gl.glGetProgramiv(program, gl.GL_LINK_STATUS, ctypes.byref(linked))
-    if not linked.value:
-        raise WorkError(
-            "display-unfit",
-            what="The graphics driver could not build the player's drawing program.",
-            remedy="Install the display's current graphics driver, or Mesa (libgl1-mesa-dri).",
-        )
-    gl.glUseProgram(program)
-    vertices = gl.GLuint()
-    gl.glGenVertexArrays(1, ctypes.byref(vertices))
-    gl.glBindVertexArray(vertices)
-    for state in (gl.GL_DITHER, gl.GL_BLEND, gl.GL_DEPTH_TEST, gl.GL_FRAMEBUFFER_SRGB):
-        gl.glDisable(state)
-    gl.glClearColor(0, 0, 0, 1)
-    gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
-    return program
-
-
-def _texture(size: OutputSize) -> int:
-    name = gl.GLuint()
-    gl.glGenTextures(1, ctypes.byref(name))
-    gl.glBindTexture(gl.GL_TEXTURE_2D, name.value)
-    for parameter, value in (
-        (gl.GL_TEXTURE_MIN_FILTER, gl.GL_NEAREST),
-        (gl.GL_TEXTURE_MAG_FILTER, gl.GL_NEAREST),
-        (gl.GL_TEXTURE_WRAP_S, gl.GL_CLAMP_TO_EDGE),
-        (gl.GL_TEXTURE_WRAP_T, gl.GL_CLAMP_TO_EDGE),
-    ):
-        gl.glTexParameteri(gl.GL_TEXTURE_2D, parameter, value)
-    shape = (size.width_px, size.height_px)
-    gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, gl.GL_RGB8, *shape, 0, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, None)
-    return int(name.value)
