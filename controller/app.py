@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+from controller.bundle.install import CURRENT
 from controller.bundle.signing import write_public_key
 from controller.calibrate.intrinsics import read_intrinsics
 from controller.calibrate.reconstruction import CameraPrior
@@ -116,8 +117,10 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
 
 
 @contextlib.contextmanager
-def opened(checked: Checked, *, deadline: Deadline) -> Iterator[Rig]:
+def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iterator[Rig]:
     """Open every device of the stage and start the player; close them, and end the player, on leaving.
+
+    ``plays``: the player starts with the installed bundle, and a start that shows no picture of it counts as failed.
 
     Mains relays are closed first. They and the lamps are left as they are: switching them off is ``lit``'s.
     """
@@ -139,7 +142,7 @@ def opened(checked: Checked, *, deadline: Deadline) -> Iterator[Rig]:
         camera = cast("Camera", _device(stage.tables.camera, driver, settings, context, deadline))
         stack.callback(camera.close)
         if checked.stage.tables.display.driver == "player":
-            stack.enter_context(_player(stage, context))
+            stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
         display = cast("Display", _device(stage.tables.display, driver, settings, context, deadline))
         stack.callback(display.close)
@@ -184,16 +187,20 @@ def _device(
         raise UsageError(error.code, what=f"{place.file}, line {line}: {error.what}", remedy=error.remedy) from error
 
 
-def _player(stage: Stage, context: OpenContext) -> PlayerProcess:
+def _player(stage: Stage, context: OpenContext, *, plays: bool) -> PlayerProcess:
     """The player of this stage; a context manager that ends it."""
     table = stage.tables.display
     frames = None if table.frames is None else stage.path(table.frames)
     if frames is not None:
         frames.parent.mkdir(parents=True, exist_ok=True)
     assert context.runtime is not None
+    # Given as the link, so that a bundle that never shows a picture is given up (docs/bundle-format.md). Not to a
+    # calibration, which must go on whatever is installed.
+    bundle = stage.folder / "bundles" / CURRENT
     settings = PlayerSettings(
         outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
         frames=frames,
+        bundle=bundle if plays and bundle.is_symlink() else None,
         trusted=_key_files(stage.tables.bundle.trusted_keys, context.runtime, "trusted"),
         revoked=_key_files(stage.tables.bundle.revoked_keys, context.runtime, "revoked"),
         allow_unsigned=stage.tables.bundle.allow_unsigned,
@@ -251,11 +258,12 @@ def run_on_stage(
     cancel: threading.Event,
     around: contextlib.AbstractContextManager[object] | None = None,
     dark: bool = False,
+    plays: bool = False,
 ) -> Path:
     """Open the stage, run the steps of a new or unfinished run with the lamps on, and leave the lamps safe.
 
     ``around`` is entered before the devices are opened and left when they are closed; ``dark``: not in a bright room,
-    where the stage has a light sensor. Returns the run's folder.
+    where the stage has a light sensor; ``plays``: as in ``opened``. Returns the run's folder.
     Raises what the steps raise; UsageError("already-running") if another program works on the stage.
     """
     stage = checked.stage
@@ -264,7 +272,7 @@ def run_on_stage(
     with (
         exclusive(stage.folder / LOCK, what_is_running="Velatura"),
         around or contextlib.nullcontext(),
-        opened(checked, deadline=deadline) as rig,
+        opened(checked, deadline=deadline, plays=plays) as rig,
         Journal(unfinished_run(stage.folder, name)) as journal,
     ):
         clear_unfinished_writes(journal.folder)
