@@ -1,0 +1,100 @@
+"""Uploaded pictures: decoded in a process of their own, kept and served only as we encoded them again."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from controller.errors import UsageError
+from controller.panel import decoder
+from controller.storage import write_atomically
+
+KEY: Final = r"^[0-9a-f]{24}$"
+
+
+@dataclass(frozen=True, slots=True)
+class UploadLimits:
+    """``most_bytes`` of the file as it comes; pixels, memory and time of its decoding."""
+
+    most_bytes: int = 64 << 20
+    most_pixels: int = 40_000_000
+    memory_bytes: int = 1 << 30
+    seconds: int = 20
+
+
+def decode_picture(file: Path, limits: UploadLimits) -> bytes:
+    """The picture in ``file`` as a PNG that we made (RGB, 8 bit, no metadata).
+
+    Raises UsageError("picture-refused") for anything but a PNG, JPEG, TIFF or WebP that decodes within ``limits``, and
+    UsageError("picture-too-large") for one with too many pixels.
+    """
+    command = [sys.executable, "-I", str(Path(decoder.__file__))]
+    command += [str(limits.most_pixels), str(limits.memory_bytes), str(limits.seconds)]
+    try:
+        with file.open("rb") as data:
+            done = subprocess.run(  # noqa: S603 - our own file, with numbers as arguments
+                command,
+                stdin=data,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={},
+                cwd="/",
+                timeout=limits.seconds + 5,
+                check=False,
+            )
+    except subprocess.TimeoutExpired:
+        raise _refused() from None
+    if done.returncode == decoder.TOO_MANY_PIXELS:
+        raise UsageError(
+            "picture-too-large",
+            what=f"The picture has more than {limits.most_pixels / 1e6:.0f} million pixels.",
+            remedy="Make it smaller; more than the camera's own resolution is of no use.",
+        )
+    if done.returncode != 0 or not done.stdout.startswith(b"\x89PNG"):
+        raise _refused()
+    return done.stdout
+
+
+def _refused() -> UsageError:
+    return UsageError(
+        "picture-refused",
+        what="The file could not be read as a picture.",
+        remedy="Save it as PNG or JPEG and upload it again.",
+    )
+
+
+class Targets:
+    """Uploaded targets, as our own PNG files in ``folder``; the newest ``most`` are kept."""
+
+    def __init__(self, folder: Path, limits: UploadLimits, *, most: int = 20) -> None:
+        self._folder, self._limits, self._most = folder, limits, most
+        # One at a time: the limits hold for all uploads together.
+        self._one = threading.Lock()
+
+    @property
+    def limits(self) -> UploadLimits:
+        return self._limits
+
+    def add(self, uploaded: Path) -> str:
+        """Decode ``uploaded`` and return the key of the target made from it. Raises as ``decode_picture``."""
+        with self._one:
+            png = decode_picture(uploaded, self._limits)
+            key = secrets.token_hex(12)
+            write_atomically(self._folder / f"{key}.png", png, mode=0o600)
+            kept = sorted(self._folder.glob("*.png"), key=lambda file: file.stat().st_mtime, reverse=True)
+            for old in kept[self._most :]:
+                old.unlink(missing_ok=True)
+        return key
+
+    def path(self, key: str) -> Path:
+        """Raises UsageError("target-unknown")."""
+        file = self._folder / f"{key}.png"
+        if not re.fullmatch(KEY, key) or not file.is_file():
+            raise UsageError("target-unknown", what="This target is not there any more.", remedy="Upload it again.")
+        return file
