@@ -1,15 +1,17 @@
 # make demo   the whole job on an emulated stage, ending in demo/report.html
 # make test   every test
 # make blender   Blender, for targets that it renders
-# Both do their own set-up.
+# make campaign NAME=camera_faults COUNT=10000   a test of hours that has a short version in `make test` (tests/campaigns/)
+# All do their own set-up.
 
 SIZE ?= small
 OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(notdir $(basename $(OBJECT))))
 SEED ?= 1
 OBJECT ?=
 NAME ?=
+COUNT ?=
 
-.PHONY: demo blender test lint bench lock clean
+.PHONY: demo blender test lint bench campaign lock clean
 
 demo:
 	@.ci/setup demo
@@ -34,6 +36,11 @@ lint:
 bench:
 	@.ci/setup test
 	.venv/bin/python -m benchmarks $(NAME) --size $(SIZE)
+
+campaign:
+	@.ci/setup test
+	@.ci/system-packages
+	.venv/bin/python -m tests.campaigns.$(NAME) $(COUNT)
 
 lock:
 	.ci/lock
