@@ -33,6 +33,16 @@ class Timing:
     interval_s: float
     boot_interval_s: float
 
+    @property
+    def question_s(self) -> float:
+        """The longest that a question may take: its turn after one whose answer was lost, and then two answers."""
+        return self.boot_interval_s + self.late_s + 2 * self.answer_s
+
+    @property
+    def switch_s(self) -> float:
+        """The longest that switching may take: a question before it, the command, and its confirmation."""
+        return 2 * self.question_s + self.command_s + self.confirm_s
+
 
 @dataclass(frozen=True, slots=True)
 class ProjectorProfile:

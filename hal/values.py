@@ -47,7 +47,9 @@ class ProjectorCapabilities:
     """What a projector's driver can do; callers ask, never guess by model.
 
     ``power``: it can be switched, and tells whether it burns. Without it ``switch_on`` and ``switch_off`` raise
-    DeviceRefused, and the power state is UNKNOWN or COOLING.
+    DeviceRefused, and the power state is UNKNOWN or COOLING. ``answer_s``: the longest that ``status`` may take in any
+    state; ``switch_s``: the same of ``switch_on`` and ``switch_off``. A caller with less patience sees time-outs of
+    projectors that are well.
     """
 
     lamp_hours: bool
@@ -56,6 +58,8 @@ class ProjectorCapabilities:
     errors: bool
     lamp_rules: LampRules
     power: bool = True
+    answer_s: float = 10.0
+    switch_s: float = 10.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,7 +65,13 @@ class PjLinkProjector:
     @property
     def capabilities(self) -> ProjectorCapabilities:
         return ProjectorCapabilities(
-            lamp_hours=True, shutter=True, inputs=self._inputs, errors=True, lamp_rules=self._lamp
+            lamp_hours=True,
+            shutter=True,
+            inputs=self._inputs,
+            errors=True,
+            lamp_rules=self._lamp,
+            answer_s=3 * self._timing.question_s,
+            switch_s=self._timing.switch_s,
         )
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:

@@ -93,6 +93,8 @@ class SerialProjector:
             errors=bool(self._table.notices.trouble),
             lamp_rules=self._profile.lamp,
             power=self._switchable,
+            answer_s=2 * self._profile.timing.question_s,
+            switch_s=self._profile.timing.switch_s,
         )
 
     @property

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from controller.session.machine import Event, Machine
 from controller.session.mains import open_circuits
-from controller.session.power import light, power_down, steady
+from controller.session.power import BY_HAND_S, light, power_down, steady
 from controller.session.progress import Level, Reporter
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
@@ -30,6 +30,8 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
         failures = power_down(rig.guards, within_s=power_down_s)
         for failure in failures:
             _tell(reporter, f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
+        for name in (guard.name for guard in rig.guards if guard.by_hand):
+            _tell(reporter, f"Switch projector {name} off by its own remote control now.", Level.WARNING)
         if machine.allows(Event.STOP):
             machine.handle(Event.STOP, "the lamps are switched off")
         _cut_mains(rig, reporter)
@@ -62,7 +64,8 @@ def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
     """Strike the lamps and wait for steady light. Never skipped: hardware is probed, not restored."""
 
     def strike(context: Context) -> Sequence[Path]:
-        light(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance)
+        light(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance,
+              tell=lambda sentence: context.reporter.say(sentence, Level.WARNING))  # fmt: skip
         return ()
 
     def settle(context: Context) -> Sequence[Path]:
@@ -70,7 +73,7 @@ def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
         return ()
 
     rules = [guard.capabilities.lamp_rules for guard in rig.guards]
-    light_s = max(rule.warm_up_s for rule in rules) + 0.5
+    light_s = max(rule.warm_up_s for rule in rules) + (BY_HAND_S if any(g.by_hand for g in rig.guards) else 0.5)
     steady_s = max(max(rule.stable_s for rule in rules) - light_s, 0.1)
     return [
         Step("strike", strike, title="Switching the projectors on", weight=light_s, enter=Event.START,

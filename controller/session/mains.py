@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from controller.session.lamps import Clock, SystemClock
-from controller.session.power import ANSWER_S, POLL_S
-from controller.session.safety import LampGuard
+from controller.session.power import POLL_S
+from controller.session.safety import ANSWER_S, LampGuard
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceRefused
 from hal.interfaces import PowerSwitch
@@ -82,7 +82,7 @@ def open_circuits(
     while waiting:
         for circuit in tuple(waiting):
             try:
-                circuit.open(named, deadline=in_seconds(ANSWER_S))
+                circuit.open(named, deadline=in_seconds(sum(named[name].answer_s for name in circuit.feeds)))
                 waiting.remove(circuit)
             except Exception as error:  # noqa: BLE001 - returned; one broken relay must not keep the others waiting
                 last[circuit.name] = error

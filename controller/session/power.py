@@ -6,19 +6,22 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from controller.session.lamp_faults import fatal_faults, faulty
 from controller.session.lamps import Clock, SystemClock
-from controller.session.safety import LampGuard, fatal_faults, faulty
+from controller.session.safety import LampGuard
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power
 
 POLL_S = 1.0
 """Between two looks at a projector; some lock up when they are asked more often while they boot."""
-ANSWER_S = 10.0
-"""Longest wait for one answer."""
+BY_HAND_S = 60.0
+"""How long a technician may take to reach a projector that only a person can switch."""
 
 Advance = Callable[[float, str], None]
 """Fraction of the whole (0..1) and what is waited for."""
+Tell = Callable[[str], None]
+"""A sentence for the technician."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +38,15 @@ def power_up(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advanc
     steady(guards, deadline=deadline, advance=lambda fraction, note: advance(0.2 + 0.8 * fraction, note), clock=clock)
 
 
-def light(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None) -> None:
+def light(
+    guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None,
+    tell: Tell = lambda sentence: None,
+) -> None:  # fmt: skip
     """Strike every lamp and wait until each projector says that it is on.
 
     Lamps that must rest are waited for. Every projector is looked at before any lamp is struck, and all are struck
-    before any is waited for.
+    before any is waited for. The technician is told to switch those that only a person can switch, and has
+    ``BY_HAND_S`` for it.
 
     Raises
     ------
@@ -52,7 +59,7 @@ def light(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, 
     for guard in guards:
         _check(guard, deadline)
     for guard in guards:
-        _strike(guard, deadline, advance, clock)
+        _strike(guard, deadline, advance, clock, tell)
     while waiting := [guard.name for guard in guards if not _is_on(guard, deadline)]:
         names = ", ".join(waiting)
         advance(1 - len(waiting) / len(guards), f"waiting for the light of {names}")
@@ -97,6 +104,7 @@ def power_down(
     """Switch every projector off, all at once, each tried until it is seen cooling or off, or ``within_s`` is over.
 
     Is not stopped by a cancelled or overdue run: it has its own time. A failing projector never keeps the others lit.
+    Those that only a person can switch are left to the technician, whom the caller must tell.
     Returns the failures, empty when every lamp is off or cooling; raises nothing.
     """
     if not guards:
@@ -105,6 +113,9 @@ def power_down(
 
     def attempt(guard: LampGuard) -> PowerFailure | None:
         try:
+            if guard.by_hand:
+                guard.switched_by_hand(False)
+                return None
             _switch_off(guard, in_seconds(within_s), the_clock)
         except Exception as error:  # noqa: BLE001 - returned; one broken driver must not keep the other lamps lit
             return PowerFailure(guard.name, error)
@@ -125,8 +136,10 @@ def cool_all(
     clock = clock or SystemClock()
     failures = power_down(guards, clock=clock)
     failed = {failure.projector for failure in failures}
-    cooling = [guard for guard in guards if guard.name not in failed]
-    while hot := [guard.name for guard in cooling if not guard.may_open_mains(deadline=deadline.within(ANSWER_S))]:
+    cooling = [guard for guard in guards if guard.name not in failed and not guard.by_hand]
+    while hot := [
+        guard.name for guard in cooling if not guard.may_open_mains(deadline=deadline.within(guard.answer_s))
+    ]:
         advance(1 - len(hot) / len(cooling), f"cooling {', '.join(hot)}")
         deadline.check(
             "lamps-not-cool",
@@ -138,27 +151,47 @@ def cool_all(
 
 
 def _check(guard: LampGuard, deadline: Deadline) -> None:
-    status = guard.status(deadline=deadline.within(ANSWER_S))
+    status = guard.status(deadline=deadline.within(guard.answer_s))
     if status.power is Power.FAULT or fatal_faults(status):
         raise faulty(guard.name, status)
 
 
-def _strike(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock) -> None:
+def _strike(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock, tell: Tell) -> None:
+    if guard.by_hand:
+        return _by_hand(guard, deadline, advance, clock, tell)
     while True:
         try:
-            return guard.switch_on(deadline=deadline.within(ANSWER_S))
+            return guard.switch_on(deadline=deadline.within(guard.switch_s))
         except DeviceRefused as error:
             if error.code not in ("lamp-resting", "lamp-cooling"):
                 raise
-            advance(0.0, f"the lamp of {guard.name} rests for {guard.rest_left_s():.0f} s")
             deadline.check(error.code, what=error.what, remedy=error.remedy)
-            clock.sleep(POLL_S, deadline)
+            _rest(guard, guard.rest_left_s(), deadline, advance, clock)
+
+
+def _by_hand(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock, tell: Tell) -> None:
+    """Also told of one that should be on: since a run that was killed somebody may have switched it off."""
+    while (left_s := guard.rest_left_s()) > 0:
+        _rest(guard, left_s, deadline, advance, clock)
+    within = "" if guard.may_be_lit else f" It is taken to burn in {BY_HAND_S:.0f} s."
+    tell(f"Switch projector {guard.name} on by its own remote control, if it is not: nobody else can.{within}")
+    guard.switched_by_hand(True, in_s=BY_HAND_S)
+
+
+def _rest(guard: LampGuard, left_s: float, deadline: Deadline, advance: Advance, clock: Clock) -> None:
+    advance(0.0, f"the lamp of {guard.name} rests for {left_s:.0f} s")
+    deadline.check(
+        "lamp-resting",
+        what=f"The lamp of projector {guard.name} still rested when the time was over.",
+        remedy="Start again in some minutes.",
+    )
+    clock.sleep(POLL_S, deadline)
 
 
 def _is_on(guard: LampGuard, deadline: Deadline) -> bool:
     """Whether the lamp is on. A projector that boots may be silent or talk nonsense: that is not yet a failure."""
     try:
-        status = guard.status(deadline=deadline.within(ANSWER_S))
+        status = guard.status(deadline=deadline.within(guard.answer_s))
     except (DeviceTimeout, DeviceBusy, ProtocolError):
         return False
     if status.power is Power.FAULT or fatal_faults(status):
@@ -174,8 +207,8 @@ def _switch_off(guard: LampGuard, deadline: Deadline, clock: Clock) -> None:
     last: DeviceError | None = None
     while True:
         try:
-            guard.switch_off(deadline=deadline.within(ANSWER_S))
-            if guard.status(deadline=deadline.within(ANSWER_S)).power in (Power.OFF, Power.COOLING):
+            guard.switch_off(deadline=deadline.within(guard.switch_s))
+            if guard.status(deadline=deadline.within(guard.answer_s)).power in (Power.OFF, Power.COOLING):
                 return
         except Cancelled:
             raise

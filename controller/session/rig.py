@@ -11,9 +11,9 @@ import numpy as np
 from controller.arrays import ByteImage
 from controller.capture.acquire import Acquirer
 from controller.session.darkness import Darkness
+from controller.session.lamp_faults import faulty
 from controller.session.mains import Circuit
-from controller.session.power import ANSWER_S
-from controller.session.safety import LampGuard, faulty
+from controller.session.safety import LampGuard
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
 from hal.interfaces import Camera, Display
@@ -56,7 +56,7 @@ class Rig:
         Raises DeviceRefused("projector-fault" or "lamp-went-off"), and what the drivers raise.
         """
         for guard in self.guards:
-            status = guard.status(deadline=deadline.within(ANSWER_S))
+            status = guard.status(deadline=deadline.within(guard.answer_s))
             if status.power is Power.FAULT:
                 raise faulty(guard.name, status)
             if status.power is not Power.ON or guard.stable_left_s() > 0:

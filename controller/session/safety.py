@@ -13,6 +13,7 @@ import threading
 from dataclasses import dataclass, replace
 
 from controller.errors import VelaturaError
+from controller.session.lamp_faults import faulty
 from controller.session.lamps import Clock, LampLedger, LampRecord, SystemClock
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceRefused
@@ -20,6 +21,8 @@ from hal.interfaces import Projector
 from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
 
 SAVE_HOURS_EVERY_S = 60.0
+ANSWER_S = 10.0
+"""Wait at least so long for one answer, whatever the driver says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +82,17 @@ class LampGuard:
         self._projector.set_shutter(closed, deadline=deadline)
 
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
-        """As the device answers now; what is seen enters the lamp's record."""
+        """As the device answers now; what is seen enters the lamp's record.
+
+        One that only a person can switch counts as on after ``switched_by_hand``, unless it tells otherwise.
+        """
         with self._lock:
             status = self._projector.status(deadline=deadline)
             self._seen(status.power)
+            since_s = self._record.since_s
+            if self.by_hand and status.power is Power.UNKNOWN and self._record.lit:
+                burns = since_s is not None and self._now() >= since_s
+                return replace(status, power=Power.ON if burns else Power.WARMING)
             return status
 
     def switch_on(self, *, deadline: Deadline) -> None:
@@ -115,7 +125,34 @@ class LampGuard:
             if self._record.lit or power not in (Power.OFF, Power.COOLING):
                 self._went_off()
 
+    # -- projectors that only a person can switch
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether nobody knows the codes to switch this projector."""
+        return not self._projector.capabilities.power
+
+    def switched_by_hand(self, on: bool, *, in_s: float = 0.0) -> None:
+        """A technician was told to switch it, and is believed to have done so in ``in_s`` seconds."""
+        with self._lock:
+            if on and not self._record.lit:
+                strikes = self._record.strikes + 1
+                since_s = self._now() + in_s
+                self._write(replace(self._record, lit=True, since_s=since_s, boot=self._boot(), strikes=strikes))
+            elif not on and self._record.lit:
+                self._went_off()
+
     # -- the rules
+
+    @property
+    def answer_s(self) -> float:
+        """How long to wait for one answer: as the driver says, and never less than ``ANSWER_S``."""
+        return max(ANSWER_S, self._projector.capabilities.answer_s)
+
+    @property
+    def switch_s(self) -> float:
+        """How long to wait until a switch is confirmed; some projectors answer nothing while they start."""
+        return max(ANSWER_S, self._projector.capabilities.switch_s)
 
     @property
     def may_be_lit(self) -> bool:
@@ -256,24 +293,3 @@ def stricter(rules: LampRules, at_least: LampRules | None) -> LampRules:
         cool_down_s=max(rules.cool_down_s, at_least.cool_down_s),
         minimum_off_s=max(rules.minimum_off_s, at_least.minimum_off_s),
     )
-
-
-_REMEDIES = {
-    "lamp": "Let it cool for some minutes, then start again; if it comes back, replace the lamp.",
-    "temperature": "Free its air inlets, clean the filter, and let it cool for 45 minutes before the next start.",
-    "cover": "Close its cover and start again.",
-    "fan": "Check that its fans turn; have it repaired if they don't.",
-    "filter": "Clean or replace its air filter.",
-}
-
-
-def fatal_faults(status: ProjectorStatus) -> tuple[str, ...]:
-    """Faults that forbid work; a driver's words that end in ``-warning`` (lamp hours, a filter) do not."""
-    return tuple(fault for fault in status.faults if not fault.endswith("-warning"))
-
-
-def faulty(name: str, status: ProjectorStatus) -> DeviceRefused:
-    """The error for a projector that reports faults."""
-    faults = ", ".join(status.faults) or "a fault without a name"
-    remedy = next((text for word, text in _REMEDIES.items() if word in faults), "Read its display and its manual.")
-    return DeviceRefused("projector-fault", what=f"Projector {name} reports {faults}.", remedy=remedy)

@@ -56,11 +56,17 @@ class Lamp:
     reports: ProjectorStatus | None = None
     trouble: str = ""
     strikes: int = 0
+    switchable: bool = True
+    switch_s: float = 10.0
+    patience_s: list[float] = field(default_factory=list)
     sins: list[str] = field(default_factory=list)
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
-        return ProjectorCapabilities(lamp_hours=False, shutter=False, inputs=(), errors=True, lamp_rules=RULES)
+        return ProjectorCapabilities(
+            lamp_hours=False, shutter=False, inputs=(), errors=True, lamp_rules=RULES, power=self.switchable,
+            switch_s=self.switch_s,
+        )  # fmt: skip
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         return DeviceIdentity("Model", "Lamp")
@@ -74,9 +80,14 @@ class Lamp:
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
         if self.trouble in ("silent", "gone"):
             self.fail()
+        if not self.switchable:
+            return self.reports or ProjectorStatus(Power.UNKNOWN)
         return self.reports or ProjectorStatus(self.power())
 
     def switch_on(self, *, deadline: Deadline) -> None:
+        self.patience_s.append(deadline.left_s())
+        if not self.switchable:
+            raise DeviceRefused("projector-power-unknown", what="No codes.", remedy="Switch it by hand.")
         if self.trouble in ("lost", "gone", "refuse", "killed before"):
             self.fail()
         self.strike(sin=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from controller.session.power import cool_all, light, power_down, power_up, steady
+from controller.session.power import BY_HAND_S, cool_all, light, power_down, power_up, steady
 from controller.session.safety import LampGuard
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceRefused, DeviceTimeout
@@ -141,3 +141,61 @@ def test_cool_all_returns_only_when_every_mains_may_be_cut() -> None:
     light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
     assert cool_all(room.guards, deadline=soon(), advance=room.advance, clock=room.world) == ()
     assert all(guard.may_open_mains(deadline=soon()) for guard in room.guards)
+
+
+def test_a_projector_that_is_slow_to_confirm_gets_the_time_that_its_driver_asks_for() -> None:
+    room = Room()
+    room.lamps[1].switch_s = 150.0
+    light(room.guards, deadline=in_seconds(600), advance=room.advance, clock=room.world)
+    assert [round(lamp.patience_s[0], -1) for lamp in room.lamps] == [10, 150, 10]
+
+
+def test_a_projector_without_power_codes_is_left_to_the_technician_and_the_others_go_on() -> None:
+    room = Room()
+    room.lamps[1].switchable = False
+    told: list[str] = []
+    light(room.guards, deadline=in_seconds(600), advance=room.advance, clock=room.world, tell=told.append)
+    assert len(told) == 1
+    assert "middle" in told[0]
+    assert [lamp.strikes for lamp in room.lamps] == [1, 0, 1]
+    assert room.world.time_s - 1000 >= BY_HAND_S
+    steady(room.guards, deadline=in_seconds(600), advance=room.advance, clock=room.world)
+    for guard in room.guards:
+        guard.require_stable(deadline=soon())
+    assert room.guards[1].use().strikes == 1
+    assert power_down(room.guards, clock=room.world) == ()
+    assert cool_all(room.guards, deadline=soon(), advance=room.advance, clock=room.world) == ()
+
+
+def test_a_lamp_that_was_switched_off_by_hand_rests_before_the_technician_is_asked_again() -> None:
+    room = Room()
+    room.lamps[0].switchable = False
+    told: list[float] = []
+
+    def tell(sentence: str) -> None:
+        told.append(room.world.time_s)
+
+    light(room.guards[:1], deadline=in_seconds(600), advance=room.advance, clock=room.world, tell=tell)
+    power_down(room.guards[:1], clock=room.world)
+    off_s = room.world.time_s
+    light(room.guards[:1], deadline=in_seconds(600), advance=room.advance, clock=room.world, tell=tell)
+    assert told[1] - off_s >= RULES.minimum_off_s
+    assert any("rests" in note for _, note in room.notes)
+
+
+def test_the_mains_of_a_projector_that_cannot_be_switched_stay_on() -> None:
+    room = Room()
+    room.lamps[0].switchable = False
+    light(room.guards[:1], deadline=in_seconds(600), advance=room.advance, clock=room.world)
+    power_down(room.guards[:1], clock=room.world)
+    room.world.time_s += 10_000
+    assert not room.guards[0].may_open_mains(deadline=soon())
+
+
+def test_one_that_tells_of_cooling_is_not_taken_to_burn() -> None:
+    room = Room()
+    room.lamps[0].switchable = False
+    light(room.guards[:1], deadline=in_seconds(600), advance=room.advance, clock=room.world)
+    room.lamps[0].reports = ProjectorStatus(Power.COOLING)
+    assert room.guards[0].status(deadline=soon()).power is Power.COOLING
+    assert not room.guards[0].may_be_lit
