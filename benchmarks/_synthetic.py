@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Final
 
 import numpy as np
@@ -12,6 +13,8 @@ from controller.calibrate.values import Calibration, Metapixels, PhaseMap, Proje
 PROJECTOR: Final = {"small": (210, 280), "medium": (526, 700), "paper": (1050, 1400)}
 CAMERA: Final = {"small": (520, 776), "medium": (1296, 1944), "paper": (2592, 3888)}
 """(rows, columns)"""
+MARGIN_PX: Final = 6
+"""Of a crop, in projector pixels."""
 
 
 def synthetic_calibration(
@@ -28,6 +31,40 @@ def synthetic_calibration(
     black = (0.002 * albedo + 0.0005).astype(np.float32)
     to_xyz = np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]])
     return Calibration(projectors, black, mask, to_xyz, mosaic=np.array([[0, 1], [1, 2]]))
+
+
+def crop_calibration(calibration: Calibration, top: int, left: int, side: int) -> Calibration:
+    """``side`` x ``side`` camera pixels of a stage, and those projector pixels that light them.
+
+    ``top`` and ``left`` even, so that the camera's mosaic stays as it is.
+    """
+    window = slice(top, top + side), slice(left, left + side)
+    parts = []
+    for part in calibration.projectors:
+        assert part.phase_map is not None
+        at = part.phase_map.projector_px[window]
+        rows, columns = (_around(at[..., axis], part.metapixels.valid.shape[1 - axis]) for axis in (1, 0))
+        whole = part.metapixels
+        centre = whole.centre_px[rows, columns] - np.array([left, top], np.float32)
+        metapixels = Metapixels(centre, whole.covariance_px2[rows, columns], whole.valid[rows, columns])
+        phase_map = PhaseMap(
+            at - np.array([columns.start, rows.start], np.float32), part.phase_map.spread_px2[rows, columns]
+        )
+        parts.append(dataclasses.replace(part, metapixels=metapixels, white=part.white[window], phase_map=phase_map))
+    return dataclasses.replace(
+        calibration,
+        projectors=tuple(parts),
+        black=calibration.black[window],
+        object_mask=calibration.object_mask[window],
+    )
+
+
+def _around(values: FloatImage, most: int) -> slice:
+    """The projector pixels from the least to the largest of some places, and ``MARGIN_PX`` more on either side."""
+    if not np.isfinite(values).any():
+        return slice(0, 1)
+    low, high = int(np.nanmin(values)) - MARGIN_PX, int(np.nanmax(values)) + MARGIN_PX + 2
+    return slice(max(low, 0), max(min(high, most), 1))
 
 
 def synthetic_target(camera: tuple[int, int]) -> FloatImage:

@@ -17,6 +17,7 @@ from controller.compiled import compiled
 from controller.solve.bounded import Problem
 from controller.solve.box_solvers import BoxProblem
 from controller.transport import LightTransport
+from controller.transport.edge_terms import EdgedTransport
 from controller.transport.lanes import LANES
 from controller.transport.patch_transport import PatchTransport
 from controller.transport.patches import Patches
@@ -81,6 +82,9 @@ def local_transport(
     transport: LightTransport, box: Box, unknown: Pixels, channels: tuple[int, ...]
 ) -> sp.csr_matrix[np.float64]:
     """Rows (channel, pixel of the box) of T in the columns (channel, unknown pixel)."""
+    if isinstance(transport, EdgedTransport):
+        model = local_transport(transport.model, box, unknown, channels)
+        return sp.csr_matrix(model + _edge_rows(transport, box, unknown, channels))
     if isinstance(transport, WindowTransport):
         return box_rows(transport, (box.top, box.left, box.bottom, box.right), unknown, channels)
     if not isinstance(transport, PatchTransport):
@@ -105,6 +109,31 @@ def local_transport(
         mixed = [whole @ sp.diags_array(transport.mixing[owner, c, d].astype(np.float64)) for d in channels]
         blocks.append(sp.hstack(mixed, format="csr"))
     return sp.csr_matrix(sp.vstack(blocks, format="csr"))
+
+
+def _edge_rows(
+    transport: EdgedTransport, box: Box, unknown: Pixels, channels: tuple[int, ...]
+) -> sp.csr_matrix[np.float64]:
+    """What the measured terms at depth edges add to the rows of ``local_transport``."""
+    y, x = np.mgrid[box.top : box.bottom, box.left : box.right]
+    pixels = (y * transport.shape[1] + x).ravel()
+    total = sp.csr_matrix((len(channels) * pixels.size, len(channels) * unknown.size))
+    for n, term in enumerate(transport.terms):
+        span = transport.span(n)
+        mine = np.flatnonzero((unknown >= span.start) & (unknown < span.stop))
+        _, row, place = np.intersect1d(pixels, term.camera, assume_unique=True, return_indices=True)
+        if not (row.size and mine.size):
+            continue
+        near = sp.csc_matrix(term.differences[place], dtype=np.float64)[:, unknown[mine] - span.start]
+        spread = sp.csr_matrix((np.ones(row.size), (row, np.arange(row.size))), shape=(pixels.size, row.size))
+        chosen = sp.csr_matrix((np.ones(mine.size), (np.arange(mine.size), mine)), shape=(mine.size, unknown.size))
+        blocks = []
+        for c in channels:
+            seen = spread @ sp.diags_array(term.white[c, place].astype(np.float64)) @ near @ chosen
+            parts = [sp.csr_matrix(seen * float(transport.mixing[n, c, d])) for d in channels]
+            blocks.append(sp.hstack(parts, format="csr"))
+        total = sp.csr_matrix(total + sp.vstack(blocks, format="csr"))
+    return total
 
 
 def _shares(patches: Patches, unknown: Pixels, box: Box) -> sp.csc_matrix[np.float64]:

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks._synthetic import crop_calibration, synthetic_calibration
 from controller.arrays import Float64, FloatImage
 from controller.calibrate.values import Calibration
 from controller.errors import UsageError, WorkError
@@ -19,6 +20,7 @@ from controller.solve.box_solvers import SOLVERS, BoxProblem, BoxSolver, solve_b
 from controller.solve.region_equations import Box, local_transport
 from controller.solve.regions import Regions, solve_regions
 from controller.transport import LightTransport
+from controller.transport.edge_terms import EdgeTerm, with_terms
 from controller.transport.planes import frame_planes
 
 Stage = Callable[..., Calibration]
@@ -37,6 +39,21 @@ def crop(stage: Stage, *, blurred: bool = False, mixed: bool = True, seed: int =
     return dataclasses.replace(calibration, camera_blur_px=(0.6, 0.5, 0.6)) if blurred else calibration
 
 
+def windowed(*, mosaic: bool) -> LightTransport:
+    """Three small projectors whose phase maps are known."""
+    calibration = synthetic_calibration(projector=(24, 26), camera=(64, 66))
+    return LightTransport.build(calibration if mosaic else dataclasses.replace(calibration, mosaic=None))
+
+
+def edge_term_of(transport: LightTransport, n: int) -> EdgeTerm:
+    """Random differences at some camera pixels."""
+    rows, columns = transport.sizes[n]
+    camera = np.sort(np.random.default_rng(n).choice(transport.lit[0].size, 900, replace=False)).astype(np.int64)
+    random = np.random.default_rng(7 + n)
+    differences = sp.random_array((camera.size, rows * columns), density=0.02, rng=random, dtype=np.float32)
+    return EdgeTerm(sp.csr_matrix(differences), camera, random.random((3, camera.size)).astype(np.float32))
+
+
 def picture(transport: LightTransport) -> FloatImage:
     """Waves and squares, mostly reachable."""
     y, x = np.mgrid[0 : transport.shape[0], 0 : transport.shape[1]].astype(np.float32)
@@ -48,7 +65,7 @@ def picture(transport: LightTransport) -> FloatImage:
 def test_the_equations_of_a_region_are_those_of_the_transport(stage: Stage, blurred: bool) -> None:
     transport = LightTransport.build(crop(stage, blurred=blurred))
     box = Box(20, 28, 40, 48)
-    count = transport.patches.first.size
+    count = transport.pixels
     random = np.random.default_rng(2)
     unknown = np.sort(random.choice(count, 300, replace=False))
     values = random.random((3, unknown.size))
@@ -57,6 +74,36 @@ def test_the_equations_of_a_region_are_those_of_the_transport(stage: Stage, blur
     whole = np.asarray(transport.forward_planes(planes)[(slice(None), *box.window)])
     together = np.asarray(local_transport(transport, box, unknown, (0, 1, 2)) @ values.ravel())
     np.testing.assert_allclose(together, whole.ravel(), atol=2e-6 * float(whole.max()), rtol=1e-5)
+
+
+@pytest.mark.parametrize("mosaic", [True, False], ids=["bayer camera", "three colours a pixel"])
+@pytest.mark.parametrize("edged", [False, True], ids=["model alone", "with measured edges"])
+def test_the_equations_of_a_region_are_those_of_a_transport_by_camera_samples(mosaic: bool, edged: bool) -> None:
+    transport = windowed(mosaic=mosaic)
+    if edged:
+        transport = with_terms(transport, tuple(edge_term_of(transport, n) for n in range(len(transport.sizes))))
+    box = Box(20, 28, 40, 49)
+    random = np.random.default_rng(2)
+    unknown = np.sort(random.choice(transport.pixels, 300, replace=False))
+    values = random.random((3, unknown.size))
+    planes = np.zeros((3, transport.pixels), np.float32)
+    planes[:, unknown] = values
+    whole = np.asarray(transport.forward_planes(planes)[(slice(None), *box.window)])
+    assert whole.any()
+    together = np.asarray(local_transport(transport, box, unknown, (0, 1, 2)) @ values.ravel())
+    np.testing.assert_allclose(together, whole.ravel(), atol=3e-6 * float(whole.max()), rtol=1e-5)
+
+
+def test_one_region_over_a_crop_by_camera_samples_gives_the_global_optimum() -> None:
+    calibration = crop_calibration(synthetic_calibration("small"), 200, 300, 64)
+    transport = LightTransport.build(calibration)
+    target = picture(transport)
+    exact = solve_regions(transport, target, calibration.black, solver=FAST, size_px=128)
+    best = solve_bounded(transport, target, calibration.black, tolerance=1e-7, most_iterations=6000)
+    assert exact.regions == 1
+    assert best.objective == pytest.approx(exact.objective, rel=1e-4)
+    phases = solve_regions(transport, target, calibration.black, solver=FAST)
+    assert -1e-4 < phases.objective / exact.objective - 1 < 0.02
 
 
 @pytest.mark.parametrize(("blurred", "mixed"), [(False, True), (True, True), (True, False)])
@@ -151,7 +198,7 @@ def test_regions_of_a_phase_share_no_pixel_and_all_together_hold_every_pixel(sta
     transport = LightTransport.build(calibration)
     problem = pose(transport, picture(transport), calibration.black, 0.001, None)
     regions = Regions(problem)
-    nothing = np.zeros(transport.patches.first.size, np.bool_)
+    nothing = np.zeros(transport.pixels, np.bool_)
     held = np.zeros(nothing.size, int)
     for phase in ((0, 0), (0, 1), (1, 0), (1, 1)):
         unknown = [regions.unknown(i, j, nothing) for i, j in regions.of_phase(phase)]
