@@ -33,7 +33,7 @@ from controller.session.safety import LampGuard
 from controller.storage import clear_unfinished_writes, exclusive, runtime_folder
 from hal.deadline import Deadline, in_seconds
 from hal.errors import PluginError
-from hal.interfaces import Camera, Display, LightSensor, PowerSwitch, Projector
+from hal.interfaces import ButtonPanel, Camera, Display, LightSensor, PowerSwitch, Projector
 from hal.registry import Driver, Drivers, OpenContext, load_drivers
 
 OPEN_S = 20.0
@@ -54,6 +54,7 @@ class Checked:
     display: tuple[Driver, dict[str, Any]]
     relays: tuple[tuple[Driver, dict[str, Any]], ...] = ()
     light_sensor: tuple[Driver, dict[str, Any]] | None = None
+    key_panel: tuple[Driver, dict[str, Any]] | None = None
 
     @property
     def prior(self) -> CameraPrior:
@@ -113,6 +114,9 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
             None if tables.light_sensor is None
             else checked("light_sensor", tables.light_sensor, tables.light_sensor.driver)
         ),
+        key_panel=(
+            None if tables.key_panel is None else checked("button_panel", tables.key_panel, tables.key_panel.driver)
+        ),
     )  # fmt: skip
 
 
@@ -147,6 +151,19 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
         display = cast("Display", _device(stage.tables.display, driver, settings, context, deadline))
         stack.callback(display.close)
         yield replace(_rig(stage, guards, camera, display), circuits=circuits, darkness=darkness)
+
+
+@contextlib.contextmanager
+def technicians_panel(checked: Checked, *, deadline: Deadline) -> Iterator[ButtonPanel | None]:
+    """The panel of [key_panel] for a ``session.keys.KeyService``, closed on leaving; None where the stage has none."""
+    table = checked.stage.tables.key_panel
+    if table is None or checked.key_panel is None:
+        yield None
+        return
+    context = OpenContext(stage=checked.stage.folder)
+    panel = cast("ButtonPanel", _device(table, *checked.key_panel, context, deadline))
+    with contextlib.closing(panel):
+        yield panel
 
 
 def _circuits(

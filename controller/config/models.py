@@ -191,6 +191,10 @@ class LightSensorTable(OpenTable):
     )
 
 
+class KeyPanelTable(OpenTable):
+    driver: Name = Field(description='the name of a button_panel driver, e.g. "stream-deck"')
+
+
 class SafetyTable(Table):
     power_up_s: Seconds = Field(
         default=1800.0, description="seconds that lamps may take until they are steady, 0 to 86400"
@@ -248,6 +252,7 @@ class StageTables(Table):
         default=(), description="a list of [[relays]] tables, one a relay board"
     )
     light_sensor: LightSensorTable | None = Field(default=None, description="the table [light_sensor]")
+    key_panel: KeyPanelTable | None = Field(default=None, description="the table [key_panel]")
     safety: SafetyTable = Field(default_factory=SafetyTable, description="the table [safety]")
     bundle: BundleTable = Field(default_factory=BundleTable, description="the table [bundle]")
     appearances: Annotated[tuple[AppearanceTable, ...], Field(strict=False)] = Field(
