@@ -94,3 +94,11 @@ class Frames:
 def noise(outputs: list[tuple[str, int, int]], seed: int) -> Pictures:
     random = np.random.default_rng(seed)
     return {name: random.integers(0, 256, (height, width, 3), dtype=np.uint8) for name, width, height in outputs}
+
+
+def same(found: Pictures, expected: Pictures) -> bool:
+    return found.keys() == expected.keys() and all(np.array_equal(found[name], expected[name]) for name in found)
+
+
+def dark(pictures: Pictures) -> bool:
+    return not any(picture.any() for picture in pictures.values())
