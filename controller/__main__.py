@@ -135,12 +135,20 @@ def appearance(
 
 def play(
     stage: StageFolder,
-    name: Annotated[str, typer.Argument(help="The appearance to show.")],
-    seconds: Annotated[float, typer.Option(help="How long; without it, until Ctrl-C.", min=0)] = 0.0,
+    names: Annotated[list[str] | None, typer.Argument(help="The appearances to show, in turn if several.")] = None,
+    sequence: Annotated[Path | None, typer.Option(help="Instead, a TOML file of [[item]] tables.")] = None,
+    seconds: Annotated[
+        float, typer.Option(help="How long each; without it one until Ctrl-C, of several each 10 s.", min=0)
+    ] = 0.0,
+    fade: Annotated[float, typer.Option(help="Seconds in which each comes in.", min=0, max=600)] = 0,
+    repeat: Annotated[int, typer.Option(help="Rounds of several; without it until Ctrl-C.", min=0)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Light the projectors and show an appearance of the installed bundle."""
-    work("controller.services:play", as_json=as_json, stage=stage, name=name, seconds=seconds or None)
+    """Light the projectors and show appearances of the installed bundle."""
+    work(
+        "controller.play_services:play", as_json=as_json,
+        stage=stage, names=tuple(names or ()), sequence=sequence, seconds=seconds or None, fade_s=fade, repeat=repeat,
+    )  # fmt: skip
 
 
 COMMANDS: Final[tuple[Callable[..., Any], ...]] = (

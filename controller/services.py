@@ -30,10 +30,10 @@ from controller.session.journal import Journal
 from controller.session.machine import Event
 from controller.session.modes import DotOptions, dot_options
 from controller.session.progress import Level, Reporter
-from controller.session.publishing import bundle_display, publish_step
+from controller.session.publishing import publish_step
 from controller.session.rendering import scene_wish
 from controller.session.rig import Rig
-from controller.session.runner import Context, Runner, Step
+from controller.session.runner import Runner, Step
 from controller.session.solving import Calibrated, SolveOptions, base_choice, solve_steps
 from controller.session.wishes import wishes_of
 from controller.storage import exclusive
@@ -118,7 +118,7 @@ def make_appearances(
         wishes = wishes_of(checked.stage, calibrated, names) if names or not scenes else []
         wishes += [scene_wish(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve
-        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or table.base)
+        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or table.base, table.adapt)
         outputs = output_sizes(checked)
         scale = costs.scale(size for _, size in outputs.values())
         steps = [
@@ -234,39 +234,3 @@ def output_sizes(checked: Checked) -> dict[str, tuple[str, tuple[int, int]]]:
     # The player compares a bundle's outputs with its own, in the display's order.
     tables = sorted(checked.stage.tables.projectors, key=lambda table: order.index(table.output))
     return {table.name: (table.output, sizes[table.output]) for table in tables}
-
-
-def play(
-    *, stage: Path, name: str, seconds: float | None, reporter: Reporter, cancel: threading.Event
-) -> Mapping[str, Any]:
-    """Light the projectors and show an appearance of the installed bundle, for ``seconds`` or until stopped.
-
-    Raises UsageError("nothing-installed"), DeviceRefused for a name that the bundle does not have.
-    """
-    checked = check_stage(stage)
-    folder = checked.stage.folder
-    if current(folder / "bundles") is None:
-        raise UsageError(
-            "nothing-installed",
-            what="No bundle is installed on this stage.",
-            remedy="Run `velatura appearance` on it first.",
-        )
-    run_on_stage(
-        checked, lambda rig, _: _playing(rig, name=name, seconds=seconds), name="play", reporter=reporter, cancel=cancel
-    )
-    return {"played": name}
-
-
-def _playing(rig: Rig, *, name: str, seconds: float | None) -> Sequence[Step]:
-    def show(context: Context) -> Sequence[Path]:
-        display = bundle_display(rig)
-        display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
-        display.play(name, deadline=context.deadline.within(20))
-        until = in_seconds(LONGEST_RUN_S if seconds is None else seconds)
-        while not until.passed:
-            context.advance(0.0 if seconds is None else 1 - until.left_s() / max(seconds, 1e-9), name)
-            context.deadline.sleep(min(0.5, until.left_s()))
-        display.stop(deadline=context.deadline.within(20))
-        return ()
-
-    return [Step("play", show, title=f"Playing {name}", enter=Event.PLAY, leave=Event.PAUSE, always=True)]

@@ -135,9 +135,17 @@ class BundleDisplay(Display, Protocol):
         """Use another bundle from now on; return its identity (hex). Raises DeviceRefused for one it does not trust."""
 
     def play_sequence(
-        self, items: Sequence[tuple[str, float]], *, deadline: Deadline, repeat: int = 0, rate_hz: float | None = None
+        self,
+        items: Sequence[tuple[str, float] | tuple[str, float, float]],
+        *,
+        deadline: Deadline,
+        repeat: int = 0,
+        rate_hz: float | None = None,
     ) -> Presented:
-        """Show appearances in turn, (name, seconds) each, ``repeat`` times (0: for ever); return at the first."""
+        """Show appearances in turn, ``repeat`` times (0: for ever); return when the first is whole.
+
+        Each is (name, seconds) or (name, seconds, fade_s); it comes in over the one before in the first ``fade_s``.
+        """
 
     def stop(self, *, deadline: Deadline) -> Presented:
         """Show black."""

@@ -57,9 +57,14 @@ class PlayerDisplay:
     # --- hal.interfaces.BundleDisplay -------------------------------------------------------------------------------
 
     def play_sequence(
-        self, items: Sequence[tuple[str, float]], *, deadline: Deadline, repeat: int = 0, rate_hz: float | None = None
+        self,
+        items: Sequence[tuple[str, float] | tuple[str, float, float]],
+        *,
+        deadline: Deadline,
+        repeat: int = 0,
+        rate_hz: float | None = None,
     ) -> Presented:
-        """Show appearances in turn, (name, seconds) each, ``repeat`` times (0: for ever); returns at the first.
+        """Show appearances in turn; see ``hal.interfaces.BundleDisplay.play_sequence``.
 
         ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds; None: at the player's own rate.
         """
@@ -69,6 +74,10 @@ class PlayerDisplay:
     def stop(self, *, deadline: Deadline) -> Presented:
         """Show black."""
         return _presented(self._link.ask({"op": "stop"}, deadline))
+
+    def identify(self, *, deadline: Deadline) -> Presented:
+        """Show each output's number, name and size."""
+        return _presented(self._link.ask({"op": "identify"}, deadline))
 
     def status(self, *, deadline: Deadline) -> dict[str, Any]:
         """What the player shows and how evenly: the keys of "status" in docs/player-protocol.md."""

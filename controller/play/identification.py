@@ -39,10 +39,10 @@ def _picture(number: int, output: OutputSize) -> npt.NDArray[np.uint8]:
     band = height // 12
     if band:
         image[height - 2 * band : height - band] = (np.arange(width) * 16 // width * 17).astype(np.uint8)[None, :, None]
-    image[[0, -1], :] = image[:, [0, -1]] = 255
     _write(image, str(number), centre_row=height * 2 // 5, tall_px=height // 2)
     _write(image, output.name, centre_row=height * 3 // 4, tall_px=height // 14)
     _write(image, f"{width}X{height}", centre_row=height // 10, tall_px=height // 14)
+    image[[0, -1], :] = image[:, [0, -1]] = 255
     return image
 
 
