@@ -1,0 +1,299 @@
+"""Decides what the stage does: schedule, technician, lamps, player and work come together here, and nowhere else.
+
+``step`` looks at all of them, moves the state machine, and says what is wanted of each. It waits for nothing, so a
+device that hangs holds up only its own keeper.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from controller.errors import WorkError
+from controller.panel.kiosk import Schedule
+from controller.serve.agenda import Agenda
+from controller.serve.clock import Clockwork
+from controller.serve.eventlog import Decision, EventLog
+from controller.serve.planner import Plan, plan
+from controller.serve.ports import (
+    BLACK,
+    Condition,
+    Keeper,
+    PlayerPort,
+    PlayerView,
+    ProjectorView,
+    Request,
+    Showing,
+    Stock,
+    Works,
+)
+from controller.serve.wishes import Wishes
+from controller.session.machine import Event, Machine, State
+
+RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
+"""Between attempts to come out of FAULT."""
+_ON: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Deadlines of the states, in seconds."""
+
+    power_up_s: float = 1800.0
+    cool_down_s: float = 900.0
+
+
+class Conductor:
+    """The kiosk's decisions. ``step`` is called about four times a second by one thread; commands come from any.
+
+    Parameters
+    ----------
+    schedule : asked at every step
+    clock : the time to plan with; ``monotonic``: seconds that only go up, for deadlines
+    without_time : whether the stage is open while nobody knows the time
+    """
+
+    def __init__(
+        self,
+        keepers: Sequence[Keeper],
+        player: PlayerPort,
+        works: Works,
+        stock: Stock,
+        log: EventLog,
+        *,
+        schedule: Callable[[], Schedule],
+        clock: Clockwork,
+        monotonic: Callable[[], float],
+        without_time: bool = False,
+        limits: Limits | None = None,
+    ) -> None:
+        self._keepers, self._player, self._stock, self._log = keepers, player, stock, log
+        self._schedule, self._clock, self._monotonic = schedule, clock, monotonic
+        self._limits = limits or Limits()
+        self._agenda = Agenda(works, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
+        self.machine = Machine(self._changed)
+        self.wishes = Wishes(log, without_time=without_time)
+        self._lock = threading.RLock()
+        self._empty = False
+        self._plan = Plan(None)
+        self._since_s = monotonic()
+        self._attempts, self._missing = 0, frozenset[str]()
+        self._asked_for: set[frozenset[str]] = set()
+
+    # -- asked from outside
+
+    @property
+    def plan(self) -> Plan:
+        return self._plan
+
+    def open(self) -> None:
+        """Play until the schedule says otherwise the next time."""
+        with self._lock:
+            self.wishes.override(True, self._plan)
+            self._since_s = min(self._since_s, self._monotonic() - RETRY_S[-1])
+
+    def shut(self) -> None:
+        """Stop, and cool the lamps, until the schedule says otherwise the next time."""
+        with self._lock:
+            self._agenda.cancel()
+            self.wishes.override(False, self._plan)
+
+    def choose(self, appearance: str) -> None:
+        """Play this appearance of the bundle from now on."""
+        with self._lock:
+            self.wishes.choose(appearance, self._plan)
+
+    def ask(self, *requests: Request) -> None:
+        """Queue work. Raises WorkError("busy") while other work runs or waits, and with the reason it can't be done."""
+        with self._lock:
+            self._agenda.ask(*requests)
+
+    def cancel(self) -> None:
+        """Raises WorkError("nothing-to-cancel")."""
+        with self._lock:
+            if self._agenda.head is None:
+                raise WorkError("nothing-to-cancel", what="No work is going on.", remedy="There is nothing to do.")
+            self._agenda.cancel()
+
+    # -- one step
+
+    def step(self) -> None:
+        with self._lock:
+            self._look_at_the_clock()
+            self._take_finished()
+            wanted_open = self.wishes.open(self._plan)
+            self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
+            views = [keeper.view for keeper in self._keepers]
+            open_now = wanted_open and self._something_to_play(wanted_open)
+            light = open_now or self._agenda.needs_light
+            self._move(views, light, open_now)
+            cooling = self.machine.state in (State.COOLING, State.OFF)
+            for keeper in self._keepers:
+                if keeper.want_lit is not (wanted := light and not cooling):
+                    keeper.want_lit = wanted
+            self._begin_work(views)
+            self._show(views, open_now)
+
+    def _look_at_the_clock(self) -> None:
+        now_s = self._clock.now()
+        self._plan = plan(now_s, self._schedule(), self._log.done(), since_s=self._clock.since_s)
+        self.wishes.follow(self._plan)
+
+    # -- work
+
+    def _take_finished(self) -> None:
+        finished = self._agenda.take_finished()
+        if finished is not None and self.machine.state is State.CALIBRATING:
+            event = Event.CANCEL if finished.failed else Event.CALIBRATED
+            self._go(event, finished.outcome.reason)
+
+    def _begin_work(self, views: Sequence[ProjectorView]) -> None:
+        head = self._agenda.head
+        state = self.machine.state
+        if state is State.FAULT and head is not None and head.light:
+            self._agenda.drop(_FAULTY)
+        if head is not None and head.light and state not in (State.READY, State.PLAYING, State.DEGRADED):
+            return
+        if (request := self._agenda.ready(views)) is None:
+            return
+        if request.light:
+            self._go(Event.RECALIBRATE, f"{request.kind} begins")
+            self._player.want = None
+        self._agenda.begin()
+
+    # -- states
+
+    def _move(self, views: Sequence[ProjectorView], light: bool, open_now: bool) -> None:
+        state = self.machine.state
+        if state is State.OFF:
+            if light:
+                self._go(Event.START, "the lamps are wanted")
+        elif state is State.COOLING:
+            self._cool(views)
+        elif state is State.FAULT:
+            self._mend(views, light)
+        elif state is State.CALIBRATING:
+            return
+        elif not light:
+            self._go(Event.STOP, "closed" if not open_now else "nothing to do")
+        elif state in (State.POWERING, State.WARMING):
+            self._power(views, state)
+        else:
+            self._keep_playing(views, state, open_now)
+
+    def _power(self, views: Sequence[ProjectorView], state: State) -> None:
+        shining = [view for view in views if view.shines]
+        coming = [view for view in views if view.coming]
+        late = self._monotonic() - self._since_s > self._limits.power_up_s
+        if (coming and not late) or not views:
+            return
+        if not shining:
+            self._go(Event.FAIL, _reasons(views) or "No lamp gave light in time.")
+        elif state is State.POWERING:
+            self._go(Event.LAMPS_LIT, _reasons(views))
+        elif late or all(view.stable_left_s <= 0 for view in shining if view.condition is Condition.LIT):
+            self._go(Event.LAMPS_STABLE, _reasons(views))
+
+    def _keep_playing(self, views: Sequence[ProjectorView], state: State, open_now: bool) -> None:
+        shining = [view.name for view in views if view.shines]
+        reasons = _reasons(views)
+        if self._player.view.problem is not None:
+            reasons = f"{self._player.view.problem.reason} {reasons}".strip()
+        self._missing = frozenset(view.name for view in views if not view.shines)
+        if not shining and not any(view.coming for view in views):
+            self._go(Event.FAIL, reasons or "No lamp gives light.")
+        elif state is State.DEGRADED:
+            if not reasons and not self._missing:
+                self._go(Event.RECOVERED, "every projector gives light again")
+        elif reasons or self._missing:
+            self._go(Event.DEGRADE, reasons or f"{', '.join(sorted(self._missing))} gives no light.")
+        elif state is State.READY and open_now and not self._agenda.needs_light:
+            self._go(Event.PLAY, "open")
+        elif state is State.PLAYING and not open_now:
+            self._go(Event.PAUSE, "closed")
+
+    def _cool(self, views: Sequence[ProjectorView]) -> None:
+        lit = [view for view in views if view.condition is Condition.LIT or view.maybe_lit or not view.looked]
+        if not lit:
+            self._go(Event.COOLED, "every lamp is off or cooling by itself")
+        elif self._monotonic() - self._since_s > self._limits.cool_down_s:
+            names = ", ".join(view.name for view in lit)
+            self._go(Event.FAIL, f"The lamp of {names} could not be switched off. Switch it off by its remote control.")
+
+    def _mend(self, views: Sequence[ProjectorView], light: bool) -> None:
+        if not light:
+            if not any(view.condition is Condition.LIT or view.maybe_lit for view in views) or self._waited(60.0):
+                self._go(Event.STOP, "closed")
+        elif any(view.condition is Condition.LIT for view in views) or self._waited(
+            RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
+        ):
+            self._attempts += 1
+            self._go(Event.START, "another attempt")
+
+    def _waited(self, seconds: float) -> bool:
+        return self._monotonic() - self._since_s >= seconds
+
+    def _go(self, event: Event, reason: str) -> None:
+        self._since_s = self._monotonic()
+        self.machine.handle(event, reason)
+        if event in (Event.PLAY, Event.COOLED):
+            self._attempts = 0
+
+    def _changed(self, change: object) -> None:
+        machine = self.machine
+        bad = machine.state in (State.FAULT, State.DEGRADED)
+        remedy = "See the devices for what to do." if bad else ""
+        text = f"The stage is {machine.state.value}" + (f": {machine.reason}" if machine.reason else "")
+        level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
+        self._log.tell(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
+
+    # -- the picture
+
+    def _show(self, views: Sequence[ProjectorView], open_now: bool) -> None:
+        state = self.machine.state
+        if state is State.CALIBRATING:
+            return
+        self._player.want = self._picture(views) if open_now and state in _ON else BLACK
+
+    def _picture(self, views: Sequence[ProjectorView]) -> Showing:
+        names = self._stock.names()
+        name = self.wishes.appearance(self._plan, names)
+        bundle = self._stock.bundle()
+        if not self._missing or len(self._missing) == len(views):
+            return Showing(bundle, name)
+        instead = self._stock.without(self._missing)
+        if instead is not None:
+            return Showing(instead, name)
+        # The whole stage's frames go on meanwhile: dimmer, but there.
+        if self._missing not in self._asked_for:
+            request = Request("takeover", arguments=tuple(sorted(self._missing)))
+            if self._agenda.offer(request):
+                self._asked_for.add(self._missing)
+        return Showing(bundle, name)
+
+    def _something_to_play(self, wanted_open: bool) -> bool:
+        found = self._stock.bundle() is not None
+        if wanted_open and not found and not self._empty:
+            self._log.tell(_EMPTY)
+        self._empty = wanted_open and not found
+        return found
+
+    @property
+    def player(self) -> PlayerView:
+        return self._player.view
+
+
+def _reasons(views: Sequence[ProjectorView]) -> str:
+    return " ".join(view.problem.text for view in views if view.problem is not None)
+
+
+_EMPTY: Final = Decision(
+    "nothing-installed", "The stage should be open, and no bundle is installed.",
+    "Calibrate the stage and compute appearances; the lamps stay off until then.", "error",
+)  # fmt: skip
+_FAULTY: Final = Decision(
+    "work-impossible", "The work was given up: the stage is in a fault.",
+    "See what the fault is, mend that, and ask again.", "error",
+)  # fmt: skip

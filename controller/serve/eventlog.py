@@ -1,0 +1,192 @@
+"""The kiosk's memory in SQLite: the event log, what was done, and a few values. A full disk stops nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from controller.panel.kiosk import EventLevel, EventRow
+
+MOST_EVENTS: Final = 20_000
+MOST_DONE: Final = 400
+SHOWN: Final = 2_000
+_TRIM_EVERY: Final = 200
+_RETRY_S: Final = 30.0
+_LEVELS: Final[dict[str, EventLevel]] = {"info": "info", "warning": "warning", "error": "error"}
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS events (
+    number INTEGER PRIMARY KEY AUTOINCREMENT, unix_s REAL NOT NULL, level TEXT NOT NULL, code TEXT NOT NULL,
+    text TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS done (number INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT UNIQUE NOT NULL, how TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS kept (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the kiosk noticed or decided. ``reason`` and ``remedy`` are sentences; the remedy may be empty."""
+
+    code: str
+    reason: str
+    remedy: str = ""
+    level: EventLevel = "info"
+
+    @property
+    def text(self) -> str:
+        return f"{self.reason} {self.remedy}".strip()
+
+
+class EventLog:
+    """Safe to use from several threads. ``problem`` says why the disk takes nothing now, or is None.
+
+    What the disk refuses is kept in memory and written when there is space again. A damaged file is put aside.
+    """
+
+    FILE: Final = "kiosk/events.sqlite"
+
+    def __init__(self, path: Path, *, wall: Callable[[], float] = time.time) -> None:
+        self.path, self._wall = path, wall
+        self._lock = threading.RLock()
+        self.problem: str | None = None
+        self._retry_at_s = 0.0
+        self._database = self._opened()
+        self._recent: deque[EventRow] = deque(self._load(), SHOWN)
+        self._number = self._last_number()
+        self._waiting: deque[EventRow] = deque(maxlen=SHOWN)
+        self._done: dict[str, str] = dict(self._query("SELECT key, how FROM done ORDER BY number"))
+        self._kept: dict[str, str] = dict(self._query("SELECT name, value FROM kept"))
+        self._unwritten: set[tuple[str, str]] = set()
+
+    # -- events
+
+    def tell(self, decision: Decision) -> EventRow:
+        """Add one line. Never raises for the disk's sake."""
+        with self._lock:
+            self._number += 1
+            row = EventRow(self._number, self._wall(), decision.level, decision.text, decision.code)
+            self._recent.append(row)
+            self._waiting.append(row)
+            self._flush()
+            return row
+
+    def after(self, number: int) -> Sequence[EventRow]:
+        """Events with a larger number, oldest first, at most the newest ``SHOWN``."""
+        with self._lock:
+            return [row for row in self._recent if row.number > number]
+
+    @property
+    def number(self) -> int:
+        return self._number
+
+    # -- what was done, and values
+
+    def done(self) -> frozenset[str]:
+        with self._lock:
+            return frozenset(self._done)
+
+    def mark_done(self, key: str, how: str) -> None:
+        """Remember that ``key`` was done, or left out; in memory at once, on disk as soon as it lets us."""
+        with self._lock:
+            self._done[key] = how
+            self._unwritten.add(("done", key))
+            self._flush(now=True)
+
+    def value(self, name: str) -> str | None:
+        with self._lock:
+            return self._kept.get(name)
+
+    def keep(self, name: str, value: str) -> None:
+        with self._lock:
+            if self._kept.get(name) != value:
+                self._kept[name] = value
+                self._unwritten.add(("kept", name))
+                self._flush()
+
+    def close(self) -> None:
+        with self._lock:
+            self._flush(now=True)
+            self._database.close()
+
+    # -- the disk
+
+    def _flush(self, *, now: bool = False) -> None:
+        if self.problem is not None and not now and time.monotonic() < self._retry_at_s:
+            return
+        try:
+            with self._database as database:
+                for row in self._waiting:
+                    database.execute(
+                        "INSERT OR IGNORE INTO events VALUES (?, ?, ?, ?, ?)",
+                        (row.number, row.unix_s, row.level, row.code, row.text),
+                    )
+                for kind, key in self._unwritten:
+                    if kind == "done":
+                        database.execute("INSERT OR REPLACE INTO done (key, how) VALUES (?, ?)", (key, self._done[key]))
+                    else:
+                        database.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, self._kept[key]))
+                if self._number % _TRIM_EVERY == 0:
+                    self._trim(database)
+        except sqlite3.Error as error:
+            self.problem, self._retry_at_s = str(error), time.monotonic() + _RETRY_S
+            return
+        self._waiting.clear()
+        self._unwritten.clear()
+        self.problem = None
+
+    def _trim(self, database: sqlite3.Connection) -> None:
+        database.execute("DELETE FROM events WHERE number <= ?", (self._number - MOST_EVENTS,))
+        database.execute("DELETE FROM done WHERE number <= (SELECT MAX(number) FROM done) - ?", (MOST_DONE,))
+        for key in list(self._done)[: max(0, len(self._done) - MOST_DONE)]:
+            del self._done[key]
+
+    def _opened(self) -> sqlite3.Connection:
+        try:
+            return self._connected(self.path)
+        except (sqlite3.DatabaseError, OSError) as error:
+            self.problem = str(error)
+            # A damaged log must not keep the stage dark; it is kept for whoever wants to look into it.
+            with contextlib.suppress(OSError, sqlite3.Error):
+                self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
+                database = self._connected(self.path)
+                self.problem = None
+                return database
+            return self._connected(Path(":memory:"))
+
+    def _connected(self, path: Path) -> sqlite3.Connection:
+        if str(path) != ":memory:":
+            path.parent.mkdir(parents=True, exist_ok=True)
+        database = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
+        try:
+            database.execute("PRAGMA journal_mode=WAL")
+            # What was done must not be done again after a power cut.
+            database.execute("PRAGMA synchronous=FULL")
+            database.executescript(_SCHEMA)
+        except sqlite3.Error:
+            database.close()
+            raise
+        return database
+
+    def _load(self) -> list[EventRow]:
+        rows = self._query("SELECT number, unix_s, level, text, code FROM events ORDER BY number DESC LIMIT 2000")
+        return [EventRow(n, s, _LEVELS.get(level, "info"), text, code) for n, s, level, text, code in reversed(rows)]
+
+    def _last_number(self) -> int:
+        found = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
+        if found:
+            return int(found[0][0])
+        # After a damaged log numbers go on far above any that it can have had.
+        return int(self._wall()) if list(self.path.parent.glob("*.damaged-*")) else 0
+
+    def _query(self, statement: str) -> list[tuple]:  # type: ignore[type-arg]
+        try:
+            return self._database.execute(statement).fetchall()
+        except sqlite3.Error as error:
+            self.problem = str(error)
+            return []
