@@ -3,23 +3,34 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from dataclasses import dataclass
+from typing import Any, Final, NoReturn
 
 from controller.bundle.format import (
-    ALIGNMENT,
+    ALIGNMENTS,
+    FIRST_BLOB,
+    LIVE_TYPES,
     MAX_APPEARANCES,
+    MAX_DURATION_MS,
     MAX_INDEX_BYTES,
     MAX_INDEX_TABLES,
+    MAX_LIVE_ARRAYS,
+    MAX_LIVE_BYTES,
     MAX_NAME_BYTES,
     MAX_OUTPUT_NAME_BYTES,
     MAX_OUTPUT_PX,
     MAX_OUTPUTS,
     MAX_SIDE_PX,
     MAX_THUMBNAIL_BYTES,
+    VERSION,
     Appearance,
     Blob,
+    Hint,
     Index,
+    Live,
+    LiveArray,
     OutputLayout,
     compressed_bound,
     damaged,
@@ -29,7 +40,10 @@ from controller.errors import BundleError
 
 
 def encode_index(index: Index) -> bytes:
-    """The index as canonical JSON: UTF-8, keys sorted, no spaces. Raises BundleError("bundle-metadata")."""
+    """The index, in the newest version, as canonical JSON: UTF-8, keys sorted, no spaces.
+
+    Raises BundleError("bundle-metadata").
+    """
     document = {
         "stage": index.stage,
         "calibration": index.calibration,
@@ -48,6 +62,8 @@ def encode_index(index: Index) -> bytes:
             }
             for a in index.appearances
         ],
+        "schedule": [[hint.appearance, hint.duration_ms, hint.fade_ms] for hint in index.schedule],
+        "live": None if index.live is None else _live_document(index.live),
     }
     try:
         text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
@@ -61,11 +77,31 @@ def encode_index(index: Index) -> bytes:
     return data
 
 
+def _live_document(live: Live) -> dict[str, Any]:
+    arrays = {
+        name: {"dtype": array.dtype, "shape": list(array.shape), "blob": _packed(array.blob)}
+        for name, array in live.arrays.items()
+    }
+    return {"target_px": list(live.target_px), "arrays": arrays}
+
+
 def _packed(blob: Blob) -> list[int | str]:
     return [blob.offset, blob.length, f"{blob.xxh3:016x}", blob.sha256.hex()]
 
 
-def parse_index(data: bytes, *, data_end: int) -> Index:
+@dataclass(frozen=True, slots=True)
+class _Area:
+    """Where blobs may lie: at multiples of ``alignment``, up to ``end`` (bytes from the file's start)."""
+
+    alignment: int
+    end: int
+
+
+_KEYS: Final = {"stage", "calibration", "created_unix_s", "revision", "outputs", "appearances"}
+_LATER_KEYS: Final = {"schedule", "live"}
+
+
+def parse_index(data: bytes, *, data_end: int, version: int = VERSION) -> Index:
     """Read an index whose stripes must lie between the header and ``data_end`` (bytes from the file's start).
 
     Raises BundleError("bundle-damaged") for anything that the format does not allow.
@@ -77,10 +113,11 @@ def parse_index(data: bytes, *, data_end: int) -> Index:
         document = json.loads(data.decode(), object_pairs_hook=_table, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise damaged("its index is not JSON") from error
-    top = _fields(document, {"stage", "calibration", "created_unix_s", "revision", "outputs", "appearances"})
+    top = _fields(document, _KEYS if version == 1 else _KEYS | _LATER_KEYS)
+    area = _Area(ALIGNMENTS[version], data_end)
     outputs = tuple(_output(item) for item in _list(top["outputs"], "outputs", 1, MAX_OUTPUTS))
     listed = _list(top["appearances"], "appearances", 0, MAX_APPEARANCES)
-    appearances = tuple(_appearance(item, outputs, data_end) for item in listed)
+    appearances = tuple(_appearance(item, outputs, area) for item in listed)
     for what, names in (("outputs", [o.name for o in outputs]), ("appearances", [a.name for a in appearances])):
         if len(set(names)) != len(names):
             raise damaged(f"two of its {what} have the same name")
@@ -91,6 +128,8 @@ def parse_index(data: bytes, *, data_end: int) -> Index:
         revision=_whole(top["revision"], "revision", 0, 2**53),
         outputs=outputs,
         appearances=appearances,
+        schedule=_schedule(top.get("schedule", []), {a.name for a in appearances}),
+        live=None if top.get("live") is None else _live(top["live"], area),
     )
 
 
@@ -139,7 +178,7 @@ def _output(value: Any) -> OutputLayout:
     return OutputLayout(_name(table["name"], MAX_OUTPUT_NAME_BYTES), width, height, rows)
 
 
-def _appearance(value: Any, outputs: tuple[OutputLayout, ...], data_end: int) -> Appearance:
+def _appearance(value: Any, outputs: tuple[OutputLayout, ...], area: _Area) -> Appearance:
     table = _fields(value, {"name", "stripes", "thumbnail", "metadata"})
     stripes = _fields(table["stripes"], {output.name for output in outputs})
     if not isinstance(table["metadata"], dict):
@@ -147,26 +186,58 @@ def _appearance(value: Any, outputs: tuple[OutputLayout, ...], data_end: int) ->
     thumbnail = table["thumbnail"]
     return Appearance(
         name=_name(table["name"]),
-        stripes={o.name: _stripes(stripes[o.name], o, data_end) for o in outputs},
-        thumbnail=None if thumbnail is None else _blob(thumbnail, MAX_THUMBNAIL_BYTES, data_end),
+        stripes={o.name: _stripes(stripes[o.name], o, area) for o in outputs},
+        thumbnail=None if thumbnail is None else _blob(thumbnail, MAX_THUMBNAIL_BYTES, area),
         metadata=table["metadata"],
     )
 
 
-def _stripes(value: Any, output: OutputLayout, data_end: int) -> tuple[Blob, ...]:
+def _schedule(value: Any, names: set[str]) -> tuple[Hint, ...]:
+    hints = []
+    for item in _list(value, "the schedule", 0, MAX_APPEARANCES):
+        name, duration, fade = _list(item, "an entry of the schedule", 3, 3)
+        if not isinstance(name, str) or name not in names:
+            raise damaged("its schedule names an appearance that it does not hold")
+        duration = _whole(duration, "a duration", 1, MAX_DURATION_MS)
+        hints.append(Hint(name, duration, _whole(fade, "a fade", 0, duration)))
+    return tuple(hints)
+
+
+def _live(value: Any, area: _Area) -> Live:
+    table = _fields(value, {"target_px", "arrays"})
+    width, height = (_whole(side, "target_px", 1, MAX_SIDE_PX) for side in _list(table["target_px"], "target_px", 2, 2))
+    arrays = table["arrays"]
+    if not isinstance(arrays, dict) or len(arrays) > MAX_LIVE_ARRAYS:
+        raise damaged(f"the arrays of its live section are not a table of at most {MAX_LIVE_ARRAYS}")
+    return Live((width, height), {_name(name): _live_array(arrays[name], area) for name in sorted(arrays)})
+
+
+def _live_array(value: Any, area: _Area) -> LiveArray:
+    table = _fields(value, {"dtype", "shape", "blob"})
+    if table["dtype"] not in LIVE_TYPES:
+        raise damaged("an array of its live section has an element type that there is not")
+    sides = _list(table["shape"], "a shape", 1, 4)
+    shape = tuple(_whole(side, "a side of an array", 1, MAX_SIDE_PX) for side in sides)
+    raw_bytes = int(table["dtype"][1]) * math.prod(shape)
+    if raw_bytes > MAX_LIVE_BYTES:
+        raise damaged(f"an array of its live section is larger than {MAX_LIVE_BYTES} bytes")
+    return LiveArray(table["dtype"], shape, _blob(table["blob"], compressed_bound(raw_bytes), area))
+
+
+def _stripes(value: Any, output: OutputLayout, area: _Area) -> tuple[Blob, ...]:
     heights = output.stripe_heights
     blobs = _list(value, f"stripes of {output.name}", len(heights), len(heights))
     row_bytes = output.width_px * 3
     return tuple(
-        _blob(blob, compressed_bound(rows * row_bytes), data_end) for blob, rows in zip(blobs, heights, strict=True)
+        _blob(blob, compressed_bound(rows * row_bytes), area) for blob, rows in zip(blobs, heights, strict=True)
     )
 
 
-def _blob(value: Any, most_bytes: int, data_end: int) -> Blob:
+def _blob(value: Any, most_bytes: int, area: _Area) -> Blob:
     offset, length, quick, digest = _list(value, "a stripe", 4, 4)
-    offset = _whole(offset, "a stripe's offset", ALIGNMENT, data_end)
+    offset = _whole(offset, "a stripe's offset", FIRST_BLOB, area.end)
     length = _whole(length, "a stripe's length", 1, most_bytes)
-    if offset % ALIGNMENT or offset + length > data_end:
+    if offset % area.alignment or offset + length > area.end:
         raise damaged("a stripe lies outside the file or is not aligned")
     return Blob(offset, length, int.from_bytes(_hex(quick, 8), "big"), _hex(digest, 32))
 

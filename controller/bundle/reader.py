@@ -7,10 +7,12 @@ import hashlib
 import mmap
 import os
 import stat
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Final, Self
+from typing import Any, BinaryIO, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +27,6 @@ from controller.bundle.signing import BLOCK_BYTES, Trust, check_signature, sign
 from controller.errors import BundleError
 
 _MAX_WINDOW_BYTES: Final = 2**23
-_STRIPES_PER_TASK: Final = 3
 
 
 class Bundle:
@@ -54,7 +55,8 @@ class Bundle:
         self.signed_by = check_signature(
             start, index_bytes, block, trusted=trusted, allow_unsigned=allow_unsigned, revoked=revoked
         )
-        self.index = parse_index(index_bytes, data_end=header.index_offset)
+        self.index = parse_index(index_bytes, data_end=header.index_offset, version=header.version)
+        self.version = header.version
         self.identity = header.index_sha256.hex()
         self._data_end = header.index_offset
 
@@ -128,7 +130,7 @@ class Bundle:
         file.write(sign(self._data[: fmt.HEADER_BYTES], self._data[self._data_end : end], key))
 
     def _check_gap(self, start: int, end: int) -> None:
-        if end - start >= fmt.ALIGNMENT or self._data[start:end].strip(b"\0"):
+        if end - start >= fmt.FIRST_BLOB or self._data[start:end].strip(b"\0"):
             raise damaged(f"there is something between its parts, at {start}")
 
     def _blobs(self) -> list[fmt.Blob]:
@@ -136,6 +138,8 @@ class Bundle:
         for appearance in self.index.appearances:
             found += [blob for blobs in appearance.stripes.values() for blob in blobs]
             found += [appearance.thumbnail] if appearance.thumbnail else []
+        if self.index.live is not None:
+            found += [array.blob for array in self.index.live.arrays.values()]
         return found
 
     def _view(self, blob: fmt.Blob) -> memoryview:
@@ -150,6 +154,24 @@ class Bundle:
         if hashlib.sha256(data).digest() != blob.sha256 or not fmt.is_png(data):
             raise damaged(f"the thumbnail of {appearance!r} does not have its hash")
         return data
+
+    def live_array(self, name: str) -> npt.NDArray[Any]:
+        """An array of the live section, as it was written.
+
+        Raises BundleError("bundle-not-live") where the bundle has none of that name, and ("bundle-damaged").
+        """
+        found = None if self.index.live is None else self.index.live.arrays.get(name)
+        if found is None:
+            raise BundleError(
+                "bundle-not-live",
+                what=f"The bundle holds no {name!r} for the live mode.",
+                remedy="Build it again on the stage with 'velatura bundle build --live'.",
+            )
+        values = np.empty(found.shape, f"<{found.dtype}")
+        self._inflate(found.blob, values)
+        if values.dtype.kind == "u":
+            np.add.accumulate(values, axis=0, dtype=values.dtype, out=values)
+        return values
 
     def decode(self, appearance: str, output: str) -> npt.NDArray[np.uint8]:
         """One output's image of an appearance, (rows, columns, 3) uint8.
@@ -170,29 +192,21 @@ class Bundle:
         ValueError if a buffer does not have its output's shape.
         """
         found = self.index.appearance(appearance)
-        tasks = []
+        images = []
         for name, buffer in buffers.items():
             layout = self.index.output(name)
             if buffer.shape != (layout.height_px, layout.width_px, 3) or buffer.dtype != np.uint8:
                 raise ValueError(f"the buffer for {name} has shape {buffer.shape} and dtype {buffer.dtype}")
-            stripes, step = found.stripes[name], _STRIPES_PER_TASK
-            for first in range(0, len(stripes), step):
-                rows = buffer[first * layout.stripe_rows : (first + step) * layout.stripe_rows]
-                tasks.append((stripes[first : first + step], rows, layout.stripe_rows))
+            images.append(_Image(self._inflate, found.stripes[name], buffer, layout.stripe_rows))
         if pool is None:
-            for task in tasks:
-                self._decode_stripes(*task)
-        else:
-            for future in [pool.submit(self._decode_stripes, *task) for task in tasks]:
-                future.result()
+            for image in images:
+                image.decode()
+            return
+        for future in [pool.submit(task) for image in images for task in image.tasks()]:
+            future.result()
 
-    def _decode_stripes(self, blobs: Sequence[fmt.Blob], rows: npt.NDArray[np.uint8], stripe_rows: int) -> None:
-        for number, blob in enumerate(blobs):
-            self._inflate(blob, rows[number * stripe_rows : (number + 1) * stripe_rows])
-        undo_row_differences(rows, stripe_rows)
-
-    def _inflate(self, blob: fmt.Blob, rows: npt.NDArray[np.uint8]) -> None:
-        """Decompress one stripe into ``rows``; the frame must hold exactly that many bytes."""
+    def _inflate(self, blob: fmt.Blob, rows: npt.NDArray[Any]) -> None:
+        """Decompress a blob into ``rows``; its frame must hold exactly that many bytes."""
         view = self._view(blob)
         if xxhash.xxh3_64_intdigest(view) != blob.xxh3:
             raise damaged(f"the stripe at {blob.offset} does not have its checksum")
@@ -206,6 +220,40 @@ class Bundle:
             raise damaged(f"the stripe at {blob.offset} can not be decompressed") from error
         if filled != rows.nbytes:
             raise damaged(f"the stripe at {blob.offset} ends too early")
+
+
+class _Image:
+    """One image to be decoded: its stripes apart from each other, and the last to end adds the rows up.
+
+    Adding is a numpy call a row for all stripes together, so a task for some of the stripes makes as many calls as one
+    for all; these are too short for two threads to gain by making them at the same time (docs/decisions/0021).
+    """
+
+    def __init__(
+        self,
+        inflate: Callable[[fmt.Blob, npt.NDArray[Any]], None],
+        blobs: Sequence[fmt.Blob],
+        image: npt.NDArray[np.uint8],
+        stripe_rows: int,
+    ) -> None:
+        self._inflate, self._blobs, self._image, self._stripe_rows = inflate, blobs, image, stripe_rows
+        self._left, self._lock = len(blobs), threading.Lock()
+
+    def decode(self) -> None:
+        for task in self.tasks():
+            task()
+
+    def tasks(self) -> list[Callable[[], None]]:
+        """What is to be done, in any order, on any threads."""
+        return [partial(self._one, number) for number in range(len(self._blobs))]
+
+    def _one(self, number: int) -> None:
+        self._inflate(self._blobs[number], self._image[number * self._stripe_rows : (number + 1) * self._stripe_rows])
+        with self._lock:
+            self._left -= 1
+            last = self._left == 0
+        if last:
+            undo_row_differences(self._image, self._stripe_rows)
 
 
 def undo_row_differences(rows: npt.NDArray[np.uint8], stripe_rows: int) -> None:

@@ -36,6 +36,17 @@ class NewAppearance:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class NewLive:
+    """What the live mode needs, to be published.
+
+    ``target_px`` (width, height); ``arrays`` by name, uint8, uint16, float16 or float32, of 1 to 4 dimensions.
+    """
+
+    target_px: tuple[int, int]
+    arrays: Mapping[str, npt.NDArray[Any]]
+
+
 def write_bundle(
     path: Path,
     *,
@@ -46,6 +57,8 @@ def write_bundle(
     appearances: Iterable[NewAppearance],
     key: SigningKey | None = None,
     revision: int = 0,
+    schedule: Sequence[fmt.Hint] = (),
+    live: NewLive | None = None,
 ) -> fmt.Index:
     """Write a bundle atomically and return its index.
 
@@ -53,6 +66,7 @@ def write_bundle(
     ----------
     outputs : (name, width_px, height_px) of each output, in stage order
     appearances : taken one at a time, so that a long list need not be in memory at once
+    schedule : the playlist that the bundle suggests
     key : signs the bundle; None leaves it unsigned, and players refuse it unless told otherwise
 
     Raises BundleError for frames that do not fit the outputs and for names, thumbnails or metadata that the format
@@ -62,9 +76,10 @@ def write_bundle(
     written: list[fmt.Index] = []
 
     def write(file: BinaryIO) -> None:
-        file.write(bytes(fmt.ALIGNMENT))
+        file.write(bytes(fmt.FIRST_BLOB))
         parts = tuple(_write_appearance(file, layouts, appearance) for appearance in appearances)
-        index = fmt.Index(stage, calibration, created_unix_s, revision, layouts, parts)
+        kept = None if live is None else _write_live(file, live)
+        index = fmt.Index(stage, calibration, created_unix_s, revision, layouts, parts, tuple(schedule), kept)
         _finish(file, index, key)
         written.append(index)
 
@@ -138,6 +153,28 @@ def compress_image(frame: npt.NDArray[np.uint8], layout: fmt.OutputLayout) -> It
         delta = stripe.copy()
         np.subtract(stripe[1:], stripe[:-1], out=delta[1:])
         yield packer.compress(delta.tobytes())
+
+
+def _write_live(file: BinaryIO, live: NewLive) -> fmt.Live:
+    arrays = {}
+    for name, values in sorted(live.arrays.items()):
+        dtype = values.dtype.str.lstrip("<|")
+        if dtype not in fmt.LIVE_TYPES:
+            raise BundleError(
+                "bundle-live-unfit",
+                what=f"The array {name!r} of the live section has elements of type {values.dtype}.",
+                remedy=f"Give one of {', '.join(fmt.LIVE_TYPES)}, little-endian.",
+            )
+        arrays[name] = fmt.LiveArray(dtype, values.shape, _write_blob(file, _compressed_array(values)))
+    return fmt.Live(live.target_px, arrays)
+
+
+def _compressed_array(values: npt.NDArray[Any]) -> bytes:
+    """Whole numbers as differences to the row above, modulo their range; then zstd."""
+    delta = np.array(values, order="C")
+    if delta.dtype.kind == "u":
+        np.subtract(values[1:], values[:-1], out=delta[1:])
+    return zstandard.ZstdCompressor(level=3, write_checksum=False, write_content_size=True).compress(delta.tobytes())
 
 
 def _write_blob(file: BinaryIO, data: bytes) -> fmt.Blob:

@@ -21,7 +21,9 @@ from nacl.signing import SigningKey
 
 from controller.bundle.index import parse_index
 from controller.bundle.reader import Bundle
+from controller.bundle.writer import NewAppearance
 from controller.errors import BundleError
+from tests.controller.bundle.conftest import write
 
 Table = dict[str, Any]
 
@@ -38,12 +40,13 @@ def refused(path: Path, data: bytes, **how: Any) -> BundleError:
     return caught.value
 
 
-def sealed(path: Path, index: bytes, blobs: bytes = bytes(4096)) -> Path:
+def sealed(path: Path, index: bytes, blobs: bytes = bytes(4096), version: int = 2) -> Path:
     """An unsigned bundle with this index, hashes right: what someone with a text editor and time can make."""
     start = 4096 + len(blobs)
     head = struct.pack(
-        "<8sIIQQQ32s56x", b"VELBUNDL", 1, 0, start, len(index), start + len(index) + 128, hashlib.sha256(index).digest()
-    )
+        "<8sIIQQQ32s56x", b"VELBUNDL", version, 0, start, len(index), start + len(index) + 128,
+        hashlib.sha256(index).digest(),
+    )  # fmt: skip
     path.write_bytes(head.ljust(4096, b"\0") + blobs + index + bytes(128))
     return path
 
@@ -56,6 +59,7 @@ def small_index(blob: list[Any], **changes: Any) -> Table:
     output = {"name": "P1", "width_px": 4, "height_px": 3, "stripe_rows": 3}
     appearance = {"name": "a", "stripes": {"P1": [blob]}, "thumbnail": None, "metadata": {}}
     index = {"stage": "s", "calibration": "c", "created_unix_s": 0, "revision": 0}
+    index |= {"schedule": [["a", 1000, 0]], "live": None}
     return {**index, "outputs": [output], "appearances": [appearance], **changes}
 
 
@@ -118,7 +122,7 @@ def other_block(signed: Path, public: bytes) -> bytes:
 
 def test_a_newer_format_is_told_from_a_damaged_one(tmp_path: Path, unsigned: Path) -> None:
     data = bytearray(unsigned.read_bytes())
-    data[8] = 2
+    data[8] = 3
     assert refused(tmp_path / "new.vel", bytes(data), allow_unsigned=True).code == "bundle-version"
     assert refused(tmp_path / "zip.vel", b"PK\3\4" + bytes(500), allow_unsigned=True).code == "bundle-foreign"
 
@@ -131,6 +135,14 @@ GOOD = blob_of(PIXELS)
 
 def output(**changes: Any) -> Table:
     return {"outputs": [{"name": "P1", "width_px": 4, "height_px": 3, "stripe_rows": 3, **changes}]}
+
+
+def live(**changes: Any) -> Table:
+    return {"target_px": [4, 3], "arrays": {"gain": {"dtype": "u1", "shape": [36], "blob": GOOD, **changes}}}
+
+
+def many_arrays() -> Table:
+    return {f"a{number}": live()["arrays"]["gain"] for number in range(129)}
 
 
 HOSTILE: dict[str, Callable[[], bytes]] = {
@@ -149,6 +161,16 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "a stripe over the index": lambda: as_json(small_index([4096, 5000, GOOD[2], GOOD[3]])),
     "a stripe off its place": lambda: as_json(small_index([4097, 9, GOOD[2], GOOD[3]])),
     "a checksum of other length": lambda: as_json(small_index([4096, 9, GOOD[2] + "0", GOOD[3]])),
+    "a schedule of strangers": lambda: as_json(small_index(GOOD, schedule=[["b", 1, 0]])),
+    "a schedule that ends at once": lambda: as_json(small_index(GOOD, schedule=[["a", 0, 0]])),
+    "a fade longer than its picture": lambda: as_json(small_index(GOOD, schedule=[["a", 5, 6]])),
+    "a long schedule": lambda: as_json(small_index(GOOD, schedule=[["a", 1, 0]] * 5000)),
+    "a live array of objects": lambda: as_json(small_index(GOOD, live=live(dtype="O8"))),
+    "a live array of 4 TB": lambda: as_json(small_index(GOOD, live=live(shape=[16384, 16384, 16384]))),
+    "a live array without sides": lambda: as_json(small_index(GOOD, live=live(shape=[]))),
+    "a live array beyond the file": lambda: as_json(small_index(GOOD, live=live(blob=[2**40, 9, *GOOD[2:]]))),
+    "many live arrays": lambda: as_json(small_index(GOOD, live={"target_px": [4, 3], "arrays": many_arrays()})),
+    "a live target of no size": lambda: as_json(small_index(GOOD, live=live() | {"target_px": [0, 3]})),
     "an unknown key": lambda: as_json(small_index(GOOD, extra=1)),
     "a key twice": lambda: as_json(small_index(GOOD)).replace(b'"stage"', b'"stage":"x","stage"'),
     "a number without end": lambda: as_json(small_index(GOOD)).replace(b'"revision": 0', b'"revision": ' + b"9" * 9999),
@@ -169,6 +191,67 @@ def test_the_small_index_itself_is_sound(tmp_path: Path) -> None:
     with Bundle.open(path, allow_unsigned=True) as bundle:
         bundle.verify()
         assert not bundle.decode("a", "P1").any()
+
+
+def test_the_live_section_is_read_and_its_bombs_are_refused(tmp_path: Path) -> None:
+    path = sealed(tmp_path / "live.vel", as_json(small_index(GOOD, live=live())), PIXELS)
+    with Bundle.open(path, allow_unsigned=True) as bundle:
+        bundle.verify()
+        assert bundle.live_array("gain").shape == (36,)
+        with pytest.raises(BundleError, match="live mode"):
+            bundle.live_array("other")
+    path = sealed(tmp_path / "bomb.vel", as_json(small_index(GOOD, live=live(shape=[35]))), PIXELS)
+    with Bundle.open(path, allow_unsigned=True) as bundle, pytest.raises(BundleError, match="damaged"):
+        bundle.live_array("gain")
+
+
+def test_a_bundle_of_version_1_still_plays_and_keeps_its_own_rules(tmp_path: Path) -> None:
+    index = small_index(GOOD)
+    newer = as_json(index)
+    for key in ("schedule", "live"):
+        del index[key]
+    with Bundle.open(sealed(tmp_path / "old.vel", as_json(index), PIXELS, 1), allow_unsigned=True) as bundle:
+        bundle.verify()
+        assert (bundle.version, bundle.index.schedule, bundle.index.live) == (1, (), None)
+        assert not bundle.decode("a", "P1").any()
+    refused(tmp_path / "b.vel", sealed(tmp_path / "a.vel", as_json(index), PIXELS, 2).read_bytes(), allow_unsigned=True)
+    refused(tmp_path / "b.vel", sealed(tmp_path / "a.vel", newer, PIXELS, 1).read_bytes(), allow_unsigned=True)
+    shifted = small_index([4096 + 64, *GOOD[1:]])
+    blobs = bytes(64) + PIXELS
+    with Bundle.open(sealed(tmp_path / "new.vel", as_json(shifted), blobs), allow_unsigned=True) as bundle:
+        bundle.verify()
+    for key in ("schedule", "live"):
+        del shifted[key]
+    path = sealed(tmp_path / "a.vel", as_json(shifted), blobs, 1)
+    assert refused(tmp_path / "b.vel", path.read_bytes(), allow_unsigned=True).code == "bundle-damaged"
+
+
+def test_a_truncation_at_every_part_s_edge_is_refused_even_with_a_header_to_match(tmp_path: Path, signed: Path,
+                                                                                 key: SigningKey) -> None:  # fmt: skip
+    data, trusted = signed.read_bytes(), [bytes(key.verify_key)]
+    with Bundle.open(signed, trusted=trusted) as bundle:
+        blobs = [blob for part in bundle.index.appearances for found in part.stripes.values() for blob in found]
+    start, length = index_place(data)
+    edges = {0, 128, 4096, start, start + length, *(b.offset for b in blobs), *(b.offset + b.length for b in blobs)}
+    for edge in sorted(edges):
+        short = bytearray(data[:edge])
+        refused(tmp_path / "short.vel", bytes(short), trusted=trusted)
+        if edge >= 128:
+            struct.pack_into("<QQQ", short, 16, max(edge - length - 128, 128), length, edge)
+            refused(tmp_path / "short.vel", bytes(short), trusted=trusted)
+
+
+def test_parts_of_two_signed_bundles_do_not_make_a_third(tmp_path: Path, key: SigningKey,
+                                                        appearances: list[NewAppearance]) -> None:  # fmt: skip
+    one = write(tmp_path / "one.vel", appearances, key).read_bytes()
+    other = write(tmp_path / "other.vel", appearances[::-1], key).read_bytes()
+    assert len(one) == len(other)
+    start, length = index_place(one)
+    assert (start, length) == index_place(other)
+    cuts = [0, 128, start, start + length, len(one)]
+    for taken in range(1, 15):
+        parts = [(other if taken >> n & 1 else one)[cuts[n] : cuts[n + 1]] for n in range(4)]
+        refused(tmp_path / "mixed.vel", b"".join(parts), trusted=[bytes(key.verify_key)])
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -233,13 +316,24 @@ PLACES = [
     ["appearances", 0, "stripes", "P1", 0, 0],
     ["appearances", 0, "stripes", "P1", 0, 1],
     ["appearances", 0, "stripes", "P1", 0, 2],
+    ["schedule"],
+    ["schedule", 0],
+    ["schedule", 0, 1],
+    ["live"],
+    ["live", "target_px"],
+    ["live", "arrays"],
+    ["live", "arrays", "gain"],
+    ["live", "arrays", "gain", "dtype"],
+    ["live", "arrays", "gain", "shape"],
+    ["live", "arrays", "gain", "shape", 0],
+    ["live", "arrays", "gain", "blob"],
 ]
 
 
 @settings(max_examples=400, deadline=None)
 @given(st.sampled_from(PLACES), JSON)
 def test_any_value_at_any_place_is_either_in_bounds_or_refused(place: list[str | int], value: Any) -> None:
-    index: Any = small_index(GOOD)
+    index: Any = small_index(GOOD, live=live())
     inner = index
     for step in place[:-1]:
         inner = inner[step]
@@ -251,4 +345,6 @@ def test_any_value_at_any_place_is_either_in_bounds_or_refused(place: list[str |
     for appearance in parsed.appearances:
         for blobs in appearance.stripes.values():
             assert all(blob.offset >= 4096 and blob.offset + blob.length <= 8192 for blob in blobs)
+    if parsed.live is not None:
+        assert all(array.raw_bytes <= 2**28 for array in parsed.live.arrays.values())
     assert all(o.width_px * o.height_px <= 2**24 for o in parsed.outputs)

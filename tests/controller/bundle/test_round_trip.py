@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
@@ -15,8 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nacl.signing import SigningKey
 
+from controller.bundle.format import Hint
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewLive, write_bundle
 from controller.errors import BundleError
 
 Pictures = dict[str, dict[str, npt.NDArray[np.uint8]]]
@@ -73,7 +75,7 @@ def test_stripes_are_aligned_and_pixels_of_a_ramp_shrink(tmp_path: Path) -> None
     )
     blobs = index.appearances[0].stripes["P1"]
     assert len(blobs) == 6
-    assert all(blob.offset % 4096 == 0 for blob in blobs)
+    assert all(blob.offset % 64 == 0 for blob in blobs)
     assert sum(blob.length for blob in blobs) * 100 < ramp.nbytes
 
 
@@ -99,15 +101,57 @@ def test_any_size_is_decoded_exactly_on_one_thread_and_on_two(rows: int, columns
             np.testing.assert_array_equal(buffer, frame)
 
 
-def test_the_reader_in_the_documentation_sees_the_same_pixels(
-    signed: Path, pictures: Pictures, key: SigningKey
-) -> None:
+def test_schedule_and_live_arrays_are_read_back_exactly(tmp_path: Path) -> None:
+    random = np.random.default_rng(4)
+    arrays = {
+        "small": random.random((3, 256)).astype(np.float32),
+        "half": random.random((7, 5, 3)).astype(np.float16),
+        "wide": random.integers(0, 65536, (7, 5, 2), dtype=np.uint16),
+        "byte": np.arange(9, dtype=np.uint8),
+    }
+    frame = np.zeros((4, 5, 3), np.uint8)
+    path = tmp_path / "live.vel"
+    index = write_bundle(
+        path, stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 4)],
+        appearances=[NewAppearance("a", {"P1": frame}), NewAppearance("b", {"P1": frame})],
+        schedule=[Hint("b", 5000, 250), Hint("a", 1, 0)], live=NewLive((11, 13), arrays),
+    )  # fmt: skip
+    with Bundle.open(path, allow_unsigned=True) as bundle:
+        bundle.verify()
+        assert bundle.index == index
+        assert bundle.index.schedule == (Hint("b", 5000, 250), Hint("a", 1, 0))
+        assert bundle.index.live is not None
+        assert bundle.index.live.target_px == (11, 13)
+        for name, values in arrays.items():
+            found = bundle.live_array(name)
+            assert found.dtype == values.dtype
+            np.testing.assert_array_equal(found, values)
+    reader = documented_reader()
+    data = path.read_bytes()
+    found = reader["read_live_array"](data, json.loads(data[-128 - index_length(data) : -128]), "wide")
+    np.testing.assert_array_equal(found, arrays["wide"])
+    found = reader["read_live_array"](data, json.loads(data[-128 - index_length(data) : -128]), "half")
+    np.testing.assert_array_equal(found, arrays["half"])
+
+
+def index_length(data: bytes) -> int:
+    return int.from_bytes(data[24:32], "little")
+
+
+def documented_reader() -> dict[str, Any]:
     found = re.search(r"## A second reader.*?```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     assert found is not None
     assert len(found[1].splitlines()) <= 100
     assert "controller" not in found[1]
     reader: dict[str, Any] = {}
     exec(compile(found[1], str(DOCUMENT), "exec"), reader)
+    return reader
+
+
+def test_the_reader_in_the_documentation_sees_the_same_pixels(
+    signed: Path, pictures: Pictures, key: SigningKey
+) -> None:
+    reader = documented_reader()
     data, trusted = signed.read_bytes(), [bytes(key.verify_key)]
     index = reader["read_index"](data, trusted)
     assert index["stage"] == "demo"
