@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -131,26 +132,26 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
     stage = checked.stage
     context = OpenContext(stage=stage.folder, runtime=runtime_folder(stage.folder))
     with contextlib.ExitStack() as stack:
-        darkness = _darkness(checked, context, stack, deadline)
-        circuits = _circuits(checked, context, stack, deadline)
+        darkness = light_sensor(checked, context, stack, deadline)
+        circuits = mains_circuits(checked, context, stack, deadline)
         close_circuits(circuits, deadline=deadline)
         guards = []
         ledger = LampFile(stage.folder / LampFile.NAME)
         at_least = stage.tables.safety.at_least()
         for table, (driver, settings) in zip(stage.tables.projectors, checked.projectors, strict=True):
-            projector = cast("Projector", _device(table, driver, settings, context, deadline))
+            projector = cast("Projector", open_device(table, driver, settings, context, deadline))
             guard = LampGuard(table.name, projector, ledger, at_least=at_least)
             stack.callback(guard.close)
             guards.append(guard)
         driver, settings = checked.camera
-        camera = cast("Camera", _device(stage.tables.camera, driver, settings, context, deadline))
+        camera = cast("Camera", open_device(stage.tables.camera, driver, settings, context, deadline))
         stack.callback(camera.close)
         if checked.stage.tables.display.driver == "player":
             stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
-        display = cast("Display", _device(stage.tables.display, driver, settings, context, deadline))
+        display = cast("Display", open_device(stage.tables.display, driver, settings, context, deadline))
         stack.callback(display.close)
-        yield replace(_rig(stage, guards, camera, display), circuits=circuits, darkness=darkness)
+        yield replace(rig_of(stage, guards, camera, display), circuits=circuits, darkness=darkness)
 
 
 @contextlib.contextmanager
@@ -161,17 +162,17 @@ def technicians_panel(checked: Checked, *, deadline: Deadline) -> Iterator[Butto
         yield None
         return
     context = OpenContext(stage=checked.stage.folder)
-    panel = cast("ButtonPanel", _device(table, *checked.key_panel, context, deadline))
+    panel = cast("ButtonPanel", open_device(table, *checked.key_panel, context, deadline))
     with contextlib.closing(panel):
         yield panel
 
 
-def _circuits(
+def mains_circuits(
     checked: Checked, context: OpenContext, stack: contextlib.ExitStack, deadline: Deadline
 ) -> tuple[Circuit, ...]:
     circuits = []
     for table, (driver, settings) in zip(checked.stage.tables.relays, checked.relays, strict=True):
-        switch = cast("PowerSwitch", _device(table, driver, settings, context, deadline))
+        switch = cast("PowerSwitch", open_device(table, driver, settings, context, deadline))
         stack.callback(switch.close)
         circuits += [
             Circuit(f"{table.name} {mains.channel}", mains.channel, mains.feeds, table.boot_s, switch)
@@ -180,18 +181,18 @@ def _circuits(
     return tuple(circuits)
 
 
-def _darkness(
+def light_sensor(
     checked: Checked, context: OpenContext, stack: contextlib.ExitStack, deadline: Deadline
 ) -> Darkness | None:
     table = checked.stage.tables.light_sensor
     if table is None or checked.light_sensor is None:
         return None
-    sensor = cast("LightSensor", _device(table, *checked.light_sensor, context, deadline))
+    sensor = cast("LightSensor", open_device(table, *checked.light_sensor, context, deadline))
     stack.callback(sensor.close)
     return Darkness(sensor, table.most_lux)
 
 
-def _device(
+def open_device(
     table: OpenTable, driver: Driver, settings: Mapping[str, Any], context: OpenContext, deadline: Deadline
 ) -> object:
     """Open a device; what the driver finds wrong in its settings is a mistake in stage.toml, told with its line."""
@@ -206,25 +207,30 @@ def _device(
 
 def _player(stage: Stage, context: OpenContext, *, plays: bool) -> PlayerProcess:
     """The player of this stage; a context manager that ends it."""
+    assert context.runtime is not None
+    settings = player_settings(stage, context.runtime, plays=plays)
+    # A run that was killed leaves its player, which plays on by design; it still has our socket.
+    end_leftover(context.runtime)
+    return start_player(context.runtime, settings)
+
+
+def player_settings(stage: Stage, runtime: Path, *, plays: bool) -> PlayerSettings:
+    """What the stage's player is started with; ``plays``: with the installed bundle, if there is one."""
     table = stage.tables.display
     frames = None if table.frames is None else stage.path(table.frames)
     if frames is not None:
         frames.parent.mkdir(parents=True, exist_ok=True)
-    assert context.runtime is not None
     # Given as the link, so that a bundle that never shows a picture is given up (docs/bundle-format.md). Not to a
     # calibration, which must go on whatever is installed.
     bundle = stage.folder / "bundles" / CURRENT
-    settings = PlayerSettings(
+    return PlayerSettings(
         outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
         frames=frames,
         bundle=bundle if plays and bundle.is_symlink() else None,
-        trusted=_key_files(stage.tables.bundle.trusted_keys, context.runtime, "trusted"),
-        revoked=_key_files(stage.tables.bundle.revoked_keys, context.runtime, "revoked"),
+        trusted=_key_files(stage.tables.bundle.trusted_keys, runtime, "trusted"),
+        revoked=_key_files(stage.tables.bundle.revoked_keys, runtime, "revoked"),
         allow_unsigned=stage.tables.bundle.allow_unsigned,
     )
-    # A run that was killed leaves its player, which plays on by design; it still has our socket.
-    end_leftover(context.runtime)
-    return start_player(context.runtime, settings)
 
 
 def _key_files(keys: Sequence[str], folder: Path, name: str) -> list[Path]:
@@ -235,7 +241,7 @@ def _key_files(keys: Sequence[str], folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def _rig(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: Display) -> Rig:
+def rig_of(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: Display) -> Rig:
     sizes = {
         output.name: (output.width_px, output.height_px) for output in display.outputs(deadline=in_seconds(OPEN_S))
     }
@@ -262,6 +268,38 @@ def marker(name: str, title: str, *, enter: Event | None = None, leave: Event | 
     return Step(name, lambda _: (), title=title, weight=0.01, enter=enter, leave=leave, always=True)
 
 
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A stage whose lock, lamps and player somebody keeps, the kiosk; ``rig`` None for work that touches no device."""
+
+    folder: Path
+    rig: Rig | None
+
+
+_HELD: ContextVar[Held | None] = ContextVar("held", default=None)
+
+
+@contextlib.contextmanager
+def holding(held: Held) -> Iterator[None]:
+    """Inside, what runs on that stage (in this thread) uses the holder's devices and lock, and leaves its lamps lit."""
+    token = _HELD.set(held)
+    try:
+        yield
+    finally:
+        _HELD.reset(token)
+
+
+@contextlib.contextmanager
+def stage_lock(folder: Path) -> Iterator[None]:
+    """The lock of whoever works on the stage. Raises UsageError("already-running")."""
+    held = _HELD.get()
+    if held is not None and held.folder == folder:
+        yield
+        return
+    with exclusive(folder / LOCK, what_is_running="Velatura"):
+        yield
+
+
 MakeSteps = Callable[[Rig, Path], Sequence[Step]]
 """The steps of a run on the opened stage; the path is the run's folder."""
 
@@ -286,6 +324,9 @@ def run_on_stage(
     stage = checked.stage
     deadline = in_seconds(LONGEST_RUN_S, cancel)
     safety = stage.tables.safety
+    held = _HELD.get()
+    if held is not None and held.folder == stage.folder and held.rig is not None:
+        return _run_held(held.rig, make_steps, name=name, reporter=reporter, deadline=deadline, dark=dark)
     with (
         exclusive(stage.folder / LOCK, what_is_running="Velatura"),
         around or contextlib.nullcontext(),
@@ -298,6 +339,17 @@ def run_on_stage(
         steps = [*first, *power_steps(rig, power_up_s=safety.power_up_s), *make_steps(rig, journal.folder)]
         with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
             Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
+        return journal.folder
+
+
+def _run_held(
+    rig: Rig, make_steps: MakeSteps, *, name: str, reporter: Reporter, deadline: Deadline, dark: bool
+) -> Path:
+    """As ``run_on_stage`` with lamps that are lit already, and stay so; the state machine is the holder's."""
+    with Journal(unfinished_run(rig.stage, name)) as journal:
+        clear_unfinished_writes(journal.folder)
+        first = dark_before(rig.darkness) if dark else []
+        Runner([*first, *make_steps(rig, journal.folder)], journal, reporter=reporter).run(name, deadline=deadline)
         return journal.folder
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.app import LOCK, LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage
+from controller.app import LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage, stage_lock
 from controller.bundle.install import current
 from controller.bundle.signing import Trust, load_signing_key
 from controller.config import Stage
@@ -36,7 +36,6 @@ from controller.session.rig import Rig
 from controller.session.runner import Runner, Step
 from controller.session.solving import Calibrated, SolveOptions, base_choice, solve_steps
 from controller.session.wishes import wishes_of
-from controller.storage import exclusive
 from hal.deadline import in_seconds
 
 KEY_FILE = "keys/stage.key"
@@ -112,7 +111,7 @@ def make_appearances(
     chosen = None if base is None else base_choice(base)
     checked = check_stage(stage)
     folder = checked.stage.folder
-    with exclusive(folder / LOCK, what_is_running="Velatura"):
+    with stage_lock(folder):
         run = usable_calibration(checked, reporter, accept_grade=accept_grade)
         calibrated = Calibrated(run, checked.names)
         wishes = wishes_of(checked.stage, calibrated, names) if names or not scenes else []
