@@ -162,6 +162,13 @@ class SolveTable(Table):
         description='the base image: "minimum" (at each pixel the darkest white image), "white" (even light), or '
         '"high-pass" (the fine detail of each target, with a solve for each)',
     )
+    adapt: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="how much targets are bent into reach where light is lacking, keeping local contrast, 0 (cut off) "
+        "to 1",
+    )
 
 
 class MainsTable(Table):

@@ -62,7 +62,7 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     wishes = wishes_of(stage, calibrated)
     names = [wish.name for wish in wishes]
     table = stage.tables.solve
-    options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base)
+    options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
     after = [name for projector in checked.names for name in (f"radiometry-{projector}", f"pixels-{projector}")]
     longest_s = stage.tables.capture.longest_exposure_s
     return [

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
-
 from controller.arrays import ByteImage, FloatImage, Mask, load_arrays, save_arrays
 from controller.calibrate.values import Calibration
 from controller.capture.patterns import Pattern, PatternKind, plan_patterns
@@ -19,23 +17,14 @@ from controller.errors import UsageError, WorkError
 from controller.session import costs
 from controller.session.calibrating import read_calibration
 from controller.session.edging import edged
+from controller.session.progress import Level
 from controller.session.runner import Context, Step
-from controller.solve.appearance import (
-    Base,
-    BaseChoice,
-    Mode,
-    base_image,
-    high_pass_base,
-    make_appearance,
-    prepare_base,
-    solve_base,
-)
+from controller.solve.appearance import Base, BaseChoice, base_image, prepare_base, solve_base
 from controller.solve.bounded import Solution
 from controller.solve.dither import to_device
 from controller.solve.drive import Drive
-from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
+from controller.solve.request import Answer, SolveOptions, answer
 from controller.solve.targets import Target
-from controller.solve.weights import appearance_weights
 from controller.storage import write_atomically
 from controller.transport import LightTransport
 
@@ -54,22 +43,6 @@ class Wish:
     inputs: dict[str, str]
     prepare: Callable[[Context], Sequence[Path]] | None = None
     prepare_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class SolveOptions:
-    """``share`` of the object's pixels that each target's exposure makes reachable; ``smoothness`` of eq. 3.
-
-    ``base``: the base image; with "high-pass" each appearance solves one of its own.
-    """
-
-    share: float
-    smoothness: float
-    mode: Mode = "auto"
-    base: BaseChoice = "minimum"
-
-    def inputs(self) -> dict[str, str]:
-        return {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode, "base": self.base}
 
 
 def base_choice(name: str) -> BaseChoice:
@@ -138,11 +111,18 @@ class Calibrated:
 
 
 def solve_steps(
-    calibrated: Calibrated, wishes: Sequence[Wish], options: SolveOptions, after: Sequence[str], scale: float = 1.0
+    calibrated: Calibrated,
+    wishes: Sequence[Wish],
+    options: SolveOptions,
+    after: Sequence[str],
+    scale: float = 1.0,
+    *,
+    answering: Answering | None = None,
 ) -> list[Step]:
     """Solve the base, then each wish.
 
-    ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``session.costs``.
+    ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``session.costs``; ``answering``
+    makes the appearances elsewhere.
     """
     steps = [
         Step(
@@ -171,7 +151,7 @@ def solve_steps(
         steps.append(
             Step(
                 f"appearance-{wish.name}",
-                partial(_solve_appearance, calibrated, wish, options),
+                partial(_solve_appearance, calibrated, wish, options, answering),
                 inputs={**options.inputs(), **wish.inputs},
                 after=before,
                 title=f"Solving {wish.title}",
@@ -211,47 +191,38 @@ def _watched(context: Context) -> Callable[[int, float], None]:
     return progress
 
 
-def _solve_appearance(calibrated: Calibrated, wish: Wish, options: SolveOptions, context: Context) -> Sequence[Path]:
-    began_s = time.perf_counter()
-    calibration, transport = calibrated.calibration, calibrated.transport
-    black, drive = calibration.black, calibrated.drive
-    asked = wish.target()
-    picture = asked.image
-    exposure = choose_exposure(transport, picture, black, share=options.share, drive=drive)
-    wanted = np.float32(exposure) * picture
-    target = target_radiance(picture, black, exposure)
-    possible = feasibility(transport, wanted, black, drive=drive)
-    solve_began_s = time.perf_counter()
-    base = calibrated.base
-    if options.base == "high-pass":
-        image = high_pass_base(transport, base.image, target, black)
-        base = solve_base(transport, image, black, smoothness=options.smoothness, progress=_watched(context))
-    made = make_appearance(
-        transport,
-        base,
-        target,
-        black,
-        mode=options.mode,
-        smoothness=options.smoothness,
-        weights=appearance_weights(target, possible.reachable, exposure),
+Answering = Callable[[Wish, SolveOptions, Context], Answer]
+"""Makes an appearance, here or elsewhere."""
+
+
+def _answer_here(calibrated: Calibrated, wish: Wish, options: SolveOptions, context: Context) -> Answer:
+    return answer(
+        calibrated.transport,
+        calibrated.base,
+        calibrated.calibration.black,
+        wish.target(),
+        options,
+        drive=calibrated.drive,
         progress=_watched(context),
     )
-    seconds = time.perf_counter() - solve_began_s
-    device = device_frames(calibration, made.frames)
+
+
+def _solve_appearance(
+    calibrated: Calibrated, wish: Wish, options: SolveOptions, answering: Answering | None, context: Context
+) -> Sequence[Path]:
+    began_s = time.perf_counter()
+    made = (answering or partial(_answer_here, calibrated))(wish, options, context)
+    device = device_frames(calibrated.calibration, made.frames)
     arrays = context.folder / f"appearance-{wish.name}.npz"
     linear = {f"linear-{name}": values for name, values in zip(calibrated.projectors, made.frames, strict=True)}
-    save_arrays(arrays, {**device, **linear, "target": wanted, "reachable": possible.reachable & asked.mask})
+    save_arrays(arrays, {**device, **linear, "target": made.target, "reachable": made.reachable})
+    if made.figures["advice"] is not None:
+        context.reporter.say(f"{wish.title}: {made.figures['advice']}", Level.WARNING)
     figures = {
         "name": wish.name,
         "title": wish.title,
-        "mode": made.mode,
-        "exposure": exposure,
-        "seconds": seconds,
+        **made.figures,
         "seconds_with_target": time.perf_counter() - began_s,
-        "reachable_share": possible.share,
-        "fine_detail": made.fine_detail,
-        "iterations": 0 if made.solution is None else made.solution.iterations,
-        "kkt": None if made.solution is None else made.solution.kkt,
     }
     path = context.folder / f"appearance-{wish.name}.json"
     write_atomically(path, json.dumps(figures, indent=1).encode())

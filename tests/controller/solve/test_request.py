@@ -1,0 +1,70 @@
+"""An appearance from picture to frames: what is told of it, and what is advised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.arrays import FloatImage
+from controller.solve.appearance import Base, Mode, base_image, solve_base
+from controller.solve.request import SolveOptions, answer
+from controller.solve.targets_values import Target
+from controller.transport import LightTransport
+from tests.controller.solve.conftest import plane_calibration
+
+STAGE = plane_calibration(projector=(40, 52), camera=(120, 160), spill=0.0)
+OPTIONS = SolveOptions(share=0.9, smoothness=0.001)
+
+
+@pytest.fixture(scope="module")
+def transport() -> LightTransport:
+    return LightTransport.build(STAGE)
+
+
+@pytest.fixture(scope="module")
+def base(transport: LightTransport) -> Base:
+    return solve_base(transport, base_image(STAGE), STAGE.black)
+
+
+def picture(pitch_px: float) -> Target:
+    y, x = np.mgrid[0:120, 0:160].astype(np.float32)
+    wave: FloatImage = 0.5 + 0.3 * np.sin(2 * np.pi * x / pitch_px) * np.sin(2 * np.pi * y / pitch_px)
+    mask = np.ones((120, 160), np.bool_)
+    mask[:10] = False
+    return Target(np.repeat(wave[..., None], 3, axis=2).astype(np.float32), mask)
+
+
+@pytest.mark.parametrize(
+    ("pitch_px", "mode", "made", "advised"),
+    [
+        (40, "auto", "scale", False),
+        (5, "auto", "full", False),
+        (5, "scale", "scale", True),
+        (40, "scale", "scale", False),
+        (40, "full", "full", False),
+    ],
+)
+def test_fine_detail_is_solved_in_full_or_advised_to_be(
+    transport: LightTransport, base: Base, pitch_px: float, mode: Mode, made: str, advised: bool
+) -> None:
+    found = answer(transport, base, STAGE.black, picture(pitch_px), replace(OPTIONS, mode=mode))
+    assert found.figures["mode"] == made
+    assert (found.figures["advice"] is not None) is advised
+
+
+def test_reachable_pixels_are_those_where_the_target_says_something(transport: LightTransport, base: Base) -> None:
+    found = answer(transport, base, STAGE.black, picture(40), OPTIONS)
+    assert not found.reachable[:10].any()
+    assert found.reachable[10:].mean() > 0.85
+
+
+def test_adaptation_brings_more_pixels_into_reach_and_tells_the_contrast(transport: LightTransport, base: Base) -> None:
+    options = replace(OPTIONS, share=0.4, adapt=1.0)
+    figures = answer(transport, base, STAGE.black, picture(30), options).figures
+    values = {key: value for key, value in figures.items() if isinstance(value, float)}
+    assert values["reachable_share"] < 0.6 < 0.99 < values["adapted_share"]
+    assert values["contrast_kept"] > values["contrast_kept_cut_off"]
+    assert OPTIONS.inputs() != options.inputs()
+    assert "adapt" not in OPTIONS.inputs(), "results of stages that do not adapt stay valid"
