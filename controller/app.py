@@ -146,7 +146,8 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
         driver, settings = checked.camera
         camera = cast("Camera", open_device(stage.tables.camera, driver, settings, context, deadline))
         stack.callback(camera.close)
-        if checked.stage.tables.display.driver == "player":
+        # A stage that names the player's socket has a player already, for instance systemd's.
+        if checked.stage.tables.display.driver == "player" and "socket" not in checked.display[1]:
             stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
         display = cast("Display", open_device(stage.tables.display, driver, settings, context, deadline))

@@ -19,6 +19,7 @@ from controller.play.frames import FrameFile, OutputSize, parse_outputs, parse_w
 from controller.play.loop import Player
 from controller.play.outputs import MemoryOutput, Output
 from controller.play.protocol import MAX_RATE_HZ
+from controller.play.resume import SUFFIX, Kept
 from controller.play.server import Server
 
 
@@ -45,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--trusted", type=Path, action="append", default=[], help="public key file; may be repeated")
     parser.add_argument("--revoked", type=Path, action="append", default=[], help="key file never to be trusted")
     parser.add_argument("--allow-unsigned", action="store_true", help="play bundles without a signature, too")
+    parser.add_argument("--resume", action="store_true", help="go on with what was playing when it was ended or killed")
     parser.add_argument("--rate", type=float, default=60.0, help="pictures change at multiples of 1/RATE seconds")
     return parser
 
@@ -72,7 +74,9 @@ def _run(options: argparse.Namespace) -> int:
         if options.bundle is not None:
             player.load_bundle(options.bundle if start is None else start.file)
         broken = _end_on_signals(player)
-        player.run(Commands(player, server, inbox).serve)
+        playing = options.socket.with_name(options.socket.name + SUFFIX) if options.resume else None
+        commands = Commands(player, server, inbox, Kept(playing))
+        player.run(commands.serve, first=commands.resume)
         if start is not None and not broken.is_set() and not player.skipped:
             start.ended()
     return 1 if broken.is_set() else 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from functools import partial
@@ -14,14 +15,15 @@ from controller.play.frames import FrameFile, FrameSet
 from controller.play.identification import identification
 from controller.play.loop import Player, Presented
 from controller.play.playlist import Playlist
+from controller.play.resume import Kept
 from controller.play.server import Client, Server
 
 
 class Commands:
     """Between the socket, the inbox and the player; no request, however wrong, raises out of ``serve``."""
 
-    def __init__(self, player: Player, server: Server, inbox: FrameFile) -> None:
-        self._player, self._server, self._inbox = player, server, inbox
+    def __init__(self, player: Player, server: Server, inbox: FrameFile, kept: Kept) -> None:
+        self._player, self._server, self._inbox, self._kept = player, server, inbox, kept
         # One may be shown, and be what the next picture fades from, while the other is read into.
         self._patterns = [FrameSet.black(player.sizes), FrameSet.black(player.sizes)]
 
@@ -30,11 +32,20 @@ class Commands:
         for client, line in self._server.poll(timeout_s):
             self._handle(client, line)
 
+    def resume(self) -> None:
+        """Go on with what is kept, if it can still be played."""
+        request = self._kept.request()
+        if request is not None:
+            with contextlib.suppress(VelaturaError):
+                self._do(request, lambda _: None)
+
     def _handle(self, client: Client, line: bytes) -> None:
         ticket = None
         try:
             ticket, request = protocol.parse_request(line)
             values = self._do(request, partial(self._tell, client, ticket))
+            if not isinstance(request, protocol.Hello | protocol.Status | protocol.LoadBundle):
+                self._kept.accepted(request, line)
         except protocol.RequestWrong as error:
             self._server.send(client, protocol.error_line(error.ticket, error))
         except VelaturaError as error:

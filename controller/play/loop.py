@@ -101,11 +101,12 @@ class Player:
         self._appearance: str | None = None
         self._ending = False
 
-    def run(self, serve: Callable[[float], None]) -> None:
-        """Show black, serve until ``end`` is called, and leave black."""
+    def run(self, serve: Callable[[float], None], *, first: Callable[[], None] = lambda: None) -> None:
+        """Show black, do what is to be done ``first``, serve until ``end`` is called, and leave black."""
         self.stop(None)
         self._present_if_due(wait=True)
         self._notifier.ready()
+        first()
         while not self._ending:
             serve(self._patience_s())
             self._output.pump()

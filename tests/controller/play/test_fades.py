@@ -93,7 +93,7 @@ def test_a_fade_that_is_superseded_goes_on_from_where_it_was(wire: Wire, outputs
 def test_a_sequence_keeps_its_times_with_fades_in_them(wire: Wire, folder: Path, outputs: Outputs) -> None:
     shown = Frames(folder / "out.frame")
     first = wire.ask("sequence", items=[["1", 0.3, 0.2], ["2", 0.4, 0.1], ["3", 0.3, 0.3]], repeat=1)
-    whole = {}
+    whole: dict[str, float] = {}
     ends = first["presented_at"] + 3
     while "3" not in whole and time.monotonic() < ends:
         now, at_s = shown.read(), shown.presented_at

@@ -88,6 +88,32 @@ def test_a_killed_player_is_restarted_over_its_stale_socket_and_readers_see_it_g
     assert same(shown.read(), noise(outputs, 2)), "a reader that had the file mapped sees the new player"
 
 
+def test_a_killed_player_goes_on_with_what_it_played(
+    start: Start, bundle: Path, outputs: Outputs, tmp_path: Path
+) -> None:
+    player = start(bundle=bundle, allow_unsigned=True, resume=True)
+    with Wire(player.socket) as wire:
+        wire.ask("sequence", items=[["4", 60], ["5", 60]])
+    os.kill(player.pid, signal.SIGKILL)
+    began = time.monotonic()
+    player.restart()
+    shown = Frames(tmp_path / "out.frame")
+    while not same(shown.read(), noise(outputs, 4)):
+        assert time.monotonic() < began + 5
+    with Wire(player.socket) as wire:
+        wire.ask("stop")
+    player.restart()
+    with Wire(player.socket) as wire:
+        assert wire.ask("status")["showing"] == "black"
+
+
+@pytest.mark.parametrize("kept", [b"", b"{", b'{"op":"quit"}', b'{"op":"play","appearance":"gone"}'])
+def test_what_can_not_be_gone_on_with_is_left(start: Start, bundle: Path, tmp_path: Path, kept: bytes) -> None:
+    (tmp_path / "player.sock.playing").write_bytes(kept)
+    with Wire(start(bundle=bundle, allow_unsigned=True, resume=True).socket) as wire:
+        assert wire.ask("status")["showing"] == "black"
+
+
 def test_a_hung_player_is_restarted(start: Start) -> None:
     player = start()
     os.kill(player.pid, signal.SIGSTOP)
