@@ -27,7 +27,7 @@ LONGEST_PASSWORD: Final = 200
 
 NAME: Final = r"^[a-z][a-z0-9._-]{0,31}$"
 FIRST_ACCOUNT: Final = "technician"
-TOKEN_PREFIX: Final = "velatura_"
+TOKEN_PREFIX: Final = "velatura_"  # noqa: S105 - shows people what the token is for
 
 # No letter or digit that is mistaken for another when it is read from a wall.
 _READABLE: Final = "abcdefghkmnpqrstuvwxyz23456789"
@@ -169,7 +169,9 @@ class Accounts:
         with self._lock:
             if name in self._tokens:
                 raise UsageError(
-                    "token-exists", what=f"There is a token '{name}' already.", remedy="Remove it, or choose another name."
+                    "token-exists",
+                    what=f"There is a token '{name}' already.",
+                    remedy="Remove it, or choose another name.",
                 )
             token = TOKEN_PREFIX + secrets.token_urlsafe(32)
             self._tokens[name] = Token(name, role, _digest(token), self._clock())

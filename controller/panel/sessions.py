@@ -60,8 +60,8 @@ class Sessions:
             self._write()
         return secret, session
 
-    def get(self, secret: str) -> Session | None:
-        """The living session of this cookie, which counts as seen now."""
+    def get(self, secret: str, *, touch: bool = True) -> Session | None:
+        """The living session of this cookie, which with ``touch`` counts as seen now."""
         now, digest = self._clock(), _digest(secret)
         with self._lock:
             session = self._sessions.get(digest)
@@ -70,7 +70,8 @@ class Sessions:
             if now - session.began_unix_s > LONGEST_S or now - session.seen_unix_s > IDLE_S:
                 del self._sessions[digest]
                 return None
-            session.seen_unix_s = now
+            if touch:
+                session.seen_unix_s = now
             return session
 
     def end(self, secret: str) -> None:

@@ -1,0 +1,174 @@
+"""The API: the table of operations as JSON with tokens, its OpenAPI document, and the figures for Prometheus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_1_0_0
+from prometheus_client.registry import Collector
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+
+from controller.panel import answers
+from controller.panel.accounts import Role
+from controller.panel.context import Panel
+from controller.panel.fields import object_schema
+from controller.panel.operations import OPERATIONS, Operation
+from controller.panel.visitors import Endpoint, Entry, Visitor
+from controller.session.machine import State
+
+PREFIX: Final = "/api/v1"
+_ERROR: Final = {"$ref": "#/components/responses/Error"}
+
+
+def entries(panel: Panel) -> list[Entry]:
+    """All routes for machines."""
+    table = [Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op)) for op in OPERATIONS]
+    table.append(Entry("GET", PREFIX + "/openapi.json", "token", Role.VIEWER, _document))
+    table.append(Entry("GET", "/metrics", "token", Role.VIEWER, _metrics(panel)))
+    return table
+
+
+def body_limits(panel: Panel) -> dict[str, int]:
+    """Bytes that the uploads take."""
+    images, restore = panel.options.uploads.most_bytes, panel.options.most_restore_bytes
+    return {
+        PREFIX + "/targets": images,
+        PREFIX + "/restore": restore,
+        "/do/upload-target": images + 4096,
+        "/do/restore": restore + 4096,
+    }
+
+
+def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
+    async def answer(request: Request, _: Visitor) -> Response:
+        uploaded = None
+        try:
+            values = answers.scalar_values(operation, request)
+            if operation.upload is not None:
+                uploaded = await answers.body_file(request, panel.options.folder / "incoming")
+                values[operation.upload.name] = uploaded
+            elif operation.changes:
+                values |= await answers.json_values(operation, request)
+            return answers.response(await answers.run(panel, operation, values))
+        except answers.FAILURES as error:
+            return answers.failure(error)
+        finally:
+            if uploaded is not None:
+                uploaded.unlink(missing_ok=True)
+
+    return answer
+
+
+async def _document(_: Request, __: Visitor) -> Response:
+    return JSONResponse(document())
+
+
+def document() -> dict[str, Any]:
+    """The OpenAPI 3.1 document, made from the same table as the routes."""
+    paths: dict[str, dict[str, Any]] = {}
+    for operation in OPERATIONS:
+        paths.setdefault(operation.path, {})[operation.method.lower()] = _described(operation)
+    error = object_schema(()) | {
+        "properties": {key: {"type": "string"} for key in ("code", "what", "remedy")},
+        "required": ["code", "what", "remedy"],
+    }
+    return {
+        "openapi": "3.1.0",
+        "info": {
+            "title": "Velatura",
+            "version": "1",
+            "description": "Everything that the panel of a kiosk shows and does. Tokens are made on its page of accounts.",
+        },
+        "servers": [{"url": PREFIX}],
+        "security": [{"token": []}],
+        "paths": paths,
+        "components": {
+            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
+            "responses": {
+                "Error": {
+                    "description": "What happened, and what to do",
+                    "content": {"application/json": {"schema": error}},
+                },
+                "Plain": {"description": "Refused before it was read", "content": {"text/plain": {}}},
+            },
+        },
+    }
+
+
+def _described(operation: Operation) -> dict[str, Any]:
+    content: dict[str, Any] = {operation.media: {"schema": {}}}
+    if operation.media == "image/png":
+        content["image/jpeg"] = {}
+    described: dict[str, Any] = {
+        "operationId": operation.name,
+        "summary": operation.about,
+        "description": f"Needs the role {operation.role.name.lower()} or above.",
+        "responses": {
+            "200": {"description": "Done", "content": content},
+            **dict.fromkeys(("401", "403", "404", "409", "422", "429", "502"), _ERROR),
+            "413": {"$ref": "#/components/responses/Plain"},
+        },
+    }
+    scalars = [field for field in operation.fields if field.where != "body"]
+    if scalars:
+        described["parameters"] = [
+            {"name": f.name, "in": f.where, "required": f.required or f.where == "path", "schema": f.schema()}
+            for f in scalars
+        ]
+    body = [field for field in operation.fields if field.where == "body"]
+    if operation.upload is not None:
+        described["requestBody"] = {"required": True, "content": {"application/octet-stream": {}}}
+    elif body:
+        described["requestBody"] = {"required": True, "content": {"application/json": {"schema": object_schema(body)}}}
+    return described
+
+
+class KioskFigures(Collector):
+    """The kiosk's state as Prometheus has it, read when it is asked for."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+
+    def collect(self) -> Iterator[Metric]:
+        now = self._panel.kiosk.snapshot()
+        state = GaugeMetricFamily("velatura_state", "1 for the present state", labels=["state"])
+        for possible in State:
+            state.add_metric([possible.value], float(now.state == possible.value))
+        yield state
+        playing = InfoMetricFamily("velatura_playing", "What is on the projectors")
+        playing.add_metric([], {"appearance": now.playing})
+        yield playing
+        problems = GaugeMetricFamily(
+            "velatura_device_problem", "1 while a device has a problem", labels=["device", "kind"]
+        )
+        for device in now.devices:
+            problems.add_metric([device.name, device.kind], float(device.problem is not None))
+        yield problems
+        hours = GaugeMetricFamily("velatura_lamp_hours", "Hours that a lamp was lit", labels=["projector"])
+        strikes = GaugeMetricFamily("velatura_lamp_strikes", "How often a lamp was struck", labels=["projector"])
+        for lamp in now.lamps:
+            hours.add_metric([lamp.projector], lamp.hours)
+            strikes.add_metric([lamp.projector], float(lamp.strikes))
+        yield hours
+        yield strikes
+        done = sum(step.done for step in now.job.steps) / len(now.job.steps) if now.job and now.job.steps else 0.0
+        yield GaugeMetricFamily(
+            "velatura_job_running", "1 while a job runs", float(now.job is not None and not now.job.ended)
+        )
+        yield GaugeMetricFamily("velatura_job_done_ratio", "Mean share done of the job's steps", done)
+        yield GaugeMetricFamily("velatura_open_panels", "Panels that follow live", float(self._panel.hub.listening))
+
+
+def _metrics(panel: Panel) -> Endpoint:
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(KioskFigures(panel))
+
+    async def answer(_: Request, __: Visitor) -> Response:
+        text = await panel.ask(lambda: generate_latest(registry))
+        return Response(text, media_type=CONTENT_TYPE_PLAIN_1_0_0)
+
+    return answer

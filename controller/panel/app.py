@@ -1,0 +1,130 @@
+"""The panel as one Starlette application: a table of routes, and nothing outside it."""
+
+from __future__ import annotations
+
+import contextlib
+import mimetypes
+from collections.abc import AsyncIterator, Callable
+from importlib import resources
+from typing import Final
+
+import anyio
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route
+
+from controller.panel import api
+from controller.panel.accounts import Accounts
+from controller.panel.context import Panel, PanelOptions
+from controller.panel.drawing import Drawing
+from controller.panel.entrance import Entrance
+from controller.panel.forms import Forms
+from controller.panel.guard import BodyTooLarge, Guard
+from controller.panel.kiosk import Kiosk
+from controller.panel.live import Hub
+from controller.panel.pages import Pages
+from controller.panel.sessions import Sessions
+from controller.panel.setup import Setup
+from controller.panel.uploads import Targets
+from controller.panel.visitors import Endpoint, Entry, Visitor, guarded
+
+STATIC: Final = ("style.css", "panel.js", "icon.svg")
+
+
+def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starlette:
+    """The panel of ``kiosk``, ready to be served.
+
+    ``accounts.first_start()`` belongs to the caller, who shows the one-time password where technicians look. The table of
+    routes is at ``.state.entries``, the panel's parts at ``.state.panel``.
+    """
+    options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    drawing = Drawing()
+
+    def draw() -> dict[str, str]:
+        drawing.use_zone(kiosk.schedule().time_zone)
+        return drawing.parts(kiosk.snapshot(), list(kiosk.events()))
+
+    panel = Panel(
+        kiosk=kiosk,
+        accounts=accounts,
+        options=options,
+        sessions=Sessions(options.folder / "sessions.json"),
+        targets=Targets(options.folder / "targets", options.uploads),
+        hub=Hub(draw, frames_per_s=options.frames_per_s, most=options.most_open_panels),
+    )
+    drawing.use_zone(kiosk.schedule().time_zone)
+    pages = Pages(panel, drawing)
+    table = [
+        *pages.entries(),
+        *Forms(panel, pages).entries(),
+        *Entrance(panel, drawing, pages).entries(),
+        *Setup(panel, pages).entries(),
+        *api.entries(panel),
+        *(Entry("GET", f"/static/{name}", "public", None, _static(name)) for name in STATIC),
+    ]
+    guard = Middleware(Guard, hosts=options.hosts, body_limits=api.body_limits(panel), tls=options.tls)
+    app = Starlette(
+        routes=_routes(panel, table),
+        middleware=[guard],
+        exception_handlers={BodyTooLarge: _too_large, HTTPException: _http_problem},
+        lifespan=_lifespan(panel),
+    )
+    app.state.entries, app.state.panel = table, panel
+    return app
+
+
+def _routes(panel: Panel, table: list[Entry]) -> list[Route]:
+    """One route a path, so that a wrong method is answered with those that there are. Longer paths do not hide behind names."""
+    by_path: dict[str, dict[str, Entry]] = {}
+    for entry in table:
+        if by_path.setdefault(entry.path, {}).setdefault(entry.method, entry) is not entry:
+            raise ValueError(f"{entry.method} {entry.path} stands twice in the table of routes")
+    return [_route(panel, path, entries) for path, entries in by_path.items()]
+
+
+def _route(panel: Panel, path: str, entries: dict[str, Entry]) -> Route:
+    async def answer(request: Request) -> Response:
+        method = "GET" if request.method == "HEAD" else request.method
+        return await guarded(panel, entries[method], request)
+
+    return Route(path, answer, methods=list(entries))
+
+
+def _lifespan(panel: Panel) -> Callable[[Starlette], contextlib.AbstractAsyncContextManager[None]]:
+    @contextlib.asynccontextmanager
+    async def living(_: Starlette) -> AsyncIterator[None]:
+        unsubscribe = panel.kiosk.subscribe(panel.hub.changed)
+        try:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(panel.hub.run)
+                yield
+                tasks.cancel_scope.cancel()
+        finally:
+            unsubscribe()
+
+    return living
+
+
+def _static(name: str) -> Endpoint:
+    content = resources.files("controller.panel").joinpath("static", name).read_bytes()
+    media_type = mimetypes.guess_type(name)[0]
+
+    async def answer(_: Request, __: Visitor) -> Response:
+        return Response(content, media_type=media_type, headers={"cache-control": "no-cache"})
+
+    return answer
+
+
+async def _too_large(_: Request, __: Exception) -> Response:
+    return PlainTextResponse("Too large.", 413, headers={"connection": "close"})
+
+
+async def _http_problem(request: Request, error: Exception) -> Response:
+    """An address that is not in the table: back to the front for people, a plain refusal for machines."""
+    assert isinstance(error, HTTPException)
+    if error.status_code == 404 and request.method == "GET" and "text/html" in request.headers.get("accept", ""):
+        return RedirectResponse("/", 303)
+    return PlainTextResponse(error.detail, error.status_code, headers=error.headers)

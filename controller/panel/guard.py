@@ -1,0 +1,88 @@
+"""What stands before every route: names we answer to, size of bodies, headers of every answer."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+SMALL_BODY: Final = 2 << 20
+"""Bytes of a form or JSON body; uploads have limits of their own."""
+
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+HEADERS: Final = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    # "no-referrer" would also blank the Origin that changes are checked by.
+    "referrer-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=()",
+}
+
+
+class BodyTooLarge(Exception):
+    """More bytes came than this route takes."""
+
+
+class Guard:
+    """Wraps the panel. ``hosts`` without port; ``body_limits`` bytes by path, for the paths that take uploads."""
+
+    def __init__(self, app: ASGIApp, *, hosts: tuple[str, ...], body_limits: dict[str, int], tls: bool) -> None:
+        self._app, self._hosts, self._limits = app, frozenset(host.lower() for host in hosts), body_limits
+        self._headers = {**HEADERS, "strict-transport-security": "max-age=31536000"} if tls else HEADERS
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in self._headers.items():
+                    headers.setdefault(name, value)
+                headers.setdefault("cache-control", "no-store")
+            await send(message)
+
+        refusal = self._refusal(scope)
+        if refusal is not None:
+            await refusal(scope, receive, send_with_headers)
+            return
+        await self._app(scope, _limited(receive, self._limit(scope)), send_with_headers)
+
+    def _limit(self, scope: Scope) -> int:
+        return self._limits.get(scope["path"], SMALL_BODY)
+
+    def _refusal(self, scope: Scope) -> PlainTextResponse | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host", "").lower()
+        name = host if host.endswith("]") else host.rpartition(":")[0] or host
+        if name not in self._hosts:
+            # A page of another name that resolves to this machine must not reach it (DNS rebinding).
+            return PlainTextResponse("This machine does not answer to that name.", 421)
+        length = headers.get("content-length", "0")
+        if not length.isascii() or not length.isdigit() or int(length[:18]) > self._limit(scope):
+            return PlainTextResponse("Too large.", 413, headers={"connection": "close"})
+        return None
+
+
+def _limited(receive: Receive, most: int) -> Receive:
+    """``receive``, which raises BodyTooLarge once more than ``most`` bytes came, whatever was announced."""
+    came = 0
+
+    async def counted() -> Message:
+        nonlocal came
+        message = await receive()
+        came += len(message.get("body", b""))
+        if came > most:
+            raise BodyTooLarge
+        return message
+
+    return counted

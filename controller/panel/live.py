@@ -1,0 +1,98 @@
+"""Server-sent events: every change is drawn once, whoever many panels are open."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable
+from typing import Final
+
+import anyio
+
+KEEP_ALIVE_S: Final = 15.0
+QUEUED: Final = 8
+
+Draw = Callable[[], dict[str, str]]
+
+
+class Hub:
+    """Draws the live parts after a change, at most ``frames_per_s`` times a second, and hands them to all open panels.
+
+    ``draw`` returns the HTML of each part by name; it runs in a thread. Lives on one event loop, from ``run`` on;
+    ``changed`` may be called from any thread.
+    """
+
+    def __init__(self, draw: Draw, *, frames_per_s: float, most: int) -> None:
+        self._draw, self._pause_s, self._most = draw, 1.0 / frames_per_s, most
+        self._parts: dict[str, str] = {}
+        self._listeners: set[asyncio.Queue[str]] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._dirty = asyncio.Event()
+        self._drawing = asyncio.Lock()
+        self._number = 0
+
+    @property
+    def listening(self) -> int:
+        return len(self._listeners)
+
+    def changed(self) -> None:
+        """Something changed; returns at once."""
+        loop = self._loop
+        if loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(self._dirty.set)
+
+    async def run(self) -> None:
+        """Draw after every change, until cancelled. Costs nothing while nobody looks."""
+        self._loop = asyncio.get_running_loop()
+        self._dirty.set()
+        while True:
+            await self._dirty.wait()
+            self._dirty.clear()
+            if self._listeners:
+                await self._redraw()
+            await asyncio.sleep(self._pause_s)
+
+    async def _redraw(self) -> None:
+        async with self._drawing:
+            await self._draw_and_tell()
+
+    async def _draw_and_tell(self) -> None:
+        parts = await anyio.to_thread.run_sync(self._draw)
+        changed = {name: html for name, html in parts.items() if self._parts.get(name) != html}
+        self._parts = parts
+        if changed:
+            self._number += 1
+            message = self._message(changed)
+            for queue in tuple(self._listeners):
+                _put(queue, message)
+
+    def _message(self, parts: dict[str, str]) -> str:
+        return f"id: {self._number}\nevent: parts\ndata: {json.dumps(parts)}\n\n"
+
+    async def stream(self, alive: Callable[[], bool]) -> AsyncIterator[str]:
+        """The events of one open panel: everything at first, then what changes, until ``alive`` says no (logged out)."""
+        if len(self._listeners) >= self._most:
+            yield "retry: 10000\nevent: full\ndata: {}\n\n"
+            return
+        queue: asyncio.Queue[str] = asyncio.Queue(QUEUED)
+        # Those who look already are told too: what is sent later is compared with what was drawn last.
+        await self._redraw()
+        self._listeners.add(queue)
+        try:
+            yield "retry: 1000\n" + self._message(self._parts)
+            while alive():
+                try:
+                    yield await asyncio.wait_for(queue.get(), KEEP_ALIVE_S)
+                except TimeoutError:
+                    yield ": still here\n\n"
+        finally:
+            self._listeners.discard(queue)
+
+
+def _put(queue: asyncio.Queue[str], message: str) -> None:
+    """A panel that does not read is dropped back to the newest: it will ask again when it wakes up."""
+    if queue.full():
+        while not queue.empty():
+            queue.get_nowait()
+        message = "event: reload\ndata: {}\n\n"
+    queue.put_nowait(message)

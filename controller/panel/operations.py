@@ -1,0 +1,242 @@
+"""Everything that can be asked of a kiosk: one table, from which forms, API and its document are all made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from controller.errors import UsageError
+from controller.panel.accounts import Role
+from controller.panel.context import Panel, Values
+from controller.panel.fields import NAME, Field
+from controller.panel.kiosk import ComputeSettings, Schedule, ScheduleRow
+from controller.panel.uploads import KEY
+
+
+@dataclass(frozen=True, slots=True)
+class FileAnswer:
+    """A file that the kiosk or the panel made; ``download`` its name where it is to be saved."""
+
+    path: Path
+    media_type: str
+    download: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class BytesAnswer:
+    content: bytes
+    media_type: str
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """One thing that can be asked.
+
+    ``path`` below /api/v1; ``upload`` names the field that is the request's whole body; ``media`` what a file answer is;
+    ``then`` the page that a form goes on to, and ``said`` the sentence that it shows; empty ``then``: no form asks this
+    """
+
+    name: str
+    method: str
+    path: str
+    role: Role
+    about: str
+    run: Callable[[Panel, Values], Any]
+    fields: tuple[Field, ...] = ()
+    media: str = "application/json"
+    then: str = ""
+    said: str = "Done."
+
+    @property
+    def upload(self) -> Field | None:
+        return next((field for field in self.fields if field.kind == "file"), None)
+
+    @property
+    def changes(self) -> bool:
+        return self.method != "GET"
+
+
+APPEARANCE: Final = Field("name", "an appearance's name, 1 to 64 letters, digits, spaces, dots, dashes", pattern=NAME)
+TIME: Final = r"^([01][0-9]|2[0-3]):[0-5][0-9]$"
+DAY: Final = r"^(mon|tue|wed|thu|fri|sat|sun|20[0-9]{2}-[01][0-9]-[0-3][0-9])$"
+ROW: Final = (
+    Field("day", "mon to sun, or a date as 2026-12-24", pattern=DAY, longest=10),
+    Field("opens", "a time as 10:00; left out: closed", pattern=TIME, longest=5, required=False),
+    Field("closes", "a time as 18:00; left out: closed", pattern=TIME, longest=5, required=False),
+    Field("appearance", "an appearance's name; left out: the last one", pattern=NAME, required=False),
+)
+SCHEDULE: Final = (
+    Field("time_zone", "a time zone as Europe/Vienna", pattern=r"^[A-Za-z][A-Za-z0-9_+/-]{1,63}$"),
+    Field("drift_check", "the time of the nightly check as 03:00", pattern=TIME, longest=5, required=False),
+    Field("rows", "the opening hours, at most 400 rows", kind="rows", most=400, columns=ROW),
+)
+TARGET: Final = Field("target", "the key of an uploaded target", pattern=KEY, longest=24)
+SETTINGS: Final = Field("text", "the text of stage.toml", longest=1 << 20)
+RUN: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,95}$"
+
+
+def plain(value: Any) -> Any:
+    """Values as JSON has them; paths are left out, since they are nobody's business."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {key: plain(inner) for key, inner in asdict(value).items() if not isinstance(inner, Path)}
+    if isinstance(value, dict):
+        return {str(key): plain(inner) for key, inner in value.items() if not isinstance(inner, Path)}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    return value
+
+
+def _done(run: Callable[[Panel, Values], object]) -> Callable[[Panel, Values], Any]:
+    """For commands that answer nothing."""
+
+    def answered(panel: Panel, values: Values) -> Any:
+        run(panel, values)
+        return {"done": True}
+
+    return answered
+
+
+def _events(panel: Panel, values: Values) -> Any:
+    rows = panel.kiosk.events(values.get("after", 0))
+    if "level" in values:
+        rows = [row for row in rows if row.level == values["level"]]
+    return plain(list(rows)[-values.get("most", 500) :])
+
+
+def _recalibrate(panel: Panel, values: Values) -> Any:
+    return plain(panel.kiosk.recalibrate(values["kind"], values.get("projector")))
+
+
+def _compute(panel: Panel, values: Values) -> Any:
+    target = panel.targets.path(values["target"])
+    return plain(panel.kiosk.compute(values["name"], target, ComputeSettings(values.get("brightness"))))
+
+
+def _set_schedule(panel: Panel, values: Values) -> None:
+    rows = tuple(
+        ScheduleRow(row["day"], row.get("opens", ""), row.get("closes", ""), row.get("appearance", ""))
+        for row in values["rows"]
+    )
+    panel.kiosk.set_schedule(Schedule(values["time_zone"], rows, values.get("drift_check", "")))
+
+
+def _camera(panel: Panel, _: Values) -> BytesAnswer:
+    jpeg = panel.kiosk.camera_picture()
+    if jpeg is None:
+        raise UsageError(
+            "picture-unknown",
+            what="The camera shows no picture now.",
+            remedy="Look at the camera's line on the first page.",
+        )
+    return BytesAnswer(jpeg, "image/jpeg")
+
+
+def picture_answer(path: Path | None) -> FileAnswer:
+    """A picture that the kiosk made. Raises UsageError("picture-unknown") where it is not there."""
+    types = {".png": "image/png", ".jpg": "image/jpeg"}
+    if path is None or path.suffix not in types or not path.is_file():
+        raise UsageError("picture-unknown", what="There is no such picture.", remedy="Load the page again.")
+    return FileAnswer(path, types[path.suffix])
+
+
+def _run_picture(panel: Panel, values: Values) -> FileAnswer:
+    return picture_answer(panel.kiosk.results(values["run"]).pictures.get(values["picture"]))
+
+
+def _preview(panel: Panel, values: Values) -> FileAnswer:
+    found = [row.preview for row in panel.kiosk.appearances() if row.name == values["name"]]
+    return picture_answer(found[0] if found else None)
+
+
+def _saved(path: Path) -> FileAnswer:
+    return FileAnswer(path, "application/octet-stream", path.name)
+
+
+VIEWER, OPERATOR, TECHNICIAN = Role.VIEWER, Role.OPERATOR, Role.TECHNICIAN
+_NAME_IN_PATH: Final = Field("name", APPEARANCE.about, pattern=NAME, where="path")
+_RUN_IN_PATH: Final = Field("run", "a run's name", pattern=RUN, longest=96, where="path")
+_FILE: Final = "application/octet-stream"
+
+QUESTIONS: Final = (
+    Operation("state", "GET", "/state", VIEWER, "Everything on the first page", lambda p, v: plain(p.kiosk.snapshot())),
+    Operation(
+        "events", "GET", "/events", VIEWER, "The event log, oldest first", _events,
+        (
+            Field("after", "an event's number: only later ones", "integer", False, "query", most=1e12),
+            Field("level", "only this level", required=False, where="query", choices=("info", "warning", "error")),
+            Field("most", "how many, the newest", "integer", False, "query", least=1, most=2000),
+        ),
+    ),
+    Operation("appearances", "GET", "/appearances", VIEWER, "All appearances", lambda p, v: plain(p.kiosk.appearances())),
+    Operation("preview", "GET", "/appearances/{name}/preview", VIEWER, "How it will look", _preview, (_NAME_IN_PATH,), "image/png"),
+    Operation("schedule", "GET", "/schedule", VIEWER, "Opening hours", lambda p, v: plain(p.kiosk.schedule())),
+    Operation("runs", "GET", "/runs", VIEWER, "Runs with results, newest first", lambda p, v: list(p.kiosk.runs())),
+    Operation("results", "GET", "/runs/{run}", VIEWER, "Grade and figures of a run",
+              lambda p, v: plain(p.kiosk.results(v["run"])), (_RUN_IN_PATH,)),
+    Operation("run-picture", "GET", "/runs/{run}/pictures/{picture}", VIEWER, "A picture of a run", _run_picture,
+              (_RUN_IN_PATH, Field("picture", "before, target, achieved, error or resolution", where="path",
+                                   choices=("before", "target", "achieved", "error", "resolution"))), "image/png"),
+    Operation("camera", "GET", "/camera", VIEWER, "What the camera sees", _camera, media="image/jpeg"),
+    Operation("target-picture", "GET", "/targets/{target}", OPERATOR, "An uploaded target, as we encoded it",
+              lambda p, v: picture_answer(p.targets.path(v["target"])),
+              (Field("target", TARGET.about, pattern=KEY, longest=24, where="path"),), "image/png"),
+    Operation("feasibility", "GET", "/targets/{target}/feasibility", OPERATOR, "Where the target can't be reached",
+              lambda p, v: picture_answer(p.kiosk.feasibility(p.targets.path(v["target"]))),
+              (Field("target", TARGET.about, pattern=KEY, longest=24, where="path"),), "image/png"),
+    Operation("aiming", "GET", "/aiming", TECHNICIAN, "Coverage, focus and exposure now", lambda p, v: plain(p.kiosk.aiming())),
+    Operation("settings", "GET", "/settings", TECHNICIAN, "The text of stage.toml", lambda p, v: {"text": p.kiosk.settings()}),
+)  # fmt: skip
+"""What only looks."""
+
+COMMANDS: Final = (
+    Operation("recalibrate", "POST", "/recalibrations", OPERATOR, "Begin a calibration", _recalibrate,
+              (Field("kind", "full or quick", choices=("full", "quick")),
+               Field("projector", "only this projector", required=False, pattern=r"^[^\u0000-\u001f\u007f/\\]+$")),
+              then="/", said="The recalibration has begun."),
+    Operation("cancel", "POST", "/cancel", OPERATOR, "End the running job at its next safe point",
+              _done(lambda p, v: p.kiosk.cancel()), then="/", said="The job ends at its next safe point."),
+    Operation("start", "POST", "/start", OPERATOR, "Lamps on, and play", _done(lambda p, v: p.kiosk.start()),
+              then="/", said="The stage opens."),
+    Operation("stop", "POST", "/stop", OPERATOR, "Stop playing, and cool down", _done(lambda p, v: p.kiosk.stop()),
+              then="/", said="The stage closes; the lamps cool down."),
+    Operation("play", "POST", "/play", OPERATOR, "Show this appearance now", _done(lambda p, v: p.kiosk.play(v["name"])),
+              (APPEARANCE,), then="/appearances", said="It is on the projectors."),
+    Operation("identify", "POST", "/identify", OPERATOR, "Show each projector's name on it, or end that",
+              _done(lambda p, v: p.kiosk.identify(v["on"])),
+              (Field("on", "true or false", "boolean"),), then="/", said="Look at the projectors."),
+    Operation("upload-target", "POST", "/targets", OPERATOR, "Upload a picture as a target",
+              lambda p, v: {"target": p.targets.add(v["file"])},
+              (Field("file", "a PNG, JPEG, TIFF or WebP", "file"),), then="/appearances/new/{target}",
+              said="This is what we read."),
+    Operation("compute", "POST", "/appearances", OPERATOR, "Solve for an uploaded target", _compute,
+              (APPEARANCE, TARGET, Field("brightness", "0.05 to 1; left out: the brightest that fits", "number", False,
+                                         least=0.05, most=1)), then="/", said="The computation has begun."),
+    Operation("remove-appearance", "DELETE", "/appearances/{name}", TECHNICIAN, "Remove an appearance",
+              _done(lambda p, v: p.kiosk.remove_appearance(v["name"])), (_NAME_IN_PATH,),
+              then="/appearances", said="Removed."),
+    Operation("set-schedule", "PUT", "/schedule", OPERATOR, "Replace the opening hours", _done(_set_schedule), SCHEDULE,
+              then="/schedule", said="The schedule is in use."),
+    Operation("doctor", "POST", "/doctor", OPERATOR, "Look for what is wrong", lambda p, v: plain(p.kiosk.doctor())),
+    Operation("backup", "POST", "/backup", TECHNICIAN, "A file with settings, calibration and appearances",
+              lambda p, v: _saved(p.kiosk.backup()), media=_FILE, then="/care"),
+    Operation("restore", "POST", "/restore", TECHNICIAN, "Replace everything by a backup",
+              _done(lambda p, v: p.kiosk.restore(v["file"])), (Field("file", "a backup of ours", "file"),),
+              then="/care", said="The backup is in use."),
+    Operation("diagnostics", "POST", "/diagnostics", TECHNICIAN, "A file for whoever helps from afar",
+              lambda p, v: _saved(p.kiosk.diagnostics()), media=_FILE, then="/care"),
+    Operation("check-settings", "POST", "/settings/check", TECHNICIAN, "Check a stage.toml without saving it",
+              _done(lambda p, v: p.kiosk.validate_settings(v["text"])), (SETTINGS,)),
+    Operation("save-settings", "PUT", "/settings", TECHNICIAN, "Check stage.toml, save it, take it into use",
+              _done(lambda p, v: p.kiosk.save_settings(v["text"])), (SETTINGS,), then="/settings",
+              said="The settings are in use."),
+    Operation("find-devices", "POST", "/devices/found", TECHNICIAN, "Search for devices",
+              lambda p, v: plain(p.kiosk.find_devices())),
+    Operation("try-device", "POST", "/devices/tried", TECHNICIAN, "Ask a found device who it is",
+              lambda p, v: plain(p.kiosk.try_device(v["key"])),
+              (Field("key", "the key of a found device", longest=256),)),
+)  # fmt: skip
+"""What changes or costs something."""
+
+OPERATIONS: Final = (*QUESTIONS, *COMMANDS)

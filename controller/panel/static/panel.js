@@ -1,0 +1,86 @@
+"use strict";
+// Live parts of the page. Without this script everything works, after a reload.
+(() => {
+  const body = document.body;
+  const link = document.getElementById("link");
+  const camera = document.getElementById("camera");
+  const cancel = document.getElementById("cancel");
+  const sees = document.getElementById("sees");
+  let running = false;
+
+  function follow() {
+    // What the server sends is its own HTML, escaped by the same templates as the page.
+    const job = document.getElementById("live-job");
+    const line = job && job.querySelector("[data-running]");
+    running = Boolean(line);
+    if (cancel) cancel.hidden = !line || line.dataset.running !== "yes";
+  }
+
+  function draw(parts) {
+    for (const [name, html] of Object.entries(parts)) {
+      const place = document.getElementById("live-" + name);
+      if (place && place.dataset.drawn !== html) {
+        place.innerHTML = html;
+        place.dataset.drawn = html;
+      }
+    }
+    follow();
+  }
+
+  function say(text) {
+    if (link) link.textContent = text;
+  }
+
+  function listen() {
+    const source = new EventSource(body.dataset.live);
+    source.addEventListener("open", () => say(""));
+    source.addEventListener("parts", (event) => draw(JSON.parse(event.data)));
+    source.addEventListener("reload", () => { source.close(); listen(); });
+    source.addEventListener("full", () => say("Too many panels are open"));
+    source.addEventListener("error", () => {
+      say("No connection, trying again");
+      if (source.readyState === EventSource.CLOSED) {
+        // Refused: the session may be over, or the service is starting.
+        setTimeout(async () => {
+          try {
+            const answer = await fetch(body.dataset.live, { method: "HEAD", redirect: "manual" });
+            if (answer.status === 401 || answer.type === "opaqueredirect") { location.assign("/login"); return; }
+          } catch { /* not there yet */ }
+          listen();
+        }, 1000);
+      }
+    });
+    addEventListener("pagehide", () => source.close(), { once: true });
+  }
+
+  function look() {
+    if (!camera || document.hidden || !(running || camera.dataset.always)) return;
+    const next = new Image();
+    next.onload = () => { camera.src = next.src; if (sees) sees.hidden = false; };
+    next.src = camera.dataset.src + "?t=" + Date.now();
+  }
+
+  async function aim() {
+    // The tables of the aiming page, measured anew.
+    const answer = await fetch(location.pathname, { headers: { accept: "text/html" } });
+    if (!answer.ok) return;
+    const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+    for (const place of ["hints", "aim"]) {
+      const [here, there] = [document.getElementById(place), page.getElementById(place)];
+      if (here && there) here.replaceChildren(...there.childNodes);
+    }
+    const [here, there] = [document.querySelector("dl.figures"), page.querySelector("dl.figures")];
+    if (here && there) here.replaceChildren(...there.childNodes);
+  }
+
+  // A second press while the first one is on its way would begin the work twice.
+  document.addEventListener("submit", (event) => {
+    if (event.target.dataset.sent) { event.preventDefault(); return; }
+    event.target.dataset.sent = "yes";
+    setTimeout(() => delete event.target.dataset.sent, 3000);
+  });
+
+  if (body.dataset.live) { follow(); listen(); setInterval(look, 2000); }
+  const again = document.querySelector("[data-again]");
+  if (again) setInterval(() => { if (!document.hidden) aim().catch(() => say("No connection, trying again")); }, 1000 * again.dataset.again);
+})();
