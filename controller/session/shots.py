@@ -23,6 +23,7 @@ from controller.capture.latency import (
 )
 from controller.capture.profile import FILE_NAME, CameraProfile, load_profile
 from controller.capture.raw import Photograph, read_photograph
+from controller.session.camera_watch import CameraWatch
 from controller.session.progress import Level
 from controller.session.rig import Rig
 from controller.session.runner import Context
@@ -79,10 +80,12 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, index: str)
     use_delay(rig, context.folder)
     taken: list[Taken] = []
     before: _Before | None = None
+    watch = CameraWatch(rig.camera)
     for number, planned in enumerate(plan):
         context.advance(number / len(plan), planned.name)
         one, before = _take(rig, context, planned, folder, before)
         taken.append(one)
+        watch.look(context)
     keep_if_lit(rig, context, taken)
     path = context.folder / f"{index}.json"
     rows = [
