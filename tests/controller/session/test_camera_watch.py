@@ -77,7 +77,7 @@ def test_every_mended_fault_is_journalled_once(context: Context) -> None:
 def test_a_low_battery_is_told_to_the_technician_once_a_run(context: Context, heard: Heard) -> None:
     camera = TellingCamera(state=CameraStatus(battery_percent=8, warnings=("battery-low",)))
     for _ in range(3):
-        moments = iter((0.0, 0.0, 2 * EVERY_S, 2 * EVERY_S, 4 * EVERY_S, 4 * EVERY_S))
+        moments = iter((0.0, 0.0, 0.0, 2 * EVERY_S, 2 * EVERY_S))
         watch = CameraWatch(camera, clock=lambda moments=moments: next(moments))  # type: ignore[misc]
         watch.look(context)
         watch.look(context)
