@@ -102,8 +102,8 @@ def edid(serial: str, number: int = 0) -> bytes:
 
 
 @contextmanager
-def running_server(folder: Path) -> Iterator[Outputs]:
-    """Run a server on a free display number, which is ``DISPLAY`` meanwhile."""
+def running_server(folder: Path, *, settings_folder: Path | None = None) -> Iterator[Outputs]:
+    """Run a server on a free display number, which is ``DISPLAY`` meanwhile; also with all settings of a folder."""
     (folder / "xorg.conf").write_text(_CONFIGURATION)
     reading, writing = os.pipe()
     command = [
@@ -116,6 +116,7 @@ def running_server(folder: Path) -> Iterator[Outputs]:
         str(folder / "log"),
     ]
     command += ["-noreset", "-nocursor", "-nolisten", "tcp", "-novtswitch", "-sharevts"]
+    command += [] if settings_folder is None else ["-configdir", str(settings_folder)]
     with (folder / "told").open("wb") as told:
         server = subprocess.Popen(command, pass_fds=[writing], stdout=told, stderr=told)
     os.close(writing)

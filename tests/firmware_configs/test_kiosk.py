@@ -1,0 +1,88 @@
+"""The systemd units and X11 settings that we ship: systemd and Xorg understand them, and so does what they start."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from controller.play.__main__ import _parser
+from controller.play.launch import PlayerSettings, start_player
+from tests.controller.play.wire import Wire
+from tests.controller.play.xorg import HEIGHT, WIDTH, running_server
+
+CONFIGS = Path(__file__).parents[2] / "firmware_configs"
+UNITS = CONFIGS / "systemd"
+MOST_EXPOSED = {"velatura-player": 15, "velatura-controller": 20, "velatura-x11": 70}
+"""Tenths of systemd's measure of what a broken-into service could do; 100 is everything. X drives the hardware."""
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+
+
+@pytest.fixture
+def units(tmp_path: Path) -> Path:
+    """The units as on a kiosk whose programs are there."""
+    for path in UNITS.iterdir():
+        text = re.sub(r"/opt/velatura/bin/\S+|/usr/lib/xorg/Xorg", "/bin/true", path.read_text())
+        (tmp_path / path.name).write_text(text)
+    return tmp_path
+
+
+@needs_systemd
+def test_systemd_understands_every_line(units: Path) -> None:
+    files = [str(path) for path in sorted(units.iterdir())]
+    told = subprocess.run(["systemd-analyze", "verify", *files], capture_output=True, text=True, check=False)
+    assert (told.returncode, told.stderr) == (0, "")
+
+
+@needs_systemd
+@pytest.mark.parametrize(("unit", "most"), MOST_EXPOSED.items())
+def test_services_can_do_little_else(units: Path, unit: str, most: int) -> None:
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", f"--threshold={most}"]
+    told = subprocess.run([*command, str(units / f"{unit}.service")], capture_output=True, text=True, check=False)
+    assert told.returncode == 0, told.stdout[-200:]
+
+
+def setting(unit: str, key: str) -> str:
+    found = re.search(rf"^{key}=(.*)$", (UNITS / unit).read_text(), re.MULTILINE)
+    assert found is not None
+    return found[1]
+
+
+def test_the_players_command_is_one_that_it_understands() -> None:
+    text = setting("velatura-player.service", "ExecStart").replace("${OUTPUTS}", "P1:1400x1050")
+    line = text.replace("${BUNDLE}", "/b").replace("$OPTIONS", "--where P1=HDMI-1 --trusted /etc/velatura/stage.pub")
+    program, *arguments = shlex.split(line)
+    assert (program, *arguments[:2]) == ("/opt/velatura/bin/python", "-m", "controller.play")
+    options = _parser().parse_args(arguments[2:])
+    assert options.windows
+    assert options.resume
+    assert options.socket.parent == Path("/run") / setting("velatura-player.service", "RuntimeDirectory")
+
+
+def test_a_hung_player_is_replaced_within_five_seconds() -> None:
+    watchdog, pause = (int(setting("velatura-player.service", key)) for key in ("WatchdogSec", "RestartSec"))
+    assert watchdog + pause + 0.7 < 5, "0.7 s is what the player needs to its first picture"
+
+
+def test_an_x_server_with_our_settings_starts_and_the_player_on_it(tmp_path: Path) -> None:
+    settings = tmp_path / "conf.d"
+    settings.mkdir()
+    shutil.copy(CONFIGS / "x11" / "10-velatura.conf", settings)
+    with running_server(tmp_path, settings_folder=settings) as outputs:
+        log = (tmp_path / "log").read_text()
+        for option in re.findall(r'Option ("\w+" "\w+")', (settings / "10-velatura.conf").read_text()):
+            assert f"(**) Option {option}" in log or "Disable" in option
+        chosen = PlayerSettings([("P1", WIDTH, HEIGHT)], None, where={"P1": "DUMMY1"})
+        with start_player(tmp_path, chosen) as player, Wire(player.socket) as wire:
+            assert wire.ask("identify")["ok"]
+            assert outputs.picture(WIDTH)[0].all()
+
+
+def test_the_outputs_file_has_one_mode_for_all() -> None:
+    text = (CONFIGS / "x11" / "20-velatura-outputs.conf").read_text()
+    assert len(set(re.findall(r"^  Modeline .*$", text, re.MULTILINE))) == 1
+    assert len(re.findall(r'"Enable" "true"', text)) == len(re.findall(r'Section "Monitor"', text))
