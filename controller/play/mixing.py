@@ -17,7 +17,7 @@ _BLOCK_BYTES: Final = 96 * 1024
 def mix_sets(before: FrameSet, after: FrameSet, share: float, into: FrameSet, pool: Executor | None = None) -> None:
     """Write ``sqrt((1 - share) before^2 + share after^2)``, rounded, into ``into``; ``share`` is in [0, 1].
 
-    The square stands for every projector's response (docs/decisions/0016-fades-in-linear-light.md). Both ends are
+    The square stands for every projector's response (docs/decisions/0016-fades-mix-squares.md). Both ends are
     exact. All sets have the same shapes; ``into`` is neither of the others. On the threads of ``pool`` if given.
     """
     halves = []
