@@ -18,7 +18,7 @@ from controller.config.loader import FILE
 from controller.errors import BundleError, UsageError
 from controller.services import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
 from controller.session.progress import Reporter
-from controller.session.publishing import next_revision, write_solved
+from controller.session.publishing import publish_solved
 from controller.storage import exclusive
 from hal.deadline import Cancelled
 
@@ -27,12 +27,19 @@ BUNDLES = "bundles"
 
 
 def build(
-    *, stage: Path, names: Sequence[str], out: Path | None, reporter: Reporter, cancel: threading.Event
+    *,
+    stage: Path,
+    names: Sequence[str],
+    out: Path | None,
+    reporter: Reporter,
+    cancel: threading.Event,
+    live: bool = False,
 ) -> Mapping[str, Any]:
     """Write appearances that are solved on the last calibration as a signed bundle; nothing is installed.
 
     ``names`` empty: those of stage.toml that are solved, in its order. The revision is one above the installed
-    bundles'. Raises UsageError("not-calibrated", "nothing-solved" or "no-signing-key"), and as ``write_solved``.
+    bundles', unless one of them is the same, to the byte. ``live``: with what the live mode needs.
+    Raises UsageError("not-calibrated", "nothing-solved" or "no-signing-key"), and as ``publish_solved``.
     """
     checked = check_stage(stage)
     folder = checked.stage.folder
@@ -41,15 +48,17 @@ def build(
         chosen = tuple(dict.fromkeys(names)) or _solved(checked.stage, run)
         path, key = out or folder / "bundle.vel", signing_key(checked)
         reporter.say(f"Writing {len(chosen)} appearances.")
-        index = write_solved(
+        index = publish_solved(
             path,
             run,
             output_sizes(checked),
             chosen,
             stage=checked.stage.tables.stage.name,
             calibration=run.name,
-            revision=next_revision(folder / BUNDLES, stage_trust(checked.stage)),
             key=key,
+            slots=folder / BUNDLES,
+            trust=stage_trust(checked.stage),
+            live=live,
             check=lambda: _check(cancel),
         )
     signed = "nobody" if key is None else str(key)

@@ -20,10 +20,11 @@ def build(
     stage: StageFolder,
     names: Annotated[list[str] | None, typer.Argument(help="Appearances; all solved ones if none is given.")] = None,
     out: Annotated[Path | None, typer.Option(help="The file to write; else STAGE/bundle.vel.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="With what live targets need; a good deal larger.")] = False,
     as_json: Json = False,
 ) -> None:
     """Write the appearances solved last as a bundle, signed with the stage's key, one revision above the installed."""
-    work("controller.bundle_services:build", as_json=as_json, stage=stage, names=tuple(names or ()), out=out)
+    work("controller.bundle_services:build", as_json=as_json, stage=stage, names=tuple(names or ()), out=out, live=live)
 
 
 def inspect(file: BundleFile, as_json: Json = False) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -11,18 +13,23 @@ from pathlib import Path
 import numpy as np
 
 from controller.arrays import FloatImage, save_arrays
-from controller.bundle.format import Index
-from controller.bundle.install import install, revision_floor
+from controller.bundle.format import Hint, Index
+from controller.bundle.install import current, install, revision_floor
+from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANYONE, Trust, load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.capture.brackets import merge_brackets
-from controller.errors import UsageError
+from controller.config import load_stage
+from controller.config.loader import FILE
+from controller.errors import BundleError, UsageError
 from controller.session import costs
 from controller.session.capturing import bracket
+from controller.session.live_parts import live_arrays
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
 from controller.session.shots import keep_if_lit, take_photograph
 from controller.session.solving import read_solved
+from controller.session.thumbnails import Thumbnails
 from controller.storage import sha256_of, write_atomically
 from hal.deadline import Deadline
 from hal.interfaces import BundleDisplay
@@ -30,6 +37,10 @@ from hal.interfaces import BundleDisplay
 PHOTO_BRACKET = (0.7, 5.0)
 """Exposures of an appearance's photograph, relative to the one at which its target's white fills the scale."""
 PLAYBACK_RATE_HZ = 60.0
+METADATA = ("title", "mode", "exposure", "reachable_share", "fine_detail")
+"""Figures of the solving that a bundle tells; none of them differs between two solvings of the same."""
+SHOWN_MS = (15_000, 1_000)
+"""For how long the bundle's playlist suggests to show each appearance, and to fade into it."""
 
 
 def bundle_display(rig: Rig) -> BundleDisplay:
@@ -52,6 +63,9 @@ def publish_step(
 ) -> Step:
     """Write, sign and install the bundle of these appearances; its artefacts are the bundle and its figures.
 
+    The bundle holds what else is solved on the calibration, too: see ``kept_names``. Publishing is cheap, and what it
+    holds depends on more than its own steps, so it is done in every run; nothing new gives the same bytes.
+
     ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle.
     """
     return Step(
@@ -61,6 +75,7 @@ def publish_step(
         after=tuple(f"appearance-{name}" for name in names),
         title="Publishing the signed bundle",
         weight=1,
+        always=True,
     )
 
 
@@ -73,26 +88,50 @@ def _publish(
     context: Context,
 ) -> Sequence[Path]:
     built, slots = context.folder / "bundle.vel", folder / "bundles"
-    write_solved(
-        built, context.folder, outputs, names, stage=identity[0], calibration=identity[1],
-        revision=next_revision(slots), key=key,
-    )  # fmt: skip
+    names = kept_names(folder, context.folder, names)
     trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
+    index = publish_solved(
+        built, context.folder, outputs, names, stage=identity[0], calibration=identity[1], key=key, slots=slots,
+        live=_holds_live(slots),
+    )  # fmt: skip
     installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
     raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
-    size = built.stat().st_size
-    figures = {"bytes": size, "ratio": raw / size, "file": installed.name}
+    stored = sum(blob.length for one in index.appearances for blobs in one.stripes.values() for blob in blobs)
+    figures = {"bytes": built.stat().st_size, "ratio": raw / stored, "file": installed.name, "names": list(names)}
     path = context.folder / "bundle.json"
     write_atomically(path, json.dumps(figures, indent=1).encode())
     return [path, built]
 
 
-def next_revision(slots: Path, trust: Trust = ANYONE) -> int:
-    """One more than those installed bundles of the folder ``slots`` that ``trust`` lets pass."""
-    return revision_floor(slots, trust) + 1
+def kept_names(stage_folder: Path, run: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """``names``, and what else the folder ``run`` holds solved that stage.toml or the installed bundle names.
+
+    In stage.toml's order, then as installed, then as given. What was solved on another calibration is not kept: its
+    frames are for other light.
+    """
+    listed = []
+    if (stage_folder / FILE).exists():
+        listed += [table.name for table in load_stage(stage_folder).tables.appearances]
+    listed += [appearance.name for index in _installed(stage_folder / "bundles") for appearance in index.appearances]
+    solved = [name for name in listed if name in names or (run / f"appearance-{name}.json").exists()]
+    return tuple(dict.fromkeys([*solved, *names]))
 
 
-def write_solved(
+def _installed(slots: Path) -> list[Index]:
+    """What the current bundle of the folder ``slots`` holds; empty where there is none that can be read."""
+    file = current(slots)
+    with contextlib.suppress(BundleError):
+        if file is not None:
+            with Bundle.open_trusted(file, ANYONE) as bundle:
+                return [bundle.index]
+    return []
+
+
+def _holds_live(slots: Path) -> bool:
+    return any(index.live is not None for index in _installed(slots))
+
+
+def publish_solved(
     path: Path,
     run: Path,
     outputs: Outputs,
@@ -100,32 +139,64 @@ def write_solved(
     *,
     stage: str,
     calibration: str,
-    revision: int,
     key: Path | None,
+    slots: Path,
+    trust: Trust = ANYONE,
+    live: bool = False,
     check: Callable[[], None] = lambda: None,
 ) -> Index:
     """Write the appearances that the folder ``run`` holds solved as a bundle at ``path``, signed with the key file.
 
+    Where the folder ``slots`` has the same bundle installed, the file is that one, byte for byte. Else its revision is
+    one more than those installed bundles that ``trust`` lets pass. ``live``: with what the live mode needs.
     ``check`` is called before each appearance, to stop the work by raising.
-    Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then as it was.
+    Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then as it was, or sound.
     """
+    thumbnails = Thumbnails(run, tuple(outputs))
 
     def appearance(name: str) -> NewAppearance:
         check()
         solved = read_solved(run, name, tuple(outputs))
         frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
-        return NewAppearance(name, frames, metadata={"mode": solved.figures["mode"], "exposure": solved.exposure})
+        metadata = {key: solved.figures[key] for key in METADATA if key in solved.figures}
+        return NewAppearance(name, frames, thumbnails.of(name), metadata)
 
-    return write_bundle(
-        path,
-        stage=stage,
-        calibration=calibration,
-        created_unix_s=int(time.time()),
-        outputs=[(output, *size) for output, size in outputs.values()],
-        appearances=(appearance(name) for name in names),
-        key=None if key is None else load_signing_key(key),
-        revision=revision,
-    )
+    arrays = live_arrays(run, outputs) if live else None
+
+    def write(revision: int) -> Index:
+        return write_bundle(
+            path,
+            stage=stage,
+            calibration=calibration,
+            created_unix_s=created_unix_s(run),
+            outputs=[(output, *size) for output, size in outputs.values()],
+            appearances=(appearance(name) for name in names),
+            key=None if key is None else load_signing_key(key),
+            revision=revision,
+            schedule=[Hint(name, *SHOWN_MS) for name in names],
+            live=arrays,
+        )
+
+    floor = revision_floor(slots, trust)
+    if floor >= 0:
+        index = write(floor)
+        if (slots / f"{sha256_of(path)}.vel").exists():
+            return index
+    return write(floor + 1)
+
+
+def created_unix_s(run: Path) -> int:
+    """When the calibration in the folder ``run`` was begun, so that publishing again gives the same bytes.
+
+    The environment's SOURCE_DATE_EPOCH goes before it; 0 where neither tells.
+    """
+    given = os.environ.get("SOURCE_DATE_EPOCH", "")
+    if given.isascii() and given.isdigit() and int(given) <= 2**53:
+        return int(given)
+    try:
+        return max(0, int(time.mktime(time.strptime(run.name[:15], "%Y%m%d-%H%M%S"))))
+    except (ValueError, OverflowError):
+        return 0
 
 
 def photograph_step(rig: Rig, names: Sequence[str], *, longest_exposure_s: float) -> Step:

@@ -103,7 +103,7 @@ def test_any_size_is_decoded_exactly_on_one_thread_and_on_two(rows: int, columns
 
 def test_schedule_and_live_arrays_are_read_back_exactly(tmp_path: Path) -> None:
     random = np.random.default_rng(4)
-    arrays = {
+    arrays: dict[str, npt.NDArray[Any]] = {
         "small": random.random((3, 256)).astype(np.float32),
         "half": random.random((7, 5, 3)).astype(np.float16),
         "wide": random.integers(0, 65536, (7, 5, 2), dtype=np.uint16),
