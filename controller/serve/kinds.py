@@ -1,0 +1,129 @@
+"""The kinds of work of a kiosk: each calls the service that the command line calls, on the stage that is held open."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from controller.app import Held, check_stage, holding
+from controller.serve.eventlog import Decision
+from controller.serve.ports import Finished, Request
+from controller.serve.takeover import solve_without
+from controller.serve.works import JobReporter, Kind, run_name
+from controller.session.rig import Rig
+
+QUICK: Final = Request("quick", light=True)
+PUBLISH: Final = Request("publish")
+VARIANTS: Final = Request("variants")
+
+LendRig = Callable[[], AbstractContextManager[Rig]]
+"""Gives the opened devices for a piece of work; raises DeviceError for one that is missing."""
+
+
+class Kinds:
+    """``missing_device`` says which device is away that photographs need; ``calibrated``, ``idle``: from memory."""
+
+    def __init__(
+        self,
+        stage: Path,
+        lend: LendRig,
+        *,
+        missing_device: Callable[[], Decision | None],
+        calibrated: Callable[[], bool],
+    ) -> None:
+        self._stage, self._lend = stage, lend
+        self._missing_device, self._calibrated = missing_device, calibrated
+
+    def table(self) -> dict[str, Kind]:
+        """Every kind by its name."""
+        lit, known = self._needs_camera, self._needs_calibration
+        return {
+            "drift": Kind(self._drift, lit),
+            "quick": Kind(self._quick, lit),
+            "full": Kind(self._full, lambda request: self._missing_device()),
+            "publish": Kind(self._publish, known),
+            "compute": Kind(self._publish, known),
+            "takeover": Kind(self._takeover, known),
+            "variants": Kind(self._variants, known),
+        }
+
+    def _needs_calibration(self, request: Request) -> Decision | None:
+        if self._calibrated():
+            return None
+        return Decision("not-calibrated", "This stage has no finished calibration.", "Calibrate it first.", "error")
+
+    def _needs_camera(self, request: Request) -> Decision | None:
+        return self._missing_device() or self._needs_calibration(request)
+
+    # -- with light
+
+    def _drift(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.drift_services import check_drift
+
+        with self._lend() as rig, holding(Held(self._stage, rig)):
+            found = check_drift(stage=self._stage, details=True, reporter=reporter, cancel=cancel)
+        reporter.job = replace(reporter.job, run=run_name(found))
+        advice = str(found["advice"])
+        if advice == "nothing":
+            return Finished(request, Decision("drift-none", "Nothing has moved or dimmed since the calibration."))
+        if advice == "look":
+            return Finished(request, Decision("drift-look", "The drift check could not tell what has changed.",
+                                              "Look at the stage; then calibrate anew.", "warning"))  # fmt: skip
+        told = Decision("drift-found", "The stage has changed since its calibration.", "It is recalibrated.", "warning")
+        return Finished(request, told, then=(replace(QUICK, key=request.key),))
+
+    def _quick(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.drift_services import recalibrate
+
+        with self._lend() as rig, holding(Held(self._stage, rig)):
+            found = recalibrate(stage=self._stage, reporter=reporter, cancel=cancel)
+        return self._calibrated_anew(request, reporter, found)
+
+    def _full(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.services import calibrate
+
+        with self._lend() as rig, holding(Held(self._stage, rig)):
+            found = calibrate(stage=self._stage, reporter=reporter, cancel=cancel)
+        return self._calibrated_anew(request, reporter, found)
+
+    def _calibrated_anew(self, request: Request, reporter: JobReporter, found: object) -> Finished:
+        assert isinstance(found, dict)
+        reporter.job = replace(reporter.job, run=run_name(found))
+        told = Decision("calibrated", "The stage is calibrated anew.")
+        then = (replace(PUBLISH, key=request.key),) if self._wishes() else ()
+        return Finished(request, told, then=then)
+
+    def _wishes(self) -> bool:
+        return bool(check_stage(self._stage).stage.tables.appearances)
+
+    # -- without
+
+    def _publish(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.services import make_appearances
+
+        with holding(Held(self._stage, None)):
+            made = make_appearances(stage=self._stage, names=(), reporter=reporter, cancel=cancel)
+        told = Decision("published", f"A new bundle is installed: {made['appearances']}.")
+        return Finished(request, told, then=(VARIANTS,) if self._several() else ())
+
+    def _several(self) -> bool:
+        return len(check_stage(self._stage).names) > 1
+
+    def _variants(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        names = check_stage(self._stage).names
+        self._solve([(name,) for name in names], reporter, cancel)
+        return Finished(request, Decision("variants-solved", "Frames for the loss of any one projector are ready."))
+
+    def _takeover(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        self._solve([request.arguments], reporter, cancel)
+        names = ", ".join(request.arguments)
+        return Finished(request, Decision("takeover-solved", f"Frames without {names} are ready."))
+
+    def _solve(self, sets: Sequence[tuple[str, ...]], reporter: JobReporter, cancel: threading.Event) -> None:
+        with holding(Held(self._stage, None)):
+            for missing in sets:
+                solve_without(self._stage, missing, reporter=reporter, cancel=cancel)

@@ -1,0 +1,60 @@
+"""The bundles of a stage: the installed one, and those solved for the stage without some of its projectors."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Final
+
+from controller.bundle.format import Index
+from controller.bundle.install import current
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import Trust
+from controller.errors import BundleError, VelaturaError
+
+WITHOUT: Final = "bundles-without"
+"""Folder of the stage: for each set of missing projectors a folder like ``bundles``."""
+
+
+def slots_without(stage: Path, missing: Collection[str]) -> Path:
+    """Where bundles for the stage without these projectors are installed."""
+    # Names may hold spaces and dots, and never a slash; "+" in a name is doubled so that no two sets meet.
+    return stage / WITHOUT / " + ".join(name.replace("+", "++") for name in sorted(missing))
+
+
+class BundleStock:
+    """Reads what is installed; asks the disk for links alone unless they have changed. See ``ports.Stock``."""
+
+    def __init__(self, stage: Path, trust: Trust) -> None:
+        self._stage, self._trust = stage, trust
+        self._known: dict[Path, Index | None] = {}
+
+    def bundle(self) -> Path | None:
+        """The installed bundle's file; also one that can't be read: the player's own start finds the way back."""
+        return current(self._stage / "bundles")
+
+    def names(self) -> Sequence[str]:
+        index = self.index(self.bundle())
+        return () if index is None else tuple(one.name for one in index.appearances)
+
+    def without(self, missing: Collection[str]) -> Path | None:
+        path, whole = current(slots_without(self._stage, missing)), self.index(self.bundle())
+        index = self.index(path)
+        if index is None or whole is None or index.calibration != whole.calibration:
+            return None
+        wanted = {one.name for one in whole.appearances}
+        return path if wanted <= {one.name for one in index.appearances} else None
+
+    def index(self, path: Path | None) -> Index | None:
+        """What an installed bundle holds; None for none, and for one that this stage would not play."""
+        if path is None:
+            return None
+        if path not in self._known:
+            if len(self._known) > 64:
+                self._known.clear()
+            try:
+                with Bundle.open_trusted(path, self._trust) as bundle:
+                    self._known[path] = bundle.index
+            except (BundleError, VelaturaError, OSError):
+                self._known[path] = None
+        return self._known[path]
