@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import signal
 import sys
 import threading
@@ -68,6 +69,8 @@ def _run(options: argparse.Namespace) -> int:
         stack.callback(inbox.close)
         output = _open_output(options, sizes)
         stack.callback(output.close)
+        if options.bundle is not None and options.bundle.name == CURRENT and not os.path.lexists(options.bundle):
+            options.bundle = None  # Nothing is installed yet: a kiosk starts all the same.
         start = _counted_start(options.bundle)
         shown = None if start is None else start.shown
         player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, on_appearance=shown)

@@ -95,3 +95,9 @@ def test_a_bundle_by_a_revoked_key_is_not_played(start: Start, bundle: Path, tmp
         assert wire.ask("load-bundle", path=str(bundle))["error"]["code"] == "bundle-revoked"
         sign_bundle(bundle, load_signing_key(tmp_path / "new"))
         assert wire.ask("load-bundle", path=str(bundle))["ok"]
+
+
+def test_where_nothing_is_installed_yet_the_player_starts_all_the_same(start: Start, tmp_path: Path) -> None:
+    player = start(bundle=tmp_path / "bundles" / "current")
+    with Wire(player.socket) as wire:
+        assert wire.ask("hello")["bundle"] is None
