@@ -202,6 +202,28 @@ class KeyPanelTable(OpenTable):
     driver: Name = Field(description='the name of a button_panel driver, e.g. "stream-deck"')
 
 
+class HoursTable(Table):
+    """Opening hours of a weekday or a date; see ``controller.serve.hours`` for what they mean together."""
+
+    day: str = Field(description='"mon" to "sun", or a date such as "2026-12-24", which takes precedence')
+    opens: str = Field(default="", description='the local time "HH:MM"; left out, with closes: closed all day')
+    closes: str = Field(default="", description='the local time "HH:MM"; at or before opens: on the next day')
+    appearance: str = Field(default="", description="the appearance to play; left out: what was played last")
+
+
+class ScheduleTable(Table):
+    time_zone: str = Field(default="UTC", description='a name of the IANA database, e.g. "Europe/Vienna"')
+    drift_check: str = Field(
+        default="", description='the local time "HH:MM" of the nightly drift check; left out: none'
+    )
+    without_time: Literal["open", "closed"] = Field(
+        default="closed", description='"open" or "closed": what the stage is while nobody knows the time'
+    )
+    hours: Annotated[tuple[HoursTable, ...], Field(strict=False)] = Field(
+        default=(), description="a list of [[schedule.hours]] tables with day, opens and closes; none: always open"
+    )
+
+
 class SafetyTable(Table):
     power_up_s: Seconds = Field(
         default=1800.0, description="seconds that lamps may take until they are steady, 0 to 86400"
@@ -260,6 +282,7 @@ class StageTables(Table):
     )
     light_sensor: LightSensorTable | None = Field(default=None, description="the table [light_sensor]")
     key_panel: KeyPanelTable | None = Field(default=None, description="the table [key_panel]")
+    schedule: ScheduleTable = Field(default_factory=ScheduleTable, description="the table [schedule]")
     safety: SafetyTable = Field(default_factory=SafetyTable, description="the table [safety]")
     bundle: BundleTable = Field(default_factory=BundleTable, description="the table [bundle]")
     appearances: Annotated[tuple[AppearanceTable, ...], Field(strict=False)] = Field(
