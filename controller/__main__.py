@@ -21,6 +21,7 @@ import typer
 from controller import console
 from controller.commands import bundle as bundle_commands
 from controller.commands import camera as camera_commands
+from controller.commands.doctor import doctor
 from controller.commands.drift import drift
 from controller.commands.export import export
 from controller.commands.keys import keys
@@ -153,6 +154,7 @@ def play(
 
 COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     demo,
+    doctor,
     calibrate,
     drift,
     appearance,

@@ -1,0 +1,170 @@
+"""Look at every bus, try the stage's own devices, and compare."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from controller.app import LOCK, Checked, check_stage
+from controller.config.loader import FILE
+from controller.doctor.trying import Trying, devices_of
+from controller.doctor.values import Examination, Finding
+from controller.doctor.writing import write
+from controller.errors import UsageError
+from controller.session.progress import Reporter
+from controller.storage import exclusive
+from hal.deadline import Deadline, in_seconds
+from hal.errors import DeviceError
+from hal.finding import Finder, Found, Known, Problem, Wanted, load_finders
+from hal.registry import Drivers, load_drivers
+
+LONGEST_S: Final = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class Tools:
+    """What finds and what drives; other than the installed ones only in tests. ``wanted`` changes where is looked."""
+
+    finders: tuple[Finder, ...] | None = None
+    drivers: Drivers | None = None
+    wanted: dict[str, Any] | None = None
+
+
+def examine(
+    *, stage: Path | None, write_it: bool, reporter: Reporter, cancel: threading.Event, tools: Tools | None = None
+) -> Examination:
+    """Everything that `velatura doctor` tells. ``write_it``: then put what was found into stage.toml.
+
+    Raises UsageError("already-running") while another program works on the stage, and what writing raises.
+    """
+    tools = tools or Tools()
+    folder = stage or Path()
+    deadline = in_seconds(LONGEST_S, cancel)
+    with contextlib.ExitStack() as stack:
+        if stage is not None and (folder / FILE).exists():
+            stack.enter_context(exclusive(folder / LOCK, what_is_running="Velatura"))
+        checked, wrong = _checked(folder, tools) if stage is not None else (None, [])
+        wanted = Wanted(folder, _known(checked), **(tools.wanted or {}))
+        found, problems = _search(wanted, tools.finders, deadline, reporter)
+        seen = _compared(checked, found, [*wrong, *problems], tools)
+        if checked is not None:
+            seen = _tried(checked, seen, deadline, reporter)
+    if write_it:
+        if wrong:
+            raise UsageError(wrong[0].problem.code, what=wrong[0].problem.what, remedy=wrong[0].problem.remedy)
+        seen = replace(seen, written=write(folder, None if checked is None else checked.stage, seen))
+    return seen
+
+
+def _checked(folder: Path, tools: Tools) -> tuple[Checked | None, list[Finding]]:
+    """The stage, or what is wrong with its stage.toml; a folder without one is no stage yet."""
+    if not (folder / FILE).exists():
+        if not folder.is_dir():
+            raise UsageError("stage-missing", what=f"There is no folder {folder}.", remedy="Make it, or give another.")
+        return None, []
+    try:
+        return check_stage(folder, drivers=tools.drivers), []
+    except (UsageError, DeviceError) as error:
+        return None, [Finding(FILE, Problem(error.code, error.what, error.remedy))]
+
+
+def _known(checked: Checked | None) -> tuple[Known, ...]:
+    if checked is None:
+        return ()
+    return tuple(Known(device.kind, device.driver.name, device.settings) for device in devices_of(checked))
+
+
+def _search(
+    wanted: Wanted, finders: Sequence[Finder] | None, deadline: Deadline, reporter: Reporter
+) -> tuple[list[Found], list[Finding]]:
+    """All buses side by side, because most of the time is spent waiting for answers."""
+    broken: tuple[Problem, ...] = ()
+    if finders is None:
+        finders, broken = load_finders()
+    problems = [Finding("", problem) for problem in broken]
+    found: list[Found] = []
+    reporter.say(f"Looking at {', '.join(finder.bus for finder in finders)}.")
+    with ThreadPoolExecutor(max(1, len(finders)), thread_name_prefix="doctor") as pool:
+        for finder, search in [(one, pool.submit(one.find, wanted, deadline)) for one in finders]:
+            try:
+                found += search.result()
+            except DeviceError as error:
+                problems.append(Finding(finder.bus, Problem.of(error)))
+    return found, problems
+
+
+def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Finding], tools: Tools) -> Examination:
+    """Which of them the stage has, and the problems of each."""
+    known = [] if checked is None else list(devices_of(checked))
+    own = {(device.driver.name, device.place) for device in known}
+    kinds = {device.kind for device in known}
+    outputs = {output.name for output in checked.stage.tables.display.outputs} if checked is not None else set()
+    new = []
+    for one in found:
+        problems += [Finding(one.address, problem) for problem in one.problems]
+        if not one.driver or one.kind == "display":
+            continue
+        # Without a place in its table the stage takes the only device of this kind that there is.
+        if not any((one.driver, place) in own for place in (*map(str, one.settings.values()), "")):
+            new.append(one)
+    if checked is not None:
+        problems += _not_in_stage(new, kinds)
+        problems += _unplugged_outputs(found, outputs)
+    for plugin in (tools.drivers or load_drivers()).broken:
+        what = f"The plugin {plugin.entry_point} of {plugin.distribution} can't be used: {plugin.reason}."
+        problems.append(Finding("", Problem("plugin-broken", what, "Reinstall that distribution.")))
+    return Examination(tuple(found), (), tuple(problems), tuple(new))
+
+
+def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
+    told = []
+    for one in new:
+        if one.kind == "power_switch":
+            remedy = (
+                "Add it by hand, because only you know what each relay feeds: [[relays]] with driver, serial and "
+                "[[relays.mains]] (docs/drivers.md)."
+            )
+        elif one.kind == "camera" and "camera" in kinds:
+            remedy = f"If it is the one to use, write address = {one.settings.get('address', '')!r} into [camera]."
+        else:
+            remedy = "Add it with `velatura doctor STAGE --write`, or unplug it if another machine's."
+        told.append(Finding(one.address, Problem("not-in-stage", f"{one.what} is not in stage.toml.", remedy)))
+    return told
+
+
+def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Finding]:
+    """Outputs of stage.toml that the X server does not have; without an X server nobody can tell."""
+    there = {one.address for one in found if one.kind == "display"}
+    if not there:
+        return []
+    return [
+        Finding(
+            name,
+            Problem(
+                "output-missing",
+                f"stage.toml has an output {name}, and the X server has {', '.join(sorted(there))}.",
+                "Plug the projector in and switch the output on (xrandr), or correct [[display.outputs]].",
+            ),
+        )
+        for name in sorted(outputs - there)
+    ]
+
+
+def _tried(checked: Checked, seen: Examination, deadline: Deadline, reporter: Reporter) -> Examination:
+    reporter.say("Trying the stage's own devices; no lamp is struck.")
+    failed = {
+        one.address: one.problems[0]
+        for one in seen.found
+        if one.problems and not one.problems[0].code.endswith("may-be-taken")
+    }
+    tried, findings = [], list(seen.findings)
+    for one, finding in Trying(checked, deadline).each(failed):
+        tried.append(one)
+        if finding is not None and finding.problem not in [known.problem for known in findings]:
+            findings.append(finding)
+    return replace(seen, tried=tuple(tried), findings=tuple(findings))

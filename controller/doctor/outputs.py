@@ -1,0 +1,178 @@
+"""Which projector shows which output: a number on each for people, and for the camera white and a shutter.
+
+White stands on one output at a time. If the photograph goes dark when the shutter of the projector closes that
+stage.toml names for it, the cables are right; else the shutters of the others tell whose light it is. The lamps are lit
+for this, under the lamp rules, and switched off afterwards.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+
+from controller.app import LOCK, Checked, check_stage, opened
+from controller.arrays import ByteImage
+from controller.capture.acquire import Shot
+from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic
+from controller.doctor.values import Examination, Finding
+from controller.session.lighting import lit
+from controller.session.machine import Machine
+from controller.session.power import light
+from controller.session.progress import Level, Reporter
+from controller.session.rig import Rig, RigProjector
+from controller.storage import exclusive
+from hal.deadline import Deadline, in_seconds
+from hal.finding import Problem
+from hal.values import Presented
+
+LONGEST_S: Final = 3600.0
+NUMBERS_S: Final = 10.0
+"""How long the numbers are shown to whoever stands there."""
+ANSWER_S: Final = 10.0
+LEAST_LIGHT: Final = 1e-4
+"""Less light than this share of full scale is noise."""
+DARKER: Final = 0.5
+"""A shutter is in the way of a light of which it takes more than this share."""
+
+
+@runtime_checkable
+class _Identifies(Protocol):
+    """A display that has a picture with the number of each output."""
+
+    def identify(self, *, deadline: Deadline) -> Presented: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """Whose light an output is: a projector's name, or None where no shutter took it away."""
+
+    output: str
+    projector: str | None
+
+
+def examine_outputs(
+    seen: Examination, *, stage: Path, reporter: Reporter, cancel: threading.Event, checked: Checked | None = None
+) -> Examination:
+    """``seen`` with what the outputs showed. Strikes the lamps; raises what the session raises."""
+    checked = checked or check_stage(stage)
+    deadline = in_seconds(LONGEST_S, cancel)
+    safety = checked.stage.tables.safety
+    with (
+        exclusive(stage / LOCK, what_is_running="Velatura"),
+        opened(checked, deadline=deadline) as rig,
+        lit(rig, Machine(), power_down_s=safety.power_down_s, reporter=reporter),
+    ):
+        reporter.say("Lighting the lamps.")
+        light(
+            rig.guards,
+            deadline=deadline.within(safety.power_up_s),
+            advance=lambda fraction, note: None,
+            tell=lambda sentence: reporter.say(sentence, Level.WARNING),
+        )
+        show_numbers(rig, reporter, deadline)
+        with tempfile.TemporaryDirectory(prefix="velatura-doctor-") as folder:
+            shown = who_shows_what(rig, Path(folder), deadline=deadline)
+    findings = judge(rig.projectors, shown)
+    return replace(seen, findings=(*seen.findings, *findings))
+
+
+def show_numbers(rig: Rig, reporter: Reporter, deadline: Deadline, seconds: float = NUMBERS_S) -> None:
+    """Numbers on the outputs, where the display has them, and the list of whose they should be."""
+    if not isinstance(rig.display, _Identifies):
+        return
+    numbers = {info.name: n for n, info in enumerate(rig.display.outputs(deadline=deadline.within(ANSWER_S)), 1)}
+    rig.display.identify(deadline=deadline.within(ANSWER_S))
+    for projector in rig.projectors:
+        reporter.say(f"Projector {projector.name} should show the number {numbers[projector.output]}.")
+    deadline.sleep(seconds)
+
+
+def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Shown]:
+    """Light on one output after another, and whose shutter takes it away."""
+    look = _Camera(rig, folder, deadline)
+    exposure_s = look.exposure_s()
+    with_shutter = [one for one in rig.projectors if one.guard.capabilities.shutter]
+    shown = []
+    for projector in rig.projectors:
+        frames = rig.on_outputs({projector.name: np.full_like(projector.black(), 255)})
+        bright = look.brightness(frames, exposure_s)
+        # The one that stage.toml names first: if all is well, one photograph an output is enough.
+        suspects = sorted(with_shutter, key=lambda one: one is not projector)
+        owner = next((one.name for one in suspects if look.goes_dark(one, frames, bright, exposure_s)), None)
+        shown.append(Shown(projector.output, owner))
+    return shown
+
+
+def judge(projectors: Sequence[RigProjector], shown: Sequence[Shown]) -> list[Finding]:
+    """What is wrong with the cables, by output."""
+    findings = []
+    for projector, one in zip(projectors, shown, strict=True):
+        if one.projector is None:
+            what = f"Whose light output {one.output} is could not be seen: no shutter made the photograph darker."
+            remedy = "Check that the lamp burns and the camera sees its picture, or look at the numbers yourself."
+            findings.append(Finding(one.output, Problem("output-unseen", what, remedy)))
+        elif one.projector != projector.name:
+            what = f"Output {one.output} is shown by projector {one.projector}, not by {projector.name}."
+            remedy = f'Swap the cables, or write output = "{one.output}" for {one.projector} into stage.toml.'
+            findings.append(Finding(one.output, Problem("output-swapped", what, remedy)))
+    return findings
+
+
+class _Camera:
+    """Photographs, of which only the light as a whole counts."""
+
+    def __init__(self, rig: Rig, folder: Path, deadline: Deadline) -> None:
+        self._rig = rig
+        self._folder = folder
+        self._deadline = deadline
+        self._taken = 0
+        self._black: float | None = None
+
+    def exposure_s(self) -> float:
+        """Short enough for white on all outputs: whichever of them is alone then is not clipped either."""
+        frames = {p.output: np.full_like(p.black(), 255) for p in self._rig.projectors}
+        for exposure_s in reversed(self._rig.acquirer.exposures_s()):
+            if exposure_s <= 1.0 and self._values(frames, exposure_s)[1] < 0.01:
+                return exposure_s
+        return self._rig.acquirer.exposures_s()[0]
+
+    def brightness(self, frames: Mapping[str, ByteImage], exposure_s: float) -> float:
+        return self._values(frames, exposure_s)[0]
+
+    def goes_dark(
+        self, projector: RigProjector, frames: Mapping[str, ByteImage], bright: float, exposure_s: float
+    ) -> bool:
+        """Whether closing this projector's shutter takes the light away; it is opened again, whatever happens."""
+        with self._closed(projector):
+            dark = self.brightness(frames, exposure_s)
+        if self._black is None:
+            self._black = self.brightness(self._rig.on_outputs({}), exposure_s)
+        light_of_white = bright - self._black
+        return light_of_white > LEAST_LIGHT and bright - dark > DARKER * light_of_white
+
+    @contextlib.contextmanager
+    def _closed(self, projector: RigProjector) -> Iterator[None]:
+        guard = projector.guard
+        guard.set_shutter(True, deadline=self._deadline.within(ANSWER_S))
+        try:
+            yield
+        finally:
+            guard.set_shutter(False, deadline=in_seconds(ANSWER_S))
+
+    def _values(self, frames: Mapping[str, ByteImage], exposure_s: float) -> tuple[float, float]:
+        """Mean of a photograph, 0 to 1, and the share of it that is clipped."""
+        self._taken += 1
+        shot = Shot(f"look-{self._taken}", dict(frames), exposure_s)
+        file, _ = self._rig.acquirer.take(shot, self._folder, deadline=self._deadline)
+        if is_jpeg(file.path):
+            image = read_jpeg_values(file.path) / np.float32(255)
+            return float(image.mean()), float((image >= 1).any(axis=2).mean())
+        linear, clipped = read_mosaic(file.path).linear()
+        return float(linear.mean()), float(clipped.mean())

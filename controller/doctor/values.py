@@ -1,0 +1,90 @@
+"""What the doctor tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from controller.text import printable
+from hal.finding import Found, Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A problem with the device at ``device``, or with the whole stage where that is ""."""
+
+    device: str
+    problem: Problem
+
+    def as_json(self) -> dict[str, Any]:
+        problem = self.problem
+        return {
+            "device": self.device,
+            "code": problem.code,
+            "what": printable(problem.what),
+            "remedy": printable(problem.remedy),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """A device of stage.toml that was opened and asked: ``answer`` is what it said, None where it failed."""
+
+    name: str
+    kind: str
+    answer: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """Everything that was seen. ``new``: devices that stage.toml does not have yet."""
+
+    found: tuple[Found, ...]
+    tried: tuple[Tried, ...]
+    findings: tuple[Finding, ...]
+    new: tuple[Found, ...]
+    written: tuple[str, ...] = ()
+
+    @property
+    def healthy(self) -> bool:
+        return not self.findings
+
+    def as_json(self) -> dict[str, Any]:
+        """For machines; every text of a device is made printable."""
+        return {
+            "healthy": self.healthy,
+            "found": [
+                {
+                    "bus": one.bus,
+                    "address": printable(one.address),
+                    "what": printable(one.what),
+                    "kind": one.kind,
+                    "driver": one.driver,
+                    "settings": dict(one.settings),
+                    "new": one in self.new,
+                }
+                for one in self.found
+            ],
+            "tried": [{"name": one.name, "kind": one.kind, "answer": one.answer} for one in self.tried],
+            "problems": [finding.as_json() for finding in self.findings],
+            "written": list(self.written),
+        }
+
+    def as_text(self) -> str:
+        """For people: what there is, what the stage's devices said, and what to mend, most important last."""
+        lines = [f"Found {len(self.found)} devices." if self.found else "Nothing was found."]
+        lines += [
+            f"  {one.bus:<8} {one.address:<28} {one.what}{'  (not in stage.toml)' * (one in self.new)}"
+            for one in self.found
+        ]
+        if self.tried:
+            lines += ["", "The stage's devices:"]
+            lines += [f"  {one.name:<16} {one.answer or 'failed, see below'}" for one in self.tried]
+        for number, finding in enumerate(self.findings, 1):
+            where = f"{finding.device}: " if finding.device else ""
+            lines += ["", f"{number}. {where}{finding.problem.what} [{finding.problem.code}]",
+                      f"   {finding.problem.remedy}"]  # fmt: skip
+        if self.written:
+            lines += ["", *(f"Written into stage.toml: {text}." for text in self.written)]
+        lines += ["", "No problem was found." if self.healthy else f"{len(self.findings)} to mend."]
+        return "\n".join(printable(line) for line in lines)

@@ -1,0 +1,125 @@
+"""What was found, into stage.toml: new devices, and settings that the devices themselves contradict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from controller.config import Stage, StageTables, write_stage
+from controller.config.editing import Change, rewrite_stage
+from controller.doctor.values import Examination
+from controller.errors import UsageError
+from hal.finding import Found
+
+CORRECTIONS: Final = ("serial-wrong-baud", "serial-other-profile")
+"""Problems whose remedy is a setting that the finder has put into its table."""
+SINGLE: Final[Mapping[str, str]] = {"camera": "camera", "light_sensor": "light_sensor", "button_panel": "key_panel"}
+"""Kinds of which a stage has one, with the name of its table."""
+FIRST_ISO: Final = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What would be written: changes of keys, further tables, and both in words."""
+
+    changes: list[Change] = field(default_factory=list)
+    tables: dict[str, Any] = field(default_factory=dict)
+    words: list[str] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        return bool(self.changes or self.tables)
+
+
+def plan_for(stage: Stage, seen: Examination) -> Plan:
+    """What to write into a stage that has a stage.toml."""
+    plan = Plan()
+    _correct(stage, seen.found, plan)
+    outputs = _outputs(stage.tables, seen.found)
+    free = [name for name in outputs if name not in {projector.output for projector in stage.tables.projectors}]
+    names = {projector.name for projector in stage.tables.projectors}
+    for one in seen.new:
+        if one.kind == "projector" and free:
+            name = next(f"projector-{n}" for n in range(1, 1000) if f"projector-{n}" not in names)
+            names.add(name)
+            table = {"name": name, "output": free.pop(0), "driver": one.driver, **one.settings}
+            plan.tables.setdefault("projectors", []).append(table)
+            plan.words.append(f"projector {name} at {one.address} on output {table['output']}")
+        elif one.kind in ("light_sensor", "button_panel") and not getattr(stage.tables, SINGLE[one.kind]):
+            table_name = SINGLE[one.kind]
+            if table_name not in plan.tables:
+                plan.tables[table_name] = {"driver": one.driver, **one.settings}
+                plan.words.append(f"[{table_name}] {one.what}")
+    return plan
+
+
+def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str]]:
+    """The content of a first stage.toml, and what it says in words. Raises UsageError("doctor-not-enough")."""
+    outputs = [table for one in seen.found if one.kind == "display" for table in one.settings["outputs"]]
+    projectors = [one for one in seen.new if one.kind == "projector"]
+    cameras = [one for one in seen.new if one.kind == "camera"]
+    missing = [
+        word
+        for word, there in (
+            ("a projector", projectors),
+            ("a camera", cameras),
+            ("an output for each projector", len(outputs) >= len(projectors) > 0),
+        )
+        if not there
+    ]
+    if missing:
+        raise UsageError(
+            "doctor-not-enough",
+            what=f"A stage needs {', '.join(missing)} more than was found, so no stage.toml was written.",
+            remedy="Plug in and switch on what is missing, or write stage.toml by hand (docs/architecture.md).",
+        )
+    content: dict[str, Any] = {
+        "stage": {"name": folder.resolve().name},
+        "projectors": [
+            {"name": f"projector-{n}", "output": output["name"], "driver": one.driver, **one.settings}
+            for n, (one, output) in enumerate(zip(projectors, outputs, strict=False), 1)
+        ],
+        "camera": {"driver": cameras[0].driver, "iso": FIRST_ISO, **cameras[0].settings},
+        "display": {"driver": "player", "outputs": outputs},
+    }
+    for one in seen.new:
+        if one.kind in ("light_sensor", "button_panel"):
+            content.setdefault(SINGLE[one.kind], {"driver": one.driver, **one.settings})
+    return content, [f"[{name}]" if not isinstance(table, list) else f"{len(table)} [[{name}]]"
+                     for name, table in content.items()]  # fmt: skip
+
+
+def write(folder: Path, stage: Stage | None, seen: Examination) -> tuple[str, ...]:
+    """Write what was found into the stage's folder; what was written, in words.
+
+    Raises UsageError where the result would not be a stage ("doctor-not-enough", or as ``load_stage``); the file is
+    then as it was.
+    """
+    if stage is None:
+        content, words = new_stage(folder, seen)
+        write_stage(folder / "stage.toml", content)
+        return tuple(words)
+    plan = plan_for(stage, seen)
+    if plan:
+        rewrite_stage(stage.folder / "stage.toml", plan.changes, plan.tables)
+    return tuple(plan.words)
+
+
+def _correct(stage: Stage, found: Sequence[Found], plan: Plan) -> None:
+    for one in found:
+        if not any(problem.code in CORRECTIONS for problem in one.problems):
+            continue
+        for position, projector in enumerate(stage.tables.projectors):
+            written = projector.model_dump()
+            if projector.driver != one.driver or written.get("port") != one.settings.get("port"):
+                continue
+            wanted = {key: value for key, value in one.settings.items() if written.get(key) != value}
+            for key, value in wanted.items():
+                plan.changes.append(Change(("projectors", position), key, value))
+                plan.words.append(f"{key} = {value!r} for projector {projector.name}")
+
+
+def _outputs(tables: StageTables, found: Sequence[Found]) -> list[str]:
+    own = [output.name for output in tables.display.outputs]
+    return own or [table["name"] for one in found if one.kind == "display" for table in one.settings["outputs"]]

@@ -1,0 +1,1 @@
+"""What looks for devices, one file a bus (``hal.finding``)."""

@@ -1,0 +1,96 @@
+"""HID devices that a driver knows: relay boards, light sensors, key panels. No relay is moved."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from hal import hid_light, hid_relay
+from hal.deadline import Deadline
+from hal.errors import DeviceError
+from hal.finding import Finder, Found, Problem, Wanted
+from hal.ptp import printable
+from plugins.finding.access import forbidden, holders
+from plugins.hid_link import BACKENDS, HidHandle
+from plugins.worker_link import WorkerLink
+
+RULES: Final = "70-velatura-hid.rules"
+ELGATO: Final = 0x0FD9
+LISTING_S: Final = 5.0
+
+
+class _Listing(WorkerLink[Any]):
+    """hidapi on a thread of its own: its ``enumerate`` can hang."""
+
+    def __init__(self) -> None:
+        super().__init__("list of HID devices", broken=(OSError, ValueError))
+
+    def find(self) -> Any:
+        import importlib
+
+        return importlib.import_module(BACKENDS["hidraw"])
+
+    def let_go(self, opened: Any) -> None:
+        """There is nothing to close."""
+
+
+def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    """Every HID device that could be one of ours. Raises DeviceError where hidapi is missing or hangs."""
+    with contextlib.closing(_Listing()) as listing:
+        return listing.call(_listed, deadline=deadline.within(LISTING_S))
+
+
+def _listed(hidapi: Any) -> list[Found]:
+    by_path = {entry["path"]: entry for entry in hidapi.enumerate()}
+    return [found for entry in by_path.values() if (found := _found(hidapi, entry)) is not None]
+
+
+def _found(hidapi: Any, entry: Mapping[str, Any]) -> Found | None:
+    numbers = (entry["vendor_id"], entry["product_id"])
+    product, serial = (printable(str(entry[key] or "")[:60]) for key in ("product_string", "serial_number"))
+    channels = hid_relay.channels_of(product) if numbers == (hid_relay.VENDOR, hid_relay.PRODUCT) else None
+    if channels is not None:
+        kind, driver, what = "power_switch", "usb-relay", f"relay board with {channels} relays"
+    elif numbers == (hid_light.VENDOR, hid_light.PRODUCT):
+        kind, driver, what = "light_sensor", "colorhug-als", "ambient light sensor"
+    elif numbers[0] == ELGATO:
+        kind, driver, what = "button_panel", "stream-deck", f"key panel, {product}"
+    else:
+        return None
+    node = Path(entry["path"].decode("utf-8", "replace"))
+    problem = forbidden(node, what, RULES, f"{numbers[0]:04x}") or _held(node, what)
+    if problem is None and channels is not None:
+        try:
+            serial = _relay_serial(hidapi.device(), entry["path"], channels)
+        except (OSError, ValueError, DeviceError) as error:
+            problem = Problem(
+                "hid-not-opened", f"The {what} at {node} can't be asked: {error}.", "Plug it out and in again."
+            )
+    settings = {"serial": serial} if serial else {}
+    problems = () if problem is None else (problem,)
+    return Found(
+        "hid", str(node), what, kind, driver, settings, serial or f"{numbers[0]:04x}:{numbers[1]:04x}", problems
+    )
+
+
+def _relay_serial(handle: HidHandle, path: bytes, channels: int) -> str:
+    """A board tells its serial number only when it is asked; USB's descriptor has none."""
+    handle.open_path(path)
+    try:
+        return hid_relay.parse_state(handle.get_feature_report(0, hid_relay.REPORT_LENGTH), channels).serial
+    finally:
+        handle.close()
+
+
+def _held(node: Path, what: str) -> Problem | None:
+    who = holders(node)
+    if not who:
+        return None
+    return Problem(
+        "hid-taken", f"The {what} at {node} is open in {', '.join(who)}.", "End that program, or see that it is ours."
+    )
+
+
+FINDER: Final = Finder("hid", find)

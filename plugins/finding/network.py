@@ -1,0 +1,69 @@
+"""Projectors and cameras on the network: PJLink's search, and the addresses in stage.toml."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from hal.deadline import Deadline
+from hal.errors import DeviceError
+from hal.finding import Finder, Found, Problem, Wanted
+from hal.links import host_and_port
+from hal.pjlink import PORT
+from hal.registry import OpenContext
+from plugins.pjlink_listener import PjLinkListener
+from plugins.pjlink_projector import open_pjlink_projector
+
+ANSWER_S: Final = 8.0
+
+
+def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    """Projectors that answer the search (class 2), and those that stage.toml names (any class)."""
+    known = {str(settings.get("address", "")): settings for settings in wanted.of("projector", "pjlink")}
+    found = [_tried(address, settings, wanted, deadline) for address, settings in known.items()]
+    hosts = {host for address in known if (host := _host(address))}
+    try:
+        answers = _searched(wanted, deadline)
+    except DeviceError as error:
+        problem = Problem.of(error)
+        return [*found, Found("network", "PJLink search", "search for projectors", problems=(problem,))]
+    for host, mac in answers:
+        if host in hosts:
+            found = [dataclasses.replace(one, identity=mac) if _host(one.address) == host else one for one in found]
+        else:
+            found.append(dataclasses.replace(_tried(host, {"address": host}, wanted, deadline), identity=mac))
+    return found
+
+
+def _searched(wanted: Wanted, deadline: Deadline) -> list[tuple[str, str]]:
+    if wanted.search is None:
+        return []
+    with PjLinkListener(*wanted.listen) as listener:
+        answers = listener.search(deadline=deadline, to=wanted.search, patience_s=wanted.search_s)
+        return [(one.host, one.mac) for one in answers]
+
+
+def _tried(address: str, settings: Mapping[str, Any], wanted: Wanted, deadline: Deadline) -> Found:
+    table = {"address": address, **{key: value for key, value in settings.items() if key in ("password", "profile")}}
+    found = Found("network", address, "PJLink projector", "projector", "pjlink", table)
+    try:
+        projector = open_pjlink_projector(table, OpenContext(wanted.stage), deadline.within(ANSWER_S))
+    except DeviceError as error:
+        return dataclasses.replace(found, problems=(Problem.of(error),))
+    with contextlib.closing(projector):
+        try:
+            identity = projector.identity(deadline=deadline.within(ANSWER_S))
+        except DeviceError as error:
+            return dataclasses.replace(found, problems=(Problem.of(error),))
+    return dataclasses.replace(found, what=f"PJLink projector, {identity.maker} {identity.model}")
+
+
+def _host(address: str) -> str:
+    with contextlib.suppress(DeviceError):
+        return host_and_port(address, PORT)[0]
+    return ""
+
+
+FINDER: Final = Finder("network", find)

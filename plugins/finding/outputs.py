@@ -1,0 +1,61 @@
+"""Display outputs, as the X server tells them through xrandr."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from typing import Final
+
+from hal.deadline import Deadline
+from hal.errors import DeviceTimeout
+from hal.finding import Finder, Found, Problem, Wanted
+from hal.ptp import printable
+
+PATIENCE_S: Final = 5.0
+_OUTPUT: Final = re.compile(
+    r"^(\S{1,64}) connected (?:primary )?(?:(\d{1,5})x(\d{1,5})\+(\d{1,5})\+(\d{1,5}))?", re.MULTILINE
+)
+
+
+def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    """Outputs with something plugged into them; none where there is no X server, as with frames in memory."""
+    program = shutil.which("xrandr")
+    if not os.environ.get("DISPLAY") or program is None:
+        return []
+    try:
+        done = subprocess.run(  # noqa: S603 - a program of the system, without arguments from anybody
+            [program, "--query"], capture_output=True, text=True, errors="replace", check=False,
+            timeout=max(0.1, deadline.within(PATIENCE_S).left_s()),
+        )  # fmt: skip
+    except subprocess.TimeoutExpired as error:
+        raise DeviceTimeout(
+            "display-no-answer",
+            what="The X server did not tell its outputs in time.",
+            remedy="Check that DISPLAY names the server that runs.",
+        ) from error
+    return parse_outputs(done.stdout)
+
+
+def parse_outputs(text: str) -> list[Found]:
+    """The connected outputs in what ``xrandr --query`` prints."""
+    found = []
+    for match in _OUTPUT.finditer(text):
+        name, (width, height, left, top) = printable(match[1]), match.groups()[1:]
+        if width is None:
+            dark = Problem(
+                "output-off",
+                f"Something is plugged into output {name}, and it is switched off.",
+                f"Switch it on: xrandr --output {name} --auto, and place it beside the others.",
+            )
+            found.append(Found("display", name, "output, off", identity=name, problems=(dark,)))
+            continue
+        table = {"name": name, "width_px": int(width), "height_px": int(height)}
+        what = f"output of {width}x{height} at +{left}+{top}"
+        found.append(Found("display", name, what, "display", "player", {"outputs": [table]}, name))
+    return found
+
+
+FINDER: Final = Finder("display", find)

@@ -1,0 +1,225 @@
+"""Serial ports, and which projector answers there.
+
+A port is asked for the power state in the words of every shipped profile, one after another: questions only, never a
+command, each as seldom as the profile wants. What nobody answers at its usual rate is asked at others where stage.toml
+names the port, or where something came back that nobody understood.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from serial.tools import list_ports
+
+from hal.deadline import Deadline
+from hal.errors import DeviceBusy, DeviceError, DeviceTimeout, ProtocolError
+from hal.finding import Finder, Found, Problem, Wanted
+from hal.profiles import ProjectorProfile
+from hal.ptp import printable
+from hal.serial_link import SerialLink
+from hal.serial_protocol import Answer, Reply, head_bytes, parse_line, query_bytes, rest_bytes
+from hal.serial_table import Query, SerialTable
+from plugins.finding.access import forbidden, holders
+from plugins.profile_files import load_profile, shipped_profiles
+
+RULES: Final = "70-velatura-serial.rules"
+WRITE_S: Final = 1.0
+END: Final = b"\r"
+BAUDS: Final = (9600, 19200, 38400, 57600, 115200)
+MOST_PORTS: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """A port by its most stable name. ``settings``: its table in stage.toml, None if it has none."""
+
+    name: str
+    path: Path
+    what: str
+    settings: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """Who answered: a profile at a baud rate (None: nobody), and whether anything at all came back."""
+
+    profile: ProjectorProfile | None
+    baud: int = 0
+    anything: bool = False
+
+
+def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    """Every serial port of this machine and of stage.toml."""
+    profiles = [load_profile(name, wanted.stage) for name in shipped_profiles()]
+    profiles = [profile for profile in profiles if profile.serial is not None]
+    return [_found(port, wanted, profiles, deadline) for port in _ports(wanted)]
+
+
+def _ports(wanted: Wanted) -> list[Port]:
+    """Each port once, though it has many names: first as stage.toml calls it, then by its stable name."""
+    ports: dict[str, Port] = {}
+    for settings in wanted.of("projector", "serial"):
+        name = str(settings.get("port", ""))
+        path = wanted.stage / name
+        ports[str(path.resolve())] = Port(name, path, "named in stage.toml", settings)
+    with contextlib.suppress(OSError):
+        for path in sorted(wanted.serial_ports.iterdir()):
+            ports.setdefault(str(path.resolve()), Port(str(path), path, "serial adapter"))
+    for listed in list_ports.comports() if wanted.system_ports else ():
+        # Ports of a board that may not be there have no hardware number.
+        if listed.hwid != "n/a":
+            path = Path(listed.device)
+            ports.setdefault(str(path.resolve()), Port(listed.device, path, printable(listed.description or "port")))
+    return list(ports.values())[:MOST_PORTS]
+
+
+def _found(port: Port, wanted: Wanted, profiles: Sequence[ProjectorProfile], deadline: Deadline) -> Found:
+    problem = forbidden(port.path, "serial port", RULES, "tty") if port.path.exists() else None
+    if problem is not None:
+        return Found("serial", port.name, port.what, identity=port.name, problems=(problem,))
+    try:
+        own = None if port.settings is None else load_profile(str(port.settings.get("profile", "")), wanted.stage)
+        return _asked(port, own, profiles, wanted.answer_s, deadline)
+    except DeviceBusy as busy:
+        who = ", ".join(holders(port.path))
+        held = Problem("port-taken", f"{port.name} is in use{f' by {who}' if who else ''}.", busy.remedy)
+        return Found("serial", port.name, port.what, identity=port.name, problems=(held,))
+    except DeviceError as error:
+        return Found("serial", port.name, port.what, identity=port.name, problems=(Problem.of(error),))
+
+
+def _asked(
+    port: Port, own: ProjectorProfile | None, profiles: Sequence[ProjectorProfile], answer_s: float, deadline: Deadline
+) -> Found:
+    settings = port.settings or {}
+    written = int(settings.get("baud", own.serial.baud if own is not None and own.serial is not None else 0))
+    heard = _who(port, _order(own, written, profiles), answer_s, deadline)
+    if heard.profile is None:
+        return _nobody(port, own, heard, written)
+    profile, baud = heard.profile, heard.baud
+    assert profile.serial is not None
+    table: dict[str, Any] = {"profile": settings.get("profile", profile.name), "port": port.name}
+    if baud != profile.serial.baud or (own is not None and baud != written):
+        table["baud"] = baud
+    problems = []
+    if own is not None and profile.name != own.name:
+        table["profile"] = profile.name
+        problems.append(
+            Problem(
+                "serial-other-profile",
+                f'{port.name} is answered by a projector of "{profile.name}", and stage.toml says "{own.name}".',
+                f'Write profile = "{profile.name}" for {port.name} into stage.toml.',
+            )
+        )
+    elif own is not None and baud != written:
+        problems.append(
+            Problem(
+                "serial-wrong-baud",
+                f"The projector at {port.name} answers at {baud} baud, and stage.toml says {written}.",
+                f"Write baud = {baud} for {port.name} into stage.toml, or set {written} in the projector's menu.",
+            )
+        )
+    what = f"projector, {profile.maker} ({profile.name}), {baud} baud"
+    return Found("serial", port.name, what, "projector", "serial", table, port.name, tuple(problems))
+
+
+def _nobody(port: Port, own: ProjectorProfile | None, heard: Heard, written: int) -> Found:
+    if own is None and not heard.anything:
+        return Found("serial", port.name, f"{port.what}, nobody answers", identity=port.name)
+    code, remedy = "serial-no-answer", "Check that the projector has mains, the cable (a null modem?), and the profile."
+    what = f"Nobody at {port.name} answers as any profile would, at any usual rate."
+    if heard.anything:
+        code = "serial-garbage"
+        what = f"Something at {port.name} answers, and no profile understands it at any usual rate."
+        remedy = "Look up its commands and write a profile (docs/drivers.md), or it is no projector."
+    return Found("serial", port.name, port.what, identity=port.name, problems=(Problem(code, what, remedy),))
+
+
+def _order(
+    own: ProjectorProfile | None, written: int, profiles: Sequence[ProjectorProfile]
+) -> Iterator[tuple[int, Sequence[ProjectorProfile], bool]]:
+    """Rates with the profiles to try there; True: only if something came back, or stage.toml names a profile."""
+    if own is not None:
+        yield written, [own], False
+    usual: dict[int, list[ProjectorProfile]] = {}
+    # Last those whose questions do not end in a carriage return: what hears them waits for the rest of a line.
+    for profile in sorted(profiles, key=lambda one: not _question(one)[1].endswith(END)):
+        if profile.serial is not None:
+            usual.setdefault(profile.serial.baud, []).append(profile)
+    yield from ((baud, known, False) for baud, known in usual.items())
+    for baud in BAUDS:
+        others = [one for one in profiles if one.serial is not None and one.serial.baud != baud]
+        yield baud, others if own is None else [own], True
+
+
+def _who(
+    port: Port, order: Iterable[tuple[int, Sequence[ProjectorProfile], bool]], answer_s: float, deadline: Deadline
+) -> Heard:
+    anything, named = False, port.settings is not None
+    for baud, profiles, only_if in order:
+        if only_if and not (anything or named):
+            continue
+        try:
+            link = SerialLink(port.path, baud=baud, deadline=deadline)
+        except ValueError:
+            continue  # a rate that this adapter does not have
+        try:
+            for profile in profiles:
+                answered, came = _answers(link, profile, answer_s, deadline)
+                anything |= came
+                if answered:
+                    return Heard(profile, baud, True)
+        finally:
+            link.close()
+    return Heard(None, anything=anything)
+
+
+def _answers(link: SerialLink, profile: ProjectorProfile, answer_s: float, deadline: Deadline) -> tuple[bool, bool]:
+    """Ask one question in a profile's words: whether the answer is one, and whether anything came."""
+    table = profile.serial
+    assert table is not None
+    query, said = _question(profile)
+    deadline.sleep(profile.timing.interval_s)
+    came = bool(link.drain())
+    link.write(said, deadline=deadline.within(WRITE_S))
+    patience = deadline.within(answer_s)
+    while True:
+        try:
+            line = _line(link, table, patience)
+        except DeviceTimeout:
+            deadline.check("doctor-too-slow", what="The search took too long.", remedy="Unplug what is not needed.")
+            if not said.endswith(END):
+                link.write(END, deadline=deadline.within(WRITE_S))  # the next question begins a line of its own
+            return False, came or bool(link.drain())
+        came = True
+        with contextlib.suppress(ProtocolError):
+            meaning = parse_line(table, line, query, sent=said)
+            if isinstance(meaning, Answer) or meaning is Reply.COOLING:
+                return True, True
+
+
+def _question(profile: ProjectorProfile) -> tuple[Query, bytes]:
+    """The question for the power state, or another where a family's is not known, and its bytes."""
+    table = profile.serial
+    assert table is not None
+    query = table.queries["power"] if "power" in table.queries else next(iter(table.queries.values()))
+    return query, query_bytes(table, query, table.address)
+
+
+def _line(link: SerialLink, table: SerialTable, deadline: Deadline) -> bytes:
+    """The next line or frame, or what came instead of one."""
+    try:
+        if table.frame is None:
+            return link.read_until(table.terminator, limit=table.longest_answer, deadline=deadline)
+        head = link.read_exactly(head_bytes(table.frame), deadline=deadline)
+        rest = rest_bytes(table.frame, head, longest=table.longest_answer)
+        return head + link.read_exactly(rest, deadline=deadline)
+    except ProtocolError:
+        return link.drain()
+
+
+FINDER: Final = Finder("serial", find)

@@ -1,0 +1,67 @@
+"""Still cameras on USB, who may use them, and who holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from hal.deadline import Deadline
+from hal.finding import Finder, Found, Problem, Wanted
+from hal.ptp import printable
+from plugins.finding.access import forbidden, holders, running
+from plugins.ptp_usb_bus import UsbCamera, usb_cameras
+
+RULES: Final = "70-velatura-camera.rules"
+MONITORS: Final = ("gvfs-gphoto2-volume-monitor", "gvfsd-gphoto2", "gphoto2", "digikam", "darktable", "entangle")
+"""Programs that take a camera for themselves as soon as it is plugged in, or keep it while they run."""
+
+
+def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    """Every still camera, with what stands between it and us. Nothing is sent to a camera."""
+    found = []
+    for camera in usb_cameras():
+        deadline.check("doctor-too-slow", what="The search took too long.", remedy="Unplug what is not needed.")
+        found.append(_found(camera))
+    return found
+
+
+def _found(camera: UsbCamera) -> Found:
+    node = Path(f"/dev/bus/usb/{camera.device.bus:03d}/{camera.device.address:03d}")
+    address = f"usb:{camera.serial}" if camera.serial else f"usb:{camera.port}"
+    what = f"still camera, {_name(camera.device)}{camera.vendor:04x}:{camera.product:04x}"
+    problems = [problem for problem in (forbidden(node, "camera", RULES, "usb"), _held(node)) if problem is not None]
+    identity = camera.serial or f"{camera.vendor:04x}:{camera.product:04x}"
+    table = {"address": address}
+    return Found("usb", f"port {camera.port}", what, "camera", "ptp", table, identity, tuple(problems))
+
+
+def _held(node: Path) -> Problem | None:
+    who = holders(node)
+    if who:
+        return Problem(
+            "camera-taken",
+            what=f"The camera at {node} is held by {', '.join(who)}.",
+            remedy="End that program. The desktop's own: systemctl --user mask --now gvfs-gphoto2-volume-monitor, and "
+            "gio mount -u its mount.",
+        )
+    waiting = running(*MONITORS)
+    if waiting:
+        return Problem(
+            "camera-may-be-taken",
+            what=f"{', '.join(waiting)} runs, and takes cameras when it likes.",
+            remedy="End it before a run: systemctl --user mask --now gvfs-gphoto2-volume-monitor keeps the desktop's "
+            "own away for good.",
+        )
+    return None
+
+
+def _name(device: Any) -> str:
+    """Its product name with a space after it; "" where it may not be read."""
+    try:
+        return printable(f"{device.product or ''}"[:60]).strip() + " "
+    except (ValueError, NotImplementedError, OSError):
+        return ""
+
+
+FINDER: Final = Finder("usb", find)
