@@ -133,6 +133,35 @@ class LightTransport(ABC):
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         """T' r on planes: (3, rows, columns) to (3, pixels)."""
 
+    def sheet(self) -> FloatImage:
+        """The light of no projector, in the form that a solver keeps it in: as the camera samples it.
+
+        A solver that changes one projector at a time adds light to sheets, and needs a picture only at its end. Here a
+        sheet is a picture (3, rows, columns).
+        """
+        return np.zeros((3, *self.shape), np.float32)
+
+    def add_light(self, n: int, p: FloatImage, sheet: FloatImage) -> None:
+        """Add T_n p_n to a sheet; ``p`` (3, pixels of all projectors), of which those of ``n`` are read."""
+        sheet += self.forward_planes(p, projectors=(n, n + 1))
+
+    def pull(self, n: int, sheet: FloatImage, out: FloatImage) -> None:
+        """Write the transpose of ``add_light`` to those pixels of ``out`` (3, pixels of all projectors) that are n's."""
+        out[:, self.span(n)] = self.adjoint_planes(sheet)[:, self.span(n)]
+
+    def weigh(self, sheet: FloatImage, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
+        """Write D' w D sheet - aim, with D making the picture of a sheet; ``weights`` (rows, columns)."""
+        np.multiply(sheet, weights, out=out)
+        out -= aim
+
+    def aim(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
+        """D' w picture: a sheet, from (3, rows, columns) and (rows, columns)."""
+        return picture * weights
+
+    def coarser(self) -> LightTransport | None:
+        """About the same transport at half the resolution of camera and projectors, or None where there is none."""
+        return None
+
     @abstractmethod
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         """``gaussian_mean`` on planes: (3, rows, columns) to (3, pixels); pixels of other projectors are 0."""

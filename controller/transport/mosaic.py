@@ -18,6 +18,8 @@ from controller.compiled import compiled
 BORDER: Final = 2
 """Rows and columns whose neighbours, or neighbours' neighbours, may lie outside."""
 GREEN: Final = 1
+STRIP: Final = 16
+"""Rows of a picture that fit a core's second cache, three planes of them."""
 
 Colours = npt.NDArray[np.int64]
 """(2, 2): 0 red, 1 green, 2 blue at even and odd rows and columns."""
@@ -33,32 +35,30 @@ def _count(colours: Colours, y: int, x: int, colour: int, rows: int, columns: in
 
 
 @compiled()
-def _interpolate_one(sites: FloatImage, colours: Colours, y: int, x: int, out: FloatImage) -> None:
+def _picture_one(sites: FloatImage, colours: Colours, y: int, x: int) -> tuple[float, float, float]:
     rows, columns = sites.shape
-    for colour in range(3):
-        if colours[y & 1, x & 1] == colour:
-            out[colour, y, x] = sites[y, x]
-            continue
-        total = np.float32(0)
-        n = 0
-        for r in range(max(y - 1, 0), min(y + 2, rows)):
-            for c in range(max(x - 1, 0), min(x + 2, columns)):
-                if colours[r & 1, c & 1] == colour:
-                    total += sites[r, c]
-                    n += 1
-        out[colour, y, x] = total / np.float32(max(n, 1))
+    total, n = np.zeros(3, np.float32), np.zeros(3, np.int64)
+    for r in range(max(y - 1, 0), min(y + 2, rows)):
+        for c in range(max(x - 1, 0), min(x + 2, columns)):
+            colour = colours[r & 1, c & 1]
+            total[colour] += sites[r, c]
+            n[colour] += 1
+    own = colours[y & 1, x & 1]
+    total[own], n[own] = sites[y, x], 1
+    return total[0] / max(n[0], 1), total[1] / max(n[1], 1), total[2] / max(n[2], 1)
 
 
 @compiled()
-def _collect_one(planes: FloatImage, colours: Colours, y: int, x: int, out: FloatImage) -> None:
-    _, rows, columns = planes.shape
+def _collect_one(planes: FloatImage, above: int, rows: int, colours: Colours, y: int, x: int) -> float:
+    """The transpose at one site of a picture of ``rows`` rows; ``planes`` begin with row ``above`` of it."""
+    columns = planes.shape[2]
     own = colours[y & 1, x & 1]
-    total = planes[own, y, x]
+    total = planes[own, y - above, x]
     for r in range(max(y - 1, 0), min(y + 2, rows)):
         for c in range(max(x - 1, 0), min(x + 2, columns)):
             if colours[r & 1, c & 1] != own:
-                total += planes[own, r, c] / np.float32(_count(colours, r, c, own, rows, columns))
-    out[y, x] = total
+                total += planes[own, r - above, c] / np.float32(_count(colours, r, c, own, rows, columns))
+    return total
 
 
 @compiled(fastmath=True)
@@ -112,32 +112,72 @@ def _collect_row(own: FloatImage, green: FloatImage, y: int, at: int, out: Float
         to[i] = others if (i & 1) == at else greens
 
 
+@compiled()
+def _picture_row(
+    sites: FloatImage, colours: Colours, y: int, red: FloatImage, green: FloatImage, blue: FloatImage
+) -> None:
+    """Row ``y`` of the picture."""
+    rows, columns = sites.shape
+    inner = BORDER <= y < rows - BORDER
+    if inner:
+        at = 1 if colours[y & 1, 0] == GREEN else 0
+        if colours[y & 1, at] == 0:
+            _interpolate_row(sites[y - 1], sites[y], sites[y + 1], at, red, green, blue)
+        else:
+            _interpolate_row(sites[y - 1], sites[y], sites[y + 1], at, blue, green, red)
+    for x in range(min(BORDER, columns) if inner else columns):
+        red[x], green[x], blue[x] = _picture_one(sites, colours, y, x)
+    for x in range(max(columns - BORDER, BORDER) if inner else columns, columns):
+        red[x], green[x], blue[x] = _picture_one(sites, colours, y, x)
+
+
+@compiled()
+def _sites_row(planes: FloatImage, above: int, rows: int, colours: Colours, y: int, out: FloatImage) -> None:
+    """Row ``y`` of the transpose; ``planes`` begin with row ``above`` of the picture."""
+    columns = out.size
+    inner = BORDER <= y < rows - BORDER
+    if inner:
+        at = 1 if colours[y & 1, 0] == GREEN else 0
+        _collect_row(planes[colours[y & 1, at]], planes[GREEN], y - above, at, out)
+    for x in range(min(BORDER, columns) if inner else columns):
+        out[x] = _collect_one(planes, above, rows, colours, y, x)
+    for x in range(max(columns - BORDER, BORDER) if inner else columns, columns):
+        out[x] = _collect_one(planes, above, rows, colours, y, x)
+
+
 @compiled(parallel=True)
 def interpolate(sites: FloatImage, colours: Colours, out: FloatImage) -> None:
     """Write the picture (3, rows, columns) that a camera makes of its ``sites`` (rows, columns)."""
-    rows, columns = sites.shape
-    for y in prange(rows):
-        inner = BORDER <= y < rows - BORDER
-        if inner:
-            at = 1 if colours[y & 1, 0] == GREEN else 0
-            own = colours[y & 1, at]
-            _interpolate_row(sites[y - 1], sites[y], sites[y + 1], at, out[own, y], out[GREEN, y], out[2 - own, y])
-        for x in range(min(BORDER, columns) if inner else columns):
-            _interpolate_one(sites, colours, y, x, out)
-        for x in range(max(columns - BORDER, BORDER) if inner else columns, columns):
-            _interpolate_one(sites, colours, y, x, out)
+    for y in prange(sites.shape[0]):
+        _picture_row(sites, colours, y, out[0, y], out[1, y], out[2, y])
 
 
 @compiled(parallel=True)
 def collect(planes: FloatImage, colours: Colours, out: FloatImage) -> None:
     """The transpose of ``interpolate``: (3, rows, columns) to sites (rows, columns)."""
-    _, rows, columns = planes.shape
+    rows = planes.shape[1]
     for y in prange(rows):
-        inner = BORDER <= y < rows - BORDER
-        if inner:
-            at = 1 if colours[y & 1, 0] == GREEN else 0
-            _collect_row(planes[colours[y & 1, at]], planes[GREEN], y, at, out[y])
-        for x in range(min(BORDER, columns) if inner else columns):
-            _collect_one(planes, colours, y, x, out)
-        for x in range(max(columns - BORDER, BORDER) if inner else columns, columns):
-            _collect_one(planes, colours, y, x, out)
+        _sites_row(planes, 0, rows, colours, y, out[y])
+
+
+@compiled(parallel=True, fastmath=True)
+def weigh(sites: FloatImage, colours: Colours, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
+    """Write D' w D sites - aim, with D the interpolation; all (rows, columns).
+
+    In strips of rows whose pictures stay in a near cache, so that a picture of three planes is never written.
+    """
+    rows, columns = sites.shape
+    for i in prange((rows + STRIP - 1) // STRIP):
+        first, last = STRIP * i, min(STRIP * (i + 1), rows)
+        above = max(first - 1, 0)
+        end = min(last + 1, rows)
+        planes = np.empty((3, end - above, columns), np.float32)
+        for y in range(above, end):
+            _picture_row(sites, colours, y, planes[0, y - above], planes[1, y - above], planes[2, y - above])
+            for c in range(3):
+                for x in range(columns):
+                    planes[c, y - above, x] *= weights[y, x]
+        for y in range(first, last):
+            _sites_row(planes, above, rows, colours, y, out[y])
+            for x in range(columns):
+                out[y, x] -= aim[y, x]

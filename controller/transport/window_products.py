@@ -120,11 +120,9 @@ def _buffered(
 def forward_sites(
     windows: Windows, table: Profiles, mixing: FloatImage, p: FloatImage, projectors: tuple[int, int], out: FloatImage
 ) -> None:
-    """Write the light of the projectors at every site to ``out`` (sites,)."""
+    """Add the light of the projectors at every site to ``out`` (sites,)."""
     halo = windows.halo[0]
     side = TILE + 2 * halo
-    for i in prange(out.size // 4096 + 1):
-        out[4096 * i : 4096 * (i + 1)] = 0
     for n in range(projectors[0], projectors[1]):
         begin, end = windows.cell_first[n], windows.cell_first[n + 1]
         half = (end - begin + 1) // 2
@@ -172,14 +170,15 @@ def adjoint_sites(
     projectors: tuple[int, int],
     out: FloatImage,
 ) -> None:
-    """Write the transpose of ``forward_sites``: ``r`` (sites,) to ``out`` (3, pixels), 0 for other projectors.
+    """Write the transpose of ``forward_sites``: ``r`` (sites,) to those pixels of ``out`` (3, pixels) that are theirs.
 
     ``weighted``: with the windows' gains; else every site counts alike.
     """
     halo = windows.halo[0]
     side = TILE + 2 * halo
-    for i in prange(out.shape[1] // 4096 + 1):
-        out[:, 4096 * i : 4096 * (i + 1)] = 0
+    begin, end = windows.start[projectors[0]], windows.start[projectors[1]]
+    for i in prange((end - begin) // 4096 + 1):
+        out[:, begin + 4096 * i : min(begin + 4096 * (i + 1), end)] = 0
     for t in range(TURNS):
         begin, end = windows.turn_first[t], windows.turn_first[t + 1]
         for i in prange(end - begin):

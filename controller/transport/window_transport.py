@@ -7,7 +7,6 @@ sampled, and D the interpolation of the camera's colours, exactly as the picture
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,12 +14,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import FloatImage
+from controller.arrays import FloatImage, Mask
 from controller.calibrate.values import Calibration, PhaseMap
 from controller.transport.light import FAINTEST, LightTransport
-from controller.transport.mosaic import collect, interpolate
+from controller.transport.mosaic import collect, interpolate, weigh
 from controller.transport.planes import image_planes
 from controller.transport.profiles import Profiles, build_profiles
+from controller.transport.spare import lent
 from controller.transport.window_products import adjoint_sites, forward_sites
 from controller.transport.windows import Windows, build_windows
 
@@ -48,36 +48,51 @@ class WindowTransport(LightTransport):
     def from_calibration(cls, calibration: Calibration) -> WindowTransport:
         """Build T from phase maps; the calibration is consistent, and every projector has one."""
         parts = calibration.projectors
-        mask = calibration.object_mask
-        mosaic = calibration.mosaic is not None and min(mask.shape) >= SMALLEST_MOSAIC
+        mosaic = calibration.mosaic is not None and min(calibration.object_mask.shape) >= SMALLEST_MOSAIC
         colours = np.asarray(calibration.mosaic, np.int64) if mosaic else np.zeros((0, 0), np.int64)
-        # a pixel of the object is made of samples beside it, too
-        near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if mosaic else mask
-        maps: tuple[PhaseMap, ...] = tuple(part.phase_map for part in parts if part.phase_map is not None)
-        bright = tuple(near & (part.white.max(axis=2) > FAINTEST * part.white.max(initial=0)) for part in parts)
-        windows = build_windows(maps, tuple(part.white for part in parts), colours, bright)
-        sizes = tuple((int(rows), int(columns)) for rows, columns in windows.size)
+        maps = tuple(part.phase_map for part in parts if part.phase_map is not None)
         mixing = np.stack([part.radiometry.mixing for part in parts]).astype(np.float32)
-        lit = np.zeros((len(parts), *mask.shape), np.bool_)
+        return cls.of(maps, tuple(part.white for part in parts), colours, calibration.object_mask, mixing)
+
+    @classmethod
+    def of(
+        cls,
+        maps: tuple[PhaseMap, ...],
+        whites: tuple[FloatImage, ...],
+        colours: npt.NDArray[np.int64],
+        mask: Mask,
+        mixing: FloatImage,
+    ) -> WindowTransport:
+        """From a phase map and a white image (rows, columns, 3) for each projector; ``mask``: the object."""
+        # a pixel of the object is made of samples beside it, too
+        near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if colours.size else mask
+        bright = tuple(near & (white.max(axis=2) > FAINTEST * white.max(initial=0)) for white in whites)
+        windows = build_windows(maps, whites, colours, bright)
+        sizes = tuple((int(rows), int(columns)) for rows, columns in windows.size)
+        lit = np.zeros((len(maps), *mask.shape), np.bool_)
         pixels = int(windows.start[-1])
         none = np.zeros((3, pixels), np.float32)
         made = cls(mixing, lit, none[0], sizes, windows, build_profiles(), colours, none)
         light = np.empty((3, *mask.shape), np.float32)
         plain = np.broadcast_to(np.eye(3, dtype=np.float32), mixing.shape).copy()
-        for n, part in enumerate(parts):
-            made._products(np.ones((3, pixels), np.float32), plain, (n, n + 1), light)
-            lit[n] = mask & bright[n] & np.all(light >= np.float32(WHOLE) * made._sampled(part.white), axis=0)
-        total = made._sums(np.ones((3, *mask.shape), np.float32), (0, len(parts)))
+        ones = np.ones((3, pixels), np.float32)
+        for n, white in enumerate(whites):
+            made._products(ones, plain, (n, n + 1), light)
+            lit[n] = mask & bright[n] & np.all(light >= np.float32(WHOLE) * made._sampled(white), axis=0)
+        light[:] = 1
+        total = made._sums(light, (0, len(maps)))
         per_sum = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
         return cls(mixing, lit, per_sum.max(axis=0), sizes, windows, made.table, colours, per_sum)
 
     def _products(self, p: FloatImage, mixing: FloatImage, projectors: tuple[int, int], out: FloatImage) -> None:
         if not self.colours.size:
+            out[:] = 0
             forward_sites(self.windows, self.table, mixing, p, projectors, out.reshape(-1))
             return
-        sites = _scratch(self.shape)
-        forward_sites(self.windows, self.table, mixing, p, projectors, sites.reshape(-1))
-        interpolate(sites, self.colours, out)
+        with lent(self.shape) as sites:
+            sites[:] = 0
+            forward_sites(self.windows, self.table, mixing, p, projectors, sites.reshape(-1))
+            interpolate(sites, self.colours, out)
 
     def _sampled(self, white: FloatImage) -> FloatImage:
         """(3, rows, columns): a picture again as it is made of its own samples."""
@@ -92,18 +107,21 @@ class WindowTransport(LightTransport):
         return planes
 
     def _sums(self, image: FloatImage, projectors: tuple[int, int]) -> FloatImage:
-        out = np.empty((3, self.pixels), np.float32)
+        out = np.zeros((3, self.pixels), np.float32)
         plain = np.broadcast_to(np.eye(3, dtype=np.float32), self.mixing.shape).copy()
-        adjoint_sites(self.windows, self.table, plain, self._samples(image), False, projectors, out)
+        self._transposed(image, plain, False, projectors, out)
         return out
 
-    def _samples(self, picture: FloatImage) -> FloatImage:
-        """The transpose of how a picture (3, rows, columns) is made of its samples, flat."""
-        sites = picture
-        if self.colours.size:
-            sites = _scratch(self.shape)
+    def _transposed(
+        self, picture: FloatImage, mixing: FloatImage, weighted: bool, projectors: tuple[int, int], out: FloatImage
+    ) -> None:
+        if not self.colours.size:
+            samples = np.ascontiguousarray(picture).reshape(-1)
+            adjoint_sites(self.windows, self.table, mixing, samples, weighted, projectors, out)
+            return
+        with lent(self.shape) as sites:
             collect(picture, self.colours, sites)
-        return np.ascontiguousarray(sites).reshape(-1)
+            adjoint_sites(self.windows, self.table, mixing, sites.reshape(-1), weighted, projectors, out)
 
     def forward_planes(
         self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
@@ -114,9 +132,37 @@ class WindowTransport(LightTransport):
 
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         out = np.empty((3, self.pixels), np.float32) if out is None else out
-        everyone = (0, len(self.sizes))
-        adjoint_sites(self.windows, self.table, self.mixing, self._samples(r), True, everyone, out)
+        self._transposed(r, self.mixing, True, (0, len(self.sizes)), out)
         return out
+
+    def sheet(self) -> FloatImage:
+        """One number a sample; see ``LightTransport.sheet``."""
+        return np.zeros(self.shape if self.colours.size else (3, *self.shape), np.float32)
+
+    def add_light(self, n: int, p: FloatImage, sheet: FloatImage) -> None:
+        forward_sites(self.windows, self.table, self.mixing, p, (n, n + 1), sheet.reshape(-1))
+
+    def pull(self, n: int, sheet: FloatImage, out: FloatImage) -> None:
+        adjoint_sites(self.windows, self.table, self.mixing, sheet.reshape(-1), True, (n, n + 1), out)
+
+    def weigh(self, sheet: FloatImage, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
+        if self.colours.size:
+            weigh(sheet, self.colours, weights, aim, out)
+        else:
+            LightTransport.weigh(self, sheet, weights, aim, out)
+
+    def aim(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
+        weighted = picture * weights
+        if not self.colours.size:
+            return weighted
+        out = np.empty(self.shape, np.float32)
+        collect(weighted, self.colours, out)
+        return out
+
+    def coarser(self) -> WindowTransport | None:
+        from controller.transport.coarse import halved
+
+        return halved(self)
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         means = self._sums(np.ascontiguousarray(image), projectors or (0, len(self.sizes)))
@@ -131,14 +177,3 @@ class WindowTransport(LightTransport):
         windows = Windows(*(arrays[name] for name in Windows._fields))
         mixing, lit, per_weight, colours, per_sum = (arrays[name] for name in _OWN)
         return cls(mixing, lit, per_weight, sizes, windows, build_profiles(), colours, per_sum)
-
-
-_kept = threading.local()
-
-
-def _scratch(shape: tuple[int, int]) -> FloatImage:
-    """A sheet of samples for the length of one product; fresh memory would cost as much as the interpolation."""
-    sheet: FloatImage | None = getattr(_kept, "sheet", None)
-    if sheet is None or sheet.shape != shape:
-        sheet = _kept.sheet = np.empty(shape, np.float32)
-    return sheet
