@@ -19,20 +19,24 @@ void main() {
     gl_Position = vec4(2.0 * corner - 1.0, 0.0, 1.0);
 }
 """
-# The square stands for every projector's response, as in mixing.py.
-_FRAGMENT: Final = """#version 330 core
+_HEAD: Final = """#version 330 core
 in vec2 place;
 out vec4 colour;
 uniform sampler2D before;
 uniform sampler2D after;
 uniform float share;
-void main() {
-    vec3 old = share < 1.0 ? texture(before, place).rgb : vec3(0.0);
-    vec3 new = share > 0.0 ? texture(after, place).rgb : vec3(0.0);
-    vec3 mixed = sqrt((1.0 - share) * old * old + share * new * new);
-    colour = vec4(share <= 0.0 ? old : share >= 1.0 ? new : mixed, 1.0);
+"""
+_PLAIN: Final = _HEAD + "void main() { colour = vec4(texture(before, place).rgb, 1.0); }"
+# The square stands for every projector's response, as in mixing.py.
+_MIXED: Final = (
+    _HEAD
+    + """void main() {
+    vec3 old = texture(before, place).rgb;
+    vec3 new = texture(after, place).rgb;
+    colour = vec4(sqrt((1.0 - share) * old * old + share * new * new), 1.0);
 }
 """
+)
 
 
 class Canvas:
@@ -41,10 +45,13 @@ class Canvas:
     def __init__(self, sizes: Sequence[OutputSize]) -> None:
         """Raises WorkError("display-unfit")."""
         self._sizes = tuple(sizes)
-        program = _program()
-        self._share_at = gl.glGetUniformLocation(program, b"share")
+        # Two programs, for drawing without a graphics card does all that a program may do, wanted or not.
+        self._plain, self._mixed = _program(_PLAIN), _program(_MIXED)
+        gl.glUseProgram(self._mixed)
+        self._share_at = gl.glGetUniformLocation(self._mixed, b"share")
         for unit, name in enumerate((b"before", b"after")):
-            gl.glUniform1i(gl.glGetUniformLocation(program, name), unit)
+            gl.glUniform1i(gl.glGetUniformLocation(self._mixed, name), unit)
+        _set_up()
         self._before = [_texture(size) for size in sizes]
         self._after: list[int] = []
 
@@ -71,24 +78,30 @@ class Canvas:
         """Draw into a black window of this (width, height); ``places``: upper left corners, None: not drawn."""
         gl.glViewport(0, 0, *shape)
         gl.glClear(gl.GL_COLOR_BUFFER_BIT)
-        gl.glUniform1f(self._share_at, share)
+        mixed = 0 < share < 1
+        gl.glUseProgram(self._mixed if mixed else self._plain)
+        if mixed:
+            gl.glUniform1f(self._share_at, share)
+        first = self._after if share >= 1 else self._before
         for number, (place, size) in enumerate(zip(places, self._sizes, strict=True)):
             if place is None:
                 continue
             # OpenGL counts rows from below.
             gl.glViewport(place[0], shape[1] - place[1] - size.height_px, size.width_px, size.height_px)
-            for unit, textures in ((gl.GL_TEXTURE0, self._before), (gl.GL_TEXTURE1, self._after or self._before)):
-                gl.glActiveTexture(unit)
-                gl.glBindTexture(gl.GL_TEXTURE_2D, textures[number])
+            gl.glActiveTexture(gl.GL_TEXTURE0)
+            gl.glBindTexture(gl.GL_TEXTURE_2D, first[number])
+            if mixed:
+                gl.glActiveTexture(gl.GL_TEXTURE1)
+                gl.glBindTexture(gl.GL_TEXTURE_2D, self._after[number])
             gl.glDrawArrays(gl.GL_TRIANGLES, 0, 3)
         # Drawn before the deadline, so that the flip itself has nothing to wait for.
         gl.glFinish()
 
 
-def _program() -> Any:
-    """Make the drawing program current; it stays current, there is no other."""
+def _program(fragment: str) -> Any:
+    """A drawing program."""
     program = gl.glCreateProgram()
-    for kind, text in ((gl.GL_VERTEX_SHADER, _VERTEX), (gl.GL_FRAGMENT_SHADER, _FRAGMENT)):
+    for kind, text in ((gl.GL_VERTEX_SHADER, _VERTEX), (gl.GL_FRAGMENT_SHADER, fragment)):
         shader = gl.glCreateShader(kind)
         source = ctypes.cast(ctypes.pointer(ctypes.c_char_p(text.encode())), ctypes.POINTER(ctypes.POINTER(gl.GLchar)))
         gl.glShaderSource(shader, 1, source, None)
@@ -103,7 +116,11 @@ def _program() -> Any:
             what="The graphics driver could not build the player's drawing program.",
             remedy="Install the display's current graphics driver, or Mesa (libgl1-mesa-dri).",
         )
-    gl.glUseProgram(program)
+    return program
+
+
+def _set_up() -> None:
+    """What stays as it is while the window is there."""
     vertices = gl.GLuint()
     gl.glGenVertexArrays(1, ctypes.byref(vertices))
     gl.glBindVertexArray(vertices)
@@ -111,7 +128,6 @@ def _program() -> Any:
         gl.glDisable(state)
     gl.glClearColor(0, 0, 0, 1)
     gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
-    return program
 
 
 def _texture(size: OutputSize) -> int:
