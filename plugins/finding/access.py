@@ -24,7 +24,7 @@ def rule_text(name: str, needle: str) -> str:
 
 def forbidden(node: Path, device: str, rules: str, needle: str) -> Problem | None:
     """The problem of a device file that this user may not read and write; None if it may."""
-    if os.access(node, os.R_OK | os.W_OK, effective_ids=os.access in os.supports_effective_ids):
+    if os.access(node, os.R_OK | os.W_OK):
         return None
     try:
         status = node.stat()

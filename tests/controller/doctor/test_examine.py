@@ -1,0 +1,269 @@
+"""The doctor on a stage whose projectors are emulated ones on real ptys and sockets."""
+
+from __future__ import annotations
+
+import json
+import threading
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.app import LOCK
+from controller.config import load_stage
+from controller.doctor.examine import Tools, examine
+from controller.doctor.values import Examination
+from controller.errors import UsageError
+from controller.storage import exclusive
+from hal.deadline import Deadline
+from hal.errors import DeviceBusy
+from hal.finding import Finder, Found, Wanted, load_finders
+from hal.registry import Driver, Drivers, load_drivers
+from plugins.emulated.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.quick_profile import quick_profile
+from plugins.emulated.serial_projector import EmulatedSerialProjector
+from tests.controller.rig_model import ModelCamera, ModelDisplay
+from tests.controller.session.lamp_model import World
+from tests.controller.session.test_mains import Board
+from tests.controller.test_app import Told
+from tests.controller.test_app_relays_and_light import Sensor
+
+LAMP = LampTiming(0.2, 0.2)
+STAGE = """\
+# what the technician wrote
+[stage]
+name = "hall"
+[[projectors]]
+name = "left"   # by the window
+output = "P1"
+driver = "serial"
+profile = "quick.toml"
+port = "by-id/left"
+[camera]
+driver = "model"
+iso = 100
+focal_length_px = 500
+[display]
+driver = "player"
+frames = "run/outputs.frame"
+[[display.outputs]]
+name = "P1"
+width_px = 4
+height_px = 3
+[[display.outputs]]
+name = "P2"
+width_px = 4
+height_px = 3
+"""
+RELAYS = """
+[[relays]]
+name = "cupboard"
+driver = "model"
+[[relays.mains]]
+channel = 1
+feeds = ["left"]
+"""
+
+
+class Hall:
+    """A stage folder, ports beside it, and models of what has no wire here."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.wires: list[EmulatedSerialProjector] = []
+        self.board, self.sensor = Board(World()), Sensor()
+        real = [driver for driver in load_drivers().list if driver.kind == "projector" or driver.name == "player"]
+        self.drivers = Drivers(
+            (
+                *real,
+                Driver("camera", "model", "A camera.", lambda *_: ModelCamera(), {"address": "where it is"}),
+                Driver("display", "model", "A display.", lambda *_: ModelDisplay()),
+                Driver("power_switch", "model", "Relays.", lambda *_: self.board),
+                Driver("light_sensor", "colorhug-als", "A sensor.", lambda *_: self.sensor, {"serial": "its number"}),
+            )
+        )
+        (folder / "stage.toml").write_text(STAGE)
+        (folder / "quick.toml").write_text(quick_profile(LAMP))
+        (folder / "by-id").mkdir()
+        self.others: list[Finder] = []
+
+    def plug(self, name: str, *, baud: int = 9600) -> EmulatedSerialProjector:
+        wire = EmulatedSerialProjector(self.folder / "by-id" / name, EmulatedLamp(LAMP), baud=baud)
+        wire.start()
+        self.wires.append(wire)
+        return wire
+
+    def examine(self, *, write: bool = False, stage: bool = True) -> Examination:
+        finders, broken = load_finders()
+        assert broken == ()
+        assert {one.bus for one in finders} == {"display", "hid", "network", "serial", "usb"}
+        wanted = {"serial_ports": self.folder / "by-id", "system_ports": False, "search": None, "answer_s": 0.15}
+        mine = [one for one in finders if one.bus in ("serial", "network")]
+        tools = Tools((*mine, *self.others), self.drivers, wanted)
+        folder = self.folder if stage else None
+        return examine(stage=folder, write_it=write, reporter=Told(), cancel=threading.Event(), tools=tools)
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Iterator[Hall]:
+    hall = Hall(tmp_path)
+    yield hall
+    for wire in hall.wires:
+        wire.stop()
+
+
+def codes(seen: Examination) -> list[str]:
+    return [finding.problem.code for finding in seen.findings]
+
+
+def on_bus(*found: Found) -> Finder:
+    def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+        return found
+
+    return Finder("bus", find)
+
+
+def test_a_stage_that_is_well_has_no_problem_and_no_lamp_was_struck(hall: Hall) -> None:
+    wire = hall.plug("left")
+    seen = hall.examine()
+    assert seen.healthy
+    assert [(one.name, one.kind) for one in seen.tried] == [("left", "projector"), ("camera", "camera")]
+    assert "1200 lamp hours" in str(seen.tried[0].answer)
+    assert wire.lamp.strikes == 0
+    assert json.loads(json.dumps(seen.as_json()))["healthy"] is True
+    assert "No problem was found." in seen.as_text()
+
+
+def test_every_problem_says_what_it_is_and_what_to_do(hall: Hall) -> None:
+    hall.plug("left").faults.set(silent=True)
+    seen = hall.examine()
+    assert codes(seen) == ["serial-no-answer"]
+    assert seen.tried[0].answer is None
+    told = seen.as_json()["problems"][0]
+    assert set(told) == {"device", "code", "what", "remedy"}
+    assert all(told.values())
+    assert told["what"] in seen.as_text()
+    assert told["remedy"] in seen.as_text()
+
+
+def test_a_projector_behind_an_open_relay_is_told_to_have_no_mains(hall: Hall) -> None:
+    (hall.folder / "stage.toml").write_text(STAGE + RELAYS)
+    hall.board.closed = {1: False}
+    hall.plug("left").faults.set(silent=True)
+    seen = hall.examine()
+    assert "mains-off" in codes(seen)
+    assert hall.board.closed == {1: False}
+
+
+def test_a_wrong_rate_is_written_into_the_file_and_the_comments_stay(hall: Hall) -> None:
+    hall.plug("left", baud=19200)
+    seen = hall.examine(write=True)
+    assert codes(seen) == ["serial-wrong-baud"]
+    assert seen.written == ("baud = 19200 for projector left",)
+    text = (hall.folder / "stage.toml").read_text()
+    assert "# what the technician wrote" in text
+    assert "# by the window" in text
+    assert tomllib.loads(text)["projectors"][0]["baud"] == 19200
+    assert hall.examine().healthy
+
+
+def test_a_second_projector_and_a_light_sensor_are_added_on_the_free_output(hall: Hall) -> None:
+    hall.plug("left")
+    hall.plug("usb-new")
+    hall.others = [
+        on_bus(Found("hid", "/dev/hidraw0", "ambient light sensor", "light_sensor", "colorhug-als", {"serial": "L1"}))
+    ]
+    seen = hall.examine(write=True)
+    assert codes(seen) == ["not-in-stage", "not-in-stage"]
+    tables = load_stage(hall.folder).tables
+    second = tables.projectors[1].model_dump()
+    assert (second["output"], second["profile"]) == ("P2", "optoma-later")
+    assert second["port"] == str(hall.folder / "by-id" / "usb-new")
+    assert tables.light_sensor is not None
+    assert hall.examine().healthy
+
+
+def test_a_relay_board_is_never_added_by_guess(hall: Hall) -> None:
+    hall.plug("left")
+    hall.others = [on_bus(Found("hid", "/dev/hidraw0", "relay board", "power_switch", "usb-relay", {"serial": "R1"}))]
+    before = (hall.folder / "stage.toml").read_text()
+    seen = hall.examine(write=True)
+    assert codes(seen) == ["not-in-stage"]
+    assert "feeds" in seen.findings[0].problem.remedy
+    assert seen.written == ()
+    assert (hall.folder / "stage.toml").read_text() == before
+
+
+def test_a_first_stage_is_written_from_what_is_plugged_in(hall: Hall) -> None:
+    (hall.folder / "stage.toml").unlink()
+    hall.plug("usb-a")
+    hall.others = [
+        on_bus(
+            Found("usb", "port 1-1", "still camera", "camera", "model", {"address": "usb:1"}),
+            Found(
+                "display",
+                "DP-1",
+                "output",
+                "display",
+                "player",
+                {"outputs": [{"name": "DP-1", "width_px": 4, "height_px": 3}]},
+            ),
+        )
+    ]
+    seen = hall.examine(write=True)
+    assert seen.written
+    tables = load_stage(hall.folder).tables
+    assert [one.output for one in tables.projectors] == ["DP-1"]
+    assert tables.camera.driver == "model"
+    (hall.folder / "stage.toml").unlink()
+    hall.others = []
+    with pytest.raises(UsageError) as caught:
+        hall.examine(write=True)
+    assert caught.value.code == "doctor-not-enough"
+    assert not (hall.folder / "stage.toml").exists()
+
+
+def test_a_wrong_stage_toml_is_a_problem_and_the_search_goes_on(hall: Hall) -> None:
+    (hall.folder / "stage.toml").write_text(STAGE.replace("iso", "izo"))
+    hall.plug("left")
+    seen = hall.examine()
+    assert codes(seen) == ["stage-key-missing"]
+    assert [one.kind for one in seen.found] == ["projector"]
+    with pytest.raises(UsageError):
+        hall.examine(write=True)
+
+
+def test_a_bus_that_cannot_be_looked_at_stops_no_other(hall: Hall) -> None:
+    def fail(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+        raise DeviceBusy("bus-taken", what="It is taken.", remedy="Free it.")
+
+    hall.plug("left")
+    hall.others = [Finder("broken", fail)]
+    seen = hall.examine()
+    assert codes(seen) == ["bus-taken"]
+    assert len(seen.found) == 1
+
+
+def test_a_running_stage_is_not_disturbed(hall: Hall) -> None:
+    with exclusive(hall.folder / LOCK, what_is_running="Velatura"), pytest.raises(UsageError) as caught:
+        hall.examine()
+    assert caught.value.code == "already-running"
+
+
+def test_what_a_device_says_of_itself_cannot_move_the_terminal(hall: Hall) -> None:
+    hall.plug("left")
+    hall.others = [on_bus(Found("hid", "x", "panel \x1b[2J", "", ""))]
+    seen = hall.examine()
+    assert "\x1b" not in seen.as_text()
+    assert "\x1b" not in json.loads(json.dumps(seen.as_json()))["found"][-1]["what"]
+
+
+def test_without_a_stage_only_what_is_plugged_in_is_told(hall: Hall, monkeypatch: Any) -> None:
+    monkeypatch.chdir(hall.folder)
+    hall.plug("left")
+    seen = hall.examine(stage=False)
+    assert seen.tried == ()
+    assert len(seen.new) == 1
+    assert seen.healthy
