@@ -1,0 +1,274 @@
+"""A kiosk in memory: our own Protocol, done honestly but without devices, so that the panel can be driven to its ends."""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from controller.errors import UsageError, WorkError
+from controller.panel.kiosk import (
+    Aiming,
+    Appearance,
+    BundleIdentity,
+    ComputeSettings,
+    DeviceRow,
+    EventRow,
+    Finding,
+    FoundDevice,
+    Grade,
+    Job,
+    JobStep,
+    KioskState,
+    Lamp,
+    LiveValue,
+    NextEvent,
+    ProjectorAim,
+    RecalibrationKind,
+    Results,
+    Schedule,
+    ScheduleRow,
+    TriedDevice,
+    Unsubscribe,
+)
+
+STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")
+BORN = 1_767_600_000.0
+TOML = '[stage]\nname = "Head of a boy"\n'
+
+
+def devices() -> tuple[DeviceRow, ...]:
+    lamp = (LiveValue("Power", "on"), LiveValue("Lamp", "1,204 h"), LiveValue("Temperature", "41 °C"))
+    lost = "It has not answered for 12 s."
+    return (
+        DeviceRow("left", "projector", "serial", lamp),
+        DeviceRow("middle", "projector", "pjlink", lamp),
+        DeviceRow("right", "projector", "serial", lamp[:1], lost, "Check its mains plug and the serial cable."),
+        DeviceRow("camera", "camera", "ptp", (LiveValue("Model", "EOS R5"), LiveValue("Battery", "87 %"))),
+        DeviceRow("display", "display", "player", (LiveValue("Swaps", "60 /s"),)),
+    )
+
+
+class MemoryKiosk:
+    """``step_s`` how long a step of a job takes. ``pictures`` a folder for what it draws."""
+
+    def __init__(self, pictures: Path, *, step_s: float = 0.05) -> None:
+        self._folder, self._step_s = pictures, step_s
+        pictures.mkdir(parents=True, exist_ok=True)
+        self._lock = threading.RLock()
+        self._callbacks: list[Callable[[], None]] = []
+        self._cancel = threading.Event()
+        self._worker: threading.Thread | None = None
+        self._events: list[EventRow] = []
+        self._schedule = Schedule("Europe/Vienna", (ScheduleRow("mon", "10:00", "18:00", "marble"),), "03:00")
+        self._toml = TOML
+        self.asked: list[tuple[str, object]] = []
+        self._appearances = {
+            name: Appearance(name, BORN, 1.2, preview=self._drawn(name)) for name in ("marble", "warm wood")
+        }
+        self._results: dict[str, Results] = {}
+        self._state = KioskState(
+            revision=1,
+            stage="Head of a boy",
+            state="playing",
+            reason="Everything is well but one projector, whose part the others took over.",
+            since_unix_s=BORN,
+            devices=devices(),
+            playing="marble",
+            next_event=NextEvent("Closes", BORN + 7200),
+            bundle=BundleIdentity(17, "9f2c" * 16, BORN),
+            lamps=(Lamp("left", 1204.0, 88, True, 3000), Lamp("right", 3120.0, 203, False, 3000)),
+        )
+        self._finish("first", "full")
+        for number in range(12):
+            self.note("info", f"Heartbeat {number}: all projectors answer.")
+        self.note("warning", "The projector right was struck twice.", "lamp-struck")
+        self.note("error", "The projector right does not answer.", "projector-no-answer")
+
+    def change(self, **values: object) -> None:
+        with self._lock:
+            self._state = replace(self._state, revision=self._state.revision + 1, **values)  # type: ignore[arg-type]
+        for callback in tuple(self._callbacks):
+            callback()
+
+    def note(self, level: str, text: str, code: str = "") -> None:
+        with self._lock:
+            number = len(self._events) + 1
+            self._events.append(EventRow(number, BORN + number, level, text, code))  # type: ignore[arg-type]
+        for callback in tuple(self._callbacks):
+            callback()
+
+    def _drawn(self, name: str, shade: int = 120) -> Path:
+        file = self._folder / f"{len(list(self._folder.iterdir()))}.png"
+        ramp = Image.linear_gradient("L").resize((240, 160)).rotate(37)
+        Image.merge("RGB", (ramp, ramp.point(lambda value: value * shade // 255), ramp.point(lambda v: v // 3))).save(
+            file
+        )
+        return file
+
+    def snapshot(self) -> KioskState:
+        return self._state
+
+    def events(self, after: int = 0) -> Sequence[EventRow]:
+        with self._lock:
+            return [row for row in self._events if row.number > after][-2000:]
+
+    def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
+        self._callbacks.append(callback)
+        return lambda: self._callbacks.remove(callback)
+
+    def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
+        if projector is not None and projector not in [row.name for row in self._state.devices]:
+            raise UsageError("projector-wrong", what=f"There is no projector {projector}.", remedy="Choose another.")
+        return self._begin(f"Recalibration ({kind})", "calibrating", lambda run: self._finish(run, kind))
+
+    def _begin(self, name: str, state: str, finish: Callable[[str], None]) -> Job:
+        with self._lock:
+            old = self._state.job
+            if old is not None and not old.ended:
+                raise WorkError("job-running", what=f"{old.name} is running.", remedy="Wait for it, or cancel it.")
+            number = 1 if old is None else old.number + 1
+            job = Job(number, name, tuple(JobStep(title, 0.0) for title in STEPS), 60.0, run=f"run-{number}")
+            self._cancel.clear()
+            self.change(job=job, state=state, reason=f"{name} is running.")
+            self._worker = threading.Thread(target=self._work, args=(job, finish), daemon=True)
+            self._worker.start()
+            return job
+
+    def _work(self, job: Job, finish: Callable[[str], None]) -> None:
+        for at in range(len(STEPS)):
+            for done in (0.5, 1.0):
+                if self._cancel.wait(self._step_s / 2):
+                    ended = replace(job, ended=True, failed=True, outcome="It was cancelled.")
+                    self.change(job=ended, state="playing", reason="The job was cancelled; the old calibration stays.")
+                    return
+                share = [1.0] * at + [done] + [0.0] * (len(STEPS) - at - 1)
+                steps = tuple(JobStep(title, part) for title, part in zip(STEPS, share, strict=True))
+                job = replace(job, steps=steps, left_s=(len(STEPS) - at) * self._step_s)
+                self.change(job=job)
+        finish(job.run)
+        done_job = replace(job, ended=True, outcome="It ended well.", left_s=0.0)
+        self.change(job=done_job, state="playing", reason="All is well.")
+
+    def _finish(self, run: str, kind: str) -> None:
+        grade = Grade(run, BORN + len(self._results) * 86400, kind, "A", True, 1.23)
+        names = ("before", "target", "achieved", "error", "resolution")
+        pictures = {name: self._drawn(name, 60 + 30 * at) for at, name in enumerate(names)}
+        self._results[run] = Results(run, grade, pictures, (("Reprojection", "0.08 px"), ("Photographs", "35")))
+        self.change(grades=(*self._state.grades, grade))
+
+    def cancel(self) -> None:
+        job = self._state.job
+        if job is None or job.ended:
+            raise WorkError("no-job", what="No job is running.", remedy="There is nothing to cancel.")
+        self._cancel.set()
+
+    def play(self, name: str) -> None:
+        self._known(name)
+        self._appearances = {key: replace(one, playing=key == name) for key, one in self._appearances.items()}
+        self.change(playing=name, state="playing", reason="Playing as asked.")
+
+    def _known(self, name: str) -> Appearance:
+        if name not in self._appearances:
+            raise UsageError("appearance-unknown", what="There is no such appearance.", remedy="Choose another.")
+        return self._appearances[name]
+
+    def stop(self) -> None:
+        self.change(state="cooling", reason="The stage was closed by hand.", playing="")
+
+    def start(self) -> None:
+        self.change(state="powering", reason="The stage was opened by hand.")
+
+    def compute(self, name: str, target: Path, settings: ComputeSettings) -> Job:
+        self.asked.append(("compute", (name, target.read_bytes()[:4], settings)))
+        preview = self._drawn(name)
+
+        def finish(_: str) -> None:
+            self._appearances[name] = Appearance(name, time.time(), 1.0, preview=preview)
+
+        return self._begin(f"Computing {name}", "solving", finish)
+
+    def feasibility(self, target: Path) -> Path:
+        return self._drawn("feasibility", 200)
+
+    def appearances(self) -> Sequence[Appearance]:
+        return list(self._appearances.values())
+
+    def remove_appearance(self, name: str) -> None:
+        self._known(name)
+        del self._appearances[name]
+
+    def schedule(self) -> Schedule:
+        return self._schedule
+
+    def set_schedule(self, schedule: Schedule) -> None:
+        self._schedule = schedule
+        self.change()
+
+    def identify(self, on: bool) -> None:
+        self.change(identifying=on)
+
+    def doctor(self) -> Sequence[Finding]:
+        return [
+            Finding("error", "Projector right", "It does not answer.", "Check its mains plug."),
+            Finding("warning", "Disk", "It is 91 % full.", "Remove old runs."),
+        ]
+
+    def backup(self) -> Path:
+        file = self._folder.parent / "backup.velatura"
+        file.write_bytes(b"a backup")
+        return file
+
+    def restore(self, backup: Path) -> None:
+        if backup.read_bytes() != b"a backup":
+            raise UsageError("backup-wrong", what="This is not a backup of ours.", remedy="Choose another file.")
+
+    def diagnostics(self) -> Path:
+        file = self._folder.parent / "diagnostics.zip"
+        file.write_bytes(b"diagnostics")
+        return file
+
+    def settings(self) -> str:
+        return self._toml
+
+    def validate_settings(self, text: str) -> None:
+        if "[stage]" not in text:
+            raise UsageError("stage-key-missing", what="stage.toml: [stage] is missing.", remedy="Add [stage].")
+
+    def save_settings(self, text: str) -> None:
+        self.validate_settings(text)
+        self._toml = text
+        self.change(needs_setup=False)
+
+    def camera_picture(self) -> bytes | None:
+        out = io.BytesIO()
+        Image.radial_gradient("L").resize((480, 320)).save(out, "JPEG")
+        return out.getvalue()
+
+    def runs(self) -> Sequence[str]:
+        return list(self._results)[::-1]
+
+    def results(self, run: str) -> Results:
+        if run not in self._results:
+            raise UsageError("run-unknown", what="There is no such run.", remedy="Choose another.")
+        return self._results[run]
+
+    def aiming(self) -> Aiming:
+        aims = (ProjectorAim("left", 0.82, 0.9), ProjectorAim("middle", 0.9, 0.7), ProjectorAim("right", 0.4, 0.2))
+        return Aiming(aims, 0.77, 0.04, 0.06, 0.8, 0.93, ("Turn right's focus ring; its pixels are soft.",))
+
+    def find_devices(self) -> Sequence[FoundDevice]:
+        return [
+            FoundDevice("tty0", "projector", "serial", "Optoma on ttyUSB0", '[[projectors]]\nname = "left"'),
+            FoundDevice("usb", "camera", "ptp", "Canon EOS R5 on USB", '[camera]\ndriver = "ptp"'),
+        ]
+
+    def try_device(self, key: str) -> TriedDevice:
+        if key not in ("tty0", "usb"):
+            raise UsageError("device-unknown", what="There is no such device.", remedy="Search again.")
+        return TriedDevice(key == "usb", "It answered in 12 ms." if key == "usb" else "No answer. Check the cable.")

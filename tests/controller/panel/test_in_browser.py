@@ -1,0 +1,252 @@
+"""What a technician does, in a real Chromium."""
+
+from __future__ import annotations
+
+import io
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect
+
+from controller.panel.accounts import Accounts
+from tests.controller.panel.browser import CHROMIUM, chromium, enter, picture, tab
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.controller.panel.served import QUICK_HASH, Served, served
+
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
+
+PAGES = (
+    "/",
+    "/appearances",
+    "/appearances/new",
+    "/schedule",
+    "/results",
+    "/events",
+    "/doctor",
+    "/aiming",
+    "/settings",
+    "/care",
+    "/accounts",
+    "/setup",
+    "/password",
+    "/results/nothing",
+)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> Iterator[Served]:
+    """Its jobs take long enough to be watched."""
+    with served(MemoryKiosk(tmp_path / "pictures", step_s=0.6), tmp_path / "private") as running:
+        yield running
+
+
+def violations(page: Page) -> str:
+    found = Axe().run(page)
+    return str(found.generate_report()) if found.violations_count else ""
+
+
+def test_recalibration_is_one_click_and_is_followed_live_to_its_end(slow: Served, browser: Browser) -> None:
+    with tab(browser, slow.address) as page:
+        enter(page, "otto")
+        page.get_by_role("button", name="Recalibrate", exact=True).click()
+        expect(page.get_by_text("Calibrating", exact=True)).to_be_visible()
+        expect(page.locator(".steps .now")).to_be_visible()
+        expect(page.get_by_alt_text("What the camera sees now")).to_be_visible()
+        expect(page.locator("#live-job")).to_contain_text(" left")
+        expect(page.locator(".steps li").nth(1)).to_have_class("done")
+        picture(page, "recalibrating")
+        expect(page.get_by_text("It ended well.")).to_be_visible()
+        expect(page.get_by_role("button", name="Cancel this job")).to_be_hidden()
+
+
+def test_cancel_ends_the_job_and_says_so(slow: Served, browser: Browser) -> None:
+    with tab(browser, slow.address) as page:
+        enter(page, "otto")
+        page.get_by_role("button", name="Quick recalibration").click()
+        page.get_by_role("button", name="Cancel this job").click()
+        expect(page.get_by_text("It was cancelled.")).to_be_visible()
+
+
+def test_a_reload_in_the_middle_of_a_job_loses_nothing(slow: Served, browser: Browser) -> None:
+    with tab(browser, slow.address) as page:
+        enter(page, "otto")
+        page.get_by_role("button", name="Recalibrate", exact=True).click()
+        expect(page.locator(".steps li").first).to_have_class("done")
+        page.reload()
+        assert page.locator(".steps .done").count() >= 1
+        expect(page.get_by_text("It ended well.")).to_be_visible()
+
+
+def test_two_technicians_see_the_same_job_and_only_one_can_begin_it(slow: Served, browser: Browser) -> None:
+    with tab(browser, slow.address) as first, tab(browser, slow.address) as second:
+        enter(first, "otto")
+        enter(second, "tina")
+        first.get_by_role("button", name="Recalibrate", exact=True).click()
+        expect(second.locator(".steps .now")).to_be_visible()
+        second.get_by_role("button", name="Quick recalibration").click()
+        expect(second.get_by_role("alert")).to_contain_text("is running")
+        second.get_by_role("button", name="Cancel this job").click()
+        expect(first.get_by_text("It was cancelled.")).to_be_visible()
+
+
+def test_an_open_page_finds_the_service_again_after_a_restart(tmp_path: Path, browser: Browser) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    kiosk = MemoryKiosk(tmp_path / "pictures")
+    with served(kiosk, tmp_path / "private", port=port) as running:
+        address = running.address
+        browser_tab = tab(browser, address)
+        page = browser_tab.__enter__()
+        enter(page, "otto")
+    expect(page.get_by_text("No connection, trying again")).to_be_visible()
+    with served(kiosk, tmp_path / "private", port=port):
+        expect(page.get_by_text("No connection, trying again")).to_be_hidden()
+        kiosk.change(reason="The service was started again.")
+        expect(page.get_by_text("The service was started again.")).to_be_visible()
+        page.get_by_role("button", name="Quick recalibration").click()
+        expect(page.get_by_text("It ended well.")).to_be_visible()
+        browser_tab.__exit__(None, None, None)
+
+
+def test_a_target_is_uploaded_looked_at_and_computed(fresh: Served, browser: Browser) -> None:
+    out = io.BytesIO()
+    Image.radial_gradient("L").convert("RGB").save(out, "JPEG", comment=b"who took this picture")
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.get_by_role("link", name="Appearances").click()
+        page.get_by_role("link", name="New appearance").click()
+        page.set_input_files("#file", {"name": "t.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()})
+        page.get_by_role("button", name="Upload").click()
+        for alt in ("The uploaded target", "Where the target can't be reached: the brighter, the farther off"):
+            expect(page.get_by_alt_text(alt)).to_have_js_property("complete", True)
+            assert page.get_by_alt_text(alt).evaluate("picture => picture.naturalWidth") > 0
+        assert not violations(page)
+        picture(page, "feasibility")
+        page.get_by_label("Name").fill("bronze")
+        page.get_by_role("button", name="Compute").click()
+        expect(page.get_by_text("It ended well.")).to_be_visible()
+        page.get_by_role("link", name="Appearances").click()
+        expect(page.get_by_role("heading", name="bronze")).to_be_visible()
+
+
+def test_hours_are_typed_saved_and_stand_in_the_calendar(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.get_by_role("link", name="Schedule").click()
+        row = page.locator("fieldset.hours").nth(1)
+        row.get_by_label("Day").fill("tue")
+        row.get_by_label("Opens").fill("09:15")
+        row.get_by_label("Closes").fill("17:45")
+        page.get_by_role("button", name="Save the schedule").click()
+        expect(page.get_by_text("The schedule is in use.")).to_be_visible()
+        expect(page.get_by_text("09:15 to 17:45").first).to_be_visible()
+        page.locator("fieldset.hours").nth(2).get_by_label("Day").fill("someday")
+        page.get_by_role("button", name="Save the schedule").click()
+        expect(page.get_by_role("alert")).to_contain_text("'day' is not what it must be.")
+
+
+def test_each_role_sees_only_what_it_may_do(panel: Served, browser: Browser) -> None:
+    with tab(browser, panel.address) as page:
+        enter(page, "vera")
+        assert page.get_by_role("button").all_inner_texts() == ["Log out"]
+        assert page.get_by_role("link", name="Settings").count() == 0
+    with tab(browser, panel.address) as page:
+        enter(page, "otto")
+        assert page.get_by_role("button", name="Recalibrate", exact=True).count() == 1
+        assert page.get_by_role("link", name="Settings").count() == 0
+
+
+def test_settings_that_are_wrong_are_not_saved_and_not_lost(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address) as page:
+        enter(page, "tina")
+        page.get_by_role("link", name="Settings").click()
+        page.get_by_label("stage.toml").fill("[stag]\n")
+        page.get_by_role("button", name="Check and save").click()
+        expect(page.get_by_role("alert")).to_contain_text("[stage] is missing")
+        assert page.get_by_label("stage.toml").input_value() == "[stag]\n"
+        assert "[stage]" in fresh.kiosk.settings()
+        page.get_by_label("stage.toml").fill('[stage]\nname = "<new>"\n')
+        page.get_by_role("button", name="Check and save").click()
+        expect(page.get_by_text("The settings are in use.")).to_be_visible()
+        assert fresh.kiosk.settings() == '[stage]\nname = "<new>"\n'
+
+
+def test_everything_works_with_the_keyboard_only(fresh: Served, browser: Browser) -> None:
+    def tab_to(page: Page, text: str) -> None:
+        for _ in range(60):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement.textContent.trim()") == text:
+                return
+        raise AssertionError(f"no way to {text} by the Tab key")
+
+    with tab(browser, fresh.address) as page:
+        page.goto("/login")
+        for key in ("Tab", *"otto", "Tab", *"a long pass phrase"):
+            page.keyboard.press("Space" if key == " " else key)
+        page.keyboard.press("Enter")
+        page.wait_for_url("**/")
+        page.keyboard.press("Tab")
+        assert page.evaluate("document.activeElement.textContent") == "To the content"
+        tab_to(page, "Quick recalibration")
+        page.keyboard.press("Enter")
+        expect(page.get_by_text("It ended well.")).to_be_visible()
+        tab_to(page, "Schedule")
+        page.keyboard.press("Enter")
+        expect(page.get_by_role("heading", name="Schedule", exact=True)).to_be_visible()
+
+
+def test_first_start_leads_from_the_one_time_password_to_a_stage(tmp_path: Path, browser: Browser) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
+    kiosk.change(needs_setup=True)
+    accounts = Accounts(tmp_path / "private" / "accounts.json", hasher=QUICK_HASH)
+    password = accounts.first_start()
+    assert password is not None
+    with served(kiosk, tmp_path / "private", accounts=accounts) as running, tab(browser, running.address) as page:
+        page.goto("/login")
+        page.get_by_label("Name").fill("technician")
+        page.get_by_label("Password").fill(password)
+        page.get_by_role("button", name="Log in").click()
+        page.wait_for_url("**/password")
+        page.goto("/settings")
+        page.wait_for_url("**/password")
+        page.get_by_label("The one-time password").fill(password)
+        page.get_by_label("New password, 10 characters or more").fill("seven tall horses")
+        page.get_by_label("New password again").fill("seven tall horses")
+        page.get_by_role("button", name="Change").click()
+        page.wait_for_url("**/setup")
+        page.get_by_role("button", name="Find devices").click()
+        page.get_by_label("Canon EOS R5 on USB").check()
+        page.get_by_role("button", name="Try what is ticked").click()
+        expect(page.get_by_text("It answered in 12 ms.")).to_be_visible()
+        assert not violations(page)
+        picture(page, "setup")
+        page.get_by_role("button", name="Write stage.toml").click()
+        page.wait_for_url("**/aiming")
+        assert '[camera]\ndriver = "ptp"' in kiosk.settings()
+        assert accounts.first_start() is None
+
+
+@pytest.mark.parametrize("phone", [True, False])
+def test_no_page_has_a_barrier(panel: Served, browser: Browser, phone: bool) -> None:
+    with tab(browser, panel.address, phone=phone) as page:
+        page.goto("/login")
+        assert not violations(page)
+        enter(page, "tina")
+        for path in PAGES:
+            page.goto(path)
+            page.wait_for_load_state("load")
+            assert not (found := violations(page)), f"{path}\n{found}"
+            wider = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            assert wider <= 0, f"{path} is wider than the screen by {wider} px"
+            picture(page, ("phone" if phone else "desk") + (path.replace("/", "-") if path != "/" else "-now"))
