@@ -33,6 +33,7 @@ class ProjectorKeeper:
     ----------
     open_guard : opens the projector; raises DeviceError or VelaturaError while that can't be done
     tell : hears what was noticed and decided
+    asleep : whether it has no mains now, or boots, so that its silence means nothing
     """
 
     def __init__(
@@ -42,10 +43,12 @@ class ProjectorKeeper:
         tell: Callable[[Decision], object],
         *,
         clock: Clock | None = None,
+        asleep: Callable[[], bool] | None = None,
     ) -> None:
         self.name = name
         self._open_guard, self._tell = open_guard, tell
         self._clock = clock or SystemClock()
+        self._asleep = asleep or (lambda: False)
         self._guard: LampGuard | None = None
         self._want_lit = False
         self._view = ProjectorView(name)
@@ -82,6 +85,11 @@ class ProjectorKeeper:
     def step(self) -> None:
         """Look once, and do what follows. Blocks for some answers at most; raises nothing that a device can cause."""
         wanted = self._want_lit
+        if self._asleep():
+            self._silent_since_s = None
+            self._show(ProjectorView(self.name, Condition.DARK, Power.OFF, looked=True, hours=self._view.hours,
+                                     strikes=self._view.strikes, counter_hours=self._view.counter_hours))  # fmt: skip
+            return
         try:
             guard = self._opened()
             if guard is None:
@@ -121,7 +129,7 @@ class ProjectorKeeper:
         if guard is not None and not self._want_lit and guard.may_be_lit:
             # Perhaps it hears, though it does not answer.
             with contextlib.suppress(DeviceError, VelaturaError):
-                guard.switch_off(deadline=in_seconds(ANSWER_S))
+                guard.switch_off(deadline=in_seconds(guard.switch_s))
         limit_s = PATIENCE_S
         if guard is not None and self._struck_at_s is not None:
             # Many boot in silence.
@@ -145,7 +153,7 @@ class ProjectorKeeper:
     def _light(self, guard: LampGuard, status: ProjectorStatus) -> None:
         if status.power is Power.FAULT or fatal_faults(status):
             if status.power in (Power.ON, Power.WARMING):
-                guard.switch_off(deadline=in_seconds(ANSWER_S))
+                guard.switch_off(deadline=in_seconds(guard.switch_s))
             self._struck_at_s = None
             self._see(Condition.BROKEN, status, _decision(faulty(self.name, status)))
         elif status.power is Power.ON or not guard.capabilities.power:
@@ -166,7 +174,7 @@ class ProjectorKeeper:
             self._struck_at_s = self._clock.now_s()
         if self._clock.now_s() - self._struck_at_s > self._light_limit_s(guard):
             self._vain()
-            guard.switch_off(deadline=in_seconds(ANSWER_S))
+            guard.switch_off(deadline=in_seconds(guard.switch_s))
         self._see(Condition.LIGHTING, status, self._view.problem)
 
     def _strike(self, guard: LampGuard, status: ProjectorStatus) -> None:
@@ -179,7 +187,7 @@ class ProjectorKeeper:
         if self._in_vain >= MOST_STRIKES:
             return self._see(Condition.BROKEN, status, _unlit(self.name))
         try:
-            guard.switch_on(deadline=in_seconds(ANSWER_S))
+            guard.switch_on(deadline=in_seconds(guard.switch_s))
         except DeviceRefused as error:
             if error.code in ("lamp-cooling", "lamp-resting"):
                 return self._see(Condition.COOLING, status, self._view.problem)
@@ -227,7 +235,7 @@ class ProjectorKeeper:
             # Until the next look shows it off; FAULT and UNKNOWN may hide a burning lamp.
             self._see(Condition.BROKEN if faults else Condition.LIT, status, problem)
             if not (faults and status.power is Power.FAULT and not guard.may_be_lit):
-                guard.switch_off(deadline=in_seconds(ANSWER_S))
+                guard.switch_off(deadline=in_seconds(guard.switch_s))
 
     # -- what is seen
 
