@@ -1,0 +1,187 @@
+"""The connection to a Dask scheduler: tasks in, results out, whatever becomes of the workers meanwhile.
+
+Dask moves our data with its own protocol, which unpickles what a peer sends: a scheduler and its workers can run any
+code here, and the other way round. So they stand on a network of their own, or speak TLS with certificates on both
+sides (address ``tls://``; the files as Dask's own configuration names them, ``distributed.comm.tls``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Final, Generic, TypeVar
+
+from controller.cluster.tasks import Outcome, code_digest
+from controller.errors import UsageError, WorkError
+
+Value = TypeVar("Value")
+CONNECT_S: Final = 10.0
+WORKERS_S: Final = 60.0
+"""How long to wait while the scheduler has no worker at all."""
+POLL_S: Final = 0.02
+TRIES: Final = 4
+"""A task is begun anew when what it needs was lost with its worker; this often."""
+
+
+class Cluster:
+    """Workers behind a scheduler. Calls may come from one thread."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client = client
+        self._address = address
+        self._shared: dict[str, Any] = {}
+        self._seen_worker_s = time.monotonic()
+
+    @property
+    def workers(self) -> int:
+        """How many the scheduler has now."""
+        info: dict[str, Any] = self._client.scheduler_info(n_workers=-1)
+        return len(info["workers"])
+
+    def submit(self, function: Callable[..., Outcome[Value]], *arguments: Any) -> Task[Value]:
+        """Begin ``function(*arguments)`` on some worker; of arguments that are ``Shared``, it gets the values."""
+        return Task(self, lambda: self._begin(function, arguments))
+
+    def share(self, key: str, value: Any) -> Shared:
+        """Data that many tasks need. ``key`` tells contents apart; each worker gets them once, when it needs them."""
+        return Shared(key, value)
+
+    def _begin(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        given = [self._placed(part) if isinstance(part, Shared) else part for part in arguments]
+        return self._client.submit(function, *given, pure=False, retries=0)
+
+    def _placed(self, shared: Shared) -> Any:
+        """The data's place in the cluster; sent again if the worker that had it is gone."""
+        future = self._shared.get(shared.key)
+        if future is None or future.status != "finished":
+            self.wait_for_workers(lambda: None)
+            (future,) = self._client.scatter({shared.key: shared.value}, hash=False).values()
+            self._shared[shared.key] = future
+        return future
+
+    def wait_for_workers(self, check: Callable[[], None]) -> None:
+        """Return once there is a worker.
+
+        Raises WorkError("no-workers") after ``WORKERS_S`` without one, and what ``check`` raises.
+        """
+        while self.workers == 0:
+            check()
+            if time.monotonic() - self._seen_worker_s > WORKERS_S:
+                raise WorkError(
+                    "no-workers",
+                    what=f"The scheduler at {self._address} has had no worker for {WORKERS_S:g} seconds.",
+                    remedy="Start workers there (docs/facade.md), or solve without --scheduler.",
+                )
+            time.sleep(POLL_S)
+        self._seen_worker_s = time.monotonic()
+
+    def check_code(self) -> None:
+        """Raise UsageError("workers-differ") unless every worker has the code that is here."""
+        ours = code_digest()
+        self.wait_for_workers(lambda: None)
+        theirs = self._client.run(code_digest, on_error="return")
+        other = [address for address, digest in theirs.items() if digest != ours]
+        if other:
+            raise UsageError(
+                "workers-differ",
+                what=f"{len(other)} of {len(theirs)} workers have another release of Velatura, or none: {other[0]}.",
+                remedy="Install this release on every machine, and start its workers again.",
+            )
+
+
+class Shared:
+    """Data under the name of its contents; see ``Cluster.share``."""
+
+    def __init__(self, key: str, value: Any) -> None:
+        self.key = key
+        self.value = value
+
+
+class Task(Generic[Value]):
+    """Work that was begun elsewhere."""
+
+    def __init__(self, cluster: Cluster, begin: Callable[[], Any]) -> None:
+        self._cluster = cluster
+        self._begin = begin
+        self._future = begin()
+
+    def result(self, check: Callable[[], None] = lambda: None) -> Value:
+        """Wait and return the value. ``check`` is called often; where it raises, the task is let go.
+
+        Raises what the work raised; WorkError "workers-lost" or "no-workers".
+        """
+        for _ in range(TRIES):
+            try:
+                while not self._future.done():
+                    check()
+                    if self._cluster.workers == 0:
+                        self._cluster.wait_for_workers(check)
+                    time.sleep(POLL_S)
+            except BaseException:
+                self.cancel()
+                raise
+            if self._future.status == "finished":
+                with contextlib.suppress(*_lost()):
+                    outcome: Outcome[Value] = self._future.result(timeout=WORKERS_S)
+                    return outcome.unwrapped()
+            elif self._future.status == "error" and not isinstance(self._future.exception(), _lost()):
+                raise self._future.exception()
+            self._cluster.wait_for_workers(check)
+            self._future = self._begin()
+        raise WorkError(
+            "workers-lost",
+            what=f"{TRIES} workers went away, one after the other, over the same piece of work.",
+            remedy="Look whether they run out of memory; a worker needs what docs/facade.md says. Then start again.",
+        )
+
+    def cancel(self) -> None:
+        """Let go of the work, whether it has begun or not."""
+        self._future.cancel()
+
+
+def _lost() -> tuple[type[BaseException], ...]:
+    """What Dask raises when a worker, or what only it had, is gone."""
+    from concurrent.futures import CancelledError
+
+    from distributed import KilledWorker
+    from distributed.client import FutureCancelledError, FuturesCancelledError
+
+    return CancelledError, KilledWorker, FutureCancelledError, FuturesCancelledError, TimeoutError
+
+
+@contextlib.contextmanager
+def connected(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Cluster]:
+    """A connection to the scheduler at ``address``, such as tcp://host:8786 or tls://host:8786.
+
+    Raises UsageError "cluster-missing" (the package distributed is not installed), "scheduler-address" or
+    "workers-differ"; WorkError "scheduler-unreachable" or "no-workers".
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise UsageError(
+            "cluster-missing",
+            what=f"The package distributed is not installed ({error}).",
+            remedy="Install Velatura with its extra `cluster`, or solve without --scheduler.",
+        ) from error
+    if not address.startswith(("tcp://", "tls://")):
+        raise UsageError(
+            "scheduler-address",
+            what=f"{address!r} is not a scheduler's address.",
+            remedy="Give it as tcp://host:8786 or tls://host:8786.",
+        )
+    try:
+        client: Any = Client(address, timeout=timeout_s, set_as_default=False, name="velatura")  # type: ignore[no-untyped-call]
+    except (OSError, ValueError, TypeError, TimeoutError) as error:
+        raise WorkError(
+            "scheduler-unreachable",
+            what=f"No scheduler answers at {address} ({str(error).splitlines()[0] if str(error) else 'no answer'}).",
+            remedy="Start it with `dask scheduler`, correct the address, or look at Dask's TLS settings.",
+        ) from error
+    try:
+        cluster = Cluster(client, address)
+        cluster.check_code()
+        yield cluster
+    finally:
+        client.close()
