@@ -1,0 +1,216 @@
+"""The kiosk's service: makes the conductor and every keeper from a stage, and runs each in a thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from controller.app import Checked, check_stage, player_settings, stage_lock, technicians_panel
+from controller.errors import UsageError, VelaturaError, WorkError
+from controller.play.launch import PlayerSettings
+from controller.play.notify import Notifier
+from controller.serve.clock import Clockwork
+from controller.serve.conductor import Conductor, Limits
+from controller.serve.devices import Devices
+from controller.serve.eventlog import Decision, EventLog
+from controller.serve.kinds import Kinds
+from controller.serve.player_keeper import PlayerKeeper
+from controller.serve.ports import BLACK, Request
+from controller.serve.schedule_file import ScheduleFile
+from controller.serve.stock import BundleStock
+from controller.serve.works import ThreadWorks
+from controller.services import finished_calibrations, stage_trust
+from controller.session.keys import KeyService, technicians_keys
+from controller.session.machine import State
+from controller.storage import runtime_folder
+from hal.deadline import in_seconds
+from hal.errors import DeviceError
+
+STEP_S: Final = 0.25
+LOOK_S: Final = 1.0
+END_WORK_S: Final = 30.0
+
+
+class Service:
+    """One stage that runs by itself. ``changed`` is called after every step that may have changed something."""
+
+    def __init__(self, checked: Checked, log: EventLog) -> None:
+        stage = checked.stage
+        self.checked, self.log, self.stage = checked, log, stage.folder
+        self.runtime = runtime_folder(stage.folder)
+        self.stock = BundleStock(stage.folder, stage_trust(stage))
+        self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
+        self.player = PlayerKeeper(self.runtime, self._settings, log.tell)
+        self.devices = Devices(checked, self.runtime, log.tell)
+        kinds = Kinds(
+            stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated
+        )
+        self.works = ThreadWorks(kinds.table(), log, number=int(log.value("job") or 0))
+        safety = stage.tables.safety
+        self.conductor = Conductor(
+            self.devices.projectors, self.player, self.works, self.stock, log,
+            schedule=lambda: self.schedule.now,
+            clock=Clockwork(log, time.time, time.monotonic),
+            monotonic=time.monotonic,
+            without_time=self.schedule.open_without_time,
+            limits=Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
+        )  # fmt: skip
+        self.changed: Callable[[], None] = lambda: None
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._keys: contextlib.ExitStack | None = None
+        self._known_runs: tuple[float, bool] = (0.0, False)
+
+    def start(self) -> None:
+        """Begin: the player first, so that there are pictures before any device has answered."""
+        self.log.tell(Decision("service-started", "The kiosk begins."))
+        if self.schedule.problem is not None:
+            problem = self.schedule.problem
+            self.log.tell(Decision(problem.code, problem.what, problem.remedy, "error"))
+        self.conductor.step()
+        self._thread("player", self.player.step, STEP_S)
+        for projector in self.devices.projectors:
+            self._thread(f"projector {projector.name}", projector.step, LOOK_S)
+        for keeper in self.devices.others:
+            self._thread(keeper.name, keeper.step, STEP_S)
+        self._thread("keys", self._find_keys, 2.0)
+
+    def run(self, cancel: threading.Event) -> None:
+        """Decide, over and over, until ``cancel``. Feeds systemd's watchdog."""
+        notifier = Notifier()
+        ready = False
+        while not cancel.is_set():
+            self.conductor.step()
+            if self.devices.mains is not None:
+                self.devices.mains.want_on = self._light_wanted()
+            if self.works.job is not None:
+                self.log.keep("job", str(self.works.job.number))
+            self.changed()
+            if not ready and self.player.view.shown is not None:
+                ready = True
+                notifier.ready()
+            notifier.alive()
+            cancel.wait(STEP_S)
+        notifier.stopping()
+
+    def end(self, *, leave_lit: bool) -> None:
+        """Stop the work, cool the lamps (unless they are to stay lit for the next start), and let go of everything."""
+        self.works.close(END_WORK_S)
+        if not leave_lit:
+            self.player.want = BLACK
+            for projector in self.devices.projectors:
+                projector.want_lit = False
+            self._wait_until_dark()
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(5.0)
+        if self._keys is not None:
+            self._keys.close()
+        self.player.close()
+        self.devices.close()
+        self.log.tell(Decision("service-ended", "The kiosk ends."))
+
+    def ask(self, *requests: Request) -> None:
+        self.conductor.ask(*requests)
+
+    # -- inside
+
+    def _settings(self, with_bundle: bool) -> PlayerSettings:
+        return player_settings(self.checked.stage, self.runtime, plays=with_bundle)
+
+    def _calibrated(self) -> bool:
+        # Asked four times a second while a task is due; opening every journal each time would be a waste.
+        at_s, found = self._known_runs
+        if time.monotonic() - at_s > 5.0 or not at_s:
+            found = bool(finished_calibrations(self.stage))
+            self._known_runs = time.monotonic(), found
+        return found
+
+    def _light_wanted(self) -> bool:
+        machine = self.conductor.machine.state
+        return machine not in (State.OFF, State.COOLING) or any(one.want_lit for one in self.devices.projectors)
+
+    def _wait_until_dark(self) -> None:
+        until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
+        while any(one.view.maybe_lit for one in self.devices.projectors) and time.monotonic() < until_s:
+            time.sleep(0.1)
+        names = [one.name for one in self.devices.projectors if one.view.maybe_lit]
+        if names:
+            self.log.tell(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
+                                   "Switch it off by its remote control.", "error"))  # fmt: skip
+
+    def _thread(self, name: str, step: Callable[[], None], every_s: float) -> None:
+        def loop() -> None:
+            while not self._stop.is_set():
+                try:
+                    step()
+                except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
+                    what = f"{name} met an error that Velatura does not know ({type(error).__name__}: {error})."
+                    self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
+                    self._stop.wait(5.0)
+                self._stop.wait(every_s)
+
+        thread = threading.Thread(target=loop, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _find_keys(self) -> None:
+        if self._keys is not None or self.checked.key_panel is None:
+            return
+        with contextlib.ExitStack() as stack:
+            try:
+                panel = stack.enter_context(technicians_panel(self.checked, deadline=in_seconds(20.0)))
+            except (DeviceError, VelaturaError):
+                return
+            assert panel is not None
+            commands = technicians_keys(self.conductor.open, self.conductor.shut, self._recalibrate)
+            service = KeyService(panel, commands, state=lambda: self.conductor.machine.state, trouble=self._key_trouble)
+            service.start()
+            stack.callback(service.stop)
+            self._keys = stack.pop_all()
+
+    def _recalibrate(self) -> None:
+        # A refusal is in the log; the key has nothing to show it on.
+        with contextlib.suppress(WorkError):
+            self.conductor.ask(Request("quick", light=True))
+
+    def _key_trouble(self, error: DeviceError | None) -> None:
+        self.log.tell(
+            Decision("keys-back", "The technician's keys work again.")
+            if error is None
+            else Decision(error.code, error.what, error.remedy, "warning")
+        )
+
+
+@contextlib.contextmanager
+def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) -> Iterator[Service]:
+    """A started service, its loop in a thread; ended, with the lamps cooled, on leaving.
+
+    Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
+    """
+    checked = check_stage(stage)
+    if checked.stage.tables.display.driver != "player":
+        raise UsageError(
+            "display-plays-no-bundles",
+            what="A kiosk needs the player as its display.",
+            remedy='Use the driver "player" under [display] in stage.toml.',
+        )
+    with stage_lock(checked.stage.folder):
+        log = EventLog(checked.stage.folder / EventLog.FILE)
+        with contextlib.closing(log):
+            service = Service(checked, log)
+            ended = threading.Event()
+            loop = threading.Thread(target=service.run, args=(ended,), name="conductor", daemon=True)
+            try:
+                service.start()
+                loop.start()
+                yield service
+            finally:
+                ended.set()
+                if loop.is_alive():
+                    loop.join(10.0)
+                service.end(leave_lit=leave_lit)
