@@ -85,9 +85,12 @@ def _contrast(
     width, height = plan.size_px
     wave, light = np.zeros(width * height), np.zeros(width * height)
     position, along = correspondence.projector_px, np.array(frequency)
-    for pattern in plan.sinusoids(prefix):
-        image = grey(captures, pattern.name, black.shape)
-        _add_step(image, black, position, cells, along, pattern.phase_rad, wave, light)
+    steps = plan.sinusoids(prefix)
+    images = [grey(captures, pattern.name, black.shape) for pattern in steps]
+    # a wave of which a step is missing would have another contrast
+    whole = np.where(np.isfinite(sum(images, -black)), cells, np.int32(-1))
+    for pattern, image in zip(steps, images, strict=True):
+        _add_step(image, black, position, whole, along, pattern.phase_rad, wave, light)
     # n pictures of W/2 (1 + M cos) each: the light adds up to n W/2, the wave to n W M/4
     size = (NEIGHBOURHOOD, NEIGHBOURHOOD)
     around = [cv2.boxFilter(sums.reshape(height, width), -1, size, normalize=False) for sums in (wave, light)]
@@ -111,7 +114,7 @@ def _add_step(
         for column in range(columns):
             cell = cells[row, column]
             value = image[row, column] - black[row, column]
-            if cell >= 0 and np.isfinite(value):
+            if cell >= 0:
                 along = frequency[0] * position[row, column, 0] + frequency[1] * position[row, column, 1]
                 wave[cell] += value * np.cos(2 * np.pi * along - phase_rad)
                 light[cell] += value

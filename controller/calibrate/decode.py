@@ -69,7 +69,7 @@ def decode(
     Returns
     -------
     Correspondence; nothing is valid where the projector casts no light, nor at the border of its frame. The modulation
-    is that of the coarse sinusoid, worked out from the fine one's where that one can be seen.
+    is that of the coarse sinusoid, worked out from the fine one's where that one can be seen. ``as_seen_px`` is there.
 
     Raises
     ------
@@ -91,12 +91,14 @@ def decode(
     del sums, axes
     valid &= _inside(position, plan.size_px, 0.0)
     valid &= _inside(position, plan.size_px, frame_margin_px(modulation[valid]))
+    as_seen = position
     if camera_blur_px > 0:
         position = correct_for_paint(position, valid, half, camera_blur_px**2)
     if refine:
         position, valid = fit_planes(position, valid)
+    as_seen[~valid] = np.nan
     position[~valid] = np.nan
-    return Correspondence(position, np.where(valid, modulation, 0).astype(np.float32), valid)
+    return Correspondence(position, np.where(valid, modulation, 0).astype(np.float32), valid, as_seen)
 
 
 def _add_up(captures: Captures, plan: PatternPlan, shape: tuple[int, ...]) -> _Sums:

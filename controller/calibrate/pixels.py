@@ -11,7 +11,8 @@ from controller.arrays import FloatImage, Mask
 from controller.calibrate.blur import measure_blur
 from controller.calibrate.captures import Captures
 from controller.calibrate.decode import frame_margin_px
-from controller.calibrate.inversion import Inversion, invert_map
+from controller.calibrate.footprints import measure_footprints
+from controller.calibrate.inversion import invert_map
 from controller.calibrate.mosaic import find_mosaic
 from controller.calibrate.phase_map import make_phase_map
 from controller.calibrate.values import Correspondence, Metapixels, PhaseMap
@@ -19,7 +20,7 @@ from controller.capture.patterns import PatternPlan
 
 
 def fit_metapixels(captures: Captures, plan: PatternPlan, correspondence: Correspondence) -> Metapixels:
-    """One projector's metapixels: centre where the phase map equals the pixel, covariance J S J'.
+    """One projector's metapixels: mean and covariance of the shares that the phase map and the blur give each pixel.
 
     Parameters
     ----------
@@ -48,9 +49,10 @@ def fit_pixels(captures: Captures, plan: PatternPlan, correspondence: Correspond
     inverse = invert_map(correspondence, plan.size_px)
     blur, blur_valid = measure_blur(captures, plan, correspondence)
     valid = inverse.valid & blur_valid
-    covariance = carry_covariance(inverse.jacobian, blur)
+    flat = carry_covariance(inverse.jacobian, blur)
+    centre, covariance = measure_footprints(correspondence, inverse, blur, flat, valid)
     margin = int(np.ceil(frame_margin_px(correspondence.modulation[correspondence.valid])))
-    metapixels = _extend_to_frame(inverse, covariance, valid, margin)
+    metapixels = _extend_to_frame(centre, inverse.jacobian, covariance, valid, margin)
     single = captures[plan.sinusoids("blur-x")[0].name]
     mosaic = find_mosaic(single)
     phase_map = make_phase_map(
@@ -63,19 +65,24 @@ def _channels(image: FloatImage) -> tuple[float, float, float]:
     """Mean light of the three channels; alike for a grey image or none at all."""
     if image.ndim != 3:
         return 1.0, 1.0, 1.0
-    red, green, blue = (max(float(np.nanmean(image[..., c])), 0.0) for c in range(3))
+    finite = np.isfinite(image).all(axis=2)
+    if not finite.any():
+        return 1.0, 1.0, 1.0
+    red, green, blue = (max(float(np.mean(image[..., c][finite])), 0.0) for c in range(3))
     return (red, green, blue) if red + green + blue > 0 else (1.0, 1.0, 1.0)
 
 
-def _extend_to_frame(inverse: Inversion, covariance: FloatImage, valid: Mask, margin: int) -> Metapixels:
+def _extend_to_frame(
+    centre_px: FloatImage, jacobian: FloatImage, covariance: FloatImage, valid: Mask, margin: int
+) -> Metapixels:
     """Continue the outermost trusted pixels to the frame's border, where the phase can't be trusted."""
     rows, columns = valid.shape
     row, column = np.mgrid[0:rows, 0:columns]
     from_row = np.clip(row, min(margin, rows // 2), max(rows - 1 - margin, rows // 2))
     from_column = np.clip(column, min(margin, columns // 2), max(columns - 1 - margin, columns // 2))
-    a, b, c, d = np.moveaxis(inverse.jacobian[from_row, from_column], -1, 0)
+    a, b, c, d = np.moveaxis(jacobian[from_row, from_column], -1, 0)
     dx, dy = column - from_column, row - from_row
-    centre = inverse.centre_px[from_row, from_column] + np.stack([a * dx + b * dy, c * dx + d * dy], axis=-1)
+    centre = centre_px[from_row, from_column] + np.stack([a * dx + b * dy, c * dx + d * dy], axis=-1)
     valid = valid[from_row, from_column]
     centre[~valid] = np.nan
     covariance = np.where(valid[:, :, None], covariance[from_row, from_column], np.nan)

@@ -17,11 +17,14 @@ class Correspondence:
     ``projector_px`` (rows, columns, 2) float32: x and y in projector pixels, NaN where not valid
     ``modulation`` (rows, columns) float32: contrast of the finest pattern, 0..1, lowered by blur
     ``valid`` (rows, columns) bool
+    ``as_seen_px`` like ``projector_px``: mean position of the light that the camera pixel gets, neither smoothed nor
+    freed of the pull towards paler paint; None where it was not kept
     """
 
     projector_px: FloatImage
     modulation: FloatImage
     valid: Mask
+    as_seen_px: FloatImage | None = None
 
 
 @dataclass(frozen=True, slots=True)
