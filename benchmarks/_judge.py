@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks._stage import CalibratedStage
-from benchmarks._truth import Truth, developed, footprints, moments
+from benchmarks._truth import Truth, developed, footprints, moments, window_around
 from controller.arrays import ByteImage, Float64, FloatImage, Mask, load_arrays
 from controller.calibrate.values import Calibration, Metapixels, Radiometry
 from controller.calibrate.verify import verify
@@ -62,24 +62,23 @@ def map_errors(truth: Truth, n: int, run: Path) -> dict[str, float]:
 
 def metapixel_errors(truth: Truth, n: int, metapixels: Metapixels) -> dict[str, float]:
     """Centres and sigmas against the moments of single projector pixels rendered without noise, camera px."""
-    spread = metapixels.covariance_px2[metapixels.valid]
-    spacing = _spacing_px(metapixels)
-    radius = int(np.ceil(4.5 * np.sqrt(np.median(spread[:, [0, 2]])) + 1))
-    radius = min(radius, int(SPACING_PX * spacing / 2))
-    whole, blur = truth.one_surface(n, radius), truth.blur_px(n)
+    mixed, blur = ~truth.one_surface(n, 0), truth.blur_px(n)
     rows = []
     for (down, across), share in footprints(truth, n, SPACING_PX, OFFSETS):
         for row, column in np.argwhere(metapixels.valid[down::SPACING_PX, across::SPACING_PX]):
             at = (down + SPACING_PX * row, across + SPACING_PX * column)
-            centre, covariance = metapixels.centre_px[at], metapixels.covariance_px2[at].astype(np.float64)
-            true = moments(share, centre, radius)
-            if true is None:
+            centre = metapixels.centre_px[at].astype(np.float64)
+            covariance = metapixels.covariance_px2[at].astype(np.float64)
+            window = window_around(centre, covariance, share.shape)
+            true = None if window is None else moments(share, window)
+            if window is None or true is None:
                 continue
+            whole = not (mixed[window.rows, window.columns] & window.inside).any()
             x, y = round(float(centre[0])), round(float(centre[1]))
             area = np.sqrt(max(covariance[0] * covariance[2] - covariance[1] ** 2, 0))
             true_area = np.sqrt(max(true[2] * true[4] - true[3] ** 2, 1e-9))
             off = centre - true[:2]
-            rows.append((*off, np.sqrt(area / true_area) - 1, blur[y, x], whole[y, x]))
+            rows.append((*off, np.sqrt(area / true_area) - 1, blur[y, x], whole))
     table = np.array(rows, np.float64)
     inside = table[:, 4] > 0
     sharp = inside & (table[:, 3] <= IN_FOCUS_PX)
@@ -92,11 +91,6 @@ def metapixel_errors(truth: Truth, n: int, metapixels: Metapixels) -> dict[str, 
         "sigma": rms(table[inside, 2]),
         "sigma bias": float(np.median(table[inside, 2])),
     }
-
-
-def _spacing_px(metapixels: Metapixels) -> float:
-    step = np.diff(metapixels.centre_px, axis=1)
-    return float(np.nanmedian(np.hypot(step[..., 0], step[..., 1])))
 
 
 def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibration) -> list[dict[str, float]]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
@@ -20,6 +20,7 @@ from plugins.emulated.truth import FOLDER, BenchTruth, read_truth
 from plugins.emulated.world import object_of
 
 RGGB = np.array([[0, 1], [1, 2]])
+REACH_SIGMAS = 4.5
 STEEPEST = 3.0
 """Times the typical slope between adjacent camera pixels; more is another surface."""
 
@@ -113,6 +114,34 @@ class Truth:
         return mean.reshape(*self.shape, -1)
 
 
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Rows and columns around a footprint, and (rows, columns) which of these pixels belong to its ellipse."""
+
+    rows: slice
+    columns: slice
+    inside: Mask
+
+
+def window_around(centre: Float64, covariance: Float64, shape: tuple[int, int]) -> Window | None:
+    """All of a footprint, and little else: an ellipse of 4.5 standard deviations and a pixel more.
+
+    ``centre`` (2,) x, y; ``covariance`` (3,) xx, xy, yy; None where it leaves the picture of ``shape``.
+    """
+    x_px, y_px = (REACH_SIGMAS * float(np.sqrt(v)) + 1 for v in (covariance[0], covariance[2]))
+    left, right = int(np.floor(centre[0] - x_px)), int(np.ceil(centre[0] + x_px))
+    top, bottom = int(np.floor(centre[1] - y_px)), int(np.ceil(centre[1] + y_px))
+    if left < 0 or top < 0 or right >= shape[1] or bottom >= shape[0]:
+        return None
+    matrix = np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
+    narrow = float(np.sqrt(max(np.linalg.eigvalsh(matrix)[0], 1e-6)))
+    inverse = np.linalg.inv(matrix + 1e-9 * np.eye(2)) / (1 + 1 / (REACH_SIGMAS * narrow)) ** 2
+    rows, columns = slice(top, bottom + 1), slice(left, right + 1)
+    y, x = np.mgrid[rows, columns]
+    d = np.stack([x - centre[0], y - centre[1]], axis=-1)
+    return Window(rows, columns, np.einsum("ijk,kl,ijl->ij", d, inverse, d) <= REACH_SIGMAS**2)
+
+
 def developed(light: FloatImage, full: float) -> FloatImage:
     """What the controller's development makes of noise-free ``light``, in the same unit; ``full`` is full scale."""
     mosaic = np.empty(light.shape[:2], np.uint16)
@@ -147,19 +176,14 @@ def footprints(
     return found
 
 
-def moments(share: FloatImage, centre: npt.NDArray[np.floating], radius_px: int) -> Float64 | None:
-    """(5,) x, y, xx, xy, yy of a footprint within a window around ``centre`` (x, y); None at the image's border."""
-    x, y = round(float(centre[0])), round(float(centre[1]))
-    rows, columns = share.shape
-    if not (radius_px <= x < columns - radius_px and radius_px <= y < rows - radius_px):
-        return None
-    window = share[y - radius_px : y + radius_px + 1, x - radius_px : x + radius_px + 1].astype(np.float64)
-    total = window.sum()
+def moments(share: FloatImage, window: Window) -> Float64 | None:
+    """(5,) x, y, xx, xy, yy of a footprint within a window; None where there is no light."""
+    weight = np.where(window.inside, share[window.rows, window.columns], 0).astype(np.float64)
+    total = weight.sum()
     if not total > 0:
         return None
-    along = np.arange(-radius_px, radius_px + 1)
-    dx, dy = float((window.sum(0) * along).sum() / total), float((window.sum(1) * along).sum() / total)
-    xx = float((window.sum(0) * (along - dx) ** 2).sum() / total)
-    yy = float((window.sum(1) * (along - dy) ** 2).sum() / total)
-    xy = float((window * (along - dy)[:, None] * (along - dx)[None, :]).sum() / total)
-    return np.array([x + dx, y + dy, xx, xy, yy])
+    y, x = np.mgrid[window.rows, window.columns]
+    at_x, at_y = float((weight * x).sum() / total), float((weight * y).sum() / total)
+    dx, dy = x - at_x, y - at_y
+    xx, xy, yy = (float((weight * product).sum() / total) for product in (dx * dx, dx * dy, dy * dy))
+    return np.array([at_x, at_y, xx, xy, yy])
