@@ -18,6 +18,7 @@ from controller.errors import UsageError, VelaturaError
 from controller.play.commands import Commands
 from controller.play.frames import FrameFile, OutputSize, parse_outputs, parse_where
 from controller.play.loop import Player
+from controller.play.notify import tell
 from controller.play.outputs import MemoryOutput, Output
 from controller.play.protocol import MAX_RATE_HZ
 from controller.play.resume import SUFFIX, Kept
@@ -89,7 +90,7 @@ def _counted_start(bundle: Path | None) -> CountedStart | None:
     """The start's count where ``bundle`` is the link to a stage's installed bundle; None for any other file."""
     if bundle is None or bundle.name != CURRENT or not bundle.is_symlink():
         return None
-    return CountedStart(bundle.parent, lambda sentence: print(sentence, file=sys.stderr, flush=True))  # noqa: T201
+    return CountedStart(bundle.parent, tell)
 
 
 def _open_output(options: argparse.Namespace, sizes: tuple[OutputSize, ...]) -> Output:

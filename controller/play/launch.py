@@ -74,7 +74,9 @@ class PlayerProcess:
         command += ["--rate", f"{settings.rate_hz:g}"]
         with self.log.open("wb") as log:
             # A session of its own: Ctrl-C is for the supervisor, which ends the player when the lamps are safe.
-            return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)  # noqa: S603
+            return subprocess.Popen(  # noqa: S603
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env=_environment()
+            )
 
     @property
     def pid(self) -> int:
@@ -138,6 +140,11 @@ class PlayerProcess:
 
     def __exit__(self, *_: object) -> None:
         self.terminate()
+
+
+def _environment() -> dict[str, str]:
+    # The player does no linear algebra; its threads would cost a fifth of the time that its imports take.
+    return {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
 
 def end_leftover(runtime: Path, timeout_s: float = _END_S) -> bool:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import sys
 import time
+
+
+def tell(sentence: str) -> None:
+    """Write a sentence for the log. A log that is full must not stop the picture."""
+    with contextlib.suppress(OSError):
+        print(sentence, file=sys.stderr, flush=True)  # noqa: T201
 
 
 class Notifier:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from pathlib import Path
 from typing import Final
 
 from controller.errors import VelaturaError
+from controller.play.notify import tell
 from controller.play.protocol import MAX_LINE_BYTES, Play, Request, Sequence, parse_request
 from controller.storage import write_atomically
 
@@ -30,7 +30,7 @@ class Kept:
             else:
                 self._path.unlink(missing_ok=True)
         except (VelaturaError, OSError) as error:
-            print(f"What is playing could not be kept: {error}", file=sys.stderr, flush=True)  # noqa: T201
+            tell(f"What is playing could not be kept: {error}")
 
     def request(self) -> Request | None:
         """What is kept, or None where nothing is, or nothing that can be played."""
