@@ -1,0 +1,180 @@
+"""Live targets: frames from a picture by base and scale (paper eqs 4-6), from what a bundle's live section holds.
+
+``compensate`` is the reference in numpy for the shaders of ``live_gl``, and what is left where there is no OpenGL.
+docs/bundle-format.md, "Live section", has the formulas.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.bundle.format import damaged
+from controller.bundle.reader import Bundle
+from controller.play.frames import FrameSet, OutputSize
+
+MOST_RADIUS_PX: Final = 12
+REACH: Final = np.float32(3)
+"""Standard deviations at which a Gaussian is cut."""
+MOST_CORRELATION: Final = np.float32(0.96)
+TILE: Final = 64
+_FULL: Final = np.float32(65535)
+
+Float = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveOutput:
+    """One output's maps, as the bundle holds them.
+
+    ``base`` (rows, columns, 3) uint16 over ``base_range``; ``centre`` (rows, columns, 2) uint16; ``shape``
+    (rows, columns, 3) uint8; ``unmix`` (3, 3); ``response`` (3, 256); ``dither`` (rows, columns) into the tile.
+    """
+
+    size: OutputSize
+    base: npt.NDArray[np.uint16]
+    base_range: tuple[float, float]
+    centre: npt.NDArray[np.uint16]
+    shape: Bytes
+    unmix: Float
+    response: Float
+    dither: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveMaps:
+    """A bundle's live section. ``gain``, ``offset`` (height, width, 3) float16, ``present`` (height, width) uint8."""
+
+    target_px: tuple[int, int]
+    gain: npt.NDArray[np.float16]
+    offset: npt.NDArray[np.float16]
+    present: Bytes
+    unit: float
+    noise: Float
+    outputs: tuple[LiveOutput, ...]
+
+    @classmethod
+    def read(cls, bundle: Bundle) -> Self:
+        """Raises BundleError("bundle-not-live" or "bundle-damaged")."""
+        gain = bundle.live_array("gain")
+        live = bundle.index.live
+        assert live is not None
+        width, height = live.target_px
+        outputs = tuple(
+            _output(bundle, OutputSize(o.name, o.width_px, o.height_px), (width, height)) for o in bundle.index.outputs
+        )
+        found = cls(
+            (width, height), gain, bundle.live_array("offset"), bundle.live_array("present"),
+            float(_shaped(bundle.live_array("unit"), (1,), "f4", "unit")[0]),
+            _shaped(bundle.live_array("noise"), (TILE, TILE), "f4", "noise"), outputs,
+        )  # fmt: skip
+        _shaped(found.gain, (height, width, 3), "f2", "gain")
+        _shaped(found.offset, (height, width, 3), "f2", "offset")
+        _shaped(found.present, (height, width), "u1", "present")
+        return found
+
+
+def _output(bundle: Bundle, size: OutputSize, target_px: tuple[int, int]) -> LiveOutput:
+    def array(key: str, shape: tuple[int, ...], dtype: str) -> npt.NDArray[Any]:
+        return _shaped(bundle.live_array(f"{size.name}.{key}"), shape, dtype, key)
+
+    rows, columns = size.height_px, size.width_px
+    low, high = map(float, array("range", (2,), "f4"))
+    down, along = (int(value) % TILE for value in array("dither", (2,), "u2"))
+    return LiveOutput(
+        size, array("base", (rows, columns, 3), "u2"), (low, high), array("centre", (rows, columns, 2), "u2"),
+        array("shape", (rows, columns, 3), "u1"), array("unmix", (3, 3), "f4"), array("response", (3, 256), "f4"),
+        (down, along),
+    )  # fmt: skip
+
+
+def _shaped(values: npt.NDArray[Any], shape: tuple[int, ...], dtype: str, name: str) -> npt.NDArray[Any]:
+    if values.shape != shape or values.dtype != np.dtype(f"<{dtype}"):
+        raise damaged(f"the array {name} of its live section is {values.dtype} {values.shape}, not {dtype} {shape}")
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        raise damaged(f"the array {name} of its live section has values that are no numbers")
+    return values
+
+
+def light_table() -> Float:
+    """(256,) linear light of the sRGB values in which targets come (IEC 61966-2-1)."""
+    value = np.arange(256) / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def sigma_table() -> Float:
+    """(256,) standard deviation, in target pixels, of each value in ``shape``; 0 for 0."""
+    table = np.exp2((np.arange(256) - 96) / 32).astype(np.float32)
+    table[0] = 0
+    return table
+
+
+def brightness_factor(maps: LiveMaps, brightness: float) -> np.float32:
+    """What a target's linear light is multiplied with before ``gain``."""
+    return np.float32(brightness / maps.unit)
+
+
+def compensate(maps: LiveMaps, target: Bytes, brightness: float) -> FrameSet:
+    """The frames for a target (height, width, 3) uint8 sRGB; ``brightness``: the radiance of its white."""
+    light = light_table()[target]
+    factor = brightness_factor(maps, brightness)
+    scale = np.maximum(light * (maps.gain.astype(np.float32) * factor) - maps.offset.astype(np.float32), 0)
+    return FrameSet(tuple(_frame(maps, output, scale) for output in maps.outputs))
+
+
+def _frame(maps: LiveMaps, output: LiveOutput, scale: Float) -> Bytes:
+    frame = np.empty(output.size.shape, np.uint8)
+    low, high = (np.float32(value) for value in output.base_range)
+    base = low + output.base.astype(np.float32) / _FULL * (high - low)
+    means = _means(maps, output, scale) * base
+    for channel in range(3):
+        u = output.unmix[channel]
+        part = u[0] * means[..., 0] + u[1] * means[..., 1] + u[2] * means[..., 2]
+        frame[..., channel] = _device(np.clip(part, 0, 1), output, channel, maps.noise)
+    return frame
+
+
+def _means(maps: LiveMaps, output: LiveOutput, scale: Float) -> Float:
+    """P_s: (rows, columns, 3), the mean of C_s under each pixel's Gaussian where there is base light."""
+    width, height = maps.target_px
+    present = maps.present.astype(np.float32) / np.float32(255)
+    lit = output.shape[..., 0] > 0
+    sides = np.array([width - 1, height - 1], np.float32)
+    middle = output.centre[lit].astype(np.float32) / _FULL * sides
+    sigma = sigma_table()[output.shape[..., :2][lit]]
+    correlation = (output.shape[..., 2][lit].astype(np.float32) - np.float32(128)) / np.float32(127)
+    correlation = np.clip(correlation, -MOST_CORRELATION, MOST_CORRELATION)
+    reach = np.minimum(np.maximum(REACH * sigma, np.float32(0.5)), np.float32(MOST_RADIUS_PX))
+    first = np.maximum(np.ceil(middle - reach), 0).astype(np.int64)
+    last = np.minimum(np.floor(middle + reach), sides).astype(np.int64)
+    total, weight = np.zeros((len(middle), 3), np.float32), np.zeros(len(middle), np.float32)
+    for row, column in np.ndindex(*((last - first).max(axis=0, initial=-1) + 1)[::-1]):
+        here = np.flatnonzero((first[:, 0] + column <= last[:, 0]) & (first[:, 1] + row <= last[:, 1]))
+        x, y = first[here, 0] + column, first[here, 1] + row
+        dx = (x.astype(np.float32) - middle[here, 0]) / sigma[here, 0]
+        dy = (y.astype(np.float32) - middle[here, 1]) / sigma[here, 1]
+        r = correlation[here]
+        share = np.exp(np.float32(-0.5) * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r))
+        total[here] += share[:, None] * scale[y, x]
+        weight[here] += share * present[y, x]
+    found = np.zeros((*lit.shape, 3), np.float32)
+    found[lit] = np.divide(total, weight[:, None], out=np.zeros_like(total), where=weight[:, None] > 0)
+    return found
+
+
+def _device(light: Float, output: LiveOutput, channel: int, noise: Float) -> Bytes:
+    """As ``solve.dither`` with thresholds from the blue-noise tile."""
+    table = output.response[channel]
+    value = np.clip(light, table[0], table[255])
+    below = np.clip(np.searchsorted(table, value, side="right") - 1, 0, 254)
+    gap = table[below + 1] - table[below]
+    part = np.divide(value - table[below], gap, out=np.zeros_like(value), where=gap > 0)
+    rows, columns = light.shape
+    down, along = output.dither
+    row = (np.arange(rows) + down + 21 * channel) % TILE
+    column = (np.arange(columns) + along + 43 * channel) % TILE
+    return np.asarray(np.where(part > noise[np.ix_(row, column)], below + 1, below), np.uint8)
