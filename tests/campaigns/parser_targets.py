@@ -1,0 +1,247 @@
+"""Every parser that reads what a device, a network or a file says, with sound inputs to begin from."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from controller.bundle import format as bundle_format
+from controller.bundle.index import parse_index
+from controller.config import load_stage
+from controller.errors import BundleError, UsageError
+from hal import hid_light, hid_relay, pjlink, pjlink_udp, ptp, ptp_eos, ptp_ip, ptp_usb
+from hal.errors import ProtocolError
+from hal.profiles import parse_profile
+from hal.ptp_datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
+from hal.serial_protocol import parse_hours, parse_line
+from plugins.profile_files import load_profile, shipped_profiles
+
+FOLDER = Path(__file__).parents[2] / "firmware_configs" / "projectors"
+PTP_NUMBERS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0x4002, 0x4004, 0x4006, 0xFFFF)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A parser of bytes; ``refuses``: what it may raise, and nothing else."""
+
+    parse: Callable[[bytes], object]
+    seeds: tuple[bytes, ...]
+    refuses: tuple[type[Exception], ...] = (ProtocolError,)
+    most_bytes: int = 4096
+
+
+def targets(folder: Path) -> dict[str, Target]:
+    """Every parser by name; ``folder`` is where those that read files find them."""
+    return {
+        "ptp-containers": Target(_ptp_container, _containers()),
+        "ptp-datasets": Target(_ptp_dataset, _datasets()),
+        "ptp-ip": Target(_ptp_ip, _packets()),
+        "eos-records": Target(_eos, _records()),
+        "serial-answers": Target(_serial, _answers()),
+        "pjlink-answers": Target(_pjlink, tuple(bytes([n]) + answer for n, answer in enumerate(_PJLINK))),
+        "pjlink-udp": Target(pjlink_udp.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
+        "hid-reports": Target(_hid, _REPORTS),
+        "bundle-index": Target(_index, (json.dumps(_INDEX).encode(),), (BundleError,)),
+        "bundle-header": Target(_header, (bytes(128), bundle_format.MAGIC + bytes(120)), (BundleError,)),
+        "profile-toml": Target(
+            _profile, tuple((FOLDER / f"{n}.toml").read_bytes() for n in ("nec", "sanyo", "benq")), (ProtocolError,)
+        ),
+        "stage-toml": Target(partial(_stage, folder / "stage.toml"), (STAGE.encode(),), (UsageError,)),
+    }
+
+
+def _ptp_container(data: bytes) -> None:
+    parsers = (ptp_usb.parse_header, ptp_usb.parse_parameters, ptp_usb.parse_event, ptp_usb.parse_status)
+    parsers[data[0] % 4 if data else 0](data[1:])
+
+
+def _ptp_dataset(data: bytes) -> None:
+    if not data:
+        return
+    which, rest = data[0] % 6, data[1:]
+    if which == 5:
+        ptp.parse_handles(rest)
+    elif which == 4 and rest:
+        from hal.ptp_datasets import parse_value
+
+        parse_value(rest[1:], PTP_NUMBERS[rest[0] % len(PTP_NUMBERS)])
+    else:
+        (DeviceInfo, ObjectInfo, StorageInfo, PropertyDescription, DeviceInfo)[which].parse(rest)
+
+
+def _ptp_ip(data: bytes) -> None:
+    if len(data) >= 8:
+        ptp_ip.parse_header(data[:8])
+    if data:
+        ptp_ip.parse(data[0] % 16, data[1:])
+
+
+def _eos(data: bytes) -> None:
+    if data[:1] == b"v":
+        ptp_eos.parse_view(data[1:])
+    elif data[:1] == b"f":
+        ptp_eos.parse_image_format(data[1:])
+    else:
+        ptp_eos.parse_records(data[1:])
+
+
+_TABLES = [table for name in shipped_profiles() if (table := load_profile(name, Path()).serial) is not None]
+
+
+def _serial(data: bytes) -> None:
+    if len(data) < 2:
+        return
+    table = _TABLES[data[0] % len(_TABLES)]
+    queries = [None, *table.queries.values()]
+    query = queries[data[1] % len(queries)]
+    meaning = parse_line(table, data[2:], query, sent=b"~00124 1\r")
+    value = getattr(meaning, "value", None)
+    if query is table.queries.get("lamp_hours") and query is not None and isinstance(value, str):
+        parse_hours(value, query.per_hour)
+
+
+_PJLINK = (
+    b"PJLINK 1 498e4a67\r",
+    b"%1POWR=1\r",
+    b"%1ERST=012000\r",
+    b"%1LAMP=22 1 0 0\r",
+    b"%1INPT=31\r",
+    b"%1INST=11 31 32\r",
+    b"%1AVMT=31\r",
+    b"%1INF1=maker\r",
+    b"%1CLSS=2\r",
+)
+
+
+def _pjlink(data: bytes) -> None:
+    if not data:
+        return
+    names = ("POWR", "ERST", "LAMP", "INPT", "INST", "AVMT", "INF1", "CLSS")
+    readers: tuple[Callable[[str], object], ...] = (
+        pjlink.parse_power, pjlink.parse_errors, pjlink.parse_lamps, pjlink.parse_input, pjlink.parse_inputs,
+        pjlink.parse_mute, pjlink.parse_text, pjlink.parse_class,
+    )  # fmt: skip
+    which = data[0] % 9
+    if which == 0:
+        pjlink.parse_greeting(data[1:])
+        return
+    told = pjlink.parse_answer(data[1:], names[which - 1])
+    if isinstance(told, str):
+        readers[which - 1](told)
+
+
+_REPORTS = (
+    b"\x03\0BITFT\0\0\x03",
+    b"\x01" + bytes([1, 3, 0, 16, 0, 0, 0]),
+    b"\x02" + hid_light.SensorSettings().pack(),
+)
+
+
+def _hid(data: bytes) -> None:
+    report = list(data[1:])
+    match data[0] % 3 if data else 0:
+        case 0:
+            hid_relay.parse_state(report, 1 + (data[0] // 3) % 8 if data else 1)
+        case 1:
+            hid_light.parse_reading(report)
+        case _:
+            hid_light.parse_settings(report)
+
+
+_INDEX = {
+    "stage": "demo", "calibration": "c", "created_unix_s": 1, "revision": 1,
+    "outputs": [{"name": "P1", "width_px": 8, "height_px": 4, "stripe_rows": 4}],
+    "appearances": [
+        {"name": "a", "stripes": {"P1": [[4096, 10, "00" * 8, "00" * 32]]}, "thumbnail": None, "metadata": {}}
+    ],
+    "schedule": [["a", 1000, 0]], "live": None,
+}  # fmt: skip
+
+
+def _index(data: bytes) -> None:
+    parse_index(data, data_end=1 << 20)
+
+
+def _header(data: bytes) -> None:
+    bundle_format.parse_header(data, file_size=len(data), trailer_bytes=8)
+
+
+def _profile(data: bytes) -> None:
+    parse_profile(data.decode("latin-1"))
+
+
+def _stage(file: Path, data: bytes) -> None:
+    file.write_bytes(data)
+    load_stage(file)
+
+
+def _containers() -> tuple[bytes, ...]:
+    event = struct.pack("<IHHIIII", 24, 4, 0x4002, 1, 5, 0, 0)
+    command = ptp_usb.pack_command(0x1001, 1, (1, 2))
+    return b"\0" + command, b"\1" + command[12:], b"\2" + event, b"\3" + struct.pack("<HH", 4, 0x2001)
+
+
+def _datasets() -> tuple[bytes, ...]:
+    info = DeviceInfo(6, frozenset({0x1001}), frozenset({0x4002}), frozenset({0x5001}), (0x3801,), (0x3801,),
+                      "maker", "model", "1", "7")  # fmt: skip
+    handles = struct.pack("<III", 2, 1, 2)
+    storage = StorageInfo(3, True, 1 << 30, 1 << 29, 99, "card", "label")
+    return b"\0" + info.pack(), b"\2" + storage.pack(), b"\5" + handles, b"\4\x06\1\0\0\0"
+
+
+def _packets() -> tuple[bytes, ...]:
+    packets = (ptp_ip.Ping(), ptp_ip.StartData(1, 99), ptp_ip.Data(1, b"abc"), ptp_ip.EndData(1, b""))
+    return tuple(bytes([ptp_ip.parse_header(ptp_ip.pack(one)[:8])[1]]) + ptp_ip.pack(one)[8:] for one in packets)
+
+
+def _records() -> tuple[bytes, ...]:
+    end = struct.pack("<II", 8, 0)
+    values = struct.pack("<IIIIIII", 28, 0xC18A, 0xD103, 3, 2, 0x48, 0x50)
+    return (
+        b"r" + struct.pack("<IIII", 16, 0xC189, 0xD102, 0x60) + end,
+        b"r" + values + end,
+        b"f" + struct.pack("<IIIII", 1, 16, 1, 0, 3),
+        b"v" + struct.pack("<II", 12, 1) + b"jpeg",
+    )
+
+
+def _answers() -> tuple[bytes, ...]:
+    lines = (b"OK1", b"INFO2", b"PWR=01\r", b"*POW=ON#", b'(PWR!001 "On")', b"\x02Q$S2\x03", b"00410 00410", b"\x06")
+    return tuple(bytes([n % len(_TABLES), 1 + n % 2]) + line + b"\r" for n in range(8) for line in lines)
+
+
+STAGE = """\
+[stage]
+name = "demo"
+[[projectors]]
+name = "left"
+output = "P1"
+driver = "serial"
+profile = "optoma-later"
+port = "run/tty-left"
+[camera]
+driver = "ptp"
+address = "ptpip:127.0.0.1:15740:15741"
+iso = 100
+focal_length_px = 5200.0
+[display]
+driver = "player"
+outputs = [{name = "P1", width_px = 280, height_px = 210}]
+[[relays]]
+name = "cupboard"
+driver = "usb-relay"
+[[relays.mains]]
+channel = 1
+feeds = ["left"]
+"""
+
+
+def scratch() -> Path:
+    """A folder in memory where there is one."""
+    shared = Path("/dev/shm")
+    return Path(tempfile.mkdtemp(prefix="velatura-parsers-", dir=shared if shared.is_dir() else None))
