@@ -7,7 +7,7 @@ Gaussian to within what a stage's grade leaves open (docs/decisions/0021).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from controller.arrays import ByteImage, FloatImage
 from controller.bundle.writer import NewLive
+from controller.calibrate.values import Calibration
 from controller.capture.encoding import checked_response
 from controller.errors import WorkError
 from controller.session.solving import Calibrated
@@ -48,10 +49,15 @@ def live_arrays(run: Path, outputs: Mapping[str, tuple[str, tuple[int, int]]]) -
         )
     calibrated = Calibrated(run, tuple(outputs))
     calibration = calibrated.calibration
-    arrays = live_model(calibrated.transport, calibrated.base, calibration.black)
-    named: Arrays = {name: values for name, values in arrays.items() if "." not in name}
-    for n, (part, (output, _)) in enumerate(zip(calibration.projectors, outputs.values(), strict=True)):
-        named |= {f"{output}.{key}": arrays[f"{n}.{key}"] for key in ("base", "range", "centre", "shape")}
+    model = live_model(calibrated.transport, calibrated.base, calibration.black)
+    return named_arrays(model, calibration, [outputs[part.name][0] for part in calibration.projectors])
+
+
+def named_arrays(model: Arrays, calibration: Calibration, outputs: Sequence[str]) -> NewLive:
+    """The whole section, from ``live_model`` and what is known of each projector; ``outputs``: their names."""
+    named: Arrays = {name: values for name, values in model.items() if "." not in name}
+    for n, (part, output) in enumerate(zip(calibration.projectors, outputs, strict=True)):
+        named |= {f"{output}.{key}": model[f"{n}.{key}"] for key in ("base", "range", "centre", "shape")}
         named[f"{output}.unmix"] = np.linalg.inv(part.radiometry.mixing).astype(np.float32)
         named[f"{output}.response"] = checked_response(part.radiometry.response)
         named[f"{output}.dither"] = np.array([17 * n % 64, 29 * n % 64], np.uint16)
