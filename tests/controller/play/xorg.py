@@ -18,14 +18,16 @@ MODES = {
     "small": ["1.6", "160", "168", "176", "200", "120", "121", "123", "133"],
     "other": ["1.2", "120", "124", "128", "144", "100", "101", "103", "139"],
     "quick": ["3.2", "160", "168", "176", "200", "120", "121", "123", "133"],
+    "paper": ["121.75", "1400", "1488", "1632", "1864", "1050", "1053", "1057", "1089"],
 }
-"""Modelines: 160x120 and 120x100 at 60 Hz, 160x120 at 120 Hz."""
+"""Modelines: 160x120 and 120x100 at 60 Hz, 160x120 at 120 Hz, 1400x1050 at 60 Hz."""
 CONNECTORS = ("DUMMY0", "DUMMY1", "DUMMY2")
 WIDTH, HEIGHT = 160, 120
 _CONFIGURATION = """
 Section "Device"
   Identifier "d"
   Driver "dummy"
+  VideoRam 64000
 EndSection
 Section "Monitor"
   Identifier "m"
