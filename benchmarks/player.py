@@ -33,6 +33,8 @@ MOST_CACHED = 64
 STARTS = 5
 SUSTAINED_S = 20.0
 PACED_S = 10.0
+FADED_S = 5.0
+FADED_HZ = 60.0
 FEWEST_WATCHED = 2000
 WATCHED_HZ = 60.0
 WATCHED_S = 120.0
@@ -54,6 +56,7 @@ def measure(size: str) -> list[Row]:
             try:
                 rows += _sustained(display, len(swaps), paper=paper)
                 rows += [row for rate_hz in (30.0, 60.0) for row in _paced(display, rate_hz, len(swaps))]
+                rows.append(_fading(display))
                 rows.append(_watched(display, place, swaps))
                 rows += _memory(player, display, len(swaps))
             finally:
@@ -146,6 +149,18 @@ def _paced(display: PlayerDisplay, rate_hz: float, sets: int) -> list[Row]:
     how = f"p50 {1000 * found.interval_p50_s:.2f} ms of {tick_ms:.2f}; {found.late} late in {PACED_S:g} s, each decoded"
     goal = 34.5 if rate_hz == 30.0 else None
     return [at_most(f"interval at {rate_hz:g} Hz", 1000 * found.interval_p99_s, goal, unit="ms p99", how=how)]
+
+
+def _fading(display: PlayerDisplay) -> Row:
+    """Steps of one long cross-fade that are presented, of 60 a second; what is too slow is left out."""
+    before = display.playing(deadline=in_seconds(5)).swaps
+    items = [("a0", FADED_S, FADED_S)]
+    began = time.perf_counter()
+    display.play_sequence(items, repeat=1, rate_hz=FADED_HZ, deadline=in_seconds(FADED_S + 20))
+    elapsed = time.perf_counter() - began
+    steps = display.playing(deadline=in_seconds(5)).swaps - before
+    how = f"{steps} steps of a cross-fade of {FADED_S:g} s, mixed in memory on 2 threads, of {FADED_HZ:g} a second"
+    return at_least("steps of a fade", steps / elapsed, None, unit="a second", how=how)
 
 
 def _watched(display: PlayerDisplay, place: Path, swaps: Sequence[dict[str, ByteImage]]) -> Row:
