@@ -55,6 +55,11 @@ class Canvas:
         self._before = [_texture(size) for size in sizes]
         self._after: list[int] = []
 
+    @property
+    def pictures(self) -> Sequence[int]:
+        """The textures that are drawn with share 0: whoever draws into them does what ``load`` does."""
+        return self._before
+
     def load(self, frames: FrameSet) -> None:
         """Take one set over; draw it with share 0."""
         self._upload(self._before, frames)

@@ -6,6 +6,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pyglet
 
 # Must be set before pyglet.window is imported: error checks after every call, and a hidden window, cost time.
@@ -17,6 +19,8 @@ from pyglet import gl  # noqa: E402
 from controller.errors import WorkError  # noqa: E402
 from controller.play.drawing import Canvas  # noqa: E402
 from controller.play.frames import FrameSet, OutputSize  # noqa: E402
+from controller.play.live_gl import LiveRenderer  # noqa: E402
+from controller.play.live_maps import LiveMaps  # noqa: E402
 from controller.play.places import check_connectors, find_connectors, fits  # noqa: E402
 from controller.play.x11 import Connector, XServer  # noqa: E402
 
@@ -60,6 +64,7 @@ class WindowOutput:
         self._window.set_vsync(True)
         self._canvas = Canvas(sizes)
         self._share = 0.0
+        self._live: LiveRenderer | None = None
         self._damaged = False
         self._window.push_handlers(on_expose=self._on_expose, on_draw=self._on_expose, on_close=_stay)
 
@@ -93,6 +98,22 @@ class WindowOutput:
     def prepare(self, frames: FrameSet) -> None:
         self._window.switch_to()
         self._canvas.load(frames)
+        self._share = 0.0
+        self._draw()
+
+    def load_live(self, maps: LiveMaps) -> None:
+        """As ``live.LiveOutput``."""
+        self._window.switch_to()
+        if self._live is not None:
+            self._live.close()
+            self._live = None
+        self._live = LiveRenderer(maps)
+
+    def prepare_live(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
+        """As ``live.LiveOutput``; after ``load_live``."""
+        assert self._live is not None
+        self._window.switch_to()
+        self._live.render(target, brightness, self._canvas.pictures)
         self._share = 0.0
         self._draw()
 

@@ -1,0 +1,39 @@
+"""Run by test_live_window.py in a process of its own: a live target in the player's window, left there until told.
+
+Arguments: a bundle, an .npz file with "target" and "brightness". Prints a line when the picture is on the screen.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from controller.bundle.reader import Bundle
+from controller.play.frames import FrameSet
+from controller.play.live import LivePicture
+from controller.play.live_maps import LiveMaps
+from controller.play.windows import WindowOutput
+
+
+def main(bundle: Path, asked: Path) -> None:
+    with Bundle.open(bundle, allow_unsigned=True) as opened, np.load(asked) as values:
+        maps = LiveMaps.read(opened)
+        target, brightness = values["target"], float(values["brightness"])
+    output = WindowOutput([one.size for one in maps.outputs])
+    picture = LivePicture(output, maps, print)
+    picture.prepare(target, brightness)
+    output.flip()
+    print("on the screen", picture.on_gpu, flush=True)
+    sys.stdin.readline()
+    # An ordinary picture after it: the window's own drawing is as it was.
+    output.prepare(FrameSet(tuple(np.full(one.size.shape, 77, np.uint8) for one in maps.outputs)))
+    output.flip()
+    print("on the screen", flush=True)
+    sys.stdin.readline()
+    output.close()
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))
