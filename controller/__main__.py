@@ -21,6 +21,7 @@ import typer
 from controller import console
 from controller.commands import bundle as bundle_commands
 from controller.commands import camera as camera_commands
+from controller.commands import serve as serve_commands
 from controller.commands.doctor import doctor
 from controller.commands.drift import drift
 from controller.commands.export import export
@@ -164,6 +165,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     export,
     report,
     states,
+    *serve_commands.COMMANDS,
 )
 """Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
 

@@ -34,12 +34,16 @@ class Agenda:
 
     def ask(self, *requests: Request) -> None:
         """Queue work. Raises WorkError("busy") while there is other work, and with the reason why it can't be done."""
-        if self.head is not None:
-            raise WorkError("busy", what="Other work is going on.", remedy="Wait for it to end, or cancel it.")
+        self.check_idle()
         if (why := self._works.refusal(requests[0])) is not None:
             self._log.tell(why)
             raise WorkError(why.code, what=why.reason, remedy=why.remedy)
         self._queue.extend(requests)
+
+    def check_idle(self) -> None:
+        """Raises WorkError("busy")."""
+        if self.head is not None:
+            raise WorkError("busy", what="Other work is going on.", remedy="Wait for it to end, or cancel it.")
 
     def offer(self, request: Request) -> bool:
         """Queue work that nobody waits for, if there is no other; whether it was queued."""

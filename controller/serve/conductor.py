@@ -110,6 +110,11 @@ class Conductor:
         with self._lock:
             self._agenda.ask(*requests)
 
+    def check_idle(self) -> None:
+        """Raises WorkError("busy") while work runs or waits."""
+        with self._lock:
+            self._agenda.check_idle()
+
     def cancel(self) -> None:
         """Raises WorkError("nothing-to-cancel")."""
         with self._lock:

@@ -1,0 +1,151 @@
+"""``velatura serve`` and the commands that ask a running kiosk, or do it themselves where none runs."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from controller import console
+from controller.commands.running import Json, StageFolder, work
+from controller.errors import UsageError
+
+
+def serve(
+    stage: StageFolder,
+    panel: Annotated[str, typer.Option(help="HOST:PORT at which the panel listens.")] = "127.0.0.1:8377",
+    no_panel: Annotated[bool, typer.Option("--no-panel", help="Without the panel.")] = False,
+    name: Annotated[
+        list[str] | None, typer.Option(help="A further host name under which browsers may reach the panel.")
+    ] = None,
+    certificate: Annotated[Path | None, typer.Option(help="TLS certificate (PEM) of the panel.")] = None,
+    key: Annotated[Path | None, typer.Option(help="TLS key (PEM) of the panel.")] = None,
+    leave_lit: Annotated[
+        bool, typer.Option("--leave-lit", help="Leave the lamps lit at the end, for a service that starts again.")
+    ] = False,
+    setup: Annotated[
+        bool, typer.Option("--setup", help="Start without a valid stage.toml, for the panel's first page.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Run the stage by its schedule, unattended, with the technician's panel, until Ctrl-C."""
+    from controller.serve.program import PanelAddress, parse_address
+
+    host, port = parse_address(panel)
+    address = None if no_panel else PanelAddress(host, port, certificate, key, tuple(name or ()))
+    work(
+        "controller.serve.program:serve", as_json=as_json, stage=stage, panel=address, leave_lit=leave_lit, setup=setup
+    )
+
+
+def status(stage: StageFolder, as_json: Json = False) -> None:
+    """What the stage does now, and what is wrong."""
+    from controller.serve.direct import status_of, status_text
+
+    content = status_of(stage)
+    console.show_result(content if as_json else status_text(content), as_json=as_json)
+
+
+def events(
+    stage: StageFolder,
+    after: Annotated[int, typer.Option(help="Only events with a larger number.", min=0)] = 0,
+    level: Annotated[str, typer.Option(help="info, warning or error: no lesser ones.")] = "info",
+    as_json: Json = False,
+) -> None:
+    """The kiosk's event log."""
+    from controller.serve.direct import LEVELS, call
+
+    if level not in LEVELS:
+        raise UsageError("wrong-use", what=f"There is no level {level}.", remedy=f"One of {', '.join(LEVELS)}.")
+    rows = [row for row in call(stage, "events", after=after) if LEVELS.index(row["level"]) >= LEVELS.index(level)]
+    lines = [f"{row['number']:>7} {_local(row['unix_s'])} {row['level']:<7} {row['text']}" for row in rows]
+    console.show_result({"events": rows} if as_json else "\n".join(lines), as_json=as_json)
+
+
+def schedule(
+    stage: StageFolder,
+    zone: Annotated[str | None, typer.Option(help="Time zone, e.g. Europe/Vienna.")] = None,
+    hours: Annotated[
+        list[str] | None,
+        typer.Option(help="DAY=HH:MM-HH:MM or DAY=closed; replaces all rows. DAY: mon ... sun, or 2026-12-24."),
+    ] = None,
+    drift_check: Annotated[str | None, typer.Option(help="HH:MM of the nightly check; empty: none.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Show the opening hours, or change them."""
+    from controller.serve.direct import call, changed_schedule, schedule_text
+
+    now = call(stage, "schedule")
+    if zone is not None or hours is not None or drift_check is not None:
+        now = changed_schedule(now, zone, hours, drift_check)
+        call(stage, "set-schedule", **now)
+    console.show_result(now if as_json else schedule_text(now), as_json=as_json)
+
+
+def start(stage: StageFolder, as_json: Json = False) -> None:
+    """Open the running kiosk until its schedule says otherwise the next time."""
+    _told(stage, "start", "The stage opens.", as_json=as_json)
+
+
+def stop(stage: StageFolder, as_json: Json = False) -> None:
+    """Close the running kiosk, and cool its lamps, until its schedule says otherwise the next time."""
+    _told(stage, "stop", "The stage closes.", as_json=as_json)
+
+
+def cancel(stage: StageFolder, as_json: Json = False) -> None:
+    """Stop the work that the running kiosk does."""
+    _told(stage, "cancel", "The work ends at its next safe point.", as_json=as_json)
+
+
+def identify(
+    stage: StageFolder,
+    off: Annotated[bool, typer.Option("--off", help="Back to what was shown.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Show each projector's name on it, on a running kiosk."""
+    _told(stage, "identify", "The names are shown." if not off else "The names are gone.", as_json=as_json, on=not off)
+
+
+def backup(stage: StageFolder, as_json: Json = False) -> None:
+    """Write settings, calibration and appearances into one file, without secrets."""
+    _file(stage, "backup", as_json=as_json)
+
+
+def diagnostics(stage: StageFolder, as_json: Json = False) -> None:
+    """Write events, journals and states into one file for whoever helps, without secrets and pictures."""
+    _file(stage, "diagnostics", as_json=as_json)
+
+
+def restore(
+    stage: StageFolder,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A file that `velatura backup` made.")],
+    as_json: Json = False,
+) -> None:
+    """Replace settings, calibration and appearances by those of a backup."""
+    from controller.serve.direct import call
+
+    call(stage, "restore", backup=str(file.resolve()))
+    console.show_result({"restored": str(file)} if as_json else f"{file.name} is restored.", as_json=as_json)
+
+
+def _file(stage: Path, op: str, *, as_json: bool) -> None:
+    from controller.serve.direct import call
+
+    path = call(stage, op)
+    console.show_result({"file": path} if as_json else f"Written: {path}", as_json=as_json)
+
+
+def _told(stage: Path, op: str, sentence: str, *, as_json: bool, **arguments: Any) -> None:
+    from controller.serve.control import ask
+
+    ask(stage, op, **arguments)
+    console.show_result({"done": op} if as_json else sentence, as_json=as_json)
+
+
+def _local(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s, tz=datetime.now().astimezone().tzinfo).strftime("%Y-%m-%d %H:%M:%S")
+
+
+COMMANDS = (serve, status, events, schedule, start, stop, cancel, identify, backup, restore, diagnostics)

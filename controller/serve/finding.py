@@ -1,0 +1,82 @@
+"""What the doctor finds on a kiosk, and the devices that a search finds for a new one."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from controller.config.writer import toml_text
+from controller.doctor.examine import examine
+from controller.errors import VelaturaError
+from controller.panel.kiosk import Finding, FoundDevice, TriedDevice
+from controller.serve.service import Service
+from controller.session.progress import Silent
+from controller.text import printable
+from hal.deadline import in_seconds
+from hal.errors import DeviceError
+from hal.finding import Found
+from hal.interfaces import Device
+from hal.registry import OpenContext, load_drivers
+
+LOW_DISK_BYTES: Final = 2 << 30
+_TABLES: Final = {"projector": "projectors", "power_switch": "relays", "button_panel": "key_panel"}
+_LISTS: Final = ("projectors", "relays")
+
+
+def findings(stage: Path, service: Service | None) -> Sequence[Finding]:
+    """What is wrong: the devices' own problems, the disk, and what the buses say."""
+    found = []
+    for row in () if service is None else service.devices.rows():
+        if row.problem is not None:
+            found.append(Finding("error", f"{row.kind} {row.name}", row.problem, row.remedy))
+    if service is not None and service.player.view.problem is not None:
+        problem = service.player.view.problem
+        found.append(Finding("error", "player", problem.reason, problem.remedy))
+    if shutil.disk_usage(stage).free < LOW_DISK_BYTES:
+        found.append(Finding("warning", "disk", "Less than 2 GiB are free on the stage's disk.",
+                             "Delete old runs or backups; playback goes on, calibrating may not."))  # fmt: skip
+    seen = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event())
+    for one in seen.findings:
+        found.append(Finding("warning", printable(one.device or "bus"), one.problem.what, one.problem.remedy))
+    return found
+
+
+def find(stage: Path) -> Sequence[FoundDevice]:
+    """Every device of every bus, with its table for stage.toml."""
+    seen = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event())
+    return [_found(one) for one in seen.found]
+
+
+def _found(one: Found) -> FoundDevice:
+    table = _TABLES.get(one.kind, one.kind)
+    text = ""
+    if one.driver:
+        content = {"driver": one.driver, **one.settings}
+        text = toml_text({table: [content] if table in _LISTS else content})
+    return FoundDevice(f"{one.bus}:{one.address}", one.kind, one.driver, printable(one.what), text)
+
+
+def try_device(stage: Path, key: str) -> TriedDevice:
+    """Open the device and ask it who it is; changes nothing."""
+    seen = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event())
+    one = next((one for one in seen.found if f"{one.bus}:{one.address}" == key), None)
+    if one is None:
+        return TriedDevice(False, "It is not there any more. Plug it in and search again.")
+    if not one.driver:
+        return TriedDevice(False, "Nobody knows what drives it. Write its table into stage.toml by hand.")
+    try:
+        driver = load_drivers().get(one.kind, one.driver)
+        opened = driver.open(dict(one.settings), OpenContext(stage=stage), in_seconds(20.0))
+    except (DeviceError, VelaturaError) as error:
+        return TriedDevice(False, f"{error.what} {error.remedy}")
+    assert isinstance(opened, Device)
+    try:
+        who = opened.identity(deadline=in_seconds(10.0))
+        return TriedDevice(True, f"It answers: {printable(f'{who.maker} {who.model} {who.serial}'.strip())}.")
+    except (DeviceError, VelaturaError) as error:
+        return TriedDevice(False, f"{error.what} {error.remedy}")
+    finally:
+        opened.close()

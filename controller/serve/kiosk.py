@@ -1,0 +1,275 @@
+"""A kiosk as its panel and the command line see it: ``controller.panel.kiosk.Kiosk`` over the running service."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from controller.errors import UsageError, WorkError
+from controller.panel.kiosk import (
+    Aiming,
+    Appearance,
+    BundleIdentity,
+    ComputeSettings,
+    DeviceRow,
+    EventRow,
+    Finding,
+    FoundDevice,
+    Grade,
+    Job,
+    KioskState,
+    Lamp,
+    RecalibrationKind,
+    Results,
+    Schedule,
+    TriedDevice,
+    Unsubscribe,
+)
+from controller.serve import aim, archive, finding, runs, settings
+from controller.serve.control import plain
+from controller.serve.ports import Request
+from controller.serve.service import Service
+from controller.storage import write_atomically
+
+GRADES_EVERY_S: Final = 10.0
+_REVISIONS: Final = 1_000_000_000
+
+
+class StageKiosk:
+    """Goes on while the service is made anew; ``service`` None while stage.toml is missing or wrong.
+
+    ``reload`` is set when somebody changed the settings: whoever runs the service then starts it again.
+    """
+
+    def __init__(self, stage: Path) -> None:
+        self.stage = stage
+        self.reload = threading.Event()
+        self._service: Service | None = None
+        self._lock = threading.RLock()
+        self._callbacks: list[Callable[[], None]] = []
+        self._grades: tuple[float, tuple[Grade, ...]] = (0.0, ())
+        self._last = KioskState(0, stage.name, "off", "The stage is not set up yet.", time.time(), needs_setup=True)
+        self._events = 0
+        self._since = ("", 0.0)
+
+    def attach(self, service: Service | None, reason: str = "") -> None:
+        """The service that runs from now on, or why there is none."""
+        with self._lock:
+            self._service = service
+            if service is None:
+                revision = self._last.revision + 1
+                state, why = ("fault", reason) if reason else ("off", "The stage is not set up yet.")
+                self._last = KioskState(revision, self.stage.name, state, why, time.time(), needs_setup=True)
+            else:
+                starts = int(service.log.value("starts") or 0) + 1
+                service.log.keep("starts", str(starts))
+                self._last = replace(self._last, revision=starts * _REVISIONS)
+                service.changed = self._refresh
+        self._notify()
+
+    @property
+    def service(self) -> Service:
+        """Raises WorkError("not-set-up")."""
+        service = self._service
+        if service is None:
+            raise WorkError("not-set-up", what=self._last.reason, remedy="Set the stage up first.")
+        return service
+
+    # -- asked often
+
+    def snapshot(self) -> KioskState:
+        return self._last
+
+    def events(self, after: int = 0) -> Sequence[EventRow]:
+        return () if self._service is None else self._service.log.after(after)
+
+    def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
+        with self._lock:
+            self._callbacks.append(callback)
+        return lambda: self._callbacks.remove(callback) if callback in self._callbacks else None
+
+    def _refresh(self) -> None:
+        service = self._service
+        if service is None:
+            return
+        now = self._made(service)
+        with self._lock:
+            same = replace(now, revision=self._last.revision) == self._last and self._events == service.log.number
+            self._events = service.log.number
+            if not same:
+                self._last = now
+        if not same:
+            self._notify()
+
+    def _notify(self) -> None:
+        for callback in tuple(self._callbacks):
+            callback()
+
+    def _made(self, service: Service) -> KioskState:
+        machine, shown = service.conductor.machine, service.player.view.shown
+        state = machine.state.value
+        if self._since[0] != state:
+            self._since = (state, time.time())
+        at_s, grades = self._grades
+        if time.monotonic() - at_s > GRADES_EVERY_S or not at_s:
+            grades = runs.grades(self.stage, service.checked.stage.tables.calibration.worst_grade)
+            self._grades = time.monotonic(), grades
+        index = service.stock.index(bundle := service.stock.bundle())
+        identity = None
+        if index is not None and bundle is not None:
+            identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
+        lamps = tuple(
+            Lamp(view.name, view.hours, view.strikes, view.condition.value == "lit")
+            for view in (keeper.view for keeper in service.devices.projectors)
+        )
+        return KioskState(
+            revision=self._last.revision + 1,
+            stage=service.checked.stage.tables.stage.name,
+            state=state,
+            reason=machine.reason,
+            since_unix_s=self._since[1],
+            devices=(*service.devices.rows(), self._player_row(service), *self._disk_row(service)),
+            job=service.works.job,
+            playing=shown.appearance if shown is not None else "",
+            next_event=service.conductor.plan.next,
+            bundle=identity,
+            lamps=lamps,
+            grades=grades,
+            identifying=service.player.identifying,
+        )
+
+    def _player_row(self, service: Service) -> DeviceRow:
+        problem = service.player.view.problem
+        what, remedy = (None, "") if problem is None else (problem.reason, problem.remedy)
+        return DeviceRow("player", "display", "player", (), what, remedy)
+
+    def _disk_row(self, service: Service) -> tuple[DeviceRow, ...]:
+        if service.log.problem is None:
+            return ()
+        remedy = "Free some space on the disk; playback goes on meanwhile."
+        return (DeviceRow("disk", "disk", "", (), f"The event log can't be written: {service.log.problem}.", remedy),)
+
+    # -- commands
+
+    def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
+        """``projector``: the quick way, which finds by itself what changed of it. Raises WorkError("busy"), ..."""
+        service = self.service
+        if projector is not None and projector not in service.checked.names:
+            raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
+                             remedy=f"It is one of {', '.join(service.checked.names)}.")  # fmt: skip
+        service.ask(Request("quick" if projector is not None else kind, light=True))
+        return self._job(service, "Quick recalibration" if kind == "quick" else "Full recalibration")
+
+    def _job(self, service: Service, name: str) -> Job:
+        last = service.works.job
+        return Job(1 if last is None else last.number + 1, name)
+
+    def cancel(self) -> None:
+        self.service.conductor.cancel()
+
+    def play(self, name: str) -> None:
+        service = self.service
+        if name not in service.stock.names():
+            raise UsageError("appearance-unknown", what=f"The installed bundle has no appearance {name[:64]!r}.",
+                             remedy=f"It has {', '.join(service.stock.names()) or 'none'}.")  # fmt: skip
+        service.conductor.choose(name)
+        service.conductor.open()
+
+    def stop(self) -> None:
+        self.service.conductor.shut()
+
+    def start(self) -> None:
+        for keeper in self.service.devices.projectors:
+            keeper.forgive()
+        self.service.conductor.open()
+
+    def compute(self, name: str, target: Path, settings_: ComputeSettings) -> Job:
+        service = self.service
+        settings.check_name(name)
+        if settings_.brightness is not None:
+            raise UsageError("brightness-fixed", what="The brightness of one appearance can't be chosen.",
+                             remedy="Set exposure_share under [solve] in stage.toml, for all of them.")  # fmt: skip
+        kept = self.stage / "appearances" / f"{name}.png"
+        service.conductor.check_idle()
+        write_atomically(kept, target.read_bytes())
+        settings.add_picture(self.stage, name, kept)
+        service.ask(Request("compute", arguments=(name,)))
+        return self._job(service, "New appearance")
+
+    def feasibility(self, target: Path) -> Path:
+        return aim.feasibility_map(self.stage, target)
+
+    def appearances(self) -> Sequence[Appearance]:
+        service = self.service
+        index = service.stock.index(service.stock.bundle())
+        playing = self._last.playing
+        if index is None:
+            return ()
+        made = float(index.created_unix_s)
+        return tuple(Appearance(one.name, made, playing=one.name == playing) for one in index.appearances)
+
+    def remove_appearance(self, name: str) -> None:
+        service = self.service
+        if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
+            raise UsageError("appearance-in-use", what=f"{name} is playing, or the schedule names it.",
+                             remedy="Play another one, and take it out of the schedule.")  # fmt: skip
+        settings.remove_picture(self.stage, name)
+        service.ask(Request("publish"))
+
+    def schedule(self) -> Schedule:
+        return Schedule("UTC") if self._service is None else self._service.schedule.now
+
+    def set_schedule(self, schedule: Schedule) -> None:
+        self.service.schedule.replace(schedule, self.service.stock.names())
+
+    def identify(self, on: bool) -> None:
+        self.service.player.identifying = on
+
+    def doctor(self) -> Sequence[Finding]:
+        return finding.findings(self.stage, self._service)
+
+    def backup(self) -> Path:
+        return archive.backup(self.stage)
+
+    def restore(self, backup: Path) -> None:
+        if self._service is not None:
+            self._service.conductor.check_idle()
+        archive.restore(self.stage, backup)
+        self.reload.set()
+
+    def diagnostics(self) -> Path:
+        return archive.diagnostics(self.stage, {"state": plain(self._last), "events": plain(self.events())})
+
+    def settings(self) -> str:
+        return settings.text(self.stage)
+
+    def validate_settings(self, text: str) -> None:
+        settings.validate(text)
+
+    def save_settings(self, text: str) -> None:
+        if self._service is not None:
+            self._service.conductor.check_idle()
+        settings.save(self.stage, text)
+        self.reload.set()
+
+    def camera_picture(self) -> bytes | None:
+        return None if self._service is None else aim.camera_picture(self._service.devices)
+
+    def runs(self) -> Sequence[str]:
+        return runs.names(self.stage)
+
+    def results(self, run: str) -> Results:
+        return runs.results(self.stage, run, self.service.checked.stage.tables.calibration.worst_grade)
+
+    def aiming(self) -> Aiming:
+        return aim.aiming(self.service.checked, self.service.devices)
+
+    def find_devices(self) -> Sequence[FoundDevice]:
+        return finding.find(self.stage)
+
+    def try_device(self, key: str) -> TriedDevice:
+        return finding.try_device(self.stage, key)

@@ -1,0 +1,66 @@
+"""What past runs left for the panel: grades, pictures and figures."""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from controller.errors import UsageError
+from controller.panel.kiosk import Grade, Results
+from controller.services import finished_calibrations
+from controller.session.grading import FILE, PICTURE, passes, worst_of
+
+MOST: Final = 50
+_NAME: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[a-z]+")
+_PICTURES: Final = ("before", "target", "achieved", "error", "resolution")
+
+
+def grades(stage: Path, worst_grade: float) -> tuple[Grade, ...]:
+    """Of every graded run, newest first."""
+    finished = {run.name for run in finished_calibrations(stage)}
+    found = []
+    for run in sorted((stage / "runs").glob("*"), reverse=True)[:MOST]:
+        if (worst := worst_of(run)) is not None:
+            kept = run.name in finished and passes(run, worst_grade)
+            note = f"{worst[0]} is predicted with {worst[1]:.1f} % error"
+            found.append(Grade(run.name, began_s(run.name), run.name.rpartition("-")[2], _letter(run), kept, note=note))
+    return tuple(found)
+
+
+def began_s(run: str) -> float:
+    """Unix seconds of the beginning, as the folder's name tells in local time; 0 for another name."""
+    try:
+        return datetime.strptime(run[:15], "%Y%m%d-%H%M%S").astimezone().timestamp()
+    except ValueError:
+        return 0.0
+
+
+def _letter(run: Path) -> str:
+    content: dict[str, Any] = json.loads((run / FILE).read_text())
+    return max(str(figures["grade"]) for figures in content.values())
+
+
+def names(stage: Path) -> tuple[str, ...]:
+    """Runs that have something to show, newest first."""
+    found = [run.name for run in (stage / "runs").glob("*") if (run / FILE).exists() and _NAME.fullmatch(run.name)]
+    return tuple(sorted(found, reverse=True)[:MOST])
+
+
+def results(stage: Path, run: str, worst_grade: float) -> Results:
+    """Raises UsageError("run-unknown")."""
+    if run not in names(stage):
+        raise UsageError(
+            "run-unknown", what=f"There is no run {run[:80]!r} with results.", remedy="Choose another one."
+        )
+    folder = stage / "runs" / run
+    pictures = {"error": folder / PICTURE} if (folder / PICTURE).exists() else {}
+    for name in _PICTURES:
+        if (folder / f"{name}.png").exists():
+            pictures[name] = folder / f"{name}.png"
+    content: dict[str, Any] = json.loads((folder / FILE).read_text())
+    figures = [(f"Error of {name}", f"{100 * values['relative_rms']:.2f} %") for name, values in content.items()]
+    grade = next((one for one in grades(stage, worst_grade) if one.run == run), None)
+    return Results(run, grade, pictures, tuple(figures))
