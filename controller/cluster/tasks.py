@@ -55,7 +55,8 @@ class StageData:
 
 def _update(hashed: xxhash.xxh3_128, name: str, array: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> None:
     hashed.update(f"{name} {array.dtype} {array.shape}".encode())
-    hashed.update(memoryview(np.ascontiguousarray(array)).cast("B"))
+    if array.size:
+        hashed.update(np.ascontiguousarray(array).data.cast("B"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,25 @@
+"""``velatura live``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from controller.commands.running import Json, StageFolder, work
+
+
+def live(
+    stage: StageFolder,
+    source: Annotated[Path, typer.Argument(help="A video file, or a folder into which pictures are written.")],
+    fps: Annotated[float, typer.Option(help="Take at most so many pictures a second.", min=0.1, max=240)] = 25.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end; a folder in turn.")] = False,
+    seconds: Annotated[float, typer.Option(help="How long; without it, until it ends or Ctrl-C.", min=0)] = 0.0,
+    as_json: Json = False,
+) -> None:
+    """Light the projectors and show a stream of targets as it comes, by base and scale."""
+    work(
+        "controller.live_services:live", as_json=as_json,
+        stage=stage, source=source, rate_hz=fps, loop=loop, seconds=seconds or None,
+    )  # fmt: skip

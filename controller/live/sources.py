@@ -1,0 +1,173 @@
+"""Where live targets come from: a folder that fills, a running render, a video file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+import cv2
+import numpy as np
+
+from controller.arrays import ByteImage
+from controller.errors import UsageError
+from controller.solve.targets_files import read_picture
+from controller.solve.targets_values import linear_to_srgb
+
+PICTURES: Final = (".png", ".jpg", ".jpeg", ".exr")
+SETTLED_S: Final = 0.2
+"""A picture that can't be read and is older than this is damaged, not half written."""
+
+
+@dataclass(frozen=True, slots=True)
+class LivePicture:
+    """``pixels`` (rows, columns, 3) uint8 sRGB; ``number`` its place in the source; ``skipped`` since the last."""
+
+    pixels: ByteImage
+    number: int
+    skipped: int
+
+
+class LiveSource(Protocol):
+    """Pictures over time."""
+
+    def next(self, at_s: float) -> LivePicture | None:
+        """The picture that is due ``at_s`` seconds after the beginning, if it is another than the last; never waits."""
+
+    @property
+    def ended(self) -> bool: ...
+
+    def close(self) -> None: ...
+
+
+class VideoSource:
+    """A video file, at its own rate; frames whose time has passed are skipped, and counted."""
+
+    def __init__(self, path: Path, *, loop: bool) -> None:
+        """Raises UsageError("live-source-unreadable")."""
+        self._path, self._loop = path, loop
+        self._capture = cv2.VideoCapture(str(path))
+        rate = float(self._capture.get(cv2.CAP_PROP_FPS)) if self._capture.isOpened() else 0.0
+        if not rate > 0:
+            self._capture.release()
+            raise unreadable(path, "it is no video that OpenCV can decode")
+        self.rate_hz = rate
+        self._at = -1
+        self._before = 0
+        self._ended = False
+
+    def next(self, at_s: float) -> LivePicture | None:
+        """See ``LiveSource``."""
+        due = int(at_s * self.rate_hz)
+        skipped = 0
+        found: ByteImage | None = None
+        while self._at < due and not self._ended:
+            # only the frame that is due is decoded; those before it are passed over
+            if not self._capture.grab():
+                self._rewind()
+                continue
+            self._at += 1
+            if self._at == due:
+                got, image = self._capture.retrieve()
+                found = np.ascontiguousarray(image[..., ::-1]) if got else None
+            else:
+                skipped += 1
+        return None if found is None else LivePicture(found, self._at, skipped)
+
+    def _rewind(self) -> None:
+        if not self._loop or self._at + 1 == self._before:
+            self._ended = True
+            return
+        self._before = self._at + 1
+        self._capture.release()
+        self._capture = cv2.VideoCapture(str(self._path))
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last frame's time has passed."""
+        return self._ended
+
+    def close(self) -> None:
+        """Close the file."""
+        self._capture.release()
+
+
+class FolderSource:
+    """A folder that fills: always the newest whole picture, by name; those that came between are skipped, and counted.
+
+    With ``loop`` (or ``rate_hz``) the pictures that are there are shown in turn instead, at that rate.
+    """
+
+    def __init__(self, folder: Path, *, loop: bool, rate_hz: float, clock: Callable[[], float] = time.time) -> None:
+        self._folder, self._loop, self._rate_hz, self._clock = folder, loop, rate_hz, clock
+        self._last: tuple[str, int] | None = None
+        self._shown = -1
+        self._known = 0
+
+    def next(self, at_s: float) -> LivePicture | None:
+        """See ``LiveSource``. A damaged picture raises UsageError("target-unreadable") once it is surely whole."""
+        names = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in PICTURES)
+        if not names:
+            return None
+        if self._loop:
+            turn = int(at_s * self._rate_hz)
+            if turn == self._shown:
+                return None
+            skipped, self._shown = max(turn - self._shown - 1, 0), turn
+            return LivePicture(_as_srgb(names[turn % len(names)]), turn, skipped)
+        newest = names[-1]
+        mark = (newest.name, newest.stat().st_mtime_ns)
+        if mark == self._last:
+            return None
+        try:
+            pixels = _as_srgb(newest)
+        except UsageError:
+            # half written: it is asked again, unless nobody has written to it for a while
+            if self._clock() - mark[1] / 1e9 > SETTLED_S:
+                self._last = mark
+                raise
+            return None
+        skipped = max(len(names) - self._known - 1, 0) if self._last is not None else 0
+        self._last, self._known = mark, len(names)
+        self._shown += 1 + skipped
+        return LivePicture(pixels, self._shown, skipped)
+
+    @property
+    def ended(self) -> bool:
+        """A folder may always fill."""
+        return False
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def open_source(path: Path, *, loop: bool, rate_hz: float) -> LiveSource:
+    """A folder or a video file. Raises UsageError("live-source-unreadable")."""
+    if path.is_dir():
+        return FolderSource(path, loop=loop, rate_hz=rate_hz)
+    if not path.is_file():
+        raise unreadable(path, "it is not there")
+    return VideoSource(path, loop=loop)
+
+
+def unreadable(path: Path, why: str) -> UsageError:
+    """The error of a source that can't be used."""
+    return UsageError(
+        "live-source-unreadable",
+        what=f"{path} can't be used as a stream of targets: {why}.",
+        remedy=f"Give a video file, or a folder with {', '.join(PICTURES)} pictures as seen from the camera.",
+    )
+
+
+def _as_srgb(path: Path) -> ByteImage:
+    if path.suffix.lower() != ".exr":
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        data_ends = path.read_bytes()[-4096:]
+        if image is None or not (b"IEND" in data_ends or b"\xff\xd9" in data_ends):
+            read_picture(path)  # tells what is wrong with it
+            raise unreadable(path, "a picture in it could not be decoded")
+        return np.ascontiguousarray(image[..., ::-1])
+    light = read_picture(path)[..., :3]
+    return np.round(linear_to_srgb(np.nan_to_num(light)) * np.float32(255)).astype(np.uint8)

@@ -1,0 +1,158 @@
+"""Live: pictures of a source scaled into frames and shown, the newest first, those that come too late told of."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from controller.arrays import ByteImage
+from controller.live.scaling import LiveScaler, fitted
+from controller.live.sources import LiveSource
+
+IDLE_S: Final = 0.002
+TOLD_EVERY_S: Final = 1.0
+BUFFERS: Final = 3
+"""One that is shown, one that waits, one that is being made."""
+
+Frames = dict[str, ByteImage]
+
+
+@dataclass(slots=True)
+class LiveFigures:
+    """What became of the pictures of a source."""
+
+    shown: int = 0
+    late: int = 0
+    seconds: float = 0.0
+    delays_s: list[float] = field(default_factory=list)
+
+    def told(self) -> dict[str, Any]:
+        """For a person or a machine; ``delay`` is from when a picture was due to when it was presented."""
+        delays = np.array(self.delays_s[-4096:] or [0.0])
+        return {
+            "shown": self.shown,
+            "late": self.late,
+            "pictures_per_s": self.shown / self.seconds if self.seconds > 0 else 0.0,
+            "delay_p50_ms": 1e3 * float(np.percentile(delays, 50)),
+            "delay_p99_ms": 1e3 * float(np.percentile(delays, 99)),
+        }
+
+
+class _Mailbox:
+    """One set of frames, replaced by a newer one before it is taken; buffers go round."""
+
+    def __init__(self, buffers: list[Frames]) -> None:
+        self._changed = threading.Condition()
+        self._free = buffers
+        self._full: tuple[Frames, float, int] | None = None
+        self.ended = False
+        self.error: BaseException | None = None
+
+    def buffer(self) -> Frames:
+        with self._changed:
+            return self._free.pop()
+
+    def put(self, frames: Frames, due_s: float, late: int) -> None:
+        with self._changed:
+            if self._full is not None:
+                old, _, before = self._full
+                self._free.append(old)
+                late += before + 1
+            self._full = frames, due_s, late
+            self._changed.notify_all()
+
+    def give_back(self, frames: Frames) -> None:
+        with self._changed:
+            self._free.append(frames)
+
+    def take(self, timeout_s: float) -> tuple[Frames, float, int] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._full is not None or self.ended, timeout_s)
+            found, self._full = self._full, None
+            return found
+
+    def end(self, error: BaseException | None) -> None:
+        with self._changed:
+            self.ended, self.error = True, error
+            self._changed.notify_all()
+
+
+def run_live(
+    source: LiveSource,
+    scaler: LiveScaler,
+    show: Callable[[Mapping[str, ByteImage]], object],
+    *,
+    rate_hz: float,
+    seconds: float | None = None,
+    tell: Callable[[LiveFigures], None] = lambda figures: None,
+) -> LiveFigures:
+    """Show the pictures of ``source`` until it ends, ``seconds`` have passed or ``tell`` raises.
+
+    Parameters
+    ----------
+    show : called with frames by projector name; returns once they are presented
+    rate_hz : pictures are taken at most so often; those that are due between two of them count as late
+    tell : called about once a second, and may raise to stop
+
+    Raises what the source, ``show`` and ``tell`` raise; the source is closed by then.
+    """
+    box = _Mailbox([scaler.blank() for _ in range(BUFFERS)])
+    stop = threading.Event()
+    began_s = time.monotonic()
+    worker = threading.Thread(target=_make, args=(source, scaler, box, stop, rate_hz, began_s), name="live")
+    worker.start()
+    figures = LiveFigures()
+    told_s = began_s
+    try:
+        while seconds is None or time.monotonic() - began_s < seconds:
+            taken = box.take(0.1)
+            if taken is not None:
+                frames, due_s, late = taken
+                show(frames)
+                box.give_back(frames)
+                figures.shown += 1
+                figures.late += late
+                figures.delays_s.append(time.monotonic() - due_s)
+            elif box.ended:
+                break
+            figures.seconds = time.monotonic() - began_s
+            if time.monotonic() - told_s >= TOLD_EVERY_S:
+                told_s = time.monotonic()
+                tell(figures)
+    finally:
+        stop.set()
+        worker.join()
+        source.close()
+    if box.error is not None:
+        raise box.error
+    return figures
+
+
+def _make(
+    source: LiveSource, scaler: LiveScaler, box: _Mailbox, stop: threading.Event, rate_hz: float, began_s: float
+) -> None:
+    error: BaseException | None = None
+    number = -1
+    try:
+        while not stop.is_set() and not source.ended:
+            now_s = time.monotonic() - began_s
+            turn = int(now_s * rate_hz)
+            if turn == number:
+                stop.wait(min(IDLE_S, 0.25 / rate_hz))
+                continue
+            picture = source.next(now_s)
+            if picture is None:
+                stop.wait(IDLE_S)
+                continue
+            number = turn
+            frames = box.buffer()
+            scaler.frames(fitted(picture.pixels, scaler.size), frames)
+            box.put(frames, began_s + now_s, picture.skipped)
+    except BaseException as raised:  # noqa: BLE001 - raised again where the pictures are shown
+        error = raised
+    box.end(error)
