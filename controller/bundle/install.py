@@ -49,6 +49,8 @@ def install(
     with exclusive(folder / _LOCK, what_is_running="Another installation"):
         incoming = folder / _INCOMING
         _clear_unfinished(folder)
+        # Refused before a byte is copied: what is no bundle may be endless, and what is hostile may be huge.
+        Bundle.open_trusted(source, trust).close()
         try:
             _copy(source, incoming)
             # What is checked is the copy: the source may change while it is read.

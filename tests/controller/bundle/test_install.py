@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +16,7 @@ from controller.bundle.format import Index
 from controller.bundle.install import current, install, rollback
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.errors import BundleError
+from controller.errors import BundleError, WorkError
 
 
 def made(path: Path, value: int, revision: int = 0, key: SigningKey | None = None) -> Path:
@@ -128,3 +132,62 @@ def test_a_sound_bundle_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         install(made(tmp_path / "b.vel", 2), folder, allow_unsigned=True, accept=accept)
     assert caught.value.code == "bundle-other-stage"
     assert plays(folder) == 1
+
+
+def test_what_is_no_bundle_is_refused_before_a_byte_is_copied(tmp_path: Path) -> None:
+    folder = tmp_path / "bundles"
+    install(made(tmp_path / "1.vel", 1), folder, allow_unsigned=True)
+    before = sorted(path.name for path in folder.iterdir())
+    pipe, huge, link = tmp_path / "pipe.vel", tmp_path / "huge.vel", tmp_path / "link.vel"
+    os.mkfifo(pipe)
+    with huge.open("wb") as file:
+        file.write(made(tmp_path / "2.vel", 2).read_bytes())
+        file.truncate(2**40)
+    link.symlink_to(tmp_path / "nowhere.vel")
+    for source in (pipe, huge, link, Path("/dev/zero"), tmp_path):
+        began = time.process_time()
+        tracemalloc.start()
+        try:
+            with pytest.raises(BundleError):
+                install(source, folder, allow_unsigned=True)
+            assert tracemalloc.get_traced_memory()[1] < 64 * 2**20
+        finally:
+            tracemalloc.stop()
+        assert time.process_time() - began < 0.1
+        assert sorted(path.name for path in folder.iterdir()) == before
+    assert plays(folder) == 1
+
+
+def test_links_that_lead_elsewhere_are_not_followed(tmp_path: Path) -> None:
+    folder = tmp_path / "bundles"
+    install(made(tmp_path / "1.vel", 1), folder, allow_unsigned=True)
+    outside = made(tmp_path / ("0" * 64 + ".vel"), 9)
+    for target in (str(outside), f"../{outside.name}", "../../etc/passwd", "current", "."):
+        (folder / "current").unlink()
+        (folder / "current").symlink_to(target)
+        assert current(folder) is None, target
+    assert outside.exists()
+    install(made(tmp_path / "2.vel", 2, revision=1), folder, allow_unsigned=True)
+    assert plays(folder) == 2
+
+
+def test_a_disk_that_is_read_only_or_full_leaves_what_plays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "bundles"
+    install(made(tmp_path / "1.vel", 1), folder, allow_unsigned=True)
+    source = made(tmp_path / "2.vel", 2, revision=1)
+
+    def fails(number: int) -> None:
+        def mkstemp(*_: object, **__: object) -> tuple[int, str]:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr("controller.storage.tempfile.mkstemp", mkstemp)
+
+    for number, code in ((errno.EROFS, "cannot-write"), (errno.ENOSPC, "no-space"), (errno.EDQUOT, "no-space")):
+        fails(number)
+        with pytest.raises(WorkError) as wrong:
+            install(source, folder, allow_unsigned=True)
+        assert wrong.value.code == code
+        assert plays(folder) == 1
+    monkeypatch.undo()
+    install(source, folder, allow_unsigned=True)
+    assert plays(folder) == 2
