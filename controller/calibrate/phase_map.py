@@ -6,6 +6,7 @@ interpolates by itself; the blur that it wants is that of one sample.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Final
 
 import cv2
@@ -14,12 +15,15 @@ import numpy.typing as npt
 
 from controller.arrays import Float64, FloatImage, Mask
 from controller.calibrate.inversion import Inversion
+from controller.calibrate.smoothing import correct_for_paint, fit_curved
 from controller.calibrate.values import Correspondence, PhaseMap
 
 INTERPOLATION_PX2: Final = np.array([1 / 2, 1 / 4, 1 / 2])
 """Variance along an axis of bilinear interpolation, averaged over the sites: red, green, blue."""
 LEAST_VARIANCE_PX2: Final = 0.06
 """Of a projector pixel that is evenly lit: 1/12, of a somewhat smaller square."""
+STEADY_PX: Final = 5
+"""The blur changes slowly: its median over so many projector pixels a side is taken."""
 MOST_CORRELATED: Final = 0.9
 FARTHEST_PX: Final = 12
 """Camera pixels that the map is continued beyond what was decoded: to the frame's border, and over small gaps."""
@@ -33,6 +37,7 @@ def make_phase_map(
     *,
     light: tuple[float, float, float] = (1.0, 1.0, 1.0),
     interpolated: bool = True,
+    white: FloatImage | None = None,
 ) -> PhaseMap:
     """The map that ``LightTransport`` is built from.
 
@@ -41,11 +46,19 @@ def make_phase_map(
     inverse, blur_px2 (rows, columns, 3), blur_valid : of the projector's pixels, measured in developed pictures
     light : strength of the camera's channels; stronger ones weigh more in the measured blur
     interpolated : whether the camera has one colour a sample
+    white : (camera rows, columns) light of the projector's white; with it and ``as_seen_px``, each sample looks at the
+        mean position of its own light: freed of the interpolation's pull towards paler paint, not of the lens's
     """
     slope, known = _slopes(inverse)
     taken = float(np.average(INTERPOLATION_PX2, weights=light)) if interpolated else 0.0
     own = _without_interpolation(blur_px2.astype(np.float64), slope, taken)
     spread = _nearest(own.astype(np.float32), blur_valid & known)
+    for k in range(3) if (blur_valid & known).any() else ():
+        spread[..., k] = cv2.medianBlur(np.ascontiguousarray(spread[..., k]), STEADY_PX)
+    if white is not None and correspondence.as_seen_px is not None:
+        at = correct_for_paint(correspondence.as_seen_px, correspondence.valid, white, taken)
+        at = fit_curved(at, correspondence.valid, correspondence.projector_px)
+        correspondence = dataclasses.replace(correspondence, projector_px=at)
     return PhaseMap(_continued(correspondence, slope, known), spread)
 
 

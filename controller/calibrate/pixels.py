@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from controller.arrays import FloatImage, Mask
 from controller.calibrate.blur import measure_blur
-from controller.calibrate.captures import Captures
+from controller.calibrate.captures import Captures, grey
 from controller.calibrate.decode import frame_margin_px
 from controller.calibrate.footprints import measure_footprints
 from controller.calibrate.inversion import invert_map
@@ -56,9 +56,22 @@ def fit_pixels(captures: Captures, plan: PatternPlan, correspondence: Correspond
     single = captures[plan.sinusoids("blur-x")[0].name]
     mosaic = find_mosaic(single)
     phase_map = make_phase_map(
-        correspondence, inverse, blur, blur_valid, light=_channels(single), interpolated=mosaic is not None
+        correspondence,
+        inverse,
+        blur,
+        blur_valid,
+        light=_channels(single),
+        interpolated=mosaic is not None,
+        white=_white(captures, plan),
     )
     return FittedPixels(metapixels, phase_map, mosaic)
+
+
+def _white(captures: Captures, plan: PatternPlan) -> FloatImage:
+    """Twice the mean of a sinusoid's three steps, less black: (rows, columns)."""
+    black = grey(captures, "black")
+    steps = [grey(captures, pattern.name, black.shape) for pattern in plan.sinusoids("blur-x")]
+    return np.asarray(sum(steps, -len(steps) * black) * np.float32(2 / len(steps)), np.float32)
 
 
 def _channels(image: FloatImage) -> tuple[float, float, float]:

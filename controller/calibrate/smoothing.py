@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numba
 import numpy as np
 
@@ -15,6 +16,8 @@ STEEPEST = 4.0
 """Times the typical slope; a larger change between neighbours is a jump to another surface."""
 NARROWEST_PX = 2.0
 """Width of the window, camera px, where projector pixels are smaller than that."""
+CURVED_RADIUS = 2
+WORST_CURVED_PX = 0.25
 MOST_PULL = 1.0
 """Relative change of the light from a camera pixel to the next; more is an edge, not paint."""
 
@@ -43,6 +46,26 @@ def fit_planes(position_px: FloatImage, valid: Mask) -> tuple[FloatImage, Mask]:
     wide = np.ones(weights.size + 2)
     _fit(position_px, valid, weights, wide, STEEPEST * slope, smooth, kept)
     return smooth, kept
+
+
+def fit_curved(position_px: FloatImage, valid: Mask, otherwise_px: FloatImage) -> FloatImage:
+    """Value of the polynomial of second degree through each pixel's 5x5 neighbours, by least squares.
+
+    ``otherwise_px`` stands where a neighbour is missing or off the polynomial, as at edges. (rows, columns, 2) float32
+    """
+    side = 2 * CURVED_RADIUS + 1
+    y, x = (
+        np.mgrid[-CURVED_RADIUS : CURVED_RADIUS + 1, -CURVED_RADIUS : CURVED_RADIUS + 1]
+        .astype(np.float64)
+        .reshape(2, -1)
+    )
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    kernel = np.linalg.pinv(terms)[0].reshape(side, side)
+    fitted = cv2.filter2D(np.where(valid[..., None], position_px, np.float32(0)), -1, kernel)
+    off = np.where(valid, np.abs(fitted - np.nan_to_num(position_px)).max(axis=2), np.float32(np.inf))
+    around = np.ones((side, side), np.uint8)
+    use = cv2.dilate(off, around, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf) < WORST_CURVED_PX
+    return np.where(use[..., None], fitted, otherwise_px).astype(np.float32)
 
 
 def _typical_slope(position_px: FloatImage, valid: Mask) -> float:
