@@ -22,6 +22,8 @@ SPACING_PX = 16
 OFFSETS = ((2, 3), (7, 11), (12, 6), (14, 14))
 IN_FOCUS_PX = 0.40
 """Defocus up to this many projector px counts as in focus (the emulated lenses' best is 0.28 to 0.36)."""
+EDGE_PX = 3
+"""Camera pixels from any edge or fold that count as one surface in columns of T."""
 GROSS_MM = 5.0
 HEAD_ON = 1.3
 """Times the median slope of the map; a steeper one is grazing."""
@@ -123,6 +125,11 @@ def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibratio
         for name, on in (("chequers", (x + y) % 2), ("columns", (x // 2) % 2)):
             light = np.repeat(on.astype(np.float32)[..., None], 3, axis=2)
             figures[name] = relative(transport.project_one(n, light), clean((light * 255).astype(np.uint8)), lit)
+        single = np.zeros((rows, columns, 3), np.uint8)
+        single[3::SPACING_PX, 5::SPACING_PX] = 255
+        predicted, real = transport.project_one(n, (single / 255).astype(np.float32)), clean(single)
+        figures["column of T"] = relative(predicted, real, lit)
+        figures["column of T, one surface"] = relative(predicted, real, lit & truth.one_surface(n, EDGE_PX))
         found.append(figures)
     return found
 

@@ -154,6 +154,15 @@ def _pattern_rows(worst: Callable[..., None]) -> None:
         "predicted one-pixel chequers", "chequers", None, unit="% rms", scale=100, more="against a noise-free picture"
     )
     worst("predicted two-pixel columns", "columns", None, unit="% rms", scale=100, more="against a noise-free picture")
+    worst(
+        "column of T, one surface",
+        "column of T, one surface",
+        2.5,
+        unit="% rms",
+        scale=100,
+        more="single pixels, 3 camera px or more from edges and folds",
+    )
+    worst("column of T, everywhere", "column of T", None, unit="% rms", scale=100, more="edges and folds too")
 
 
 def _geometry_rows(worst: Callable[..., None]) -> None:
