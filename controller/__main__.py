@@ -26,6 +26,7 @@ from controller.commands.doctor import doctor
 from controller.commands.drift import drift
 from controller.commands.export import export
 from controller.commands.keys import keys
+from controller.commands.live import live
 from controller.commands.report import report
 from controller.commands.running import Json, StageFolder, group, work
 from controller.errors import UsageError, VelaturaError
@@ -125,6 +126,9 @@ def appearance(
     base: Annotated[
         str | None, typer.Option(help="The base image: minimum, white or high-pass; else as stage.toml says.")
     ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Solve on the workers of a Dask scheduler: tcp://host:8786 or tls://host:8786.")
+    ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
@@ -132,6 +136,7 @@ def appearance(
     work(
         "controller.services:make_appearances", as_json=as_json,
         stage=stage, names=tuple(names or ()), scenes=tuple(blender or ()), accept_grade=accept_grade, base=base,
+        scheduler=scheduler,
     )  # fmt: skip
 
 
@@ -160,6 +165,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     drift,
     appearance,
     play,
+    live,
     keys,
     emulate,
     export,

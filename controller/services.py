@@ -35,6 +35,7 @@ from controller.session.rendering import scene_wish
 from controller.session.rig import Rig
 from controller.session.runner import Runner, Step
 from controller.session.solving import Calibrated, SolveOptions, base_choice, solve_steps
+from controller.session.spreading import answering_on
 from controller.session.wishes import wishes_of
 from hal.deadline import in_seconds
 
@@ -99,14 +100,16 @@ def make_appearances(
     cancel: threading.Event,
     accept_grade: bool = False,
     base: str | None = None,
+    scheduler: str | None = None,
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml on the last calibration, and install them as the stage's bundle.
 
     ``scenes``: Blender scenes to render besides ``names``, or alone if no names are given.
     ``accept_grade``: publish whatever the calibration's grade. ``base``: the base image, instead of stage.toml's.
+    ``scheduler``: of a Dask cluster, on whose workers the appearances are solved.
 
     No device is touched: the projectors may be off, or playing.
-    Raises what ``usable_calibration`` raises, and what ``wishes_of`` and the steps raise.
+    Raises what ``usable_calibration``, ``wishes_of``, ``answering_on`` and the steps raise.
     """
     chosen = None if base is None else base_choice(base)
     checked = check_stage(stage)
@@ -120,14 +123,14 @@ def make_appearances(
         options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or table.base, table.adapt)
         outputs = output_sizes(checked)
         scale = costs.scale(size for _, size in outputs.values())
-        steps = [
-            *([] if (run / GRADED).exists() else [verify_step(calibrated, (), scale)]),
-            gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
-            *solve_steps(calibrated, wishes, options, (), scale),
-            publish_step(folder, outputs, [wish.name for wish in wishes],
-                         stage=checked.stage.tables.stage.name, calibration=run.name, key=signing_key(checked)),
-        ]  # fmt: skip
-        with Journal(run) as journal:
+        with answering_on(scheduler, calibrated, wishes) as answering, Journal(run) as journal:
+            steps = [
+                *([] if (run / GRADED).exists() else [verify_step(calibrated, (), scale)]),
+                gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
+                *solve_steps(calibrated, wishes, options, (), scale, answering=answering),
+                publish_step(folder, outputs, [wish.name for wish in wishes],
+                             stage=checked.stage.tables.stage.name, calibration=run.name, key=signing_key(checked)),
+            ]  # fmt: skip
             Runner(steps, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(wish.name for wish in wishes)}
 
