@@ -39,7 +39,12 @@ MISTAKES = {
     ),
     "not TOML": Mistake("iso = 100", "iso = ", "stage-syntax", "this is not TOML", "iso"),
     "unknown driver": Mistake(
-        'driver = "ptp"', 'driver = "pttp"', "stage-key-value", "'pttp' is not a camera driver", "driver", "one of ptp."
+        'driver = "ptp"',
+        'driver = "pttp"',
+        "stage-key-value",
+        "'pttp' is not a camera driver",
+        "driver",
+        "one of gphoto2, ptp.",
     ),
     "misspelt setting": Mistake(
         'port = "run/tty-left"', 'prt = "x"', "stage-key-unknown", "did you mean 'port'", "prt"

@@ -142,7 +142,7 @@ def test_the_same_command_then_goes_on_and_repeats_neither_photograph_nor_finish
 ) -> None:
     run = run_of(finished_demo.stage)
     now = shots(run)
-    assert len(finished_demo.shots_then) > 100
+    assert len(finished_demo.shots_then) > 90  # 31 a projector, and black
     assert {name: now[name] for name in finished_demo.shots_then} == finished_demo.shots_then
     assert asked(run, "SELECT outcome FROM runs ORDER BY id") == [("cancelled",), ("done",)]
     assert skipped(finished_demo.ended.records) >= {"Reconstructing the object and the poses", "Solving the base image"}
