@@ -53,7 +53,7 @@ class Keeper(Protocol):
     """Keeps one projector as it is wanted; see ``ProjectorKeeper``."""
 
     name: str
-    want_lit: bool
+    want_lit: bool | None
 
     @property
     def view(self) -> ProjectorView: ...

@@ -23,6 +23,10 @@ PATIENCE_S: Final = 15.0
 MOST_STRIKES: Final = 3
 """Strikes in a row without light, after which the lamp is left alone until the next opening."""
 LIGHT_MARGIN_S: Final = 30.0
+_LOOKS: Final = {
+    Power.ON: Condition.LIT, Power.WARMING: Condition.LIGHTING, Power.COOLING: Condition.COOLING,
+    Power.OFF: Condition.DARK,
+}  # fmt: skip
 _REOPEN_S: Final = (2.0, 5.0, 15.0, 60.0)
 
 
@@ -50,7 +54,7 @@ class ProjectorKeeper:
         self._clock = clock or SystemClock()
         self._asleep = asleep or (lambda: False)
         self._guard: LampGuard | None = None
-        self._want_lit = False
+        self._want_lit: bool | None = None
         self._view = ProjectorView(name)
         self._silent_since_s: float | None = None
         self._reopen_at_s, self._reopened = 0.0, 0
@@ -68,11 +72,12 @@ class ProjectorKeeper:
         return self._guard
 
     @property
-    def want_lit(self) -> bool:
+    def want_lit(self) -> bool | None:
+        """None until somebody has said it: a lamp that burns when the service begins is left as it is until then."""
         return self._want_lit
 
     @want_lit.setter
-    def want_lit(self, wanted: bool) -> None:
+    def want_lit(self, wanted: bool | None) -> None:
         if wanted and not self._want_lit:
             # A lamp that was given up gets one more strike at every opening.
             self._in_vain = min(self._in_vain, MOST_STRIKES - 1)
@@ -100,7 +105,9 @@ class ProjectorKeeper:
             return
         self._silent_since_s, self._reopened = None, 0
         try:
-            if wanted:
+            if wanted is None:
+                self._see(_LOOKS.get(status.power, Condition.BROKEN), status, None)
+            elif wanted:
                 self._light(guard, status)
             else:
                 self._darken(guard, status)
@@ -126,7 +133,7 @@ class ProjectorKeeper:
         if self._silent_since_s is None:
             self._silent_since_s = now_s
         guard = self._guard
-        if guard is not None and not self._want_lit and guard.may_be_lit:
+        if guard is not None and self._want_lit is False and guard.may_be_lit:
             # Perhaps it hears, though it does not answer.
             with contextlib.suppress(DeviceError, VelaturaError):
                 guard.switch_off(deadline=in_seconds(guard.switch_s))
