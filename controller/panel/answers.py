@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 
 from controller.errors import UsageError, VelaturaError
@@ -87,7 +87,7 @@ async def body_file(request: Request, folder: Path) -> Path:
         with path.open("wb") as file:
             async for chunk in request.stream():
                 file.write(chunk)
-    except (OSError, ClientDisconnect):
+    except BaseException:
         path.unlink(missing_ok=True)
         raise
     return path

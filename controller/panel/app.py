@@ -18,6 +18,7 @@ from starlette.routing import Route
 
 from controller.panel import api
 from controller.panel.accounts import Accounts
+from controller.panel.building import BuildingControl
 from controller.panel.context import Panel, PanelOptions
 from controller.panel.drawing import Drawing
 from controller.panel.entrance import Entrance
@@ -100,6 +101,8 @@ def _lifespan(panel: Panel) -> Callable[[Starlette], contextlib.AbstractAsyncCon
         try:
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(panel.hub.run)
+                if panel.options.broker is not None:
+                    tasks.start_soon(BuildingControl(panel.kiosk, panel.options.broker).run)
                 yield
                 tasks.cancel_scope.cancel()
         finally:

@@ -12,6 +12,7 @@ import anyio
 from argon2 import PasswordHasher
 
 from controller.panel.accounts import Accounts
+from controller.panel.broker import BrokerOptions
 from controller.panel.kiosk import Kiosk
 from controller.panel.live import Hub
 from controller.panel.sessions import LoginLimit, Sessions
@@ -37,6 +38,7 @@ class PanelOptions:
     tls_certificate: Path | None = None
     tls_key: Path | None = None
     uploads: UploadLimits = field(default_factory=UploadLimits)
+    broker: BrokerOptions | None = None
     most_restore_bytes: int = 8 << 30
     most_open_panels: int = 200
     frames_per_s: float = 4.0

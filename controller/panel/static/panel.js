@@ -80,6 +80,9 @@
     setTimeout(() => delete event.target.dataset.sent, 3000);
   });
 
+  const here = document.querySelector("nav [aria-current]");
+  if (here) here.parentElement.scrollLeft = here.offsetLeft - 24;
+
   if (body.dataset.live) { follow(); listen(); setInterval(look, 2000); }
   const again = document.querySelector("[data-again]");
   if (again) setInterval(() => { if (!document.hidden) aim().catch(() => say("No connection, trying again")); }, 1000 * again.dataset.again);

@@ -1,0 +1,140 @@
+"""Building control over MQTT: the kiosk's state is published, and it can be opened, closed, and told what to play."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import ssl
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import aiomqtt
+import anyio
+
+from controller.panel.answers import FAILURES
+from controller.panel.broker import BrokerOptions
+from controller.panel.fields import parse
+from controller.panel.kiosk import Kiosk
+from controller.panel.operations import APPEARANCE
+
+LONGEST_PAUSE_S: Final = 60.0
+MOST_COMMANDS_WAITING: Final = 20
+LONGEST_PAYLOAD: Final = 256
+
+
+class BuildingControl:
+    """One connection to a broker, made again for as long as it takes, each time after a longer pause.
+
+    Topics: ``T/available`` "online" or "offline" (retained, also by the broker when we vanish); ``T/state`` JSON (retained);
+    ``T/command/open``, ``T/command/close``, ``T/command/play`` (payload: the appearance's name); ``T/answer`` what came of it.
+    Who may publish to ``T/command`` is the broker's to decide.
+    """
+
+    def __init__(self, kiosk: Kiosk, options: BrokerOptions, *, first_pause_s: float = 1.0) -> None:
+        self._kiosk, self._options, self._first_pause_s = kiosk, options, first_pause_s
+        self._changed = asyncio.Event()
+
+    async def run(self) -> None:
+        """Until cancelled. A broker that is not there costs nothing but tries."""
+        loop = asyncio.get_running_loop()
+
+        def tell() -> None:
+            loop.call_soon_threadsafe(self._changed.set)
+
+        unsubscribe = self._kiosk.subscribe(tell)
+        pause_s = self._first_pause_s
+        try:
+            while True:
+                began_s = loop.time()
+                try:
+                    await self._connected()
+                except (aiomqtt.MqttError, OSError):
+                    # The kiosk goes on without the building; whoever watches "available" sees that it is cut off.
+                    pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
+                await asyncio.sleep(pause_s)
+                pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
+        finally:
+            unsubscribe()
+
+    async def _connected(self) -> None:
+        options, topic = self._options, self._options.topic
+        password = await anyio.to_thread.run_sync(_password, options.password_file)
+        tls = ssl.create_default_context(cafile=str(options.certificates)) if options.certificates else None
+        will = aiomqtt.Will(f"{topic}/available", "offline", qos=1, retain=True)
+        async with aiomqtt.Client(
+            options.host,
+            options.port,
+            username=options.username,
+            password=password,
+            will=will,
+            tls_context=tls,
+            max_queued_incoming_messages=MOST_COMMANDS_WAITING,
+        ) as client:
+            await client.subscribe(f"{topic}/command/+", qos=1)
+            await client.publish(f"{topic}/available", "online", qos=1, retain=True)
+            self._changed.set()
+            publishing = asyncio.create_task(self._publish(client))
+            try:
+                async for message in client.messages:
+                    await self._obey(client, message)
+            finally:
+                publishing.cancel()
+                await asyncio.gather(publishing, return_exceptions=True)
+
+    async def _publish(self, client: aiomqtt.Client) -> None:
+        last = ""
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            now = json.dumps(await anyio.to_thread.run_sync(self._state))
+            if now != last:
+                await client.publish(f"{self._options.topic}/state", now, qos=1, retain=True)
+                last = now
+            await asyncio.sleep(0.2)
+
+    def _state(self) -> dict[str, Any]:
+        now = self._kiosk.snapshot()
+        return {
+            "state": now.state,
+            "reason": now.reason,
+            "since_unix_s": now.since_unix_s,
+            "playing": now.playing,
+            "problems": [{"device": row.name, "problem": row.problem} for row in now.devices if row.problem],
+        }
+
+    async def _obey(self, client: aiomqtt.Client, message: aiomqtt.Message) -> None:
+        if message.retain:
+            return  # said long ago to somebody else: a restart must not open a closed house
+        word = str(message.topic).rsplit("/", 1)[-1]
+        payload = message.payload if isinstance(message.payload, bytes) else b""
+        command = self._command(word, payload)
+        if command is None:
+            answer = {"command": word[:40], "done": False, "code": "command-unknown"}
+        else:
+            try:
+                await anyio.to_thread.run_sync(command)
+                answer = {"command": word, "done": True}
+            except FAILURES as error:
+                answer = {
+                    "command": word,
+                    "done": False,
+                    "code": error.code,
+                    "what": error.what,
+                    "remedy": error.remedy,
+                }
+        await client.publish(f"{self._options.topic}/answer", json.dumps(answer), qos=1)
+
+    def _command(self, word: str, payload: bytes) -> Callable[[], None] | None:
+        if word == "open":
+            return self._kiosk.start
+        if word == "close":
+            return self._kiosk.stop
+        if word == "play":
+            text = payload[:LONGEST_PAYLOAD].decode("utf-8", "replace")
+            return lambda: self._kiosk.play(parse((APPEARANCE,), {"name": text}, strings=True)["name"])
+        return None
+
+
+def _password(file: Path | None) -> str | None:
+    return None if file is None else file.read_text("utf-8").strip()

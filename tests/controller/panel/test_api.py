@@ -1,0 +1,149 @@
+"""The API: as its own document says, for whoever reads it and whoever breaks it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, settings
+from prometheus_client.parser import text_string_to_metric_families
+from schemathesis import checks
+
+from controller.panel.accounts import Role
+from controller.panel.api import PREFIX, document
+from controller.panel.operations import OPERATIONS
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.controller.panel.served import Served, served
+from tests.controller.panel.test_uploads import jpeg
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("api")
+    with served(MemoryKiosk(folder / "pictures", step_s=0.001), folder / "private") as running:
+        yield running
+
+
+SCHEMA = schemathesis.openapi.from_dict(document())
+
+
+@SCHEMA.parametrize()
+@settings(
+    max_examples=8,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    phases=[Phase.explicit, Phase.generate],
+    suppress_health_check=list(HealthCheck),
+)
+def test_the_api_does_what_its_document_says(case: schemathesis.Case, quick: Served) -> None:
+    if case.operation.path == "/restore":
+        return  # the whole body is a file of any bytes; its own test says what comes of it
+    panel = quick.app.state.panel
+    panel.by_token.succeeded("127.0.0.1")
+    token = HEADERS.setdefault(quick.address, quick.token(Role.TECHNICIAN))
+    case.call_and_validate(
+        base_url=quick.address + PREFIX,
+        headers=token,
+        checks=[
+            checks.not_a_server_error,
+            checks.CHECKS.get_one("status_code_conformance"),
+            checks.CHECKS.get_one("content_type_conformance"),
+            checks.CHECKS.get_one("response_schema_conformance"),
+            checks.CHECKS.get_one("negative_data_rejection"),
+            checks.CHECKS.get_one("unsupported_method"),
+            checks.CHECKS.get_one("use_after_free"),
+        ],
+    )
+
+
+HEADERS: dict[str, dict[str, str]] = {}
+
+
+def test_every_operation_stands_in_the_document_with_its_role() -> None:
+    paths = document()["paths"]
+    for operation in OPERATIONS:
+        described = paths[operation.path][operation.method.lower()]
+        assert described["operationId"] == operation.name
+        assert operation.role.name.lower() in described["description"]
+
+
+def test_a_machine_can_do_the_whole_job(fresh: Served) -> None:
+    token = fresh.token(Role.TECHNICIAN)
+    with fresh.client() as client:
+        client.headers |= token
+        target = client.post(f"{PREFIX}/targets", content=jpeg()).json()["target"]
+        assert client.get(f"{PREFIX}/targets/{target}/feasibility").content.startswith(b"\x89PNG")
+        job = client.post(f"{PREFIX}/appearances", json={"name": "bronze", "target": target, "brightness": 0.5}).json()
+        assert job["name"] == "Computing bronze"
+        assert client.post(f"{PREFIX}/recalibrations", json={"kind": "full"}).status_code == 409
+        for _ in range(200):
+            if client.get(f"{PREFIX}/state").json()["job"]["ended"]:
+                break
+        assert client.post(f"{PREFIX}/play", json={"name": "bronze"}).json() == {"done": True}
+        assert client.get(f"{PREFIX}/state").json()["playing"] == "bronze"
+        assert client.get(f"{PREFIX}/appearances/bronze/preview").headers["content-type"] == "image/png"
+        assert client.delete(f"{PREFIX}/appearances/none").status_code == 404
+        schedule = client.get(f"{PREFIX}/schedule").json()
+        assert client.put(f"{PREFIX}/schedule", json=schedule).status_code == 422
+        schedule["rows"] = [{"day": "2026-12-24"}]
+        assert client.put(f"{PREFIX}/schedule", json=schedule).json() == {"done": True}
+        backup = client.post(f"{PREFIX}/backup")
+        assert backup.headers["content-disposition"].startswith("attachment")
+        assert client.post(f"{PREFIX}/restore", content=backup.content).json() == {"done": True}
+        assert client.post(f"{PREFIX}/restore", content=b"x").json()["code"] == "backup-wrong"
+        assert [row["level"] for row in client.get(f"{PREFIX}/events?level=error").json()] == ["error"]
+        assert "preview" not in str(client.get(f"{PREFIX}/appearances").json())
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"[]",
+        b"{",
+        b'{"name": 1}',
+        b'{"name": "a", "x": 1}',
+        b'{"name": "../a"}',
+        b"[" * 100_000,
+        b'{"name": "\\ud800"}',
+        b"\xff",
+    ],
+)
+def test_bodies_that_are_wrong_are_refused_in_words(panel: Served, body: bytes) -> None:
+    headers = panel.token(Role.OPERATOR) | {"content-type": "application/json"}
+    with panel.client() as client:
+        answer = client.post(f"{PREFIX}/play", content=body, headers=headers)
+        assert answer.status_code == 422
+        assert set(answer.json()) == {"code", "what", "remedy"}
+
+
+def test_prometheus_reads_our_figures(panel: Served) -> None:
+    with panel.client() as client:
+        text = client.get("/metrics", headers=panel.token(Role.VIEWER)).text
+    rows = {
+        (s.name, tuple(sorted(s.labels.items()))): s.value
+        for f in text_string_to_metric_families(text)
+        for s in f.samples
+    }
+    assert rows["velatura_lamp_hours", (("projector", "left"),)] == 1204
+    assert rows["velatura_device_problem", (("device", "right"), ("kind", "projector"))] == 1
+    assert sum(value for (name, _), value in rows.items() if name == "velatura_state") == 1
+
+
+def test_a_kiosk_error_reaches_the_caller_with_its_remedy(fresh: Served) -> None:
+    with fresh.client() as client, contextlib.suppress(KeyError):
+        answer = client.post(f"{PREFIX}/cancel", headers=fresh.token(Role.OPERATOR))
+        assert (answer.status_code, answer.json()["code"]) == (409, "no-job")
+
+
+def test_pictures_of_the_kiosk_can_only_be_those_of_a_run(panel: Served, tmp_path: Path) -> None:
+    with panel.client() as client:
+        client.headers |= panel.token(Role.TECHNICIAN)
+        assert client.get(f"{PREFIX}/runs/first/pictures/error").status_code == 200
+        assert client.get(f"{PREFIX}/runs/first/pictures/secrets").status_code == 422
+        for run in ("..", "%2e%2e", "..%2f..", "none"):
+            assert client.get(f"{PREFIX}/runs/{run}/pictures/error").status_code in (404, 422)

@@ -1,0 +1,156 @@
+"""Building control through a real broker."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+from controller.panel.broker import BrokerOptions
+from controller.panel.building import BuildingControl
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+
+MOSQUITTO = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
+pytestmark = pytest.mark.skipif(not Path(MOSQUITTO).exists(), reason="needs mosquitto (a package of the test set-up)")
+USER, SECRET = "kiosk", "word for the broker"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextlib.contextmanager
+def broker(folder: Path, port: int) -> Iterator[None]:
+    folder.mkdir(exist_ok=True)
+    passwords = folder / "passwords"
+    tool = shutil.which("mosquitto_passwd") or "/usr/bin/mosquitto_passwd"
+    subprocess.run([tool, "-b", "-c", str(passwords), USER, SECRET], check=True, capture_output=True)
+    passwords.chmod(0o644)
+    folder.chmod(0o755)
+    config = folder / "mosquitto.conf"
+    config.write_text(f"listener {port} 127.0.0.1\nallow_anonymous false\npassword_file {passwords}\nuser root\n")
+    with subprocess.Popen(
+        [MOSQUITTO, "-c", str(config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            until = time.monotonic() + 10
+            while True:
+                with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+                    break
+                assert time.monotonic() < until, "the broker did not start"
+                time.sleep(0.02)
+            yield
+        finally:
+            process.terminate()
+
+
+def options(folder: Path, port: int) -> BrokerOptions:
+    secret = folder / "secret"
+    secret.write_text(SECRET + "\n")
+    return BrokerOptions("127.0.0.1", port, "hall/velatura", USER, secret)
+
+
+@contextlib.asynccontextmanager
+async def building(port: int) -> AsyncIterator[tuple[aiomqtt.Client, asyncio.Queue[tuple[str, str]]]]:
+    """The building's side: everything that is published, and a client to publish with."""
+    heard: asyncio.Queue[tuple[str, str]] = asyncio.Queue()
+    async with aiomqtt.Client("127.0.0.1", port, username=USER, password=SECRET) as client:
+        await client.subscribe("hall/velatura/#")
+
+        async def listen() -> None:
+            async for message in client.messages:
+                assert isinstance(message.payload, bytes)
+                heard.put_nowait((str(message.topic).removeprefix("hall/velatura/"), message.payload.decode()))
+
+        listening = asyncio.create_task(listen())
+        try:
+            yield client, heard
+        finally:
+            listening.cancel()
+            await asyncio.gather(listening, return_exceptions=True)
+
+
+async def wait_for(heard: asyncio.Queue[tuple[str, str]], topic: str, words: str) -> str:
+    async with asyncio.timeout(10):
+        while True:
+            where, said = await heard.get()
+            if where == topic and words in said:
+                return said
+
+
+@contextlib.asynccontextmanager
+async def controlled(kiosk: MemoryKiosk, settings: BrokerOptions) -> AsyncIterator[None]:
+    running = asyncio.create_task(BuildingControl(kiosk, settings, first_pause_s=0.1).run())
+    try:
+        yield
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
+def test_a_building_opens_closes_and_plays_and_hears_what_came_of_it(tmp_path: Path) -> None:
+    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+
+    async def story() -> None:
+        async with building(port) as (client, heard), controlled(kiosk, options(tmp_path, port)):
+            await wait_for(heard, "available", "online")
+            state = json.loads(await wait_for(heard, "state", "playing"))
+            assert state["problems"][0]["device"] == "right"
+            await client.publish("hall/velatura/command/close")
+            await wait_for(heard, "state", "cooling")
+            await client.publish("hall/velatura/command/open")
+            await wait_for(heard, "state", "powering")
+            await client.publish("hall/velatura/command/play", "warm wood")
+            await wait_for(heard, "state", "warm wood")
+            for payload in ("../etc", "x" * 4000, "\x00", "", "no such thing"):
+                await client.publish("hall/velatura/command/play", payload)
+                await wait_for(heard, "answer", '"done": false')
+            await client.publish("hall/velatura/command/format", "c:")
+            await wait_for(heard, "answer", "command-unknown")
+            assert kiosk.snapshot().playing == "warm wood"
+
+    with broker(tmp_path / "broker", port):
+        asyncio.run(story())
+
+
+def test_a_command_kept_by_the_broker_is_not_obeyed_after_a_restart(tmp_path: Path) -> None:
+    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+
+    async def story() -> None:
+        async with building(port) as (client, heard):
+            await client.publish("hall/velatura/command/close", retain=True)
+            async with controlled(kiosk, options(tmp_path, port)):
+                await wait_for(heard, "state", "playing")
+                await client.publish("hall/velatura/command/play", "warm wood")
+                await wait_for(heard, "answer", "play")
+                assert kiosk.snapshot().state == "playing"
+
+    with broker(tmp_path / "broker", port):
+        asyncio.run(story())
+
+
+def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path) -> None:
+    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+
+    async def story() -> None:
+        async with controlled(kiosk, options(tmp_path, port)):
+            await asyncio.sleep(0.3)
+            for _ in range(2):
+                started = broker(tmp_path / "broker", port)
+                await asyncio.to_thread(started.__enter__)
+                async with building(port) as (_, heard):
+                    await wait_for(heard, "available", "online")
+                await asyncio.to_thread(started.__exit__, None, None, None)
+
+    asyncio.run(story())

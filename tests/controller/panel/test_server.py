@@ -1,0 +1,86 @@
+"""Where the panel listens, and how."""
+
+from __future__ import annotations
+
+import shutil
+import ssl
+import subprocess
+from pathlib import Path
+
+import httpx
+import pytest
+
+from controller.errors import UsageError, WorkError
+from controller.panel.app import make_panel
+from controller.panel.context import PanelOptions
+from controller.panel.server import PanelServer, check_exposure
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.controller.panel.served import PASSWORD, accounts_in, csrf
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.4", "kiosk.local", ""])
+def test_beyond_this_machine_only_with_tls(tmp_path: Path, host: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        check_exposure(PanelOptions(tmp_path, host=host))
+    assert caught.value.code == "panel-open-without-tls"
+    check_exposure(PanelOptions(tmp_path, host=host, tls_certificate=tmp_path / "c.pem", tls_key=tmp_path / "k.pem"))
+
+
+def test_it_listens_on_loopback_unless_told_otherwise(tmp_path: Path) -> None:
+    assert PanelOptions(tmp_path).host == "127.0.0.1"
+    check_exposure(PanelOptions(tmp_path, host="::1"))
+
+
+def test_a_port_that_is_taken_is_told_and_a_stopped_panel_frees_it(tmp_path: Path) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
+    first_options = PanelOptions(tmp_path / "a", port=0)
+    first = PanelServer(make_panel(kiosk, accounts_in(tmp_path / "a"), first_options), first_options)
+    address = first.start()
+    port = int(address.rstrip("/").rpartition(":")[2])
+    second_options = PanelOptions(tmp_path / "b", port=port)
+    for taken in (True, False):
+        second = PanelServer(make_panel(kiosk, accounts_in(tmp_path / "b"), second_options), second_options)
+        if taken:
+            with pytest.raises(WorkError) as caught:
+                second.start()
+            assert caught.value.code == "panel-not-started"
+            first.stop()
+        else:
+            assert second.start() == address
+            second.stop()
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl to make a certificate")
+def test_with_tls_nothing_crosses_in_the_clear_and_cookies_stay(tmp_path: Path) -> None:
+    certificate, key = tmp_path / "c.pem", tmp_path / "k.pem"
+    command = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "ec",
+        "-pkeyopt",
+        "ec_paramgen_curve:P-256",
+        "-nodes",
+        "-days",
+        "2",
+    ]
+    command += ["-keyout", str(key), "-out", str(certificate), "-subj", "/CN=localhost"]
+    subprocess.run([*command, "-addext", "subjectAltName=IP:127.0.0.1"], check=True, capture_output=True)
+    options = PanelOptions(tmp_path / "p", port=0, tls_certificate=certificate, tls_key=key)
+    app = make_panel(MemoryKiosk(tmp_path / "pictures"), accounts_in(tmp_path / "p"), options)
+    server = PanelServer(app, options)
+    address = server.start()
+    try:
+        trust = ssl.create_default_context(cafile=str(certificate))
+        with httpx.Client(base_url=address, verify=trust, trust_env=False) as client:
+            page = client.get("/login")
+            assert page.headers["strict-transport-security"]
+            answer = client.post("/login", data={"csrf": csrf(page.text), "name": "vera", "password": PASSWORD})
+            cookie = next(text for text in answer.headers.get_list("set-cookie") if text.startswith("__Host-velatura="))
+            assert "Secure" in cookie
+            assert client.get("/").status_code == 200
+        with httpx.Client(trust_env=False) as client, pytest.raises(httpx.HTTPError):
+            client.get(address.replace("https", "http") + "login")
+    finally:
+        server.stop()
