@@ -201,5 +201,8 @@ class Bench(Protocol):
         technician of a real stage would know. The truth stays in the bench's own file, which no controller reads.
         """
 
-    def serve(self, stage: Path, *, json_lines: bool) -> int:
-        """Serve every device of ``stage`` until SIGINT/SIGTERM, printing each address; return the exit code."""
+    def serve(self, stage: Path, *, json_lines: bool, scenario: Path | None = None) -> int:
+        """Serve every device of ``stage`` until SIGINT/SIGTERM, printing each address; return the exit code.
+
+        ``scenario``: a script of the faults that its devices shall have.
+        """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import signal
 import socket
 import sys
@@ -16,6 +17,7 @@ from typing import Any, Final
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
+from plugins.emulated.bench_usb import UsbDevices, read_usb
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.objects import load_object
 from plugins.emulated.ptp_body import CameraNames
@@ -68,13 +70,16 @@ class EmulatedBench:
             (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
         return device_tables(truth, shape)
 
-    def serve(self, stage: Path, *, json_lines: bool) -> int:
-        """Serve the stage's devices until SIGINT or SIGTERM; returns 0, or 3 when a device can't be served."""
+    def serve(self, stage: Path, *, json_lines: bool, scenario: Path | None = None) -> int:
+        """Serve the stage's devices until SIGINT or SIGTERM; returns 0, or 3 when a device can't be served.
+
+        ``scenario``: a script of faults, instead of the one in bench.toml; relative to the working folder.
+        """
         out = _Lines(json_lines)
         stopped = threading.Event()
         with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
             try:
-                world = _start(stage.resolve(), out, stack, stopped)
+                world = _start(stage.resolve(), out, stack, stopped, scenario)
             except DeviceError as error:
                 out.failed(error)
                 return DEVICE_FAILED
@@ -112,6 +117,10 @@ class _Lines:
     def served(self, device: str, kind: str, address: str) -> None:
         self.say({"device": device, "kind": kind, "address": address}, f"{kind:<10} {device:<10} {address}")
 
+    def environment(self, variables: Mapping[str, str]) -> None:
+        words = " ".join(f"{name}={shlex.quote(value)}" for name, value in variables.items())
+        self.say({"environment": dict(variables)}, f"To see the USB devices, begin commands with: {words}")
+
     def ready(self) -> None:
         self.say({"ready": True}, "Ready. Ctrl-C ends.")
 
@@ -122,11 +131,16 @@ class _Lines:
             sys.stderr.write(f"velatura: {error.what}\n{error.remedy}\n")
 
 
-def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event) -> World:
+def _start(
+    stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
+) -> World:
     """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
     truth = read_truth(stage)
     _require_free(truth.camera.command_port, truth.camera.event_port)
-    scenario = read_scenario(stage / truth.scenario) if truth.scenario else None
+    if script is None and truth.scenario:
+        script = stage / truth.scenario
+    scenario = read_scenario(script) if script is not None else None
+    usb = read_usb(stage)
     lamps = [EmulatedLamp(LampTiming(p.lamp.warm_up_s, p.lamp.cool_down_s)) for p in truth.projectors]
 
     def progress(share: float) -> None:
@@ -157,6 +171,11 @@ def _start(stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threa
     stack.enter_context(camera)
     out.served("camera", "camera", camera.address)
     out.served("display", "display", str(stage / truth.frames))
+    if usb:
+        bus = stack.enter_context(UsbDevices(usb, script.read_text(encoding="utf-8") if script is not None else ""))
+        for device in usb:
+            out.served(device.name, device.kind, "usb")
+        out.environment(bus.environment)
     return world
 
 
