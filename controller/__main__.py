@@ -72,6 +72,9 @@ def demo(
 
 def emulate(
     stage: StageFolder,
+    scenario: Annotated[
+        Path | None, typer.Option(help="A script of faults (docs/drivers.md) that the devices play.")
+    ] = None,
     until_input_ends: Annotated[
         bool, typer.Option("--until-input-ends", help="End, too, when standard input is closed.")
     ] = False,
@@ -89,7 +92,7 @@ def emulate(
         )
     if until_input_ends:
         terminated_when_input_ends()
-    return bench_of(stage).serve(stage, json_lines=as_json)
+    return bench_of(stage).serve(stage, json_lines=as_json, scenario=scenario)
 
 
 def calibrate(
