@@ -227,6 +227,7 @@ def player_settings(stage: Stage, runtime: Path, *, plays: bool) -> PlayerSettin
     return PlayerSettings(
         outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
         frames=frames,
+        where={output.name: output.where for output in table.outputs if output.where is not None},
         bundle=bundle if plays and bundle.is_symlink() else None,
         trusted=_key_files(stage.tables.bundle.trusted_keys, runtime, "trusted"),
         revoked=_key_files(stage.tables.bundle.revoked_keys, runtime, "revoked"),

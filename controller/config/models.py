@@ -99,6 +99,11 @@ class OutputTable(Table):
     name: Name = Field(description="the output's name, different for every output, 1 to 64 printable characters")
     width_px: Size = Field(description="the output's width in pixels, a whole number from 1 to 16384")
     height_px: Size = Field(description="the output's height in pixels, a whole number from 1 to 16384")
+    where: str | None = Field(
+        default=None,
+        pattern=r"^[^\s=](.*[^\s])?$",
+        description='the connector ("HDMI-1") or the serial number of its display; left out: the name is one of these',
+    )
 
 
 class DisplayTable(OpenTable):
