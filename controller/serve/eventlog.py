@@ -46,13 +46,14 @@ class Decision:
 class EventLog:
     """Safe to use from several threads. ``problem`` says why the disk takes nothing now, or is None.
 
+    ``durable``: what is told survives a power cut, too; without it only the end of the process.
     What the disk refuses is kept in memory and written when there is space again. A damaged file is put aside.
     """
 
     FILE: Final = "kiosk/events.sqlite"
 
-    def __init__(self, path: Path, *, wall: Callable[[], float] = time.time) -> None:
-        self.path, self._wall = path, wall
+    def __init__(self, path: Path, *, wall: Callable[[], float] = time.time, durable: bool = True) -> None:
+        self.path, self._wall, self._durable = path, wall, durable
         self._lock = threading.RLock()
         self.problem: str | None = None
         self._retry_at_s = 0.0
@@ -166,7 +167,7 @@ class EventLog:
         try:
             database.execute("PRAGMA journal_mode=WAL")
             # What was done must not be done again after a power cut.
-            database.execute("PRAGMA synchronous=FULL")
+            database.execute(f"PRAGMA synchronous={'FULL' if self._durable else 'OFF'}")
             database.executescript(_SCHEMA)
         except sqlite3.Error:
             database.close()

@@ -152,7 +152,7 @@ class Kiosk:
 
     def boot(self) -> None:
         """The service begins, after whatever ended it; lamps, ledger and disk are as they were."""
-        self.log = EventLog(self.folder / "events.sqlite", wall=self.wall)
+        self.log = EventLog(self.folder / "events.sqlite", wall=self.wall, durable=False)
         self.works = ModelWorks(self.world, camera=self.works.camera, done=self.works.done, drifted=self.works.drifted)
         self.player = ModelPlayer(self.world)
         self.keepers = [self._keeper(name) for name in NAMES]
