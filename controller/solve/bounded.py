@@ -1,8 +1,9 @@
 """Compensation images by a global, bounded, smooth least-squares solve (paper 2.2-2.4, eqs 2 and 3).
 
 Minimise  sum_u w_u |T p + K - C|^2  +  s sum over adjacent pixels of alpha^2 (p_i - p_j)^2   subject to 0 <= p <= 1
-by accelerated projected gradient. T is (nearly) non-negative, so the row sums |T|' w |T| 1 majorise the Hessian's data
-part and give every projector pixel its own step; momentum restarts where it points uphill (O'Donoghue and Candes 2015).
+by accelerated projected gradient, one projector after the other (``descent``, docs/decisions/0022). T is (nearly)
+non-negative, so the row sums |T_n|' w |T_n| 1 majorise the data part of the Hessian of projector n, and give every one
+of its pixels a step of its own.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from typing import Final
 import numpy as np
 
 from controller.arrays import FloatImage, Mask
-from controller.errors import UsageError, WorkError
-from controller.solve.gradient import extrapolate, projected_step, weighted_residual
+from controller.errors import UsageError
+from controller.solve.descent import Watch, descend
+from controller.solve.gradient import weighted_residual
 from controller.solve.smoothness import squared_edges
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
@@ -25,7 +27,7 @@ SMOOTHNESS: Final = 0.001
 """Default strength of smoothness, relative to the mean diagonal of the data's majoriser. On a disturbed synthetic stage
 the edges kept (eq. 9) peak between 0.003 and 0.01; colour noise falls up to 0.03, at the cost of detail."""
 TOLERANCE: Final = 3e-5
-"""Default KKT residual. Colours no longer change from 1e-4 on; the objective is within 1e-3 of its limit near 1e-5."""
+"""Default KKT residual: the objective is within about 1e-3 of its limit there, within 1e-2 at 3e-4."""
 MOST_ITERATIONS: Final = 1000
 
 
@@ -55,7 +57,7 @@ class Problem:
 
     ``wanted`` (3, camera rows, columns): target less black; ``weights`` (camera rows, columns): 0 off the object;
     ``across``, ``down``, ``majoriser`` (3, pixels of all projectors): squared smoothness weights to the right and lower
-    neighbour, and the diagonal that bounds the Hessian, 0 where a pixel lights nothing
+    neighbour, and the diagonal that bounds each projector's own Hessian, 0 where a pixel lights nothing
     """
 
     transport: LightTransport
@@ -122,7 +124,7 @@ def solve_bounded(
         if x.shape != problem.majoriser.shape:
             raise _wrong("the frames to start from are not of the projectors' sizes")
     x[problem.majoriser == 0] = 0
-    x, kkt, iterations = _descend(problem, x, tolerance, most_iterations, progress, cancelled)
+    x, kkt, iterations = descend(problem, x, Watch(tolerance, most_iterations, progress, cancelled))
     light = transport.forward_planes(x)
     objective = weighted_residual(light, problem.wanted, problem.weights, np.empty_like(light)) + roughness(problem, x)
     frames = tuple(plane_frames(x, transport.sizes))
@@ -142,23 +144,40 @@ def pose(
         raise _wrong("the black image is not finite or not of the target's size")
     if not 0 <= smoothness < np.inf:
         raise _wrong(f"a smoothness of {smoothness} is not a number of at least 0")
-    wanted = image_planes(np.maximum(target - black, 0))
     counted = transport.object_mask.astype(np.float32)
     if weights is not None:
         if weights.shape != counted.shape or not np.isfinite(weights).all() or weights.min(initial=0) < 0:
             raise _wrong("the weights are not finite numbers of at least 0, one a camera pixel")
         counted *= weights
-    magnitude = transport.with_absolute_mixing()
-    diagonal = magnitude.adjoint_planes(magnitude.reach_planes() * counted)
+    return posed(transport, image_planes(np.maximum(target - black, 0)), counted, smoothness)
+
+
+def posed(transport: LightTransport, wanted: FloatImage, counted: FloatImage, smoothness: float) -> Problem:
+    """The equations for planes ``wanted`` (3, rows, columns) and weights (rows, columns) that are 0 off the object."""
+    diagonal, scale = _majoriser(transport, counted)
     across, down = squared_edges(transport, wanted)
+    across *= np.float32(smoothness * scale)
+    down *= np.float32(smoothness * scale)
     active = diagonal > 0
-    scale = np.float32(smoothness * diagonal[active].mean(dtype=np.float64)) if active.any() else np.float32(0)
-    across *= scale
-    down *= scale
     for n in range(len(transport.sizes)):
         lit = active[:, transport.span(n)].reshape(3, *transport.sizes[n])
         _tie(lit, *(_frame_view(transport, n, planes) for planes in (across, down, diagonal)))
     return Problem(transport, wanted, counted, across, down, diagonal)
+
+
+def _majoriser(transport: LightTransport, counted: FloatImage) -> tuple[FloatImage, float]:
+    """The data's part of each projector's own majoriser, and the mean diagonal of that of all together."""
+    magnitude = transport.with_absolute_mixing()
+    ones = np.ones((3, transport.pixels), np.float32)
+    diagonal = np.zeros_like(ones)
+    reach, light = np.zeros((3, *transport.shape), np.float32), np.empty((3, *transport.shape), np.float32)
+    for n in range(len(transport.sizes)):
+        magnitude.forward_planes(ones, projectors=(n, n + 1), out=light)
+        reach += light
+        magnitude.pull(n, magnitude.aim(light, counted), diagonal)
+    pixels = max(int(np.count_nonzero(diagonal > 0)), 1)
+    # 1' T' w T 1 is the sum of all row sums
+    return diagonal, weighted_residual(reach, np.zeros_like(reach), counted, light) / pixels
 
 
 def _frame_view(transport: LightTransport, n: int, planes: FloatImage) -> FloatImage:
@@ -179,52 +198,6 @@ def first_guess(problem: Problem) -> FloatImage:
     reach = problem.transport.reach_planes()
     share = np.divide(problem.wanted, reach, out=np.zeros_like(reach), where=reach > 0)
     return np.clip(problem.transport.gaussian_mean_planes(np.minimum(share, 1)), 0, 1)
-
-
-def _descend(
-    problem: Problem,
-    x: FloatImage,
-    tolerance: float,
-    most_iterations: int,
-    progress: Callable[[int, float], None] | None,
-    cancelled: Callable[[], bool] | None,
-) -> tuple[FloatImage, float, int]:
-    transport = problem.transport
-    y, new = x.copy(), np.empty_like(x)
-    light, gradient = np.empty_like(problem.wanted), np.empty_like(x)
-    total = max(float(problem.majoriser.sum(dtype=np.float64)), np.finfo(np.float64).tiny)
-    inertia, kkt, iteration = 1.0, np.inf, 0
-    for iteration in range(1, most_iterations + 1):
-        if cancelled is not None and cancelled():
-            raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again when wanted.")
-        transport.forward_planes(y, out=light)
-        weighted_residual(light, problem.wanted, problem.weights, light)
-        transport.adjoint_planes(light, out=gradient)
-        squared_step, uphill = _step(problem, y, x, gradient, new)
-        kkt = float(np.sqrt(squared_step / total))
-        following = (1 + np.sqrt(1 + 4 * inertia**2)) / 2
-        momentum = (inertia - 1) / following
-        inertia = following
-        if uphill > 0:
-            momentum, inertia = 0.0, 1.0
-        extrapolate(new, x, momentum, y)
-        x, new = new, x
-        if progress is not None:
-            progress(iteration, kkt)
-        if kkt <= tolerance:
-            break
-    return x, kkt, iteration
-
-
-def _step(problem: Problem, y: FloatImage, x: FloatImage, gradient: FloatImage, new: FloatImage) -> tuple[float, float]:
-    squared_step = uphill = 0.0
-    for n, (rows, columns) in enumerate(problem.transport.sizes):
-        start = problem.transport.span(n).start
-        a, b = projected_step(
-            y, x, gradient, problem.majoriser, problem.across, problem.down, start, rows, columns, new
-        )
-        squared_step, uphill = squared_step + a, uphill + b
-    return squared_step, uphill
 
 
 def roughness(problem: Problem, x: FloatImage) -> float:

@@ -36,7 +36,7 @@ def _pull(into: FloatImage, here: FloatImage, there: FloatImage, weight: FloatIm
 
 @compiled(fastmath=True)
 def _move(
-    y: FloatImage, x: FloatImage, gradient: FloatImage, majoriser: FloatImage, new: FloatImage
+    y: FloatImage, x: FloatImage, gradient: FloatImage, majoriser: FloatImage, new: FloatImage, step: FloatImage
 ) -> tuple[float, float]:
     kkt = uphill = np.float32(0)
     for i in range(y.size):
@@ -45,6 +45,7 @@ def _move(
         to = min(max(to, np.float32(0)), np.float32(1))
         to = to if d > 0 else np.float32(0)
         new[i] = to
+        step[i] = to - y[i]
         kkt += d * (to - y[i]) * (to - y[i])
         uphill += d * (y[i] - to) * (to - x[i])
     return float(kkt), float(uphill)
@@ -66,8 +67,8 @@ def projected_step(
     """Write one projected gradient step from ``y`` to ``new`` for the projector whose pixels begin at ``start``.
 
     All arrays (3, pixels of all projectors), each projector row by row. ``gradient`` is that of the data; that of the
-    smoothness is added here. Returns two sums: majoriser x step^2, whose size measures the KKT residual, and
-    majoriser x (y - new) x (new - x), positive where the momentum points uphill.
+    smoothness is added here. It is overwritten with new - y. Returns two sums: majoriser x step^2, whose size measures
+    the KKT residual, and majoriser x (y - new) x (new - x), positive where the momentum points uphill.
     """
     sums = np.zeros((rows, 2), np.float64)
     for v in prange(rows):
@@ -83,7 +84,7 @@ def projected_step(
                 _pull(total, here, y[c, a - columns : a], down[c, a - columns : a])
             if v < rows - 1:
                 _pull(total, here, y[c, e : e + columns], down[c, a:e])
-            kkt, uphill = _move(here, x[c, a:e], total, majoriser[c, a:e], new[c, a:e])
+            kkt, uphill = _move(here, x[c, a:e], total, majoriser[c, a:e], new[c, a:e], gradient[c, a:e])
             sums[v, 0] += kkt
             sums[v, 1] += uphill
     return float(sums[:, 0].sum()), float(sums[:, 1].sum())
@@ -96,6 +97,16 @@ def extrapolate(new: FloatImage, x: FloatImage, momentum: float, y: FloatImage) 
     for i in prange(new.shape[1]):
         for c in range(3):
             y[c, i] = new[c, i] + beta * (new[c, i] - x[c, i])
+
+
+@compiled(parallel=True, fastmath=True)
+def carry_on(new: FloatImage, last: FloatImage, momentum: float) -> None:
+    """Write new + momentum (new - last) to ``new``, and what was there to ``last``; both flat."""
+    beta = np.float32(momentum)
+    for i in prange(new.size):
+        value = new[i]
+        new[i] = value + beta * (value - last[i])
+        last[i] = value
 
 
 @compiled(parallel=True, fastmath=True)

@@ -146,7 +146,7 @@ class LightTransport(ABC):
         sheet += self.forward_planes(p, projectors=(n, n + 1))
 
     def pull(self, n: int, sheet: FloatImage, out: FloatImage) -> None:
-        """Write the transpose of ``add_light`` to those pixels of ``out`` (3, pixels of all projectors) that are n's."""
+        """Write the transpose of ``add_light`` to the pixels of ``n`` in ``out`` (3, pixels of all projectors)."""
         out[:, self.span(n)] = self.adjoint_planes(sheet)[:, self.span(n)]
 
     def weigh(self, sheet: FloatImage, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
@@ -157,10 +157,6 @@ class LightTransport(ABC):
     def aim(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
         """D' w picture: a sheet, from (3, rows, columns) and (rows, columns)."""
         return picture * weights
-
-    def coarser(self) -> LightTransport | None:
-        """About the same transport at half the resolution of camera and projectors, or None where there is none."""
-        return None
 
     @abstractmethod
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:

@@ -53,7 +53,7 @@ def _collect_one(planes: FloatImage, above: int, rows: int, colours: Colours, y:
     """The transpose at one site of a picture of ``rows`` rows; ``planes`` begin with row ``above`` of it."""
     columns = planes.shape[2]
     own = colours[y & 1, x & 1]
-    total = planes[own, y - above, x]
+    total = float(planes[own, y - above, x])
     for r in range(max(y - 1, 0), min(y + 2, rows)):
         for c in range(max(x - 1, 0), min(x + 2, columns)):
             if colours[r & 1, c & 1] != own:

@@ -159,11 +159,6 @@ class WindowTransport(LightTransport):
         collect(weighted, self.colours, out)
         return out
 
-    def coarser(self) -> WindowTransport | None:
-        from controller.transport.coarse import halved
-
-        return halved(self)
-
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         means = self._sums(np.ascontiguousarray(image), projectors or (0, len(self.sizes)))
         means *= self.per_sum

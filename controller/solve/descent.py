@@ -1,0 +1,75 @@
+"""Sweeps over the projectors, one after the other, with momentum: the work of the bounded solver.
+
+Each projector takes a projected gradient step against what the others show by then, scaled by a diagonal that bounds
+its own part of the Hessian alone; with n projectors alike that is n times as far as a step of all at once could go.
+Momentum carries on from sweep to sweep and starts anew where it points uphill (O'Donoghue and Candes 2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from controller.arrays import FloatImage
+from controller.errors import WorkError
+from controller.solve.gradient import carry_on, extrapolate, projected_step
+
+if TYPE_CHECKING:
+    from controller.solve.bounded import Problem
+
+MOST_GROWTH: Final = 5.0
+"""Without momentum sweeps never go uphill; with it nothing is proven, so it ends where the residual grows as much."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """When to stop, and whom to tell; see ``solve_bounded``."""
+
+    tolerance: float
+    most_iterations: int
+    progress: Callable[[int, float], None] | None = None
+    cancelled: Callable[[], bool] | None = None
+
+
+def descend(problem: Problem, x: FloatImage, watch: Watch) -> tuple[FloatImage, float, int]:
+    """Sweep from ``x`` (3, pixels), which is overwritten; returns the last point, its KKT residual and the sweeps."""
+    transport = problem.transport
+    aim = transport.aim(problem.wanted, problem.weights)
+    light, ahead, residual = transport.sheet(), transport.sheet(), np.empty_like(aim)
+    for n in range(len(transport.sizes)):
+        transport.add_light(n, x, light)
+    ahead[:] = light
+    y, new, step = x.copy(), np.empty_like(x), np.empty_like(x)
+    total = max(float(problem.majoriser.sum(dtype=np.float64)), np.finfo(np.float64).tiny)
+    inertia, kkt, least, iteration = 1.0, np.inf, np.inf, 0
+    for iteration in range(1, watch.most_iterations + 1):
+        if watch.cancelled is not None and watch.cancelled():
+            raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again when wanted.")
+        squared_step = uphill = 0.0
+        for n, (rows, columns) in enumerate(transport.sizes):
+            transport.weigh(ahead, problem.weights, aim, residual)
+            transport.pull(n, residual, step)
+            start = transport.span(n).start
+            ties = problem.majoriser, problem.across, problem.down
+            a, b = projected_step(y, x, step, *ties, start, rows, columns, new)
+            squared_step, uphill = squared_step + a, uphill + b
+            transport.add_light(n, step, ahead)
+        kkt = float(np.sqrt(squared_step / total))
+        following = (1 + np.sqrt(1 + 4 * inertia**2)) / 2
+        momentum = (inertia - 1) / following
+        inertia = following
+        least = min(least, kkt)
+        if uphill > 0 or kkt > MOST_GROWTH * least:
+            momentum, inertia = 0.0, 1.0
+        extrapolate(new, x, momentum, y)
+        x, new = new, x
+        # the sheets follow: ``ahead`` is the light of the new point by now, and becomes that of y
+        carry_on(ahead.reshape(-1), light.reshape(-1), momentum)
+        if watch.progress is not None:
+            watch.progress(iteration, kkt)
+        if kkt <= watch.tolerance:
+            break
+    return x, kkt, iteration
