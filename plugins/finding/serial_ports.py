@@ -16,7 +16,7 @@ from typing import Any, Final
 from serial.tools import list_ports
 
 from hal.deadline import Deadline
-from hal.errors import DeviceBusy, DeviceError, DeviceTimeout, ProtocolError
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
 from hal.finding import Finder, Found, Problem, Wanted
 from hal.profiles import ProjectorProfile
 from hal.ptp import printable
@@ -165,8 +165,10 @@ def _who(
             continue
         try:
             link = SerialLink(port.path, baud=baud, deadline=deadline)
-        except ValueError:
-            continue  # a rate that this adapter does not have
+        except DeviceGone:
+            if port.path.exists():
+                continue  # a rate that this adapter does not have
+            raise
         try:
             for profile in profiles:
                 answered, came = _answers(link, profile, answer_s, deadline)
