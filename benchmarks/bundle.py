@@ -61,15 +61,26 @@ def _bundle(swaps: Sequence[dict[str, ByteImage]], *, paper: bool) -> list[Row]:
         ratio = raw / path.stat().st_size
         with Bundle.open(path, allow_unsigned=True) as bundle:
             times = {threads: _decoding(bundle, swaps, threads) for threads in GOAL_MS}
-            stored = [blob.length for one in bundle.index.appearances for blobs in one.stripes.values() for blob in blobs]
+            stripes = [blobs for one in bundle.index.appearances for blobs in one.stripes.values()]
+            stored = [blob.length for blobs in stripes for blob in blobs]
             opening = timed(lambda: Bundle.open(path, allow_unsigned=True).close())
     return [
         at_least("smaller than raw", ratio, GOAL_RATIO, unit="x", how=f"{len(swaps)} appearances of dithered frames"),
         *(_row(threads, time, goal=GOAL_MS[threads] if paper else None) for threads, time in times.items()),
-        at_least("two threads decode faster than one", times[1].minimum / times[2].minimum, None, unit="x",
-                 how="of the minima, which other work on the machine disturbs least"),
-        at_least("smaller than raw, stripes at 4 KiB", raw / sum(-(-size // 4096) * 4096 for size in stored), None,
-                 unit="x", how="as version 1 of the format laid them; the index left out"),
+        at_least(
+            "two threads decode faster than one",
+            times[1].minimum / times[2].minimum,
+            None,
+            unit="x",
+            how="of the minima, which other work on the machine disturbs least",
+        ),
+        at_least(
+            "smaller than raw, stripes at 4 KiB",
+            raw / sum(-(-size // 4096) * 4096 for size in stored),
+            None,
+            unit="x",
+            how="as version 1 of the format laid them; the index left out",
+        ),
         at_most("opening", 1000 * opening.median, None, unit="ms", how=f"index and checks; {opening}"),
         at_most("writing", writing.median / len(swaps), None, unit="s an appearance", how=str(writing)),
     ]
