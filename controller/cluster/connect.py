@@ -20,6 +20,8 @@ CONNECT_S: Final = 10.0
 WORKERS_S: Final = 60.0
 """How long to wait while the scheduler has no worker at all."""
 POLL_S: Final = 0.02
+ASK_S: Final = 1.0
+"""How often the scheduler is asked whether it has workers, while a task is waited for."""
 TRIES: Final = 4
 """A task is begun anew when what it needs was lost with its worker; this often."""
 
@@ -113,10 +115,12 @@ class Task(Generic[Value]):
         """
         for _ in range(TRIES):
             try:
+                asked_s = time.monotonic()
                 while not self._future.done():
                     check()
-                    if self._cluster.workers == 0:
+                    if time.monotonic() - asked_s > ASK_S:
                         self._cluster.wait_for_workers(check)
+                        asked_s = time.monotonic()
                     time.sleep(POLL_S)
             except BaseException:
                 self.cancel()
