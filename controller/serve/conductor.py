@@ -88,6 +88,11 @@ class Conductor:
     def plan(self) -> Plan:
         return self._plan
 
+    @property
+    def working(self) -> bool:
+        """Whether work runs or waits."""
+        return self._agenda.head is not None
+
     def open(self) -> None:
         """Play until the schedule says otherwise the next time."""
         with self._lock:
@@ -126,8 +131,9 @@ class Conductor:
 
     def step(self) -> None:
         with self._lock:
-            self._look_at_the_clock()
+            # First: what is done now must not be due in the plan.
             self._take_finished()
+            self._look_at_the_clock()
             wanted_open = self.wishes.open(self._plan)
             self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
             views = [keeper.view for keeper in self._keepers]

@@ -7,7 +7,8 @@ import pytest
 from tests.controller.serve.matrix import Fault, cases, judge
 from tests.controller.serve.model import Kiosk
 
-ALL = list(cases())
+ALL = list(cases())[::6]
+"""A sixth of the matrix, another fault at each step; all of it: ``python -m tests.campaigns.serve_matrix``."""
 
 
 @pytest.mark.parametrize(("step", "fault"), ALL, ids=[f"{step}-{fault.name}" for step, fault in ALL])
