@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final
 
-from controller.bundle.format import Appearance, Index, OutputLayout
+from controller.bundle.format import Appearance, Index, Live, OutputLayout
 from controller.bundle.reader import Bundle
 
 _LAST_SECOND: Final = 253_402_300_799
@@ -20,6 +20,7 @@ def describe(bundle: Bundle) -> dict[str, Any]:
     raw = sum(3 * output.width_px * output.height_px for output in index.outputs) * len(index.appearances)
     return {
         "file": str(bundle.path),
+        "version": bundle.version,
         "bytes": bundle.size,
         "ratio": raw / bundle.size,
         "identity": bundle.identity,
@@ -28,7 +29,13 @@ def describe(bundle: Bundle) -> dict[str, Any]:
         "created": _utc(index.created_unix_s),
         "outputs": [_output(output) for output in index.outputs],
         "appearances": [_appearance(appearance) for appearance in index.appearances],
+        "schedule": [[hint.appearance, hint.duration_ms, hint.fade_ms] for hint in index.schedule],
+        "live": None if index.live is None else _live(index.live),
     }
+
+
+def _live(live: Live) -> dict[str, Any]:
+    return {"target_px": list(live.target_px), "bytes": sum(array.blob.length for array in live.arrays.values())}
 
 
 def _output(output: OutputLayout) -> dict[str, Any]:
@@ -63,6 +70,12 @@ def as_text(found: Mapping[str, Any]) -> str:
         f"appearances  {len(found['appearances'])}",
     ]
     lines += [f"  {appearance['name']}  {appearance['bytes']} bytes" for appearance in found["appearances"]]
+    lines += [
+        f"schedule     {name} for {shown / 1000:g} s, fade {fade / 1000:g} s" for name, shown, fade in found["schedule"]
+    ]
+    if found["live"] is not None:
+        width, height = found["live"]["target_px"]
+        lines.append(f"live         targets of {width}x{height}, {found['live']['bytes']} bytes")
     return "\n".join(lines)
 
 
@@ -74,9 +87,16 @@ def differences(one: Bundle, other: Bundle) -> dict[str, Any]:
     changed = {key: [getattr(one.index, key), getattr(other.index, key)] for key in _HEADS}
     changed["signed_by"] = [None if key is None else key.hex() for key in (one.signed_by, other.signed_by)]
     changed["outputs"] = [[_output(output) for output in bundle.index.outputs] for bundle in (one, other)]
+    changed["schedule"] = [describe(bundle)["schedule"] for bundle in (one, other)]
+    changed["live"] = [_live_hashes(bundle.index) for bundle in (one, other)]
     changed = {key: pair for key, pair in changed.items() if pair[0] != pair[1]}
     appearances = _appearance_differences(one.index, other.index)
     return {"same": not (changed or any(appearances.values())), "changed": changed, "appearances": appearances}
+
+
+def _live_hashes(index: Index) -> dict[str, str]:
+    arrays = {} if index.live is None else index.live.arrays
+    return {name: array.blob.sha256.hex()[:16] for name, array in arrays.items()}
 
 
 def _appearance_differences(one: Index, other: Index) -> dict[str, list[Any]]:
@@ -114,6 +134,9 @@ def differences_as_text(found: Mapping[str, Any]) -> str:
         return "The bundles hold the same."
     lines = []
     for key, (one, other) in found["changed"].items():
+        if key in ("schedule", "live"):
+            lines.append(f"~ {key}")
+            continue
         lines += [f"- {key} {_value(one)}", f"+ {key} {_value(other)}"]
     appearances = found["appearances"]
     lines += [f"- appearance {name}" for name in appearances["removed"]]

@@ -17,9 +17,10 @@ from skimage.io import imread
 
 from controller.bundle.describe import as_text, describe, differences, differences_as_text
 from controller.bundle.export import export_pictures
+from controller.bundle.format import Hint
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANYONE
-from controller.bundle.writer import NewAppearance, sign_bundle, write_bundle
+from controller.bundle.writer import NewAppearance, NewLive, sign_bundle, write_bundle
 from controller.errors import BundleError, UsageError
 from tests.controller.bundle.conftest import OUTPUTS, PNG, write
 
@@ -139,3 +140,26 @@ def test_what_is_damaged_is_not_signed(unsigned: Path, key: SigningKey) -> None:
     with pytest.raises(BundleError, match="damaged"):
         sign_bundle(unsigned, key)
     assert unsigned.read_bytes() == bytes(data)
+
+
+def test_schedule_and_live_section_are_told_and_compared(tmp_path: Path) -> None:
+    frame = {"P1": np.zeros((4, 5, 3), np.uint8)}
+
+    def bundle(name: str, fade_ms: int, value: float) -> Bundle:
+        write_bundle(
+            tmp_path / name, stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 4)],
+            appearances=[NewAppearance("a", frame)], schedule=[Hint("a", 5000, fade_ms)],
+            live=NewLive((7, 6), {"gain": np.full(3, value, np.float32)}),
+        )  # fmt: skip
+        return Bundle.open(tmp_path / name, allow_unsigned=True)
+
+    with bundle("1.vel", 250, 1) as one, bundle("2.vel", 500, 1) as other, bundle("3.vel", 250, 2) as third:
+        found = describe(one)
+        assert (found["version"], found["schedule"]) == (2, [["a", 5000, 250]])
+        assert found["live"]["target_px"] == [7, 6]
+        assert "a for 5 s, fade 0.25 s" in as_text(found)
+        assert "targets of 7x6" in as_text(found)
+        assert list(differences(one, other)["changed"]) == ["schedule"]
+        assert list(differences(one, third)["changed"]) == ["live"]
+        assert differences_as_text(differences(one, third)) == "~ live"
+        assert differences(one, one)["same"]
