@@ -25,7 +25,7 @@ from benchmarks._stage import over
 from controller.arrays import Float64
 from controller.calibrate.geometry import reconstruct
 from controller.calibrate.intrinsics import read_intrinsics
-from controller.calibrate.reconstruction import Reconstruction
+from controller.calibrate.reconstruction import CameraPrior, Reconstruction
 from controller.calibrate.values import Correspondence
 from controller.errors import VelaturaError
 from plugins.emulated.objects import StageObject, default_object, load_object
@@ -64,7 +64,19 @@ def measure(size: str) -> list[Row]:
     return rows
 
 
-def _one(size: str, seed: int, projectors: int, found: Found) -> None:
+def geometry_seconds(size: str, seed: int) -> tuple[float, float]:
+    """Wall and CPU seconds of one solve with three projectors; raises what ``reconstruct`` raises."""
+    truth, _, seen, _, prior = _posed(size, seed, 3)
+    sizes = [p.lens.size_px for p in truth.projectors]
+    began, cpu_began = time.perf_counter(), time.process_time()
+    reconstruct(seen, truth.camera.lens.size_px, sizes, prior)
+    return time.perf_counter() - began, time.process_time() - cpu_began
+
+
+def _posed(
+    size: str, seed: int, projectors: int
+) -> tuple[BenchTruth, StageObject, list[Correspondence], Float64, CameraPrior]:
+    """A random stage, what is seen of it, its true points and what is known of the camera."""
     thing = default_object() if seed % 2 == 0 else _rock(seed)
     truth = random_truth(size, seed, thing, ObjectTruth("mesh", "object.npz", seed), (1, 2))
     truth = replace(truth, subsamples=1, projectors=truth.projectors[:projectors])
@@ -73,6 +85,11 @@ def _one(size: str, seed: int, projectors: int, found: Found) -> None:
         path = Path(folder) / "camera-intrinsics.toml"
         path.write_text(intrinsics_of(truth))
         prior = read_intrinsics(path).prior(distance_m=float(device_tables(truth, thing)["camera"]["distance_m"]))
+    return truth, thing, seen, points, prior
+
+
+def _one(size: str, seed: int, projectors: int, found: Found) -> None:
+    truth, _, seen, points, prior = _posed(size, seed, projectors)
     sizes = [p.lens.size_px for p in truth.projectors]
     began = time.perf_counter()
     try:
