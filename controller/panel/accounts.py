@@ -63,7 +63,7 @@ class Account:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """What a machine shows instead of a password. Only its SHA-256 is kept: a random 256-bit token needs no slow hash."""
+    """What a machine shows instead of a password. Only its SHA-256 is kept: 256 random bits need no slow hash."""
 
     name: str
     role: Role

@@ -81,7 +81,7 @@ def document() -> dict[str, Any]:
         "info": {
             "title": "Velatura",
             "version": "1",
-            "description": "Everything that the panel of a kiosk shows and does. Tokens are made on its page of accounts.",
+            "description": "All that the panel shows and does. Tokens are made on its page of accounts.",
         },
         "servers": [{"url": PREFIX}],
         "security": [{"token": []}],

@@ -38,8 +38,8 @@ STATIC: Final = ("style.css", "panel.js", "icon.svg")
 def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starlette:
     """The panel of ``kiosk``, ready to be served.
 
-    ``accounts.first_start()`` belongs to the caller, who shows the one-time password where technicians look. The table of
-    routes is at ``.state.entries``, the panel's parts at ``.state.panel``.
+    ``accounts.first_start()`` belongs to the caller, who shows the one-time password where technicians look. The
+    table of routes is at ``.state.entries``, the panel's parts at ``.state.panel``.
     """
     options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     drawing = Drawing()
@@ -78,7 +78,9 @@ def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starl
 
 
 def _routes(panel: Panel, table: list[Entry]) -> list[Route]:
-    """One route a path, so that a wrong method is answered with those that there are. Longer paths do not hide behind names."""
+    """One route a path, so that a wrong method is answered with those that there are. Longer paths do not hide behind
+    names.
+    """
     by_path: dict[str, dict[str, Entry]] = {}
     for entry in table:
         if by_path.setdefault(entry.path, {}).setdefault(entry.method, entry) is not entry:

@@ -8,9 +8,11 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class BrokerOptions:
-    """Where the broker is. ``password_file`` holds the password and nothing else: it stands in no settings and no export.
+    """Where the broker is. ``password_file`` holds the password and nothing else: it stands in no settings and no
+    export.
 
-    ``topic`` the first part of all topics; ``certificates`` the authorities (PEM) with which the broker's TLS is checked.
+    ``topic`` the first part of all topics; ``certificates`` the authorities (PEM) with which the broker's TLS is
+    checked.
     """
 
     host: str

@@ -26,9 +26,9 @@ LONGEST_PAYLOAD: Final = 256
 class BuildingControl:
     """One connection to a broker, made again for as long as it takes, each time after a longer pause.
 
-    Topics: ``T/available`` "online" or "offline" (retained, also by the broker when we vanish); ``T/state`` JSON (retained);
-    ``T/command/open``, ``T/command/close``, ``T/command/play`` (payload: the appearance's name); ``T/answer`` what came of it.
-    Who may publish to ``T/command`` is the broker's to decide.
+    Topics: ``T/available`` "online" or "offline" (retained, also by the broker when we vanish); ``T/state`` JSON
+    (retained); ``T/command/open``, ``T/command/close``, ``T/command/play`` (payload: the appearance's name);
+    ``T/answer`` what came of it. Who may publish to ``T/command`` is the broker's to decide.
     """
 
     def __init__(self, kiosk: Kiosk, options: BrokerOptions, *, first_pause_s: float = 1.0) -> None:

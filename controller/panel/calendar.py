@@ -16,7 +16,9 @@ SHOWN: Final = 14
 
 @dataclass(frozen=True, slots=True)
 class CalendarDay:
-    """One day: ``bars`` are (first minute, minutes, appearance) within it; ``special`` True where a date's own row rules."""
+    """One day: ``bars`` are (first minute, minutes, appearance) within it; ``special`` True where a date's own row
+    rules.
+    """
 
     day: date
     text: str

@@ -26,9 +26,9 @@ Values = dict[str, Any]
 class PanelOptions:
     """How the panel is set up.
 
-    ``folder`` private files of the panel (accounts, sessions, uploads). ``hosts`` the names under which browsers may reach
-    it, without port: a page of another name that resolves to us is refused. Loopback by default; with ``tls_certificate``
-    and ``tls_key`` (PEM files) it speaks TLS only, and cookies never leave it.
+    ``folder`` private files of the panel (accounts, sessions, uploads). ``hosts`` the names under which browsers may
+    reach it, without port: a page of another name that resolves to us is refused. Loopback by default; with
+    ``tls_certificate`` and ``tls_key`` (PEM files) it speaks TLS only, and cookies never leave it.
     """
 
     folder: Path

@@ -1,7 +1,8 @@
 """The process that decodes one uploaded picture and ends: bytes on its input, our own PNG on its output.
 
-Runs as a file of its own with ``python -I``: it imports nothing of the controller, so there is nothing in its memory to steal.
-Exit codes: 0 done; 3 not a picture that we take; 4 too many pixels. A crash, or a limit of the system, is any other.
+Runs as a file of its own with ``python -I``: it imports nothing of the controller, so there is nothing in its memory
+to steal. Exit codes: 0 done; 3 not a picture that we take; 4 too many pixels. A crash, or a limit of the system, is
+any other.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ def limit(memory_bytes: int, seconds: int) -> None:
 
 
 def decode(data: bytes, most_pixels: int) -> bytes:
-    """``data`` as PNG: RGB, 8 bit, turned as its EXIF says, without any metadata. Raises ValueError, OSError, SyntaxError."""
+    """``data`` as PNG: RGB, 8 bit, turned as its EXIF says, without any metadata. Raises ValueError, OSError,
+    SyntaxError.
+    """
     from PIL import Image, ImageOps
 
     Image.MAX_IMAGE_PIXELS = None

@@ -20,7 +20,9 @@ Where = Literal["body", "path", "query"]
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One value of a call. ``least`` and ``most`` bound a number, or the number of rows; ``columns`` are a row's fields."""
+    """One value of a call. ``least`` and ``most`` bound a number, or the number of rows; ``columns`` are a row's
+    fields.
+    """
 
     name: str
     about: str
@@ -62,8 +64,9 @@ def object_schema(fields: Sequence[Field]) -> dict[str, Any]:
 def parse(fields: Sequence[Field], sent: Mapping[str, Any], *, strings: bool) -> dict[str, Any]:
     """The checked values of ``sent``; a field that is not there is left out.
 
-    ``strings`` True where everything came as text (forms, addresses): numbers are then read from text, an empty text means
-    "left out", and a box that is not ticked is False. Raises UsageError("field-unknown", "field-missing", "field-wrong").
+    ``strings`` True where everything came as text (forms, addresses): numbers are then read from text, an empty text
+    means "left out", and a box that is not ticked is False. Raises UsageError("field-unknown", "field-missing",
+    "field-wrong").
     """
     known = {field.name for field in fields}
     for name in sent:

@@ -3,10 +3,10 @@
 ``controller.serve`` implements it. The panel holds nothing of its own but accounts and sessions: every page and every
 answer of the API is made from these values.
 
-Every method may be called from any thread. ``snapshot``, ``events``, ``lamps`` and the other questions answer from memory in
-milliseconds and never wait for a device; where a method may take longer, its text says so. Every text may hold what a
-device or a file said: it is hostile, and whoever shows it escapes it. Refusals are ``VelaturaError`` with code, what and
-remedy.
+Every method may be called from any thread. ``snapshot``, ``events``, ``lamps`` and the other questions answer from
+memory in milliseconds and never wait for a device; where a method may take longer, its text says so. Every text may
+hold what a device or a file said: it is hostile, and whoever shows it escapes it. Refusals are ``VelaturaError`` with
+code, what and remedy.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ class LiveValue:
 
 @dataclass(frozen=True, slots=True)
 class DeviceRow:
-    """One device. ``kind`` is "projector", "camera", "display", "relay", "sensor" or "buttons"; ``problem`` a sentence or None.
+    """One device. ``kind`` is "projector", "camera", "display", "relay", "sensor" or "buttons"; ``problem`` a
+    sentence or None.
 
     ``remedy`` says what to do about the problem, or is empty.
     """
@@ -56,8 +57,8 @@ class JobStep:
 class Job:
     """Work that is going on, or that ended last (``ended`` True).
 
-    ``number`` grows with every job; ``left_s`` None until it can be told; ``run`` the run's folder name where the job makes
-    one; ``outcome`` a sentence when it ended, with ``failed`` when it did not do what was asked
+    ``number`` grows with every job; ``left_s`` None until it can be told; ``run`` the run's folder name where the job
+    makes one; ``outcome`` a sentence when it ended, with ``failed`` when it did not do what was asked
     """
 
     number: int
@@ -119,8 +120,9 @@ class Grade:
 class KioskState:
     """Everything that the panel's first page shows, as of one moment.
 
-    ``state`` is a value of ``controller.session.machine.State``; ``reason`` one sentence; ``since_unix_s`` when it began.
-    ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage has no valid stage.toml.
+    ``state`` is a value of ``controller.session.machine.State``; ``reason`` one sentence; ``since_unix_s`` when it
+    began. ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the
+    stage has no valid stage.toml.
     """
 
     revision: int
@@ -163,7 +165,9 @@ class Appearance:
 
 @dataclass(frozen=True, slots=True)
 class ComputeSettings:
-    """How a target is fitted. ``brightness`` 0.05..1 of what the projectors can do, None to choose the brightest that fits."""
+    """How a target is fitted. ``brightness`` 0.05..1 of what the projectors can do, None to choose the brightest that
+    fits.
+    """
 
     brightness: float | None = None
 
@@ -172,8 +176,8 @@ class ComputeSettings:
 class ScheduleRow:
     """Opening hours of one weekday ("mon".."sun") or of one date ("2026-12-24", which takes precedence over weekdays).
 
-    ``opens`` and ``closes`` are local times "HH:MM"; both empty means closed. ``closes`` at or before ``opens`` is on the next
-    day. ``appearance`` empty: what was played last.
+    ``opens`` and ``closes`` are local times "HH:MM"; both empty means closed. ``closes`` at or before ``opens`` is on
+    the next day. ``appearance`` empty: what was played last.
     """
 
     day: str
@@ -184,7 +188,7 @@ class ScheduleRow:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """``time_zone`` is an IANA name ("Europe/Vienna"); ``drift_check`` the local time of the nightly check, or empty."""
+    """``time_zone`` is an IANA name ("Europe/Vienna"); ``drift_check`` the nightly check's local time, or empty."""
 
     time_zone: str
     rows: tuple[ScheduleRow, ...] = ()
@@ -214,8 +218,9 @@ class ProjectorAim:
 class Aiming:
     """What the aiming page shows. Shares are of the object's area in the camera's picture, 0..1.
 
-    ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing`` where nothing can be done; ``camera_focus``
-    0..1; ``exposure`` the brightest hundredth's level, 0..1 of full scale; ``hints`` sentences on what to turn which way
+    ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing`` where nothing can be done;
+    ``camera_focus`` 0..1; ``exposure`` the brightest hundredth's level, 0..1 of full scale; ``hints`` sentences on
+    what to turn which way
     """
 
     projectors: tuple[ProjectorAim, ...]
@@ -260,7 +265,9 @@ class Results:
 
 
 class Kiosk(Protocol):
-    """A running stage, as the panel sees it. Commands return when they were accepted; progress is in ``snapshot().job``."""
+    """A running stage, as the panel sees it. Commands return when they were accepted; progress is in
+    ``snapshot().job``.
+    """
 
     def snapshot(self) -> KioskState: ...
 
@@ -291,7 +298,9 @@ class Kiosk(Protocol):
         """
 
     def feasibility(self, target: Path) -> Path:
-        """A PNG that shows where the target can't be reached, brighter is worse. Seconds; raises WorkError uncalibrated."""
+        """A PNG that shows where the target can't be reached, brighter is worse. Seconds; raises WorkError
+        uncalibrated.
+        """
 
     def appearances(self) -> Sequence[Appearance]: ...
 
@@ -325,7 +334,9 @@ class Kiosk(Protocol):
         """Raises UsageError naming line, key and what is allowed."""
 
     def save_settings(self, text: str) -> None:
-        """Validate, keep the old text beside it, write, and take it into use (devices are opened anew). Raises as above."""
+        """Validate, keep the old text beside it, write, and take it into use (devices are opened anew). Raises as
+        above.
+        """
 
     def camera_picture(self) -> bytes | None:
         """The camera's last live picture as JPEG, made by the kiosk itself; None when there is none."""

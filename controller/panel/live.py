@@ -70,7 +70,7 @@ class Hub:
         return f"id: {self._number}\nevent: parts\ndata: {json.dumps(parts)}\n\n"
 
     async def stream(self, alive: Callable[[], bool]) -> AsyncIterator[str]:
-        """The events of one open panel: everything at first, then what changes, until ``alive`` says no (logged out)."""
+        """The events of one open panel: all at first, then what changes, until ``alive`` says no (logged out)."""
         if len(self._listeners) >= self._most:
             yield "retry: 10000\nevent: full\ndata: {}\n\n"
             return

@@ -34,8 +34,9 @@ class BytesAnswer:
 class Operation:
     """One thing that can be asked.
 
-    ``path`` below /api/v1; ``upload`` names the field that is the request's whole body; ``media`` what a file answer is;
-    ``then`` the page that a form goes on to, and ``said`` the sentence that it shows; empty ``then``: no form asks this
+    ``path`` below /api/v1; ``upload`` names the field that is the request's whole body; ``media`` what a file answer
+    is; ``then`` the page that a form goes on to, and ``said`` the sentence that it shows; empty ``then``: no form
+    asks this
     """
 
     name: str
@@ -169,8 +170,10 @@ QUESTIONS: Final = (
             Field("most", "how many, the newest", "integer", False, "query", least=1, most=2000),
         ),
     ),
-    Operation("appearances", "GET", "/appearances", VIEWER, "All appearances", lambda p, v: plain(p.kiosk.appearances())),
-    Operation("preview", "GET", "/appearances/{name}/preview", VIEWER, "How it will look", _preview, (_NAME_IN_PATH,), "image/png"),
+    Operation("appearances", "GET", "/appearances", VIEWER, "All appearances",
+              lambda p, v: plain(p.kiosk.appearances())),
+    Operation("preview", "GET", "/appearances/{name}/preview", VIEWER, "How it will look", _preview,
+              (_NAME_IN_PATH,), "image/png"),
     Operation("schedule", "GET", "/schedule", VIEWER, "Opening hours", lambda p, v: plain(p.kiosk.schedule())),
     Operation("runs", "GET", "/runs", VIEWER, "Runs with results, newest first", lambda p, v: list(p.kiosk.runs())),
     Operation("results", "GET", "/runs/{run}", VIEWER, "Grade and figures of a run",
@@ -185,8 +188,10 @@ QUESTIONS: Final = (
     Operation("feasibility", "GET", "/targets/{target}/feasibility", OPERATOR, "Where the target can't be reached",
               lambda p, v: picture_answer(p.kiosk.feasibility(p.targets.path(v["target"]))),
               (Field("target", TARGET.about, pattern=KEY, longest=24, where="path"),), "image/png"),
-    Operation("aiming", "GET", "/aiming", TECHNICIAN, "Coverage, focus and exposure now", lambda p, v: plain(p.kiosk.aiming())),
-    Operation("settings", "GET", "/settings", TECHNICIAN, "The text of stage.toml", lambda p, v: {"text": p.kiosk.settings()}),
+    Operation("aiming", "GET", "/aiming", TECHNICIAN, "Coverage, focus and exposure now",
+              lambda p, v: plain(p.kiosk.aiming())),
+    Operation("settings", "GET", "/settings", TECHNICIAN, "The text of stage.toml",
+              lambda p, v: {"text": p.kiosk.settings()}),
 )  # fmt: skip
 """What only looks."""
 
@@ -201,7 +206,8 @@ COMMANDS: Final = (
               then="/", said="The stage opens."),
     Operation("stop", "POST", "/stop", OPERATOR, "Stop playing, and cool down", _done(lambda p, v: p.kiosk.stop()),
               then="/", said="The stage closes; the lamps cool down."),
-    Operation("play", "POST", "/play", OPERATOR, "Show this appearance now", _done(lambda p, v: p.kiosk.play(v["name"])),
+    Operation("play", "POST", "/play", OPERATOR, "Show this appearance now",
+              _done(lambda p, v: p.kiosk.play(v["name"])),
               (APPEARANCE,), then="/appearances", said="It is on the projectors."),
     Operation("identify", "POST", "/identify", OPERATOR, "Show each projector's name on it, or end that",
               _done(lambda p, v: p.kiosk.identify(v["on"])),

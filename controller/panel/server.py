@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import ssl
 import threading
@@ -41,7 +42,12 @@ class PanelServer:
             h11_max_incomplete_event_size=32 << 10,
         )
         self._server, self._options = uvicorn.Server(config), options
-        self._thread = threading.Thread(target=self._server.run, name="panel", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="panel", daemon=True)
+
+    def _run(self) -> None:
+        # How uvicorn says that it could not listen; ``start`` says it to people.
+        with contextlib.suppress(SystemExit):
+            self._server.run()
 
     def start(self) -> str:
         """Begin to serve; return the address. Raises WorkError("panel-not-started") when the port is taken."""

@@ -1,4 +1,6 @@
-"""Who asks: by session cookie on pages, by token in the API. What a route needs, and what is answered when it is refused."""
+"""Who asks: by session cookie on pages, by token in the API. What a route needs, and what is answered when it is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +116,9 @@ def _too_many(wait_s: float) -> Response:
 
 
 def same_origin(headers: Headers) -> bool:
-    """Does the browser say that one of our own pages sends this? A browser that says nothing must have the CSRF token anyway."""
+    """Does the browser say that one of our own pages sends this? A browser that says nothing must have the CSRF token
+    anyway.
+    """
     if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
         return False
     origin = headers.get("origin")

@@ -1,4 +1,4 @@
-"""A kiosk in memory: our own Protocol, done honestly but without devices, so that the panel can be driven to its ends."""
+"""A kiosk in memory: our own Protocol, done honestly but without devices: the panel can be driven to its ends."""
 
 from __future__ import annotations
 

@@ -85,7 +85,8 @@ def served(
     thread.start()
     until = time.monotonic() + 20
     while not server.started:
-        assert thread.is_alive() and time.monotonic() < until, "the panel did not start"
+        assert thread.is_alive(), "the panel did not start"
+        assert time.monotonic() < until, "the panel did not start in time"
         time.sleep(0.01)
     found = server.servers[0].sockets[0].getsockname()[1]
     try:

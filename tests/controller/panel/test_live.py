@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -30,20 +31,20 @@ def test_a_change_is_on_every_one_of_fifty_open_panels_within_a_second(tmp_path:
                         arrivals.append(time.monotonic())
                         return
 
-    with served(kiosk, tmp_path / "private", options=PanelOptions(tmp_path / "private")) as running:
-        with running.entered("vera") as vera:
-            threads = [threading.Thread(target=watch, args=(running, vera.cookies)) for _ in range(50)]
-            for thread in threads:
-                thread.start()
-            for _ in threads:
-                assert ready.acquire(timeout=20)
-            time.sleep(0.5)
-            began = time.monotonic()
-            kiosk.change(reason="now for all")
-            for thread in threads:
-                thread.join(20)
-            assert len(arrivals) == 50
-            assert max(arrivals) - began < 1.0
+    options = PanelOptions(tmp_path / "private")
+    with served(kiosk, tmp_path / "private", options=options) as running, running.entered("vera") as vera:
+        threads = [threading.Thread(target=watch, args=(running, vera.cookies)) for _ in range(50)]
+        for thread in threads:
+            thread.start()
+        for _ in threads:
+            assert ready.acquire(timeout=20)
+        time.sleep(0.5)
+        began = time.monotonic()
+        kiosk.change(reason="now for all")
+        for thread in threads:
+            thread.join(20)
+        assert len(arrivals) == 50
+        assert max(arrivals) - began < 1.0
 
 
 def test_a_storm_of_changes_is_drawn_a_few_times_only(tmp_path: Path) -> None:
@@ -94,11 +95,13 @@ def test_who_logs_out_is_told_nothing_more(fresh: Served) -> None:
 def test_too_many_panels_are_refused_and_come_back_later(tmp_path: Path) -> None:
     options = PanelOptions(tmp_path / "private", most_open_panels=1)
     kiosk = MemoryKiosk(tmp_path / "pictures")
-    with served(kiosk, tmp_path / "private", options=options) as running, running.entered("vera") as vera:
-        with vera.stream("GET", "/live") as stream:
-            next(stream.iter_lines())
-            with running.entered("otto") as otto:
-                assert "event: full" in otto.get("/live").text
+    with contextlib.ExitStack() as held:
+        running = held.enter_context(served(kiosk, tmp_path / "private", options=options))
+        vera, otto = held.enter_context(running.entered("vera")), held.enter_context(running.entered("otto"))
+        stream = held.enter_context(vera.stream("GET", "/live"))
+        lines = stream.iter_lines()
+        next(lines)
+        assert "event: full" in otto.get("/live").text
 
 
 def test_the_first_page_comes_quickly(panel: Served) -> None:

@@ -130,8 +130,11 @@ def test_every_answer_carries_the_headers_that_keep_scripts_out(panel: Served) -
         for path in ("/", "/login", "/static/panel.js", "/nothing", "/see/camera", "/api/v1/state"):
             headers = client.get(path).headers
             policy = headers["content-security-policy"]
-            assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
-            assert headers["x-content-type-options"] == "nosniff" and headers["x-frame-options"] == "DENY"
+            assert "default-src 'none'" in policy
+            assert "unsafe" not in policy
+            assert "http" not in policy
+            assert headers["x-content-type-options"] == "nosniff"
+            assert headers["x-frame-options"] == "DENY"
             assert "server" not in headers
 
 
@@ -139,6 +142,6 @@ def test_the_first_page_is_small_and_names_no_other_machine(panel: Served) -> No
     with panel.entered("tina") as client:
         texts = [client.get(path).text for path in ("/", "/static/style.css", "/static/panel.js", "/static/icon.svg")]
         assert sum(len(text.encode()) for text in texts) <= 100_000
-        assert (
-            "http" not in texts[0] and "//" not in texts[1] and "<script>" not in texts[0] and "style=" not in texts[0]
-        )
+        for word in ("http", "<script>", "style="):
+            assert word not in texts[0]
+        assert "//" not in texts[1]
