@@ -17,7 +17,7 @@ from controller.config import Stage, load_stage
 from controller.config.loader import FILE
 from controller.errors import BundleError, UsageError
 from controller.services import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
-from controller.session.progress import Reporter
+from controller.session.progress import Level, Reporter
 from controller.session.publishing import publish_solved
 from controller.storage import exclusive
 from hal.deadline import Cancelled
@@ -48,6 +48,8 @@ def build(
         chosen = tuple(dict.fromkeys(names)) or _solved(checked.stage, run)
         path, key = out or folder / "bundle.vel", signing_key(checked)
         reporter.say(f"Writing {len(chosen)} appearances.")
+        if key is None:
+            reporter.say("The bundle will carry no signature: anyone could have made it.", Level.WARNING)
         index = publish_solved(
             path,
             run,
@@ -178,6 +180,9 @@ def _identity(file: Path) -> dict[str, Any]:
     with Bundle.open_trusted(file, ANYONE) as bundle:
         return {
             "revision": bundle.index.revision,
+            "signed_by": "NOBODY: this stage plays what anyone may have made"
+            if bundle.signed_by is None
+            else bundle.signed_by.hex(),
             "appearances": ", ".join(one.name for one in bundle.index.appearances),
         }
 
