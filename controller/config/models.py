@@ -163,7 +163,7 @@ class SolveTable(Table):
         "the target has finer detail than scaling can show)",
     )
     base: Literal["minimum", "white", "high-pass"] = Field(
-        default="minimum",
+        default="white",
         description='the base image: "minimum" (at each pixel the darkest white image), "white" (even light), or '
         '"high-pass" (the fine detail of each target, with a solve for each)',
     )

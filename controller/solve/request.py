@@ -43,7 +43,7 @@ class SolveOptions:
     share: float
     smoothness: float
     mode: Mode = "auto"
-    base: BaseChoice = "minimum"
+    base: BaseChoice = "white"
     adapt: float = 0.0
 
     def inputs(self) -> dict[str, str]:
