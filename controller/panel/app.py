@@ -18,6 +18,7 @@ from starlette.routing import Route
 
 from controller.panel import api
 from controller.panel.accounts import Accounts
+from controller.panel.answers import FAILURES
 from controller.panel.building import BuildingControl
 from controller.panel.context import Panel, PanelOptions
 from controller.panel.drawing import Drawing
@@ -45,7 +46,9 @@ def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starl
     drawing = Drawing()
 
     def draw() -> dict[str, str]:
-        drawing.use_zone(kiosk.schedule().time_zone)
+        # A stage that is not set up yet may have no schedule.
+        with contextlib.suppress(*FAILURES):
+            drawing.use_zone(kiosk.schedule().time_zone)
         return drawing.parts(kiosk.snapshot(), list(kiosk.events()))
 
     panel = Panel(
@@ -56,7 +59,8 @@ def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starl
         targets=Targets(options.folder / "targets", options.uploads),
         hub=Hub(draw, frames_per_s=options.frames_per_s, most=options.most_open_panels),
     )
-    drawing.use_zone(kiosk.schedule().time_zone)
+    with contextlib.suppress(*FAILURES):
+        drawing.use_zone(kiosk.schedule().time_zone)
     pages = Pages(panel, drawing)
     table = [
         *pages.entries(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from collections.abc import AsyncIterator, Callable
 from typing import Final
 
@@ -11,6 +12,7 @@ import anyio
 
 KEEP_ALIVE_S: Final = 15.0
 QUEUED: Final = 8
+_LOG: Final = logging.getLogger("velatura.panel")
 
 Draw = Callable[[], dict[str, str]]
 
@@ -49,7 +51,10 @@ class Hub:
             await self._dirty.wait()
             self._dirty.clear()
             if self._listeners:
-                await self._redraw()
+                try:
+                    await self._redraw()
+                except Exception:  # noqa: BLE001 - one bad drawing must not end the live parts for good
+                    _LOG.exception("The live parts could not be drawn.")
             await asyncio.sleep(self._pause_s)
 
     async def _redraw(self) -> None:

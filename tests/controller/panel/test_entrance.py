@@ -45,9 +45,9 @@ def test_a_name_that_does_not_exist_costs_a_hash_too(tmp_path: Path) -> None:
 
         def verify(self, hash: str | bytes, password: str | bytes) -> Literal[True]:  # noqa: A002
             Counting.calls += 1
-            return super().verify(hash, password)
+            return QUICK_HASH.verify(hash, password)
 
-    accounts = Accounts(tmp_path / "a.json", hasher=Counting(time_cost=1, memory_cost=64, parallelism=1))
+    accounts = Accounts(tmp_path / "a.json", hasher=Counting())
     assert accounts.verify("nobody", "whatever it is") is None
     assert Counting.calls == 1
 
@@ -75,10 +75,10 @@ def test_a_damaged_file_of_accounts_does_not_open_the_door(tmp_path: Path) -> No
 def test_the_last_technician_stays(tmp_path: Path) -> None:
     accounts = Accounts(tmp_path / "a.json", hasher=QUICK_HASH)
     accounts.add("tina", Role.TECHNICIAN, PASSWORD)
-    for change in (lambda: accounts.remove("tina"), lambda: accounts.set_role("tina", Role.VIEWER)):
-        with pytest.raises(UsageError) as caught:
-            change()
-        assert caught.value.code == "last-technician"
+    with pytest.raises(UsageError, match="last technician"):
+        accounts.remove("tina")
+    with pytest.raises(UsageError, match="last technician"):
+        accounts.set_role("tina", Role.VIEWER)
 
 
 @pytest.mark.parametrize("password", ["short", "aaaaaaaaaaaaaa", "my name is tina", "x" * 201])
