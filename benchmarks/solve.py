@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -10,16 +11,22 @@ from numba import prange
 
 from benchmarks import Row, Timing, at_most, peak_bytes, timed
 from benchmarks._synthetic import synthetic_calibration, synthetic_target
-from controller.arrays import FloatImage
+from controller.arrays import ByteImage, FloatImage
+from controller.calibrate.values import Calibration
 from controller.compiled import compiled
-from controller.solve.bounded import solve_bounded
+from controller.solve.appearance import Base, base_image, scale_frames, solve_base
+from controller.solve.bounded import TOLERANCE, Solution, solve_bounded
+from controller.solve.dither import to_device
 from controller.solve.feasibility import choose_exposure, target_radiance
+from controller.solve.interactive import interactive
 from controller.transport import LightTransport
 from controller.transport.window_transport import WindowTransport
 
 STREAMED_FLOATS = 1 << 27
 NEAR_BEST = 1e-3
-CHECK_EVERY = 10
+NEAR_ENOUGH = 1e-2
+LOOSE = 4e-4
+SMALLEST = 1e-6
 
 
 @compiled(parallel=True, fastmath=True)
@@ -42,7 +49,7 @@ def measure(size: str) -> list[Row]:
     reflectance = synthetic_target(transport.shape)
     exposure = choose_exposure(transport, reflectance, calibration.black)
     target = target_radiance(reflectance, calibration.black, exposure)
-    rows += _solve(transport, target, calibration.black, paper=paper)
+    rows += _solve(transport, calibration, target, paper=paper)
     return rows
 
 
@@ -78,50 +85,78 @@ def _values(timing: Timing) -> tuple[float, float, float]:
     return timing.minimum, timing.median, timing.maximum
 
 
-def _solve(transport: LightTransport, target: FloatImage, black: FloatImage, *, paper: bool) -> list[Row]:
-    """Solve far beyond need for the best objective, then find when a fresh solve came within 1e-3 of it."""
+def _solve(transport: LightTransport, calibration: Calibration, target: FloatImage, *, paper: bool) -> list[Row]:
+    """A cold solve of ``target``, far beyond need for the best objective, then as far as 1e-3 and 1e-2 of it."""
+    black = calibration.black
     solve_bounded(transport, target, black, most_iterations=1)
-    best = solve_bounded(transport, target, black, tolerance=2e-7, most_iterations=250 if paper else 1200)
-    before = peak_bytes()
-    default = solve_bounded(transport, target, black)
-    iterations, seconds = _until_near(transport, target, black, best.objective)
-    gap = default.objective / best.objective - 1
-    return [
-        at_most(
-            "objective above the best, default tolerance", gap, None, unit="", how=f"{default.iterations} iterations"
-        ),
-        at_most("solve, default tolerance", default.seconds, None, unit="s", how=f"KKT residual {default.kkt:.2g}"),
+    at: list[float] = []
+    best = solve_bounded(
+        transport,
+        target,
+        black,
+        tolerance=2e-6,
+        most_iterations=400 if paper else 1200,
+        progress=lambda iteration, kkt: at.append(time.perf_counter()),
+    )
+    sweep = Timing(*(float(f(np.diff(at))) for f in (np.min, np.median, np.max)))
+    near = _until(transport, target, black, best.objective * (1 + NEAR_BEST), TOLERANCE)
+    memory = peak_bytes()
+    rows = [
+        at_most("one sweep over the projectors", sweep.minimum, None, unit="s", how=str(sweep)),
         at_most(
             "solve to 1e-3 of the best objective",
-            seconds,
+            near.seconds,
             15.0 if paper else None,
             unit="s",
-            how=f"{iterations} iterations, one run; best of {best.iterations} iterations, KKT residual {best.kkt:.2g}",
+            how=f"{near.iterations} sweeps, KKT residual {near.kkt:.2g}; best of {best.iterations}, {best.kkt:.2g}",
         ),
-        at_most("one iteration", best.seconds / best.iterations, None, unit="s", how=f"mean of {best.iterations}"),
         at_most(
             "peak memory of the process",
-            before / 1e9,
+            memory / 1e9,
             3.0 if paper else None,
             unit="GB",
-            how="the calibration, its pictures and one solve, resident",
+            how="the calibration, its pictures and the solves, resident",
         ),
     ]
+    base = solve_base(transport, base_image(calibration, "white"), black)
+    rows.append(at_most("base solve", base.solution.seconds, None, unit="s", how=f"{base.solution.iterations} sweeps"))
+    start = scale_frames(transport, base, target, black)
+    warm = _until(transport, target, black, best.objective * (1 + NEAR_ENOUGH), LOOSE, start)
+    rows.append(
+        at_most(
+            "full solve from base x scale to 1e-2",
+            warm.seconds,
+            5.0 if paper else None,
+            unit="s",
+            how=f"{warm.iterations} sweeps",
+        )
+    )
+    ready = interactive(transport, base, black, [part.radiometry for part in calibration.projectors])
+    shown = timed(lambda: ready.frames(target), repeats=15)
+    slow = timed(lambda: _reference(transport, base, target, calibration), repeats=2)
+    rows.append(
+        at_most("new appearance, float picture to 8-bit frames", shown.minimum, 0.1 if paper else None, unit="s",
+                how=f"{shown}; by every sample and error diffusion {slow}")
+    )  # fmt: skip
+    return rows
 
 
-def _until_near(transport: LightTransport, target: FloatImage, black: FloatImage, best: float) -> tuple[int, float]:
-    """Iterations and seconds of a cold solve that ends within 1e-3 of ``best``, found by halving the interval."""
-    low, high = 0, CHECK_EVERY
-    result = solve_bounded(transport, target, black, tolerance=0, most_iterations=high)
-    while result.objective > best * (1 + NEAR_BEST) and high < 2000:
-        low, high = high, high * 2
-        result = solve_bounded(transport, target, black, tolerance=0, most_iterations=high)
-    seconds = result.seconds
-    while high - low > max(CHECK_EVERY // 2, high // 10):
-        middle = (low + high) // 2
-        result = solve_bounded(transport, target, black, tolerance=0, most_iterations=middle)
-        if result.objective > best * (1 + NEAR_BEST):
-            low = middle
-        else:
-            high, seconds = middle, result.seconds
-    return high, seconds
+def _reference(transport: LightTransport, base: Base, target: FloatImage, calibration: Calibration) -> list[ByteImage]:
+    frames = scale_frames(transport, base, target, calibration.black)
+    return [to_device(frame, part.radiometry) for frame, part in zip(frames, calibration.projectors, strict=True)]
+
+
+def _until(
+    transport: LightTransport,
+    target: FloatImage,
+    black: FloatImage,
+    objective: float,
+    tolerance: float,
+    start: Sequence[FloatImage] | None = None,
+) -> Solution:
+    """A solve that stops by a KKT residual small enough for ``objective``, found by lowering it by a fifth."""
+    while True:
+        found = solve_bounded(transport, target, black, tolerance=tolerance, start=start)
+        if found.objective <= objective or tolerance < SMALLEST:
+            return found
+        tolerance *= 0.8

@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse as sp
 
 from benchmarks._synthetic import crop_calibration, synthetic_calibration
-from controller.arrays import FloatImage
+from controller.arrays import Float64, FloatImage
 from controller.calibrate.values import Calibration, PhaseMap
 from controller.solve.bounded import SMOOTHNESS, Problem, pose, solve_bounded
 from controller.transport import LightTransport
@@ -18,7 +18,7 @@ from controller.transport.window_matrix import box_rows
 from controller.transport.window_transport import WindowTransport
 
 
-def equations(problem: Problem) -> tuple[sp.csr_matrix[np.float64], FloatImage]:
+def equations(problem: Problem) -> tuple[sp.csr_matrix[np.float64], Float64]:
     """All rows of the problem, square roots of the weights included, and their right side."""
     transport = problem.transport
     assert isinstance(transport, WindowTransport)
