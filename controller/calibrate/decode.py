@@ -33,6 +33,8 @@ LEAST_CONSISTENT = 0.6
 LEAST_STEADY = 0.75
 LEAST_UNCONTRADICTED = 0.5
 BRIGHT_SHARE = 0.1
+BRIGHT_SIGMAS = 2.0
+"""Of one photograph's noise; the mean over a neighbourhood has a sixth of that, so none is bright by chance."""
 NOISE_WINDOW = (7, 7)
 FEWEST_PIXELS = 100
 FINE_TO_COARSE = (BLUR_FREQUENCIES["x"][0] * PERIOD_PX) ** -2
@@ -203,7 +205,9 @@ def _bright(sums: _Sums, half: FloatImage) -> Mask:
     Phases in the wrong order look like noise as strong as the pattern; real noise vanishes in a neighbourhood's mean.
     """
     around = 2 * cv2.boxFilter(np.nan_to_num(half), -1, NOISE_WINDOW)
-    return np.asarray((around > BRIGHT_SHARE * _brightest(2 * half)) & (around > sums.noise) & np.isfinite(half))
+    return np.asarray(
+        (around > BRIGHT_SHARE * _brightest(2 * half)) & (around > BRIGHT_SIGMAS * sums.noise) & np.isfinite(half)
+    )
 
 
 def _brightest(image: FloatImage) -> float:
