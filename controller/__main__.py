@@ -187,7 +187,7 @@ GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
 
 def application() -> typer.Typer:
     """The command line with every command of the table, and every group of commands."""
-    app = group("velatura", SUMMARY, COMMANDS)
+    app = group("velatura", SUMMARY, COMMANDS, completion=True)
     for name, (summary, commands) in GROUPS.items():
         app.add_typer(group(name, summary, commands), name=name)
     return app

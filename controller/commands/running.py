@@ -30,10 +30,13 @@ def work(target: str, *, as_json: bool, **arguments: Any) -> None:
     console.show_result(result, as_json=as_json)
 
 
-def group(name: str, summary: str, commands: Iterable[Callable[..., Any]]) -> typer.Typer:
-    """A command line with these commands: a function's name is the command's, its docstring the help."""
+def group(name: str, summary: str, commands: Iterable[Callable[..., Any]], *, completion: bool = False) -> typer.Typer:
+    """A command line with these commands: a function's name is the command's, its docstring the help.
+
+    ``completion``: with the options that install it in the user's shell.
+    """
     app = typer.Typer(
-        name=name, help=summary, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+        name=name, help=summary, add_completion=completion, pretty_exceptions_enable=False, rich_markup_mode=None
     )
 
     def nothing_before_a_command() -> None:

@@ -40,6 +40,26 @@ def serve(
     )
 
 
+def init(
+    stage: Annotated[Path, typer.Argument(metavar="STAGE", help="The folder to set up; made if it is not there.")],
+    name: Annotated[str | None, typer.Option(help="What the object is called; asked for if left out.")] = None,
+    focal_length_px: Annotated[
+        float | None, typer.Option(help="The lens's focal length in pixels of the camera's picture.", min=1.0)
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; take what was found.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find the devices, name the object, and write the stage's first stage.toml with its signing key."""
+    from controller.serve.setup import set_up
+
+    def ask(question: str, suggestion: str) -> str:
+        return suggestion if yes or as_json else str(typer.prompt(question, default=suggestion))
+
+    done = set_up(stage, name=name, focal_length_px=focal_length_px, ask=ask)
+    text = "\n".join([*done["words"], f"Written: {done['file']}", f"Next: velatura doctor {stage}"])
+    console.show_result(done if as_json else text, as_json=as_json)
+
+
 def status(stage: StageFolder, as_json: Json = False) -> None:
     """What the stage does now, and what is wrong."""
     from controller.serve.direct import status_of, status_text
@@ -148,4 +168,4 @@ def _local(unix_s: float) -> str:
     return datetime.fromtimestamp(unix_s, tz=datetime.now().astimezone().tzinfo).strftime("%Y-%m-%d %H:%M:%S")
 
 
-COMMANDS = (serve, status, events, schedule, start, stop, cancel, identify, backup, restore, diagnostics)
+COMMANDS = (serve, init, status, events, schedule, start, stop, cancel, identify, backup, restore, diagnostics)

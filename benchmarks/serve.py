@@ -1,0 +1,162 @@
+"""The kiosk's service as systemd starts it: from the command to a picture, over a player that hangs, and at rest."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import Row, at_most
+from benchmarks._stage import FIRST_SEED, prepared_stage
+from controller.app import check_stage
+from controller.bundle.install import install
+from controller.bundle.signing import load_signing_key
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.demo.bench_process import BenchProcess
+from controller.errors import VelaturaError
+from controller.serve.control import ask
+from controller.services import KEY_FILE, output_sizes
+from controller.storage import runtime_folder
+
+STARTS = 5
+HANGS = 3
+LONGEST_S = 60.0
+REST_S = 5.0
+NAME = "grey"
+
+
+def measure(size: str) -> list[Row]:
+    """Boots with warm lamps, restarts of a player that was stopped, and the service's processor time while it plays."""
+    with prepared_stage(size, FIRST_SEED) as stage:
+        install_grey(stage)
+        cancel = threading.Event()
+        with BenchProcess(stage, cancel=cancel):
+            with service(stage) as warm:
+                wait_for(stage, "playing")
+                warm.send_signal(signal.SIGKILL)  # lamps stay lit, as after a crash
+                warm.wait()
+            boots = [_boot(stage) for _ in range(STARTS)]
+            with service(stage) as served:
+                wait_for(stage, "playing")
+                hangs = [_hang(stage) for _ in range(HANGS)]
+                share = _at_rest(served.pid)
+    return [
+        at_most("boot to pictures, lamps warm", statistics.median(boots), 3.0, unit="s", how=_spread(boots)),
+        at_most("player stopped by SIGSTOP, until a picture", max(hangs), 5.0, unit="s", how=_spread(hangs)),
+        at_most("service while playing", 100 * share, 10.0, unit="% of a core", how=f"over {REST_S:g} s"),
+    ]
+
+
+def install_grey(stage: Path) -> None:
+    """Install a signed bundle of one grey appearance, so that there is something to play without a calibration."""
+    checked = check_stage(stage)
+    outputs = list(output_sizes(checked).values())
+    frames = {name: np.full((height, width, 3), 96, np.uint8) for name, (width, height) in outputs}
+    built, key_file = stage / "grey.vel", stage / KEY_FILE
+    key = load_signing_key(key_file) if key_file.exists() else None
+    write_bundle(
+        built, stage=checked.stage.tables.stage.name, calibration="none", created_unix_s=int(time.time()),
+        outputs=[(name, *pixels) for name, pixels in outputs], appearances=[NewAppearance(NAME, frames)], key=key,
+    )  # fmt: skip
+    trusted = () if key is None else (bytes(key.verify_key),)
+    install(built, stage / "bundles", trusted=trusted, allow_unsigned=key is None)
+
+
+@contextlib.contextmanager
+def service(stage: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """``velatura serve --no-panel`` in a process of its own, its lamps left lit at the end."""
+    command = [sys.executable, "-m", "controller", "serve", str(stage), "--no-panel", "--leave-lit"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def wait_for(stage: Path, state: str) -> dict[str, Any]:
+    """The status once the kiosk is in this state; TimeoutError with the last one."""
+    until_s, last = time.monotonic() + LONGEST_S, {}
+    while time.monotonic() < until_s:
+        with contextlib.suppress(VelaturaError):
+            last = dict(ask(stage, "status", timeout_s=2.0))
+            if last["state"] == state:
+                return last
+        time.sleep(0.02)
+    raise TimeoutError(last)
+
+
+def _boot(stage: Path) -> float:
+    before = _player_pid(stage)
+    began_s = time.perf_counter()
+    with service(stage) as process:
+        # The player of the service before plays on; its picture does not count.
+        while _player_pid(stage) in (0, before):
+            time.sleep(0.01)
+        _wait_for_picture(stage)
+        seconds = time.perf_counter() - began_s
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    return seconds
+
+
+def _wait_for_picture(stage: Path) -> None:
+    """Until the player that runs now shows the appearance: asked of the player itself."""
+    path, until_s = runtime_folder(stage) / "player.sock", time.monotonic() + LONGEST_S
+    while time.monotonic() < until_s:
+        with contextlib.suppress(OSError, ValueError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
+            channel.settimeout(0.5)
+            channel.connect(str(path))
+            channel.sendall(b'{"op":"status"}\n')
+            answer = json.loads(channel.makefile().readline())
+            if answer.get("appearance") == NAME:
+                return
+        time.sleep(0.01)
+    raise TimeoutError("no picture")
+
+
+def _hang(stage: Path) -> float:
+    pid = _player_pid(stage)
+    os.kill(pid, signal.SIGSTOP)
+    began_s = time.perf_counter()
+    while _player_pid(stage) in (0, pid):
+        time.sleep(0.02)
+    _wait_for_picture(stage)
+    seconds = time.perf_counter() - began_s
+    time.sleep(1.0)
+    return seconds
+
+
+def _player_pid(stage: Path) -> int:
+    """Of the process that owns the player's socket; 0 while there is none."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
+        channel.settimeout(0.2)
+        channel.connect(str(runtime_folder(stage) / "player.sock"))
+        return int(struct.unpack("3i", channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0])
+    return 0
+
+
+def _at_rest(pid: int) -> float:
+    def used_s() -> float:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    before_s = used_s()
+    time.sleep(REST_S)
+    return (used_s() - before_s) / REST_S
+
+
+def _spread(values: list[float]) -> str:
+    return f"{min(values):.2f} to {max(values):.2f} s over {len(values)}"
