@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numba import prange
 
 from controller.arrays import FloatImage
+from controller.compiled import compiled
 from controller.transport import LightTransport
-from controller.transport.planes import plane_frames
 
 FAINTEST: Final = 1e-3
 """Fraction of a projector's brightest observed pixel below which a pixel counts as in shadow."""
@@ -72,9 +73,42 @@ def squared_edges(transport: LightTransport, wanted: FloatImage) -> tuple[FloatI
     for n, (rows, columns) in enumerate(transport.sizes):
         span = transport.span(n)
         transport.forward_planes(ones, projectors=(n, n + 1), out=light)
-        observed = transport.gaussian_mean_planes(light, projectors=(n, n + 1))
-        size = [(rows, columns)]
-        edges = smoothness_weights(plane_frames(target[:, span], size)[0], plane_frames(observed[:, span], size)[0])
-        across[:, span].reshape(3, rows, columns)[:, :, :-1] = np.moveaxis(edges.across**2, 2, 0)
-        down[:, span].reshape(3, rows, columns)[:, :-1] = np.moveaxis(edges.down**2, 2, 0)
+        observed = transport.gaussian_mean_planes(light, projectors=(n, n + 1))[:, span]
+        faint = float(FAINTEST * observed.max(initial=0))
+        _squared(target, observed, faint, span.start, rows, columns, across, down)
     return across, down
+
+
+@compiled()
+def _squared_alike(target: float, observed: float, other: float, other_observed: float, faint: float) -> float:
+    if observed <= faint or other_observed <= faint:
+        return 0.0
+    a, b = target / observed, other / other_observed
+    larger = max(a, b)
+    alpha = min(a, b) / larger if larger > 0 else 1.0
+    return float(alpha * alpha)
+
+
+@compiled(parallel=True)
+def _squared(
+    target: FloatImage,
+    observed: FloatImage,
+    faint: float,
+    start: int,
+    rows: int,
+    columns: int,
+    across: FloatImage,
+    down: FloatImage,
+) -> None:
+    """``smoothness_weights`` of one projector, squared; ``observed`` (3, its pixels), the others of all projectors."""
+    for y in prange(rows):
+        for c in range(3):
+            for x in range(columns):
+                i = y * columns + x
+                k = start + i
+                here, seen = target[c, k], observed[c, i]
+                if x + 1 < columns:
+                    across[c, k] = _squared_alike(here, seen, target[c, k + 1], observed[c, i + 1], faint)
+                if y + 1 < rows:
+                    below = k + columns, i + columns
+                    down[c, k] = _squared_alike(here, seen, target[c, below[0]], observed[c, below[1]], faint)
