@@ -60,13 +60,13 @@ class Operation:
 
 
 APPEARANCE: Final = Field("name", "an appearance's name, 1 to 64 letters, digits, spaces, dots, dashes", pattern=NAME)
-TIME: Final = r"^([01][0-9]|2[0-3]):[0-5][0-9]$"
+TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9])?$"
 DAY: Final = r"^(mon|tue|wed|thu|fri|sat|sun|20[0-9]{2}-[01][0-9]-[0-3][0-9])$"
 ROW: Final = (
     Field("day", "mon to sun, or a date as 2026-12-24", pattern=DAY, longest=10),
     Field("opens", "a time as 10:00; left out: closed", pattern=TIME, longest=5, required=False),
     Field("closes", "a time as 18:00; left out: closed", pattern=TIME, longest=5, required=False),
-    Field("appearance", "an appearance's name; left out: the last one", pattern=NAME, required=False),
+    Field("appearance", "an appearance's name; left out: the last one", pattern=f"^({NAME[1:-1]})?$", required=False),
 )
 SCHEDULE: Final = (
     Field("time_zone", "a time zone as Europe/Vienna", pattern=r"^[A-Za-z][A-Za-z0-9_+/-]{1,63}$"),

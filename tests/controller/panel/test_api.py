@@ -56,6 +56,10 @@ CHECKS: list[Any] = [
 ]
 
 
+REFUSES_WHAT_IS_WRONG: Any = checks.CHECKS.get_one("negative_data_rejection")
+SHORTENED = ("/schedule", "/settings", "/settings/check", "/devices/tried")
+
+
 @SCHEMA.parametrize()
 @settings(
     max_examples=3,
@@ -74,7 +78,8 @@ def test_the_api_does_what_its_document_says(case: schemathesis.Case[Any], quick
     case.call_and_validate(
         base_url=quick.address + PREFIX,
         headers=token,
-        checks=CHECKS,
+        # What was made smaller above is no longer what the panel refuses.
+        checks=CHECKS if case.operation.path in SHORTENED else [*CHECKS, REFUSES_WHAT_IS_WRONG],
     )
 
 
@@ -104,9 +109,13 @@ def test_a_machine_can_do_the_whole_job(fresh: Served) -> None:
         assert client.get(f"{PREFIX}/appearances/bronze/preview").headers["content-type"] == "image/png"
         assert client.delete(f"{PREFIX}/appearances/none").status_code == 404
         schedule = client.get(f"{PREFIX}/schedule").json()
-        assert client.put(f"{PREFIX}/schedule", json=schedule).status_code == 422
-        schedule["rows"] = [{"day": "2026-12-24"}]
+        schedule["rows"].append({"day": "2026-12-24"})
         assert client.put(f"{PREFIX}/schedule", json=schedule).json() == {"done": True}
+        schedule = client.get(f"{PREFIX}/schedule").json()
+        assert schedule["rows"][-1] == {"day": "2026-12-24", "opens": "", "closes": "", "appearance": ""}
+        assert client.put(f"{PREFIX}/schedule", json=schedule).json() == {"done": True}
+        schedule["rows"][-1]["opens"] = "25:00"
+        assert client.put(f"{PREFIX}/schedule", json=schedule).status_code == 422
         backup = client.post(f"{PREFIX}/backup")
         assert backup.headers["content-disposition"].startswith("attachment")
         assert client.post(f"{PREFIX}/restore", content=backup.content).json() == {"done": True}
