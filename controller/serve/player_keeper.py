@@ -17,13 +17,13 @@ from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover
 from controller.serve.eventlog import Decision
 from controller.serve.ports import BLACK, PlayerView, Showing
 
-ANSWER_S: Final = 1.0
+ANSWER_S: Final = 0.8
 MOST_MISSES: Final = 2
 """Unanswered questions in a row after which a player counts as hung."""
-READY_S: Final = 15.0
-HEALTHY_S: Final = 60.0
+READY_S: Final = 8.0
+HEALTHY_S: Final = 20.0
 """A player that ran for so long is started again at once when it dies."""
-BACK_OFF_S: Final = (0.0, 0.5, 1.0, 2.0, 5.0, 15.0, 30.0)
+BACK_OFF_S: Final = (0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 15.0, 30.0)
 STARTS_WITH_BUNDLE: Final = 4
 """Failed starts in a row after which the player is started without the installed bundle, so that it shows black."""
 
