@@ -95,7 +95,7 @@ def _solve(transport: LightTransport, calibration: Calibration, target: FloatIma
         target,
         black,
         tolerance=2e-6,
-        most_iterations=400 if paper else 1200,
+        most_iterations=400,
         progress=lambda iteration, kkt: at.append(time.perf_counter()),
     )
     sweep = Timing(*(float(f(np.diff(at))) for f in (np.min, np.median, np.max)))
