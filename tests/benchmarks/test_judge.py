@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks._judge import _similarity, relative, rms
-from benchmarks._truth import developed, moments
+from benchmarks._truth import developed, moments, window_around
 
 
 def test_moments_of_a_known_footprint_are_found() -> None:
@@ -15,15 +15,30 @@ def test_moments_of_a_known_footprint_are_found() -> None:
     covariance = np.array([[3.0, 0.8], [0.8, 2.0]])
     d = np.stack([x - 41.3, y - 28.6], axis=-1)
     share = np.exp(-0.5 * np.einsum("...i,ij,...j", d, np.linalg.inv(covariance), d)).astype(np.float32)
-    found = moments(share, np.array([42.0, 28.0]), 14)
+    window = window_around(np.array([41.5, 28.4]), np.array([3.2, 0.7, 2.1]), share.shape)
+    assert window is not None
+    found = moments(share, window)
     assert found is not None
     np.testing.assert_allclose(found, [41.3, 28.6, 3.0, 0.8, 2.0], atol=2e-3)
 
 
 def test_a_footprint_at_the_border_is_not_judged() -> None:
-    share = np.ones((60, 80), np.float32)
-    assert moments(share, np.array([5.0, 30.0]), 10) is None
-    assert moments(np.zeros_like(share), np.array([40.0, 30.0]), 10) is None
+    round_covariance = np.array([4.0, 0.0, 4.0])
+    assert window_around(np.array([5.0, 30.0]), round_covariance, (60, 80)) is None
+    inside = window_around(np.array([40.0, 30.0]), round_covariance, (60, 80))
+    assert inside is not None
+    assert moments(np.zeros((60, 80), np.float32), inside) is None
+
+
+def test_light_beside_the_footprint_does_not_count() -> None:
+    y, x = np.mgrid[0:60, 0:80].astype(np.float64)
+    share = np.exp(-0.5 * ((x - 40) ** 2 / 9 + (y - 30) ** 2)).astype(np.float32)
+    share += np.exp(-0.5 * ((x - 40) ** 2 + (y - 42) ** 2)).astype(np.float32)
+    window = window_around(np.array([40.0, 30.0]), np.array([9.0, 0.0, 1.0]), share.shape)
+    assert window is not None
+    found = moments(share, window)
+    assert found is not None
+    np.testing.assert_allclose(found, [40, 30, 9, 0, 1], atol=5e-3)
 
 
 def test_a_similarity_is_undone_exactly() -> None:

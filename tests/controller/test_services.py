@@ -11,7 +11,8 @@ from controller.app import LOCK, check_stage
 from controller.bundle.signing import generate_key
 from controller.config import write_stage
 from controller.errors import UsageError
-from controller.services import KEY_FILE, finished_calibration, make_appearances, output_sizes, play, signing_key
+from controller.play_services import play
+from controller.services import KEY_FILE, finished_calibration, make_appearances, output_sizes, signing_key
 from controller.session.journal import Journal
 from controller.session.progress import Silent
 from controller.storage import exclusive
@@ -106,6 +107,9 @@ def test_solving_is_refused_while_the_stage_is_at_work(stage: Path) -> None:
 
 def test_playing_without_a_bundle_is_refused_before_any_device_is_opened(stage: Path) -> None:
     with pytest.raises(UsageError) as refused:
-        play(stage=stage, name="shine", seconds=1, reporter=Silent(), cancel=threading.Event())
+        play(
+            stage=stage, names=("shine",), sequence=None, seconds=1, fade_s=0, repeat=1,
+            reporter=Silent(), cancel=threading.Event(),
+        )  # fmt: skip
     assert refused.value.code == "nothing-installed"
     assert not (stage / "runs").exists()

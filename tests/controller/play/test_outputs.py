@@ -174,7 +174,7 @@ def test_a_fade_goes_through_mixtures_of_light_and_ends_exactly(outputs: Outputs
 
 def test_no_screen_mixes_two_appearances(outputs: Outputs, play: Start) -> None:
     expected = [np.hstack(list(noise(SIZES, seed).values())) for seed in range(APPEARANCES)]
-    seen = set()
+    seen: set[int] = set()
     with Wire(play().socket) as wire:
         wire.ask("sequence", items=[[str(seed), 1 / 60] for seed in range(APPEARANCES)])
         read, ends = 0, time.monotonic() + 10

@@ -88,6 +88,11 @@ def _remote_control(kiosk: Kiosk) -> None:
     kiosk.lamps["left"].go_dark()
 
 
+def _killed(kiosk: Kiosk) -> None:
+    kiosk.log.close()
+    kiosk.boot()
+
+
 def _nothing(kiosk: Kiosk) -> None:
     """Mends itself."""
 
@@ -107,7 +112,7 @@ FAULTS = (
     _burst("left"), _unplugged("left"), _slow("left"), _everyone("silent"), _everyone("refuse"),
     Fault("left switched off by its remote control", _remote_control, _nothing),
     Fault("power cut", lambda kiosk: kiosk.power_cut(120.0), _nothing),
-    Fault("service killed", lambda kiosk: (kiosk.log.close(), kiosk.boot())[1], _nothing),
+    Fault("service killed", _killed, _nothing),
     Fault("player hung", lambda kiosk: setattr(kiosk.player, "hung_at_s", kiosk.world.time_s), _nothing),
     _set("player.broken", True, False), _set("works.camera", False, True), _set("shelf.full", True, False),
     _set("stock.installed", None, Path("bundles/one.vel")),

@@ -106,7 +106,7 @@ class ModelWorks:
         if how != "done":
             told = Decision(f"work-{how}", f"It was {how}.", "Try again.", "error")
             return Finished(request, told, failed=True)
-        then = ()
+        then: tuple[Request, ...] = ()
         if request.kind == "drift" and self.drifted:
             self.drifted = False
             then = (Request("quick", light=True, key=request.key),)
