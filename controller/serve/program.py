@@ -98,10 +98,9 @@ def _open_panel(stack: contextlib.ExitStack, kiosk: StageKiosk, panel: PanelAddr
 @contextlib.contextmanager
 def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterator[None]:
     """The panel in a thread of its own. The player is another process, so that no page delays a picture."""
-    import uvicorn
-
     from controller.panel.app import make_panel
     from controller.panel.context import PanelOptions
+    from controller.panel.server import PanelServer
 
     options = PanelOptions(
         folder=kiosk.stage / "kiosk" / "panel", host=where.host, port=where.port,
@@ -111,21 +110,14 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
     options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     accounts = options.accounts()
     password = accounts.first_start()
-    server = uvicorn.Server(uvicorn.Config(
-        make_panel(kiosk, accounts, options), host=where.host, port=where.port, log_level="warning", access_log=False,
-        ssl_certfile=where.certificate, ssl_keyfile=where.key, server_header=False, timeout_graceful_shutdown=2,
-    ))  # fmt: skip
-    thread = threading.Thread(target=server.run, name="panel", daemon=True)
-    thread.start()
-    scheme = "https" if options.tls else "http"
-    reporter.say(f"The panel is at {scheme}://{where.host}:{where.port}/.")
+    server = PanelServer(make_panel(kiosk, accounts, options), options)
+    reporter.say(f"The panel is at {server.start()}.")
     if password is not None:
         reporter.say(f"First login: technician, password {password} (once).", Level.WARNING)
     try:
         yield
     finally:
-        server.should_exit = True
-        thread.join(10.0)
+        server.stop()
 
 
 def operations(kiosk: StageKiosk) -> dict[str, Operation]:
