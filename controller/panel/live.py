@@ -32,6 +32,7 @@ class Hub:
         self._dirty = asyncio.Event()
         self._drawing = asyncio.Lock()
         self._number = 0
+        self._ended = False
 
     @property
     def listening(self) -> int:
@@ -42,6 +43,17 @@ class Hub:
         loop = self._loop
         if loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(self._dirty.set)
+
+    def end(self) -> None:
+        """End the streams of all open panels; from any thread. Their pages ask again, of the next start."""
+        loop = self._loop
+        if loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(self._end)
+
+    def _end(self) -> None:
+        self._ended = True
+        for queue in tuple(self._listeners):
+            _put(queue, ": the service ends\n\n")
 
     async def run(self) -> None:
         """Draw after every change, until cancelled. Costs nothing while nobody looks."""
@@ -85,7 +97,7 @@ class Hub:
         self._listeners.add(queue)
         try:
             yield "retry: 1000\n" + self._message(self._parts)
-            while alive():
+            while alive() and not self._ended:
                 try:
                     yield await asyncio.wait_for(queue.get(), KEEP_ALIVE_S)
                 except TimeoutError:

@@ -41,7 +41,7 @@ class PanelServer:
             limit_concurrency=options.most_open_panels + 100,
             h11_max_incomplete_event_size=32 << 10,
         )
-        self._server, self._options = uvicorn.Server(config), options
+        self._server, self._options, self._app = uvicorn.Server(config), options, app
         self._thread = threading.Thread(target=self._run, name="panel", daemon=True)
 
     def _run(self) -> None:
@@ -66,6 +66,7 @@ class PanelServer:
 
     def stop(self) -> None:
         """End, also for panels that are open: their pages find the next start by themselves."""
+        self._app.state.panel.hub.end()
         self._server.should_exit = True
         self._thread.join(START_S)
 

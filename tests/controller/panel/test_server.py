@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import ssl
 import subprocess
+import time
 from pathlib import Path
 
 import httpx
@@ -48,6 +50,25 @@ def test_a_port_that_is_taken_is_told_and_a_stopped_panel_frees_it(tmp_path: Pat
         else:
             assert second.start() == address
             second.stop()
+
+
+def test_a_stop_ends_the_pages_that_follow_live_at_once_and_in_silence(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    options = PanelOptions(tmp_path / "p", port=0)
+    server = PanelServer(make_panel(MemoryKiosk(tmp_path / "pictures"), accounts_in(tmp_path / "p"), options), options)
+    address = server.start()
+    with httpx.Client(base_url=address, trust_env=False) as client:
+        token = csrf(client.get("/login").text)
+        client.post("/login", data={"csrf": token, "name": "vera", "password": PASSWORD})
+        with client.stream("GET", "/live") as live:
+            lines = live.iter_lines()
+            assert next(lines).startswith("retry:")
+            began_s = time.monotonic()
+            server.stop()
+            assert time.monotonic() - began_s < 0.9  # the patience of the server with open requests is a second
+            assert list(lines)
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl to make a certificate")
