@@ -10,6 +10,7 @@ SEED ?= 1
 OBJECT ?=
 NAME ?=
 COUNT ?=
+WORKERS ?= 2
 
 .PHONY: demo blender test lint bench campaign lock clean
 
@@ -24,7 +25,7 @@ test:
 	@.ci/setup test
 	@.ci/setup-blender
 	@.ci/system-packages
-	.venv/bin/python -m pytest $(TESTS)
+	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile $(TESTS)
 
 lint:
 	@.ci/setup test

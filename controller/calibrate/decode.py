@@ -177,11 +177,20 @@ def _locate(
             found = locate_pixel(waves, row, column, x, y, float(CELL_PX), light, noise[row, column], work)
             state[row, column] = found
             position[row, column, 0], position[row, column, 1] = work[0, 0], work[0, 1]
-            first = 4 if found & FINE else 0
-            strong = waves[first, row, column] ** 2 + waves[first + 1, row, column] ** 2
-            strong *= waves[first + 2, row, column] ** 2 + waves[first + 3, row, column] ** 2
-            contrast = strong**0.25 / light
-            modulation[row, column] = min(contrast, 1.0) ** FINE_TO_COARSE if found & FINE else contrast
+            fine = _contrast(waves, 4, row, column) / light
+            # A pixel may have been found by the diagonal wave alone where one along an axis is saturated.
+            if found & FINE and np.isfinite(fine):
+                modulation[row, column] = min(fine, 1.0) ** FINE_TO_COARSE
+            else:
+                modulation[row, column] = _contrast(waves, 0, row, column) / light
+
+
+@compiled()
+def _contrast(waves: FloatImage, first: int, row: int, column: int) -> float:
+    """Geometric mean of the amplitudes of two sinusoids, one along each axis; their parts begin at ``first``."""
+    x = waves[first, row, column] ** 2 + waves[first + 1, row, column] ** 2
+    y = waves[first + 2, row, column] ** 2 + waves[first + 3, row, column] ** 2
+    return float((x * y) ** 0.25)
 
 
 def _coarse_amplitude(sums: _Sums) -> FloatImage:

@@ -27,6 +27,8 @@ MARGIN_S = 0.035
 """Two frames: a picture may just have missed one, at the display and at the projector."""
 WHOLE_SHARE = 0.96
 """A picture is there when all but a few blocks show this much of the change; lamps flicker by less."""
+NEARLY_SHARE = 0.9
+"""Where the best blocks show this much, what they lack is a lamp's flicker, or less than the margin."""
 BLOCK_PX = 16
 LIT_SHARE = 0.1
 WORST_BLOCKS = 3.0
@@ -87,6 +89,9 @@ def measure_latency(look: Look) -> Latency:
         finite = share[np.isfinite(share)]
         seen = finite if to_white else 1 - finite
         share_seen = float(np.percentile(seen, WORST_BLOCKS)) if seen.size else 0.0
+        best = float(np.percentile(seen, 100 - WORST_BLOCKS)) if seen.size else 0.0
+        if best >= NEARLY_SHARE:
+            share_seen /= best
         tries.append((delay_s, share_seen))
         return share_seen >= WHOLE_SHARE
 

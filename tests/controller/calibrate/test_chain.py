@@ -30,6 +30,7 @@ TRUTH = make_stage(11, noise_px=0.0, outliers=0.0)
 LINEAR = Radiometry(np.tile(np.linspace(0, 1, 256), (3, 1)), np.eye(3))
 NAMES = ("left", "right", "above")
 SMALL = Scene((132, 100), (64, 48), 1.9, 3.0, seed=3)
+REACH_PX = 8
 SMALL_NAMES = [pattern.name for pattern in plan_patterns(SMALL.projector_px)]
 
 
@@ -203,7 +204,8 @@ def test_saturated_patches_change_nothing_beyond_their_reach(name: str, row: int
     fit = fit_pixels(captures, plan, found)
     assert np.all(np.isfinite(found.projector_px[found.valid]))
     far = np.ones(found.valid.shape, bool)
-    far[max(row - 8, 0) : row + side + 8, max(column - 8, 0) : column + side + 8] = False
+    rows, columns = (slice(max(at - REACH_PX, 0), at + side + REACH_PX) for at in (row, column))
+    far[rows, columns] = False
     assert np.mean(found.valid[far] == small_found().valid[far]) > 0.99
     both = far & found.valid & small_found().valid
     np.testing.assert_allclose(found.projector_px[both], small_found().projector_px[both], atol=0.02)

@@ -34,9 +34,11 @@ def shares_until_answer(wire: Wire, frames: Frames, before: Pictures, after: Pic
     """(monotonic seconds, share) of each set that is presented, to the one that is ``after``."""
     last, share = 0, 0.0
     while share < 1:
+        sequence = frames.sequence
         shown, moment = frames.read(), frames.presented_at
-        if frames.sequence != last:
-            last, share = frames.sequence, share_of(shown, before, after)
+        # A set that came while this one was read would lend it its number.
+        if sequence != last and frames.sequence == sequence:
+            last, share = sequence, share_of(shown, before, after)
             yield moment, share
     assert same(frames.read(), after)
     assert wire.receive()["ok"]
