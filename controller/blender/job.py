@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from controller.arrays import Float64, FloatImage, Mask, save_arrays
+from controller.arrays import FloatImage, Mask, save_arrays
+from controller.calibrate.blender import TO_BLENDER, margin_px, places_in_rendering
 from controller.calibrate.surface import grid_mesh
 from controller.calibrate.values import Geometry, Pinhole
 from controller.errors import WorkError
@@ -44,17 +45,6 @@ class RenderSettings:
     threads: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class View:
-    """The picture that is rendered: the calibrated camera without distortion, wider by ``margin_px`` on every side.
-
-    ``size_px`` (width, height) with the margins
-    """
-
-    size_px: tuple[int, int]
-    margin_px: int
-
-
 def write_job(
     folder: Path,
     geometry: Geometry,
@@ -64,7 +54,7 @@ def write_job(
     builtin: str | None,
     scene_file: Path | None,
     settings: RenderSettings,
-) -> View:
+) -> None:
     """Write ``job.json`` and ``mesh.npz`` into ``folder``.
 
     Parameters
@@ -98,15 +88,14 @@ def write_job(
             "reflectance": np.tile(paint, (2, 1)),
         },
     )
-    margin = _margin_px(geometry.camera)
-    view = View((columns + 2 * margin, rows + 2 * margin), margin)
+    margin = margin_px(geometry.camera)
     distance = mesh.vertices_m[:, 2]
     matrix = geometry.camera.matrix
     job = {
         "builtin": builtin,
         "scene_file": None if scene_file is None else str(scene_file.resolve()),
         "camera": {
-            "size_px": view.size_px,
+            "size_px": (columns + 2 * margin, rows + 2 * margin),
             "fx": float(matrix[0, 0]),
             "fy": float(matrix[1, 1]),
             "cx": float(matrix[0, 2]) + margin,
@@ -117,13 +106,11 @@ def write_job(
         **dataclasses.asdict(settings),
     }
     write_atomically(folder / "job.json", json.dumps(job, indent=1).encode())
-    return view
 
 
 def upright(vectors: FloatImage) -> FloatImage:
-    """(..., 3) from the camera's frame (x right, y down, z away) to one with z up: x right, y away."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    return np.ascontiguousarray(np.stack([x, z, -y], axis=-1), dtype=np.float32)
+    """(..., 3) from the camera's frame to Blender's world."""
+    return np.ascontiguousarray(vectors @ TO_BLENDER.T, dtype=np.float32)
 
 
 def _behind(vertices_m: FloatImage) -> FloatImage:
@@ -165,35 +152,14 @@ def own_paint(geometry: Geometry, light: FloatImage) -> FloatImage:
     return paint
 
 
-def _margin_px(camera: Pinhole) -> int:
-    """How far distortion moves the picture's edge, in pixels, and two more for the interpolation."""
-    if not np.any(camera.distortion):
-        return 0
-    width, height = camera.size_px
-    edge = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
-    moved = _ideal_px(camera, edge)
-    outwards = max(float(-moved.min()), float((moved - (width - 1, height - 1)).max()), 0.0)
-    return math.ceil(outwards) + 2
-
-
-def _ideal_px(camera: Pinhole, seen_px: Float64) -> Float64:
-    """Where the camera without its distortion would see what it sees at ``seen_px`` (n, 2)."""
-    distortion = np.array([*camera.distortion, 0.0, 0.0])
-    moved = cv2.undistortPoints(seen_px.reshape(-1, 1, 2), camera.matrix, distortion, P=camera.matrix)
-    return np.asarray(moved, np.float64).reshape(-1, 2)
-
-
-def as_seen(picture: FloatImage, view: View, camera: Pinhole, mask: Mask) -> Target:
+def as_seen(picture: FloatImage, camera: Pinhole, mask: Mask) -> Target:
     """The rendered picture (rows, columns, 4; transparent where no object is) as the calibrated camera sees it.
 
     The picture is scaled so that all but its highlights lie below 1, and clipped at 1.5; the exposure is the solver's.
     """
-    rows, columns = mask.shape
-    if view.margin_px:
-        y, x = np.mgrid[0:rows, 0:columns]
-        where = _ideal_px(camera, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)) + view.margin_px
-        maps = where.reshape(rows, columns, 2).astype(np.float32)
-        picture = np.asarray(cv2.remap(picture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR), np.float32)
+    at = places_in_rendering(camera).astype(np.float32)
+    # linear, since splines would ring around highlights and silhouettes
+    picture = np.asarray(cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.float32)
     covered = picture[..., 3] > 0.5
     # Alpha is premultiplied in a rendering; at silhouettes the object's own light is what counts.
     colour = np.where(covered[..., None], picture[..., :3] / np.maximum(picture[..., 3:], 0.5), 0)

@@ -37,16 +37,21 @@ def bend_picture(rendered: FloatImage, camera: Pinhole) -> FloatImage:
 
     ``rendered`` is larger than the camera's picture by ``margin_px`` on each side.
     """
-    width, height = camera.size_px
-    margin = margin_px(camera)
-    column, row = np.meshgrid(np.arange(width), np.arange(height))
-    at = _straightened(camera, np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64)) + margin
+    at = places_in_rendering(camera)
     # splines, since OpenCV's remap rounds places to 1/32 px
     planes = [
-        ndimage.map_coordinates(rendered[..., channel], (at[:, 1], at[:, 0]), order=3, mode="nearest")
+        ndimage.map_coordinates(rendered[..., channel], (at[..., 1], at[..., 0]), order=3, mode="nearest")
         for channel in range(rendered.shape[2])
     ]
-    return np.stack(planes, axis=1).reshape(height, width, -1).astype(np.float32)
+    return np.stack(planes, axis=2).astype(np.float32)
+
+
+def places_in_rendering(camera: Pinhole) -> Float64:
+    """(rows, columns, 2) float64: x and y, in a rendering with its margin, of what each camera pixel sees."""
+    width, height = camera.size_px
+    column, row = np.meshgrid(np.arange(width), np.arange(height))
+    straight = _straightened(camera, np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64))
+    return (straight + margin_px(camera)).reshape(height, width, 2)
 
 
 def scene_script(geometry: Geometry, names: Sequence[str], mesh_file: str) -> str:

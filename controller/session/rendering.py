@@ -43,11 +43,11 @@ def blender_wish(
         work = context.folder / f"render-{name}"
         work.mkdir(exist_ok=True)
         geometry, mask = read_geometry(calibrated.folder), calibrated.transport.object_mask
-        view = write_job(
+        write_job(
             work, geometry, mask, calibrated.transport.reach(), builtin=builtin, scene_file=file, settings=settings
         )
         picture = render(blender, work, context.advance)
-        target = as_seen(read_picture(picture), view, geometry.camera, mask)
+        target = as_seen(read_picture(picture), geometry.camera, mask)
         path = context.folder / f"target-{name}.npz"
         save_arrays(path, {"image": target.image, "mask": target.mask})
         return [path]

@@ -94,8 +94,8 @@ def test_blender_sees_what_the_calibrated_camera_sees(
 ) -> None:
     geometry, light = ball(k1)
     mask = known(geometry)
-    view = write_job(tmp_path, geometry, mask, light, builtin=None, scene_file=paint_scene, settings=QUICK)
-    target = as_seen(read_picture(render(blender, tmp_path, no_progress)), view, geometry.camera, mask)
+    write_job(tmp_path, geometry, mask, light, builtin=None, scene_file=paint_scene, settings=QUICK)
+    target = as_seen(read_picture(render(blender, tmp_path, no_progress)), geometry.camera, mask)
     y, x = np.mgrid[0:ROWS, 0:COLUMNS]
     facing = mask & (np.sum(geometry.points_m * -geometry.normals, axis=2) > 0.5)
     red, green, blue = target.image[facing].T
@@ -116,8 +116,8 @@ def test_every_scene_that_comes_along_covers_the_object_and_differs_from_the_oth
     for name in BUILTIN:
         folder = tmp_path / name
         folder.mkdir()
-        view = write_job(folder, geometry, mask, light, builtin=name, scene_file=None, settings=QUICK)
-        target = as_seen(read_picture(render(blender, folder, no_progress)), view, geometry.camera, mask)
+        write_job(folder, geometry, mask, light, builtin=name, scene_file=None, settings=QUICK)
+        target = as_seen(read_picture(render(blender, folder, no_progress)), geometry.camera, mask)
         assert np.isfinite(target.image).all()
         assert target.image.min() >= 0
         assert (target.image[mask].max(axis=1) > 0).mean() > 0.9
