@@ -46,11 +46,6 @@ def checked_response(response: Float64) -> FloatImage:
     return table
 
 
-def device_flat(level: tuple[int, int, int], size_px: tuple[int, int]) -> ByteImage:
-    """One colour in device values over the whole frame of ``size_px`` (width, height)."""
-    return np.full((size_px[1], size_px[0], 3), level, np.uint8)
-
-
 @compiled()
 def _nearest(table: FloatImage, light: float) -> int:
     low, high = 0, 255

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import hashlib
 import hmac
 import json
 import re
@@ -19,6 +18,7 @@ from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from controller.errors import UsageError
+from controller.panel.sessions import digest_of
 from controller.storage import write_atomically
 
 SHORTEST_PASSWORD: Final = 10
@@ -174,7 +174,7 @@ class Accounts:
                     remedy="Remove it, or choose another name.",
                 )
             token = TOKEN_PREFIX + secrets.token_urlsafe(32)
-            self._tokens[name] = Token(name, role, _digest(token), self._clock())
+            self._tokens[name] = Token(name, role, digest_of(token), self._clock())
             self._write()
             return token
 
@@ -189,7 +189,7 @@ class Accounts:
 
     def by_token(self, shown: str) -> Token | None:
         """The token that ``shown`` is, compared in constant time with every token there is."""
-        digest = _digest(shown)
+        digest = digest_of(shown)
         with self._lock:
             found = [token for token in self._tokens.values() if hmac.compare_digest(token.digest, digest)]
         return found[0] if found else None
@@ -238,10 +238,6 @@ def _read(file: Path) -> tuple[dict[str, Account], dict[str, Token]]:
             remedy="Restore the file from a backup, or remove it: the next start makes a new one-time password.",
         ) from error
     return {account.name: account for account in accounts}, {token.name: token for token in tokens}
-
-
-def _digest(token: str) -> str:
-    return hashlib.sha256(token.encode()).hexdigest()
 
 
 def _check_password(name: str, password: str) -> None:

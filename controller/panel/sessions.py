@@ -54,7 +54,7 @@ class Sessions:
         secret, now = secrets.token_urlsafe(32), self._clock()
         session = Session(account, secrets.token_urlsafe(32), now, now)
         with self._lock:
-            self._sessions[_digest(secret)] = session
+            self._sessions[digest_of(secret)] = session
             while len(self._sessions) > MOST_SESSIONS:
                 self._sessions.popitem(last=False)
             self._write()
@@ -62,7 +62,7 @@ class Sessions:
 
     def get(self, secret: str, *, touch: bool = True) -> Session | None:
         """The living session of this cookie, which with ``touch`` counts as seen now."""
-        now, digest = self._clock(), _digest(secret)
+        now, digest = self._clock(), digest_of(secret)
         with self._lock:
             session = self._sessions.get(digest)
             if session is None:
@@ -76,7 +76,7 @@ class Sessions:
 
     def end(self, secret: str) -> None:
         with self._lock:
-            if self._sessions.pop(_digest(secret), None) is not None:
+            if self._sessions.pop(digest_of(secret), None) is not None:
                 self._write()
 
     def end_all(self, account: str, *, but: Session | None = None) -> None:
@@ -108,7 +108,8 @@ def _read(file: Path | None) -> dict[str, Session]:
         return {}
 
 
-def _digest(secret: str) -> str:
+def digest_of(secret: str) -> str:
+    """What is kept of a session's or a token's secret: SHA-256, in hex; the secret has too many bits to be guessed."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 

@@ -54,9 +54,6 @@ class DeviceKeeper:
         what, remedy = (None, "") if self._problem is None else (self._problem.reason, self._problem.remedy)
         return DeviceRow(self.name, self.kind, self.driver, self._values, what, remedy)
 
-    def look_soon(self) -> None:
-        self._next_s = 0.0
-
     def step(self) -> None:
         """Look once if it is time to; not while somebody works with the device."""
         if self._monotonic() < self._next_s or not self.lent.acquire(blocking=False):

@@ -22,10 +22,6 @@ class Wishes:
     def open(self, plan: Plan) -> bool:
         return self._override[0] if self._override is not None else self._says(plan)
 
-    @property
-    def overridden(self) -> bool:
-        return self._override is not None
-
     def override(self, wanted: bool, plan: Plan) -> None:
         """Open or closed until the schedule's own opinion changes the next time."""
         self._set((wanted, self._says(plan)) if wanted is not self._says(plan) else None)

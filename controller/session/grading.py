@@ -9,11 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from controller.arrays import ByteImage, save_arrays
+from controller.bundle.export import png
 from controller.calibrate.reasons import Blame, blame, blame_picture, ranked
 from controller.calibrate.verify import Verification, verify
 from controller.capture.patterns import Pattern, frame
@@ -85,18 +85,19 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         context.advance(n / len(calibration.projectors), part.name)
         rows, columns = part.metapixels.valid.shape
         pattern = random_pattern((columns, rows))
-        light = transport.project_one(n, frame(pattern, (columns, rows)))
+        shown = frame(pattern, (columns, rows))
+        light = transport.project_one(n, shown)
         taken = _taken(context.folder, part.name, pattern)
         seen = taken.per_second()
         found = verify(light + calibration.black, seen, calibration.black, transport.lit[n])
-        why = blame(transport, calibration, n, frame(pattern, (columns, rows)), seen, exposure_s=taken.exposure_s)
+        why = blame(transport, calibration, n, shown, seen, exposure_s=taken.exposure_s)
         figures[part.name] = _figures(found, why)
         maps[part.name], maps[f"{part.name}-reasons"] = found.error_map, why.labels
         pictures.append(blame_picture(why, calibration, part.name))
     arrays, path = context.folder / "verification.npz", context.folder / FILE
     picture = context.folder / PICTURE
     save_arrays(arrays, maps)
-    write_atomically(picture, _png(pictures))
+    write_atomically(picture, png(np.concatenate(pictures, axis=0)))
     write_atomically(path, json.dumps(figures, indent=1).encode())
     return [path, arrays, picture]
 
@@ -109,13 +110,6 @@ def _figures(found: Verification, why: Blame) -> dict[str, object]:
         "grade": found.grade.value,
         "reasons": ranked(why),
     }
-
-
-def _png(pictures: Sequence[ByteImage]) -> bytes:
-    ok, data = cv2.imencode(".png", np.concatenate(list(pictures), axis=0)[..., ::-1])
-    if not ok:
-        raise ValueError("the map of the errors cannot be encoded")
-    return bytes(data.tobytes())
 
 
 def graded(folder: Path) -> dict[str, float] | None:
