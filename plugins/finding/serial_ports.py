@@ -31,6 +31,7 @@ WRITE_S: Final = 1.0
 END: Final = b"\r"
 BAUDS: Final = (9600, 19200, 38400, 57600, 115200)
 MOST_PORTS: Final = 64
+SLOW: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +99,11 @@ def _asked(
     settings = port.settings or {}
     written = int(settings.get("baud", own.serial.baud if own is not None and own.serial is not None else 0))
     heard = _who(port, _order(own, written, profiles), answer_s, deadline)
+    if heard.profile is None and heard.anything:
+        # Somebody is there: an adapter or a machine under load may only have been slow to say who.
+        usual = ((baud, known, only_if) for baud, known, only_if in _order(own, written, profiles) if not only_if)
+        heard = _who(port, usual, SLOW * answer_s, deadline)
+        heard = heard if heard.profile is not None else Heard(None, anything=True)
     if heard.profile is None:
         return _nobody(port, own, heard, written)
     profile, baud = heard.profile, heard.baud
@@ -170,6 +176,8 @@ def _who(
                 continue  # a rate that this adapter does not have
             raise
         try:
+            # What was asked at another rate arrived as noise: it must not stand before the first question on one line.
+            link.write(END, deadline=deadline.within(WRITE_S))
             for profile in profiles:
                 answered, came = _answers(link, profile, answer_s, deadline)
                 anything |= came
