@@ -11,9 +11,10 @@ from typing import Any
 
 from controller.errors import UsageError, VelaturaError
 from controller.play import protocol
+from controller.play.coming import Presented
 from controller.play.frames import FrameFile, FrameSet
 from controller.play.identification import identification
-from controller.play.loop import Player, Presented
+from controller.play.loop import Player
 from controller.play.playlist import Playlist
 from controller.play.resume import Kept
 from controller.play.server import Client, Server

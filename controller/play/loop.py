@@ -3,66 +3,24 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
-from controller.errors import BundleError, UsageError, VelaturaError
+from controller.errors import BundleError, UsageError
 from controller.play.cache import DecodedAhead, check_fits
+from controller.play.coming import Coming, Told
 from controller.play.frames import FrameSet, OutputSize
-from controller.play.mixing import mix_sets
 from controller.play.notify import Notifier
 from controller.play.outputs import Output
-from controller.play.pacing import Grid, Intervals, sleep_until
+from controller.play.pacing import Grid
 from controller.play.playlist import Playlist
+from controller.play.presenting import Presenter
 
 _IDLE_S: Final = 0.1
 _DECODE_WAIT_S: Final = 0.02
-_EARLY_S: Final = 0.0005
-
-
-@dataclass(frozen=True, slots=True)
-class Presented:
-    """A set became visible: the player's count of sets, and the moment in monotonic seconds."""
-
-    sequence: int
-    at_s: float
-
-
-Told: TypeAlias = Callable[[Presented | VelaturaError], None]
-"""Called once with what became of a request: presented, or why not."""
-
-
-@dataclass(slots=True)
-class _Coming:
-    """What is presented next, at a tick of the grid.
-
-    ``frames`` None: the appearance is taken from the cache once it is decoded. ``fade_s``: it comes in over what is
-    shown, in ``steps``, the first at ``begun_tick``; ``share`` of it is shown already.
-    """
-
-    showing: str
-    appearance: str | None
-    frames: FrameSet | None
-    tick: int
-    told: Told | None
-    fade_s: float = 0.0
-    begun_tick: int | None = None
-    steps: int = 1
-    share: float = 0.0
-
-    def begin(self, steps: int) -> None:
-        """The first step is presented at ``tick``."""
-        self.begun_tick, self.steps = self.tick, steps
-
-    @property
-    def next_share(self) -> float:
-        """How much of it is shown at ``tick``: by the clock, so a slow machine leaves out steps and not time."""
-        return 1.0 if self.begun_tick is None else min(1.0, (self.tick - self.begun_tick + 1) / self.steps)
 
 
 class Player:
@@ -88,15 +46,12 @@ class Player:
         self._output, self._trust, self._wake = output, trust, wake
         self._on_appearance = on_appearance
         self._notifier = Notifier()
-        self._grid = Grid(rate_hz)
-        self._black = self.shown = FrameSet.black(sizes)
+        self._presenter = Presenter(output, sizes, rate_hz)
+        self._black = self._presenter.shown
         self._decoded: DecodedAhead | None = None
-        self._coming: _Coming | None = None
+        self._coming: Coming | None = None
         self._playlist: Playlist | None = None
-        self._intervals = Intervals()
-        self._prepare_s = 0.0
-        self._last = Presented(0, 0.0)
-        self._late = self._skipped = 0
+        self._skipped = 0
         self._showing = "black"
         self._appearance: str | None = None
         self._ending = False
@@ -131,7 +86,7 @@ class Player:
     def show(self, frames: FrameSet, told: Told | None, *, showing: str = "pattern", fade_s: float = 0.0) -> None:
         """Show these frames; they must not change while they are the ``shown`` ones, or will be."""
         self.withdraw()
-        self._coming = _Coming(showing, None, frames, self._soon(), told, fade_s)
+        self._coming = Coming(showing, None, frames, self._presenter.soon(), told, fade_s)
 
     def play(self, playlist: Playlist, told: Told, *, rate_hz: float | None = None) -> None:
         """Play appearances in turn; ``told`` hears of the first. ``rate_hz``: the grid meanwhile.
@@ -147,20 +102,18 @@ class Player:
         for name in playlist.names:
             self._decoded.bundle.index.appearance(name)
         self.withdraw()
-        self._grid = Grid(rate_hz or self.rate_hz)
-        self._playlist, self._intervals, self._late = playlist, Intervals(), 0
+        self._presenter.begin_sequence(rate_hz or self.rate_hz)
+        self._playlist = playlist
         playlist.look_ahead = self._decoded.look_ahead
-        self._decoded.want(playlist.upcoming)
-        self._coming = _Coming("appearance", playlist.appearance, None, self._soon(), told, playlist.fade_s)
+        self._make_coming(self._presenter.soon(), told)
 
     def withdraw(self) -> None:
         """Present nothing more, keep the picture; whoever waits for a presentation is told."""
         coming, self._coming, self._playlist = self._coming, None, None
-        self._grid = Grid(self.rate_hz)
-        if coming is not None and coming.share > 0 and coming.frames is not None:
-            mixture = FrameSet.black(self.sizes)
-            mix_sets(self.shown, coming.frames, coming.share, mixture)
-            self._is_shown(mixture)
+        self._presenter.grid = Grid(self.rate_hz)
+        if coming is not None:
+            self._presenter.freeze(coming)
+            self._hold_shown()
         if coming is not None and coming.told is not None:
             coming.told(
                 UsageError(
@@ -185,6 +138,11 @@ class Player:
         self._decoded = DecodedAhead(bundle, self.sizes, self._wake)
 
     @property
+    def shown(self) -> FrameSet:
+        """The set that is on the outputs, or is what the next picture fades from."""
+        return self._presenter.shown
+
+    @property
     def skipped(self) -> int:
         """Appearances that could not be decoded, since the start."""
         return self._skipped
@@ -195,28 +153,26 @@ class Player:
 
     def status(self) -> dict[str, Any]:
         """What the status request answers (docs/player-protocol.md)."""
+        presenter = self._presenter
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         return {
-            "sequence": self._last.sequence,
-            "presented_at": self._last.at_s,
-            "swaps": self._last.sequence,
+            "sequence": presenter.last.sequence,
+            "presented_at": presenter.last.at_s,
+            "swaps": presenter.last.sequence,
             "showing": self._showing,
             "appearance": self._appearance,
             "fading": self._coming is not None and self._coming.share > 0,
             "missing_outputs": list(self._output.missing()),
             "sequence_running": self._playlist is not None,
-            "late": self._late,
+            "late": presenter.late,
             "skipped": self._skipped,
-            "interval_p50_s": self._intervals.percentile(50),
-            "interval_p99_s": self._intervals.percentile(99),
+            "interval_p50_s": presenter.intervals.percentile(50),
+            "interval_p99_s": presenter.intervals.percentile(99),
             "bundle": self.bundle_identity,
             "rss_bytes": pages * os.sysconf("SC_PAGESIZE"),
         }
 
     # --- presenting ---------------------------------------------------------------------------------------------
-
-    def _soon(self) -> int:
-        return self._grid.after(time.monotonic() + self._prepare_s)
 
     def _patience_s(self) -> float:
         """How long the loop may wait for requests before it must look again."""
@@ -224,7 +180,7 @@ class Player:
             return min(_IDLE_S, self._notifier.interval_s or _IDLE_S)
         if not self._take_frames():
             return _DECODE_WAIT_S if self._coming is not None else 0.0
-        return min(_IDLE_S, self._grid.at_s(self._coming.tick) - self._prepare_s - _EARLY_S - time.monotonic())
+        return min(_IDLE_S, self._presenter.patience_s(self._coming))
 
     def _take_frames(self) -> bool:
         """Whether the coming set has its frames; takes them from the cache once they are there."""
@@ -240,71 +196,42 @@ class Player:
             return False
         return coming.frames is not None
 
-    def _skip(self, coming: _Coming, error: BundleError) -> None:
+    def _skip(self, coming: Coming, error: BundleError) -> None:
         """An appearance can't be decoded: say so, keep the picture, and go on with the next of a sequence."""
         self._skipped += 1
         self._coming = None
         if coming.told is not None:
             coming.told(error)
         if self._playlist is not None and self._playlist.has_others(coming.appearance):
-            self._go_on(coming.tick + self._grid.ticks(self._playlist.seconds))
+            self._go_on(coming.tick + self._presenter.grid.ticks(self._playlist.seconds))
         else:
             self._playlist = None
 
     def _present_if_due(self, *, wait: bool = False) -> None:
-        if not self._take_frames() or self._coming is None or self._coming.frames is None:
+        coming = self._coming
+        if not self._take_frames() or coming is None or coming.frames is None:
             return
-        coming, frames, tick_s = self._coming, self._coming.frames, 1 / self._grid.rate_hz
-        due_s = self._grid.at_s(coming.tick)
-        if not wait and time.monotonic() < due_s - self._prepare_s - 2 * _EARLY_S:
-            return
-        began_s = time.monotonic()
-        self._prepare(coming, frames)
-        # Remember a slow preparation for a while, so that the next of its kind begins early enough.
-        self._prepare_s = min(max(time.monotonic() - began_s, 0.9 * self._prepare_s), tick_s)
-        sleep_until(due_s)
-        if time.monotonic() > due_s + tick_s and coming.share == 0:
-            self._late += self._playlist is not None and coming.told is None
-            coming.tick = self._grid.after(time.monotonic()) - 1
-            coming.begun_tick = None if coming.begun_tick is None else coming.tick
-        self._presented(coming, frames, self._output.flip())
+        before = self._presenter.last
+        whole = self._presenter.present(coming, coming.frames, wait=wait)
+        if self._presenter.last is not before:
+            self._showing, self._appearance = coming.showing, coming.appearance
+        if whole:
+            self._presented(coming)
 
-    def _prepare(self, coming: _Coming, frames: FrameSet) -> None:
-        """Prepare the set itself, or the next step on its way in."""
-        steps = self._grid.ticks(coming.fade_s)
-        if coming.begun_tick is None and steps > 1:
-            self._output.load_fade(self.shown, frames)
-            coming.begin(steps)
-        if coming.begun_tick is None:
-            self._output.prepare(frames)
-        else:
-            self._output.mix(coming.next_share)
-
-    def _presented(self, coming: _Coming, frames: FrameSet, at_s: float) -> None:
-        self._last = Presented(self._last.sequence + 1, at_s)
-        self._showing, self._appearance = coming.showing, coming.appearance
-        if self._playlist is not None:
-            self._intervals.presented(at_s)
-        coming.share = coming.next_share
-        if coming.share < 1:
-            last = (coming.begun_tick or 0) + coming.steps - 1
-            coming.tick = min(last, max(coming.tick + 1, self._grid.after(at_s + self._prepare_s)))
-            return
+    def _presented(self, coming: Coming) -> None:
         self._coming = None
-        self._is_shown(frames)
+        self._hold_shown()
         if coming.appearance is not None and self._on_appearance is not None:
             self._on_appearance()
             self._on_appearance = None
         if self._playlist is not None:
-            began = coming.tick if coming.begun_tick is None else coming.begun_tick
-            self._go_on(began + self._grid.ticks(self._playlist.seconds))
+            self._go_on(coming.first_tick + self._presenter.grid.ticks(self._playlist.seconds))
         if coming.told is not None:
-            coming.told(self._last)
+            coming.told(self._presenter.last)
 
-    def _is_shown(self, frames: FrameSet) -> None:
-        self.shown = frames
+    def _hold_shown(self) -> None:
         if self._decoded is not None:
-            self._decoded.hold(frames)
+            self._decoded.hold(self.shown)
 
     def _go_on(self, tick: int) -> None:
         """Make the next item of the sequence coming, no sooner than ``tick``; end the sequence after its last."""
@@ -312,6 +239,11 @@ class Player:
         if playlist is None or not playlist.advance():
             self._playlist = None
             return
+        self._make_coming(tick, None)
+
+    def _make_coming(self, tick: int, told: Told | None) -> None:
         assert self._decoded is not None
-        self._decoded.want(playlist.upcoming)
-        self._coming = _Coming("appearance", playlist.appearance, None, tick, None, playlist.fade_s)
+        assert self._playlist is not None
+        self._decoded.want(self._playlist.upcoming)
+        name, fade_s = self._playlist.appearance, self._playlist.fade_s
+        self._coming = Coming("appearance", name, None, tick, told, fade_s, paced=True)
