@@ -18,7 +18,7 @@ from controller.config.loader import FILE
 from controller.errors import BundleError, UsageError
 from controller.services import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
 from controller.session.progress import Level, Reporter
-from controller.session.publishing import publish_solved
+from controller.session.publishing import hints_ms, publish_solved
 from controller.storage import exclusive
 from hal.deadline import Cancelled
 
@@ -61,6 +61,7 @@ def build(
             slots=folder / BUNDLES,
             trust=stage_trust(checked.stage),
             live=live,
+            hints_ms=hints_ms(folder),
             check=lambda: _check(cancel),
         )
     signed = "nobody" if key is None else str(key)

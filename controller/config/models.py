@@ -267,6 +267,21 @@ class AppearanceTable(OpenTable):
     )
     kind: Name = Field(description='the kind of target, e.g. "photograph"')
     file: str | None = Field(default=None, min_length=1, description="a picture file, relative to the stage's folder")
+    shown_s: float = Field(
+        default=15.0, ge=0.1, le=604_800, description="seconds that the bundle's playlist shows it, 0.1 to 604800"
+    )
+    fade_s: float | None = Field(
+        default=None, ge=0, le=600,
+        description="seconds of shown_s in which it comes in there, 0 (at once) to 600; left out: 1, at most shown_s",
+    )  # fmt: skip
+
+    @property
+    def hint_ms(self) -> tuple[int, int]:
+        """``shown_s`` and ``fade_s`` in whole milliseconds. Raises UsageError("stage-key-value") if they do not fit."""
+        if self.fade_s is not None and self.fade_s > self.shown_s:
+            raise self.place.wrong_value("fade_s", self.fade_s, "is longer than 'shown_s'", f"at most {self.shown_s:g}")
+        fade_s = min(1.0, self.shown_s) if self.fade_s is None else self.fade_s
+        return round(1000 * self.shown_s), round(1000 * fade_s)
 
 
 class StageTables(Table):

@@ -40,7 +40,7 @@ PLAYBACK_RATE_HZ = 60.0
 METADATA = ("title", "mode", "exposure", "reachable_share", "fine_detail")
 """Figures of the solving that a bundle tells; none of them differs between two solvings of the same."""
 SHOWN_MS = (15_000, 1_000)
-"""For how long the bundle's playlist suggests to show each appearance, and to fade into it."""
+"""For how long the bundle's playlist suggests to show what stage.toml does not name, and to fade into it."""
 
 
 def bundle_display(rig: Rig) -> BundleDisplay:
@@ -92,7 +92,7 @@ def _publish(
     trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
     index = publish_solved(
         built, context.folder, outputs, names, stage=identity[0], calibration=identity[1], key=key, slots=slots,
-        live=_holds_live(slots),
+        live=_holds_live(slots), hints_ms=hints_ms(folder),
     )  # fmt: skip
     installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
     raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
@@ -115,6 +115,13 @@ def kept_names(stage_folder: Path, run: Path, names: Sequence[str]) -> tuple[str
     listed += [appearance.name for index in _installed(stage_folder / "bundles") for appearance in index.appearances]
     solved = [name for name in listed if name in names or (run / f"appearance-{name}.json").exists()]
     return tuple(dict.fromkeys([*solved, *names]))
+
+
+def hints_ms(stage_folder: Path) -> dict[str, tuple[int, int]]:
+    """(shown, fade) in milliseconds of each appearance of the stage.toml in this folder; empty if there is none."""
+    if not (stage_folder / FILE).exists():
+        return {}
+    return {table.name: table.hint_ms for table in load_stage(stage_folder).tables.appearances}
 
 
 def _installed(slots: Path) -> list[Index]:
@@ -143,12 +150,14 @@ def publish_solved(
     slots: Path,
     trust: Trust = ANYONE,
     live: bool = False,
+    hints_ms: Mapping[str, tuple[int, int]] | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> Index:
     """Write the appearances that the folder ``run`` holds solved as a bundle at ``path``, signed with the key file.
 
     Where the folder ``slots`` has the same bundle installed, the file is that one, byte for byte. Else its revision is
     one more than those installed bundles that ``trust`` lets pass. ``live``: with what the live mode needs.
+    ``hints_ms``: (shown, fade) by name for the playlist that the bundle suggests, else ``SHOWN_MS``.
     ``check`` is called before each appearance, to stop the work by raising.
     Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then as it was, or sound.
     """
@@ -173,7 +182,7 @@ def publish_solved(
             appearances=(appearance(name) for name in names),
             key=None if key is None else load_signing_key(key),
             revision=revision,
-            schedule=[Hint(name, *SHOWN_MS) for name in names],
+            schedule=[Hint(name, *(hints_ms or {}).get(name, SHOWN_MS)) for name in names],
             live=arrays,
         )
 

@@ -56,6 +56,7 @@ def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -
 def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
     if table.kind not in TITLES:
         raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
+    _ = table.hint_ms  # what is wrong with it is told before an hour of solving
     wanted = _options(table.kind)
     required = ("tint",) if table.kind == "recolour" else ()
     settings = table.settings({key: allowed(kind) for key, kind in wanted.items()}, required)

@@ -15,9 +15,10 @@ from controller.arrays import save_arrays
 from controller.bundle.install import current
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANYONE
+from controller.errors import UsageError
 from controller.session.journal import Journal
 from controller.session.progress import Silent
-from controller.session.publishing import created_unix_s, kept_names, publish_solved, publish_step
+from controller.session.publishing import created_unix_s, hints_ms, kept_names, publish_solved, publish_step
 from controller.session.runner import Runner
 from controller.session.thumbnails import LONGEST_PX, thumbnail
 from hal.deadline import in_seconds
@@ -128,3 +129,44 @@ def test_a_thumbnail_is_small_and_shows_the_picture(tmp_path: Path) -> None:
     assert (small[:, :75] == 0).all()
     done, _ = cv2.imencode(".png", small)
     assert done
+
+
+STAGE = """
+[stage]
+name = "s"
+[[projectors]]
+name = "left"
+output = "P1"
+driver = "serial"
+[camera]
+driver = "ptp"
+iso = 100
+[display]
+driver = "player"
+[[appearances]]
+name = "gold"
+kind = "gloss"
+shown_s = 40
+fade_s = 2.5
+[[appearances]]
+name = "brief"
+kind = "gloss"
+shown_s = 0.5
+"""
+
+
+def test_the_playlist_in_a_bundle_is_what_stage_toml_says(tmp_path: Path) -> None:
+    (tmp_path / "stage.toml").write_text(STAGE)
+    run = tmp_path / "runs" / NAMES[0]
+    for value, name in enumerate(("gold", "brief", "else")):
+        solve(run, name, value)
+    with Bundle.open_trusted(publish(tmp_path, run, "gold", "brief", "else"), ANYONE) as bundle:
+        suggested = [(hint.appearance, hint.duration_ms, hint.fade_ms) for hint in bundle.index.schedule]
+    assert suggested == [("gold", 40_000, 2_500), ("brief", 500, 500), ("else", 15_000, 1_000)]
+
+
+def test_a_fade_that_is_longer_than_its_picture_is_told_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "stage.toml").write_text(STAGE.replace("shown_s = 40", "shown_s = 2"))
+    with pytest.raises(UsageError, match=r"line 17.*'fade_s' = 2\.5 is longer than 'shown_s'") as caught:
+        hints_ms(tmp_path)
+    assert caught.value.code == "stage-key-value"
