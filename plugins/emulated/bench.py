@@ -19,6 +19,7 @@ from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from plugins.emulated.bench_usb import UsbDevices, read_usb
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.mains import Mains, boot_times, check_mains
 from plugins.emulated.objects import load_object
 from plugins.emulated.ptp_body import CameraNames
 from plugins.emulated.ptp_camera import EmulatedPtpCamera
@@ -121,6 +122,13 @@ class _Lines:
         words = " ".join(f"{name}={shlex.quote(value)}" for name, value in variables.items())
         self.say({"environment": dict(variables)}, f"To see the USB devices, begin commands with: {words}")
 
+    def mains(self, projector: str, on: bool, damages: int) -> None:
+        hurt = f" Its lamp was cut hot, {damages} times so far." if damages else ""
+        self.say(
+            {"mains": projector, "on": on, "damages": damages},
+            f"Projector {projector} {'has' if on else 'has no'} mains.{hurt}",
+        )
+
     def ready(self) -> None:
         self.say({"ready": True}, "Ready. Ctrl-C ends.")
 
@@ -141,6 +149,7 @@ def _start(
         script = stage / truth.scenario
     scenario = read_scenario(script) if script is not None else None
     usb = read_usb(stage)
+    check_mains(truth.mains, truth.projectors, usb)
     lamps = [EmulatedLamp(LampTiming(p.lamp.warm_up_s, p.lamp.cool_down_s)) for p in truth.projectors]
 
     def progress(share: float) -> None:
@@ -152,8 +161,11 @@ def _start(
         world = stack.enter_context(World(stage, truth, lamps, progress=progress))
     world.warm()
     _follow_bumps(world, out)
+    boot_s = boot_times(truth.mains)
+    wires = {}
     for projector, lamp in zip(truth.projectors, lamps, strict=True):
-        wire = EmulatedSerialProjector(stage / projector.port, lamp)
+        wire = EmulatedSerialProjector(stage / projector.port, lamp, boot_s=boot_s.get(projector.name, 0.0))
+        wires[projector.name] = wire
         if scenario is not None:
             wire.scenario = ScenarioPlayer(scenario, device=projector.name, faults=wire.faults, lamp=lamp, plug=wire)
         stack.enter_context(wire)
@@ -175,6 +187,7 @@ def _start(
         bus = stack.enter_context(UsbDevices(usb, script.read_text(encoding="utf-8") if script is not None else ""))
         for device in usb:
             out.served(device.name, device.kind, "usb")
+        stack.enter_context(Mains(truth.mains, wires, bus.moves, out.mains))
         out.environment(bus.environment)
     return world
 

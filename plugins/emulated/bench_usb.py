@@ -89,6 +89,7 @@ class UsbDevices:
         self.environment = environment(folder)
         try:
             bus = self._stack.enter_context(UsbBusProcess(folder))
+            self._bus = bus
             for device in devices:
                 bus.add(device.name, device.kind, **_settings(device))
                 if scenario:
@@ -96,6 +97,10 @@ class UsbDevices:
         except BaseException:
             self._stack.close()
             raise
+
+    def moves(self, relay: str, count: int) -> list[tuple[int, bool]]:
+        """What a relay board did after its first ``count`` moves, as (channel, closed)."""
+        return [(channel, closed) for channel, closed in self._bus.call(relay, "moves_since", count)]
 
     def __enter__(self) -> Self:
         return self

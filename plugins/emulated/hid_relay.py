@@ -15,7 +15,7 @@ class EmulatedRelayBoard(EmulatedHidDevice):
     """``channels`` relays, all open after power-on; ``serial`` is five characters in its memory.
 
     ``stuck``: channels (1-based) whose contacts are welded and do not move any more. ``switched``: how often each
-    channel has really moved.
+    channel has really moved; without power from USB all of them are open.
     """
 
     hid_descriptor = bytes.fromhex("0600ff0901a1010902150026ff00750895080902b102c0")
@@ -27,15 +27,23 @@ class EmulatedRelayBoard(EmulatedHidDevice):
         self.stuck: list[int] = []
         self.switched = [0] * channels
         self._closed = [False] * channels
+        self._moves: list[tuple[int, bool]] = []
 
     @property
     def state(self) -> list[bool]:
         """Which relays pass current, channel 1 first."""
         return list(self._closed)
 
-    def plugged(self) -> None:
-        super().plugged()
-        self._closed = [False] * self.channels
+    def moves_since(self, count: int) -> list[tuple[int, bool]]:
+        """Every (channel, closed) after the first ``count`` of them."""
+        with self.lock:
+            return self._moves[count:]
+
+    def unplugged(self) -> None:
+        for channel, closed in enumerate(self._closed, start=1):
+            if closed and channel not in self.stuck:
+                self._closed[channel - 1] = False
+                self._moves.append((channel, False))
 
     def get_report(self, kind: int, number: int) -> bytes:
         if kind != FEATURE:
@@ -60,3 +68,4 @@ class EmulatedRelayBoard(EmulatedHidDevice):
         if channel not in self.stuck and self._closed[channel - 1] is not closed:
             self._closed[channel - 1] = closed
             self.switched[channel - 1] += 1
+            self._moves.append((channel, closed))

@@ -55,6 +55,8 @@ class EmulatedLamp:
         self._shutter_closed = False
         self._failed = False
         self._hot = False
+        self._mains = True
+        self._damages = 0
 
     def strike(self) -> bool:
         """Try to light the lamp; False while it cools or is too hot. Harmless when it burns already.
@@ -65,7 +67,7 @@ class EmulatedLamp:
             phase = self.phase
             if phase in (LampPhase.WARMING, LampPhase.LIT):
                 return True
-            if phase is LampPhase.COOLING or self._hot:
+            if phase is LampPhase.COOLING or self._hot or not self._mains:
                 return False
             self._strikes += 1
             if not self._failed:
@@ -147,6 +149,31 @@ class EmulatedLamp:
         """A new lamp is in, or the housing has cooled."""
         with self._lock:
             self._failed = self._hot = False
+
+    @property
+    def damages(self) -> int:
+        """How often its mains were cut before it had cooled: the fans stop, and the heat stays in the lamp."""
+        with self._lock:
+            return self._damages
+
+    def cut_mains(self) -> None:
+        """The lamp goes dark at once. One that burned or cooled is damaged, and is as hot when the mains come back."""
+        with self._lock:
+            if not self._mains:
+                return
+            hot = self.phase is not LampPhase.STANDBY
+            self._damages += hot
+            self.extinguish()
+            self._off_since = self._clock() if hot else None
+            self._mains = False
+
+    def restore_mains(self) -> None:
+        """Standby; where it was cut hot, its fans begin to cool it only now."""
+        with self._lock:
+            if not self._mains and self._off_since is not None:
+                self._off_since = self._clock()
+            self._mains = True
+            self._shutter_closed = False
 
     def warm_now(self) -> None:
         """Skip the waiting, for a bench that starts with a burning projector: lit and fully warm."""

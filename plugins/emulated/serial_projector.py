@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 import select
 import termios
@@ -43,7 +44,8 @@ class EmulatedSerialProjector:
     baud : the rate it listens at; at any other the line carries noise both ways
     number : its own number on the line (it answers to 00 as well)
     board : what it does with the bytes; an Optoma of a later model, with ``number`` and ``quirks``, unless given
-    wedges_below_s : spoken to twice within this time while it warms or cools, it hangs until ``power_cycle``
+    wedges_below_s : spoken to twice within this time while it warms or cools, it hangs until its mains were cut
+    boot_s : from mains on until its control board answers
 
     ``faults`` are its knobs, ``scenario`` a script that turns them. ``start`` and ``stop`` it, or use it in a ``with``
     statement.
@@ -59,6 +61,7 @@ class EmulatedSerialProjector:
         quirks: OptomaQuirks | None = None,
         board: Board | None = None,
         wedges_below_s: float = 0.0,
+        boot_s: float = 0.0,
     ) -> None:
         self.port = port
         self.lamp = lamp
@@ -68,7 +71,10 @@ class EmulatedSerialProjector:
         self._wedged = threading.Event()
         self._heard_at_s = 0.0
         self._speed = getattr(termios, f"B{baud}")
+        self._boot_s = boot_s
+        self._awake_at_s: float | None = time.monotonic()
         self._board = board or OptomaBoard(lamp, number=number, quirks=quirks)
+        self._new_board = self._copied(self._board)
         self._lock = threading.Lock()
         self._master: int | None = None
         self._slave: int | None = None
@@ -113,9 +119,33 @@ class EmulatedSerialProjector:
         """Whether its control board hangs."""
         return self._wedged.is_set()
 
+    @property
+    def awake(self) -> bool:
+        """Whether it has mains, and has booted."""
+        awake_at_s = self._awake_at_s
+        return awake_at_s is not None and time.monotonic() >= awake_at_s
+
+    def cut_mains(self) -> None:
+        """The projector is dead; its serial adapter has its power from the computer and stays. See ``lamp.damages``."""
+        self._awake_at_s = None
+        self.lamp.cut_mains()
+
+    def restore_mains(self) -> None:
+        """It boots for ``boot_s`` into standby, and has forgotten whatever it had heard."""
+        if self._awake_at_s is None:
+            self._wedged.clear()
+            self._board = self._copied(self._new_board)
+            self.lamp.restore_mains()
+            self._awake_at_s = time.monotonic() + self._boot_s
+
     def power_cycle(self) -> None:
-        """Pull the mains plug and put it back: a hanging control board starts anew. Never done to a hot lamp."""
-        self._wedged.clear()
+        """Pull the mains plug and put it back: a hanging control board starts anew."""
+        self.cut_mains()
+        self.restore_mains()
+
+    def _copied(self, board: Board) -> Board:
+        """Another board of this kind, on the same lamp."""
+        return copy.deepcopy(board, {id(self.lamp): self.lamp})
 
     def unplug(self) -> None:
         """Pull the adapter: the tty hangs up and its name disappears. The projector itself goes on."""
@@ -169,8 +199,12 @@ class EmulatedSerialProjector:
 
     def _turn(self, master: int) -> None:
         readable, _, _ = select.select([master], [], [], _TICK_S)
-        if readable:
-            self._hear(os.read(master, 4096))
+        data = os.read(master, 4096) if readable else b""
+        if not self.awake:
+            self._due.clear()
+            return
+        if data:
+            self._hear(data)
         for notice in self._board.notices():
             if not self.faults.now.silent and not self.wedged:
                 self._due.append((time.monotonic(), notice))

@@ -58,7 +58,9 @@ def _lines(value: object, prefix: str) -> Iterator[str]:
     tables: list[tuple[str, object]] = []
     for field in dataclasses.fields(value):  # type: ignore[arg-type]
         item = getattr(value, field.name)
-        if dataclasses.is_dataclass(item) or (isinstance(item, tuple) and item and dataclasses.is_dataclass(item[0])):
+        if item == ():
+            continue  # one that may be empty has that as its default
+        if dataclasses.is_dataclass(item) or (isinstance(item, tuple) and dataclasses.is_dataclass(item[0])):
             tables.append((field.name, item))
         else:
             yield f"{field.name} = {_literal(item)}"

@@ -140,13 +140,27 @@ class ObjectTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class MainsTruth:
+    """A relay and whose mains go through it. ``relay``: the board's name in bench/usb.toml; ``feeds``: projectors;
+
+    ``boot_s``: from mains on until they can be spoken to.
+    """
+
+    relay: str
+    channel: Annotated[int, Between(1, 8)]
+    feeds: tuple[str, ...]
+    boot_s: Annotated[float, Between(0.0, 600.0)] = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class BenchTruth:
     """A whole emulated stage. ``subsamples``: S x S rays a camera pixel; ``time_scale``: emulated / real duration;
 
     ``latency_s``: from a frame's presentation to its light, real seconds (projectors: one to eight frames, the stage's
     default is two).
 
-    ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder.
+    ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder;
+    ``mains``: which emulated relays feed which projectors, whose mains are on otherwise.
     """
 
     size: str
@@ -160,6 +174,7 @@ class BenchTruth:
     camera: CameraTruth
     projectors: tuple[ProjectorTruth, ...]
     scenario: str = ""
+    mains: tuple[MainsTruth, ...] = ()
 
 
 def write_truth(stage: Path, truth: BenchTruth) -> None:

@@ -106,6 +106,8 @@ class UsbBus:
 
     def _unplug(self, place: _Place) -> None:
         place.plugged.leave()
+        with place.plugged.device.lock:
+            place.plugged.device.unplugged()
         for file in place.raw_files:
             file.gone = True
         self._sys.remove(place.port)

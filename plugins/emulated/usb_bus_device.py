@@ -149,6 +149,9 @@ class EmulatedUsbDevice:
         for pipe in self.pipes.values():
             pipe.clear()
 
+    def unplugged(self) -> None:
+        """Hook: power has gone."""
+
     def class_request(self, setup: Setup, data: bytes) -> bytes:
         """Hook: a class or vendor request; the answer, b"" where the data went to the device. Raises Stall."""
         raise Stall

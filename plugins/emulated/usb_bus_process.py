@@ -12,6 +12,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, Self
@@ -38,6 +39,7 @@ class UsbBusProcess:
     """Runs a bus in ``folder`` in another process; also a context. Raises RuntimeError where a command fails there."""
 
     def __init__(self, folder: Path) -> None:
+        self._turn = threading.Lock()
         hidden = {"LD_PRELOAD", "UMOCKDEV_DIR"}
         environment = {name: value for name, value in os.environ.items() if name not in hidden}
         self._process = subprocess.Popen(  # noqa: S603 - this very module
@@ -111,9 +113,10 @@ class UsbBusProcess:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
-            self._process.stdin.write(json.dumps(command) + "\n")
-            self._process.stdin.flush()
-            line = self._process.stdout.readline()
+            with self._turn:
+                self._process.stdin.write(json.dumps(command) + "\n")
+                self._process.stdin.flush()
+                line = self._process.stdout.readline()
         except BrokenPipeError:
             line = ""
         if not line:

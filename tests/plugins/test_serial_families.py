@@ -226,7 +226,8 @@ def test_the_emulated_wedge_is_real_a_hastier_profile_falls_into_it(open_serial:
         burn(pair)
     assert pair.emulator.wedged
     pair.emulator.power_cycle()
-    assert pair.driver.status(deadline=in_seconds(SOON)).power in (Power.WARMING, Power.ON)
+    assert pair.driver.status(deadline=in_seconds(SOON)).power in (Power.COOLING, Power.OFF)
+    assert pair.emulator.lamp.damages == 1
 
 
 @pytest.mark.parametrize("profile", SERIAL)

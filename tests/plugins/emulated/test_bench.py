@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -11,15 +12,17 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rawpy
+import serial
 
 from hal.errors import DeviceError
 from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.shot import ShotSettings
-from plugins.emulated.truth import BenchTruth, read_truth, write_truth
+from plugins.emulated.truth import BenchTruth, MainsTruth, read_truth, write_truth
 from plugins.emulated.world import World
 
 SERVE = """
@@ -48,7 +51,7 @@ def served(stage: Path) -> subprocess.Popen[str]:
     )
 
 
-def until_ready(process: subprocess.Popen[str]) -> Iterator[dict[str, object]]:
+def until_ready(process: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
     assert process.stdout is not None
     for line in process.stdout:
         record = json.loads(line)
@@ -57,8 +60,19 @@ def until_ready(process: subprocess.Popen[str]) -> Iterator[dict[str, object]]:
         yield record
 
 
+def power_of(tty: Path) -> bytes:
+    """What the projector says of its power; nothing if it has no mains."""
+    with serial.Serial(str(tty), 9600, timeout=0.5) as line:
+        line.write(b"~00124 1\r")
+        return bytes(line.read_until(b"\r"))
+
+
 def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(prepared: Path) -> None:
-    camera = read_truth(prepared).camera
+    truth = read_truth(prepared)
+    write_truth(prepared, dataclasses.replace(truth, mains=(MainsTruth("cupboard", 2, ("left", "right"), 0.1),)))
+    (prepared / "bench" / "usb.toml").write_text('[[device]]\nname = "cupboard"\nkind = "relay"\nserial = "BENCH"\n')
+    camera = truth.camera
+    ends_s = time.monotonic() + 120
     with served(prepared) as process:
         try:
             records = list(until_ready(process))
@@ -68,6 +82,14 @@ def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(
             assert all(tty.is_symlink() and tty.resolve().is_char_device() for tty in ttys)
             socket.create_connection(("127.0.0.1", camera.command_port), timeout=5).close()
             assert any("progress" in record for record in records)
+            assert [power_of(tty) for tty in ttys] == [b"", b"", b"OK0\r"], "the first two have no mains"
+            variables = next(record["environment"] for record in records if "environment" in record)
+            subprocess.run(["usbrelay", "BENCH_2=1"], env={**os.environ, **variables}, check=True, capture_output=True)
+            told = [json.loads(next(process.stdout)) for _ in range(2)] if process.stdout is not None else []
+            assert told == [{"mains": name, "on": True, "damages": 0} for name in ("left", "right")]
+            while time.monotonic() < ends_s and not all(power_of(tty) == b"OK0\r" for tty in ttys):
+                time.sleep(0.05)
+            assert [power_of(tty) for tty in ttys] == [b"OK0\r"] * 3
         finally:
             process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=20) == 0

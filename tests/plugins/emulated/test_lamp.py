@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from plugins.emulated.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
 
 
 class Clock:
@@ -89,3 +89,25 @@ def test_an_overheated_lamp_goes_out_and_refuses(lamp: EmulatedLamp, clock: Cloc
     assert not lamp.strike()
     lamp.mend()
     assert lamp.strike()
+
+
+def test_mains_cut_from_a_lamp_that_has_not_cooled_are_damage(lamp: EmulatedLamp, clock: Clock) -> None:
+    lamp.cut_mains()
+    lamp.restore_mains()
+    assert lamp.damages == 0, "it was cold"
+    lamp.strike()
+    clock.now_s += 70
+    lamp.extinguish()
+    clock.now_s += 100
+    lamp.cut_mains()
+    lamp.cut_mains()
+    assert (lamp.damages, lamp.light_level(), lamp.strike()) == (1, 0.0, False)
+    clock.now_s += 5000
+    lamp.restore_mains()
+    assert lamp.phase is LampPhase.COOLING, "without mains there were no fans"
+    assert not lamp.strike()
+    clock.now_s += 121
+    assert lamp.phase is LampPhase.STANDBY
+    assert lamp.strike()
+    lamp.cut_mains()
+    assert lamp.damages == 2
