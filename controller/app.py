@@ -93,7 +93,7 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
     Raises UsageError (see ``controller.config.load_stage``) and PluginError("driver-unknown").
     """
     stage = load_stage(folder)
-    drivers = drivers or load_drivers()
+    drivers = drivers or load_drivers(benches=False)
     tables = stage.tables
 
     def checked(kind: str, table: OpenTable, name: str) -> tuple[Driver, dict[str, Any]]:
@@ -316,11 +316,13 @@ def run_on_stage(
     around: contextlib.AbstractContextManager[object] | None = None,
     dark: bool = False,
     plays: bool = False,
+    again: bool = False,
 ) -> Path:
     """Open the stage, run the steps of a new or unfinished run with the lamps on, and leave the lamps safe.
 
     ``around`` is entered before the devices are opened and left when they are closed; ``dark``: not in a bright room,
-    where the stage has a light sensor; ``plays``: as in ``opened``. Returns the run's folder.
+    where the stage has a light sensor; ``plays``: as in ``opened``; ``again``: a finished run of the name is gone on
+    with, too, and what it has done already is not repeated. Returns the run's folder.
     Raises what the steps raise; UsageError("already-running") if another program works on the stage.
     """
     stage = checked.stage
@@ -333,7 +335,7 @@ def run_on_stage(
         exclusive(stage.folder / LOCK, what_is_running="Velatura"),
         around or contextlib.nullcontext(),
         opened(checked, deadline=deadline, plays=plays) as rig,
-        Journal(unfinished_run(stage.folder, name)) as journal,
+        Journal(unfinished_run(stage.folder, name, finished=again)) as journal,
     ):
         clear_unfinished_writes(journal.folder)
         machine = Machine(journal.record_change)
@@ -355,17 +357,17 @@ def _run_held(
         return journal.folder
 
 
-def unfinished_run(stage: Path, name: str) -> Path:
+def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:
     """The newest run folder of ``name`` whose work was begun and not finished, or a new one, not yet made.
 
-    For the holder of the stage's lock.
+    ``finished``: the newest one, finished or not. For the holder of the stage's lock.
     """
     runs = stage / "runs"
     for folder in sorted(runs.glob(f"*-{name}"), reverse=True):
         if (folder / Journal.FILE).exists():
             with Journal(folder) as journal:
                 outcomes = journal.outcomes()
-            if not outcomes or outcomes[-1][1] != "done":
+            if finished or not outcomes or outcomes[-1][1] != "done":
                 return folder
             break
     stamp = time.strftime("%Y%m%d-%H%M%S")

@@ -10,7 +10,13 @@ from typing import Any
 from controller.app import LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage, stage_lock
 from controller.bundle.install import current
 from controller.bundle.signing import Trust, load_signing_key
-from controller.config import Stage
+from controller.calibrations import (
+    finished_calibration,
+    finished_calibrations,
+    output_sizes,
+    stage_trust,
+    worst_grade,
+)
 from controller.errors import UsageError
 from controller.session import costs
 from controller.session.calibrating import calibration_steps
@@ -165,42 +171,6 @@ def _check_own_key(path: Path, trust: Trust) -> None:
     raise UsageError("signing-key-refused", what=f"The stage's own signing key {problem} by stage.toml.", remedy=remedy)
 
 
-def stage_trust(stage: Stage) -> Trust:
-    """Which bundles stage.toml lets play."""
-    table = stage.tables.bundle
-    keys, revoked = (tuple(map(bytes.fromhex, keys)) for keys in (table.trusted_keys, table.revoked_keys))
-    return Trust(keys, table.allow_unsigned, revoked)
-
-
-def finished_calibrations(stage: Path) -> list[Path]:
-    """The run folders whose calibration is complete, the newest first."""
-    found = []
-    for folder in sorted((stage / "runs").glob("*"), reverse=True):
-        if not (folder / Journal.FILE).exists():
-            continue
-        with Journal(folder) as journal:
-            if "calibrated" in journal.steps():
-                found.append(folder)
-    return found
-
-
-def finished_calibration(stage: Path) -> Path:
-    """The newest run folder whose calibration is complete. Raises UsageError("not-calibrated")."""
-    found = finished_calibrations(stage)
-    if found:
-        return found[0]
-    raise UsageError(
-        "not-calibrated",
-        what="This stage has no finished calibration.",
-        remedy="Run `velatura calibrate` on it first.",
-    )
-
-
-def worst_grade(checked: Checked) -> float:
-    """The largest error, in per cent, with which the stage publishes."""
-    return checked.stage.tables.calibration.worst_grade
-
-
 def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bool = False) -> Path:
     """The newest calibration, if it passes the gate.
 
@@ -226,13 +196,7 @@ def tell_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporte
         reporter.say(f"{error.what} {error.remedy}", Level.WARNING)
 
 
-def output_sizes(checked: Checked) -> dict[str, tuple[str, tuple[int, int]]]:
-    """Output name and (width, height) by projector, from stage.toml. Raises UsageError("stage-key-missing")."""
-    display = checked.stage.tables.display
-    sizes = {output.name: (output.width_px, output.height_px) for output in display.outputs}
-    if not sizes:
-        raise display.place.missing("outputs", "a list of [[display.outputs]] tables with name, width_px and height_px")
-    order = list(sizes)
-    # The player compares a bundle's outputs with its own, in the display's order.
-    tables = sorted(checked.stage.tables.projectors, key=lambda table: order.index(table.output))
-    return {table.name: (table.output, sizes[table.output]) for table in tables}
+__all__ = [
+    "KEY_FILE", "calibrate", "calibrating", "finished_calibration", "finished_calibrations", "make_appearances",
+    "output_sizes", "signing_key", "stage_trust", "tell_grade", "usable_calibration", "worst_grade",
+]  # fmt: skip

@@ -13,6 +13,8 @@ from hal.deadline import Deadline
 from hal.errors import PluginError
 
 GROUP = "velatura.devices"
+BENCH = "-bench"
+"""How the names of entry points end that offer a bench."""
 KINDS = ("projector", "camera", "display", "power_switch", "light_sensor", "button_panel", "bench")
 
 
@@ -78,8 +80,11 @@ class Drivers:
         return "; ".join(f"{plugin.entry_point} of {plugin.distribution} ({plugin.reason})" for plugin in self.broken)
 
 
-def load_drivers(found: Iterable[EntryPoint] | None = None) -> Drivers:
+def load_drivers(found: Iterable[EntryPoint] | None = None, *, benches: bool = True) -> Drivers:
     """Load every entry point of the group ``velatura.devices`` (or the given ones).
+
+    ``benches`` False: not those whose name ends in ``-bench``. A bench is asked for by name and never stands in
+    stage.toml, and its optics take longer to load than everything that a stage needs.
 
     A plugin that cannot be imported, or is not a ``Driver``, is reported in ``broken`` and stops no other.
     Raises PluginError("driver-twice") when two plugins claim one kind and name: neither may win by chance.
@@ -87,6 +92,8 @@ def load_drivers(found: Iterable[EntryPoint] | None = None) -> Drivers:
     drivers: dict[tuple[str, str], tuple[Driver, str]] = {}
     broken: list[BrokenPlugin] = []
     for entry in _distinct(entry_points(group=GROUP) if found is None else found):
+        if not benches and entry.name.endswith(BENCH):
+            continue
         where = f"{entry.name} = {entry.value}"
         owner = entry.dist.name if entry.dist is not None else "an unnamed distribution"
         loaded = _load(entry)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from controller.app import Checked, check_stage
+from controller.calibrations import finished_calibration
 from controller.errors import WorkError
 from controller.panel.kiosk import Aiming, ProjectorAim
 from controller.serve.devices import Devices
-from controller.services import finished_calibration
-from controller.session.solving import Calibrated
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import LiveViewCamera
+
+if TYPE_CHECKING:
+    from controller.session.solving import Calibrated
 
 DARK = 0.1
 """Below this share of the median light of the object, a place is too dark to work with."""
@@ -27,6 +29,8 @@ _lock = threading.Lock()
 
 def camera_picture(devices: Devices) -> bytes | None:
     """The camera's live picture, decoded and encoded anew, as JPEG; None without live view, or while it works."""
+    import cv2
+
     camera = devices.camera.device
     if not isinstance(camera, LiveViewCamera) or not camera.capabilities.live_view:
         return None
@@ -47,6 +51,8 @@ def camera_picture(devices: Devices) -> bytes | None:
 
 def aiming(checked: Checked, devices: Devices) -> Aiming:
     """Coverage, overlap and focus as of the newest calibration. Raises UsageError("not-calibrated")."""
+    from controller.session.solving import Calibrated
+
     run = finished_calibration(checked.stage.folder)
     with _lock:
         if run not in _measured:
@@ -85,6 +91,9 @@ def _of(calibrated: Calibrated) -> Aiming:
 
 def feasibility_map(stage: Path, target: Path) -> Path:
     """A PNG of how far the target is out of reach. Raises UsageError("not-calibrated", "target-unreadable")."""
+    import cv2
+
+    from controller.session.solving import Calibrated
     from controller.solve.feasibility import choose_exposure, feasibility
     from controller.solve.targets import load_target
 

@@ -15,9 +15,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
+from controller.calibrations import finished_calibrations
 from controller.config import load_stage
 from controller.errors import UsageError, WorkError
-from controller.services import finished_calibrations
 
 FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"

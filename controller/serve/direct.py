@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.app import stage_lock
+from controller.calibrations import stage_trust
 from controller.config import load_stage
 from controller.errors import UsageError
 from controller.panel.kiosk import Schedule, ScheduleRow
@@ -17,7 +18,6 @@ from controller.serve.eventlog import EventLog
 from controller.serve.hours import check_schedule
 from controller.serve.schedule_file import ScheduleFile
 from controller.serve.stock import BundleStock
-from controller.services import stage_trust
 
 _DIRECT: Final[dict[str, Callable[..., Any]]] = {}
 LEVELS: Final = ("info", "warning", "error")

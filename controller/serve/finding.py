@@ -68,7 +68,7 @@ def try_device(stage: Path, key: str) -> TriedDevice:
     if not one.driver:
         return TriedDevice(False, "Nobody knows what drives it. Write its table into stage.toml by hand.")
     try:
-        driver = load_drivers().get(one.kind, one.driver)
+        driver = load_drivers(benches=False).get(one.kind, one.driver)
         opened = driver.open(dict(one.settings), OpenContext(stage=stage), in_seconds(20.0))
     except (DeviceError, VelaturaError) as error:
         return TriedDevice(False, f"{error.what} {error.remedy}")

@@ -12,7 +12,6 @@ from typing import Final
 from controller.app import Held, check_stage, holding
 from controller.serve.eventlog import Decision
 from controller.serve.ports import Finished, Request
-from controller.serve.takeover import solve_without
 from controller.serve.works import JobReporter, Kind, run_name
 from controller.session.rig import Rig
 
@@ -124,6 +123,8 @@ class Kinds:
         return Finished(request, Decision("takeover-solved", f"Frames without {names} are ready."))
 
     def _solve(self, sets: Sequence[tuple[str, ...]], reporter: JobReporter, cancel: threading.Event) -> None:
+        from controller.serve.takeover import solve_without
+
         with holding(Held(self._stage, None)):
             for missing in sets:
                 solve_without(self._stage, missing, reporter=reporter, cancel=cancel)

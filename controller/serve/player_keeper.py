@@ -63,7 +63,8 @@ class PlayerKeeper:
         if self._process is None:
             if self._monotonic() >= self._start_at_s:
                 self._start()
-            return
+            if self._process is None:
+                return
         if not self._process.alive:
             self._restart(Decision("player-died", "The player ended by itself.", "It is started again.", "error"))
             return

@@ -8,10 +8,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from controller.calibrations import finished_calibrations
 from controller.errors import UsageError
 from controller.panel.kiosk import Grade, Results
-from controller.services import finished_calibrations
-from controller.session.grading import FILE, PICTURE, passes, worst_of
+from controller.session.grades import FILE, PICTURE, passes, worst_of
 
 MOST: Final = 50
 _NAME: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[a-z]+")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.app import Checked, check_stage, player_settings, stage_lock, technicians_panel
+from controller.calibrations import finished_calibrations, stage_trust
 from controller.errors import UsageError, VelaturaError, WorkError
 from controller.play.launch import PlayerSettings
 from controller.play.notify import Notifier
@@ -23,8 +24,6 @@ from controller.serve.ports import BLACK, Request
 from controller.serve.schedule_file import ScheduleFile
 from controller.serve.stock import BundleStock
 from controller.serve.works import ThreadWorks
-from controller.services import finished_calibrations, stage_trust
-from controller.session.keys import KeyService, technicians_keys
 from controller.session.machine import State
 from controller.storage import runtime_folder
 from hal.deadline import in_seconds
@@ -161,6 +160,8 @@ class Service:
     def _find_keys(self) -> None:
         if self._keys is not None or self.checked.key_panel is None:
             return
+        from controller.session.keys import KeyService, technicians_keys
+
         with contextlib.ExitStack() as stack:
             try:
                 panel = stack.enter_context(technicians_panel(self.checked, deadline=in_seconds(20.0)))

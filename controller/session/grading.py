@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from controller.errors import CalibrationError
 from controller.session import costs
 from controller.session.capturing import exposures_of
 from controller.session.drifting import shown_frames
+from controller.session.grades import ACCEPTED, FILE, PICTURE, graded, passes, worst_of
 from controller.session.progress import Level, Reporter
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
@@ -28,7 +28,6 @@ from controller.session.shots import Planned, Taken, read_index, take_all
 from controller.session.solving import Calibrated, random_pattern
 from controller.storage import write_atomically
 
-FILE, PICTURE, ACCEPTED = "verification.json", "verification.png", "accepted.json"
 INDEX = "verification-photographs"
 WORSE = 1.25
 """A calibration this many times worse than the one before it is told of, though it passes the gate."""
@@ -112,31 +111,11 @@ def _figures(found: Verification, why: Blame) -> dict[str, object]:
     }
 
 
-def graded(folder: Path) -> dict[str, float] | None:
-    """Per cent of relative error by projector; None for a run that was not graded."""
-    path = folder / FILE
-    if not path.exists():
-        return None
-    return {name: 100 * float(row["relative_rms"]) for name, row in json.loads(path.read_text()).items()}
-
-
 def grade_figures(folder: Path) -> dict[str, str]:
     """For a command's result: each projector's error, and the map of where it is bad."""
     figures = graded(folder) or {}
     text = ", ".join(f"{name} {percent:.2f} %" for name, percent in figures.items())
     return {"error": text, "map": str(folder / PICTURE)} if figures else {}
-
-
-def worst_of(folder: Path) -> tuple[str, float] | None:
-    """The projector with the largest error, in per cent; None for a run that was not graded."""
-    figures = graded(folder)
-    return max(figures.items(), key=lambda item: math.inf if math.isnan(item[1]) else item[1]) if figures else None
-
-
-def passes(folder: Path, worst_grade: float) -> bool:
-    """Whether a run's calibration may be used: good enough, accepted by a person, or graded only later."""
-    worst = worst_of(folder)
-    return worst is None or worst[1] <= worst_grade or (folder / ACCEPTED).exists()
 
 
 def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
@@ -197,6 +176,6 @@ def compare_with_last(folder: Path, last: Path | None, reporter: Reporter) -> No
 
 
 __all__ = [
-    "accept", "below_grade", "compare_with_last", "gate_step", "grade_figures", "graded", "passes", "random_pattern",
-    "require", "verification_photographs_step", "verify_step", "worst_of",
+    "ACCEPTED", "FILE", "PICTURE", "accept", "below_grade", "compare_with_last", "gate_step", "grade_figures", "graded",
+    "passes", "random_pattern", "require", "verification_photographs_step", "verify_step", "worst_of",
 ]  # fmt: skip

@@ -47,6 +47,12 @@ def test_a_plugin_of_another_distribution_is_found_and_opens(install: Install, t
     assert opened == {"port": "/dev/ttyUSB0"}
 
 
+def test_whoever_needs_no_bench_does_not_load_one(install: Install) -> None:
+    install("acme-hall", {"acme-hall-bench": "vel_hall:DRIVER"}, "raise SystemExit(3)")
+    assert not load_drivers(benches=False).broken
+    assert [plugin.entry_point for plugin in load_drivers().broken] == ["acme-hall-bench = vel_hall:DRIVER"]
+
+
 @pytest.mark.parametrize(
     ("source", "reason"),
     [
