@@ -12,7 +12,7 @@ from controller.bundle import install as slots
 from controller.bundle.export import export_pictures
 from controller.bundle.format import Index, valid_name
 from controller.bundle.reader import Bundle
-from controller.bundle.signing import ANYONE, Trust, generate_key, load_public_key
+from controller.bundle.signing import ANYONE, Trust, generate_key, load_public_key, unproven
 from controller.config import Stage, load_stage
 from controller.config.loader import FILE
 from controller.errors import BundleError, UsageError
@@ -49,7 +49,7 @@ def build(
         path, key = out or folder / "bundle.vel", signing_key(checked)
         reporter.say(f"Writing {len(chosen)} appearances.")
         if key is None:
-            reporter.say("The bundle will carry no signature: anyone could have made it.", Level.WARNING)
+            reporter.say(_warning(None, stage_trust(checked.stage))["warning"], Level.WARNING)
         index = publish_solved(
             path,
             run,
@@ -113,6 +113,7 @@ def verify(file: Path, *, stage: Path | None, trusted: Sequence[Path]) -> Mappin
         "sound": True,
         "signed_by": None if signed_by is None else signed_by.hex(),
         "trusted": "not checked" if trust is ANYONE else True,
+        **({} if trust is ANYONE else _warning(signed_by, trust)),
     }
 
 
@@ -162,30 +163,35 @@ def install(file: Path, *, stage: Path) -> Mapping[str, Any]:
         revoked=trust.revoked,
         accept=_fits(loaded),
     )
-    return {"installed": str(installed), **_identity(installed)}
+    return {"installed": str(installed), **_identity(installed, trust)}
 
 
 def rollback(stage: Path) -> Mapping[str, Any]:
     """Go back to the bundle before, if the stage still trusts that one. Raises BundleError."""
     loaded = load_stage(stage)
     folder = loaded.folder / BUNDLES
-    before = slots.previous(folder)
+    before, trust = slots.previous(folder), stage_trust(loaded)
     if before is not None:
-        with Bundle.open_trusted(before, stage_trust(loaded)) as bundle:
+        with Bundle.open_trusted(before, trust) as bundle:
             bundle.verify()
     installed = slots.rollback(folder)
-    return {"installed": str(installed), **_identity(installed)}
+    return {"installed": str(installed), **_identity(installed, trust)}
 
 
-def _identity(file: Path) -> dict[str, Any]:
+def _identity(file: Path, trust: Trust) -> dict[str, Any]:
     with Bundle.open_trusted(file, ANYONE) as bundle:
         return {
             "revision": bundle.index.revision,
-            "signed_by": "NOBODY: this stage plays what anyone may have made"
-            if bundle.signed_by is None
-            else bundle.signed_by.hex(),
+            "signed_by": "nobody" if bundle.signed_by is None else bundle.signed_by.hex(),
             "appearances": ", ".join(one.name for one in bundle.index.appearances),
+            **_warning(bundle.signed_by, trust),
         }
+
+
+def _warning(signed_by: bytes | None, trust: Trust) -> dict[str, str]:
+    """``{"warning": ...}`` for a bundle that anyone may have made, else nothing."""
+    found = unproven(signed_by, trust)
+    return {} if found is None else {"warning": f"{found.what} {found.remedy}"}
 
 
 def export(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:

@@ -12,7 +12,10 @@ from typing import Any, Final
 
 from controller.app import LONGEST_RUN_S, check_stage, run_on_stage
 from controller.bundle.install import current
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import Trust
 from controller.errors import UsageError
+from controller.services import stage_trust
 from controller.session.machine import Event
 from controller.session.progress import Reporter
 from controller.session.publishing import bundle_display
@@ -56,20 +59,23 @@ def play(
 ) -> Mapping[str, Any]:
     """Light the projectors and show appearances of the installed bundle.
 
-    One name: for ``seconds``, or until stopped. Several, or ``sequence`` (a file, see ``read_programme``): each for
-    ``seconds``, coming in over ``fade_s`` of them, ``repeat`` rounds, or for ever if 0. Raises
-    UsageError("nothing-installed", "nothing-to-play", "sequence-file-wrong" or "fade-too-long"), DeviceRefused for a
-    name that the bundle does not have.
+    Nothing named: the playlist that the bundle suggests. One name: for ``seconds``, or until stopped. Several, or
+    ``sequence`` (a file, see ``read_programme``): each for ``seconds``, coming in over ``fade_s`` of them, ``repeat``
+    rounds, or for ever if 0. Raises UsageError("nothing-installed", "nothing-to-play", "played-twice",
+    "sequence-file-wrong" or "fade-too-long"), DeviceRefused for a name that the bundle does not have.
     """
-    programme = _programme(names, sequence, seconds, fade_s, repeat)
     checked = check_stage(stage)
-    folder = checked.stage.folder
-    if current(folder / "bundles") is None:
+    installed = current(checked.stage.folder / "bundles")
+    if installed is None:
         raise UsageError(
             "nothing-installed",
             what="No bundle is installed on this stage.",
             remedy="Run `velatura appearance` on it first.",
         )
+    if names or sequence is not None:
+        programme = _programme(names, sequence, seconds, fade_s, repeat)
+    else:
+        programme = suggested_programme(installed, stage_trust(checked.stage), repeat, seconds)
     run_on_stage(
         checked, lambda rig, _: _playing(rig, programme), name="play", reporter=reporter, cancel=cancel, plays=True
     )
@@ -80,10 +86,10 @@ def play(
 def _programme(
     names: Sequence[str], sequence: Path | None, seconds: float | None, fade_s: float, repeat: int
 ) -> Programme:
-    if bool(names) == (sequence is not None):
+    if names and sequence is not None:
         raise UsageError(
-            "nothing-to-play",
-            what="Neither appearances nor a sequence were given, or both.",
+            "played-twice",
+            what="Appearances and a sequence were given.",
             remedy="Name the appearances to show, or give --sequence FILE.",
         )
     if sequence is not None:
@@ -99,6 +105,23 @@ def _programme(
             remedy="Give a shorter --fade or longer --seconds.",
         )
     return Programme(tuple((name, each_s, fade_s) for name in names), repeat)
+
+
+def suggested_programme(bundle: Path, trust: Trust, repeat: int, seconds: float | None) -> Programme:
+    """The playlist that a bundle suggests. ``seconds``: each for so long instead, its fade at most that.
+
+    Raises UsageError("nothing-to-play") for one that suggests none, and BundleError as ``Bundle.open``.
+    """
+    with Bundle.open_trusted(bundle, trust) as opened:
+        hints = opened.index.schedule
+    if not hints:
+        raise UsageError(
+            "nothing-to-play",
+            what="Neither appearances nor a sequence were given, and the installed bundle suggests no playlist.",
+            remedy="Name the appearances to show, or give --sequence FILE.",
+        )
+    lasting = [(hint.appearance, seconds or hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints]
+    return Programme(tuple((name, shown_s, min(fade_s, shown_s)) for name, shown_s, fade_s in lasting), repeat)
 
 
 def read_programme(path: Path) -> Programme:

@@ -64,7 +64,7 @@ def as_text(found: Mapping[str, Any]) -> str:
         f"stage        {found['stage']}",
         f"calibration  {found['calibration']}",
         f"revision     {found['revision']}, made {found['created']}",
-        f"signed by    {found['signed_by'] or 'nobody'}",
+        f"signed by    {found['signed_by'] or 'nobody: anyone may have made it'}",
         f"size         {found['bytes']} bytes, {found['ratio']:.1f} x smaller than raw",
         f"outputs      {outputs}",
         f"appearances  {len(found['appearances'])}",

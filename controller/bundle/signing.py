@@ -43,6 +43,21 @@ ANYONE: Final = Trust(allow_unsigned=True)
 """To look into a bundle of whatever origin: a signature must fit its content, whoever signed."""
 
 
+def unproven(signed_by: bytes | None, trust: Trust) -> BundleError | None:
+    """What people must be told of a bundle that may be used only because unsigned ones may; None if all is well.
+
+    Not to be raised: the bundle plays.
+    """
+    if signed_by is not None and signed_by in trust.keys:
+        return None
+    how = "carries no signature" if signed_by is None else "is signed by a key that the stage does not list"
+    return BundleError(
+        "bundle-unproven",
+        what=f"The bundle {how}: anyone may have made it, and it plays because the stage allows unsigned bundles.",
+        remedy="Make a key with `velatura keys STAGE`, publish again, and take allow_unsigned out of stage.toml.",
+    )
+
+
 def generate_key(path: Path) -> bytes:
     """Make a new key: the secret in ``path`` (mode 0600), the public one in ``path`` with ``.pub`` added.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -14,6 +14,14 @@ from controller.commands.running import Json, StageFolder, work
 SUMMARY: Final = "Builds, signs, checks and installs bundles: what a kiosk plays, as one file."
 
 BundleFile = Annotated[Path, typer.Argument(metavar="FILE", help="A bundle, .vel.")]
+
+
+def _show(found: Mapping[str, Any], *, as_json: bool) -> None:
+    """The result; for people a warning in it goes to where errors go, so that no pipe swallows it."""
+    if not as_json and "warning" in found:
+        typer.secho(f"WARNING: {found['warning']}", err=True, bold=True, fg="red")
+        found = {key: value for key, value in found.items() if key != "warning"}
+    console.show_result(found, as_json=as_json)
 
 
 def build(
@@ -47,7 +55,7 @@ def verify(
     """Check every byte of a bundle and its signature; without --stage and --trusted, not whose signature it is."""
     from controller.bundle_services import verify as verified
 
-    console.show_result(verified(file, stage=stage, trusted=tuple(trusted or ())), as_json=as_json)
+    _show(verified(file, stage=stage, trusted=tuple(trusted or ())), as_json=as_json)
 
 
 def diff(
@@ -82,14 +90,14 @@ def install(file: BundleFile, stage: StageFolder, as_json: Json = False) -> None
     """Make a bundle the stage's own, if the stage trusts it; the one before is kept for rollback."""
     from controller.bundle_services import install as installed
 
-    console.show_result(installed(file, stage=stage), as_json=as_json)
+    _show(installed(file, stage=stage), as_json=as_json)
 
 
 def rollback(stage: StageFolder, as_json: Json = False) -> None:
     """Go back to the bundle that was installed before."""
     from controller.bundle_services import rollback as rolled_back
 
-    console.show_result(rolled_back(stage), as_json=as_json)
+    _show(rolled_back(stage), as_json=as_json)
 
 
 def export(

@@ -20,7 +20,7 @@ from controller.play.frames import FrameFile, OutputSize, parse_outputs, parse_w
 from controller.play.loop import Player
 from controller.play.notify import tell
 from controller.play.outputs import MemoryOutput, Output
-from controller.play.protocol import MAX_RATE_HZ
+from controller.play.protocol import MAX_RATE_HZ, Suggested
 from controller.play.resume import SUFFIX, Kept
 from controller.play.server import Server
 
@@ -49,6 +49,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--revoked", type=Path, action="append", default=[], help="key file never to be trusted")
     parser.add_argument("--allow-unsigned", action="store_true", help="play bundles without a signature, too")
     parser.add_argument("--resume", action="store_true", help="go on with what was playing when it was ended or killed")
+    parser.add_argument(
+        "--suggested", action="store_true", help="begin with the bundle's playlist, or as --resume says"
+    )
     parser.add_argument("--rate", type=float, default=60.0, help="pictures change at multiples of 1/RATE seconds")
     return parser
 
@@ -79,7 +82,8 @@ def _run(options: argparse.Namespace) -> int:
             player.load_bundle(options.bundle if start is None else start.file)
         broken = _end_on_signals(player)
         playing = options.socket.with_name(options.socket.name + SUFFIX) if options.resume else None
-        commands = Commands(player, server, inbox, Kept(playing))
+        first = Suggested(repeat=0) if options.suggested else None
+        commands = Commands(player, server, inbox, Kept(playing), first=first)
         player.run(commands.serve, first=commands.resume)
         if start is not None and not broken.is_set() and not player.skipped:
             start.ended()

@@ -23,8 +23,12 @@ from controller.play.server import Client, Server
 class Commands:
     """Between the socket, the inbox and the player; no request, however wrong, raises out of ``serve``."""
 
-    def __init__(self, player: Player, server: Server, inbox: FrameFile, kept: Kept) -> None:
+    def __init__(
+        self, player: Player, server: Server, inbox: FrameFile, kept: Kept, *, first: protocol.Request | None = None
+    ) -> None:
+        """``first``: what to begin with where nothing is kept."""
         self._player, self._server, self._inbox, self._kept = player, server, inbox, kept
+        self._first = first
         # One may be shown, and be what the next picture fades from, while the other is read into.
         self._patterns = [FrameSet.black(player.sizes), FrameSet.black(player.sizes)]
 
@@ -34,8 +38,8 @@ class Commands:
             self._handle(client, line)
 
     def resume(self) -> None:
-        """Go on with what is kept, if it can still be played."""
-        request = self._kept.request()
+        """Go on with what is kept, or else begin with what there is to begin with; black if that can't be played."""
+        request = self._kept.request() or self._first
         if request is not None:
             with contextlib.suppress(VelaturaError):
                 self._do(request, lambda _: None)
@@ -78,6 +82,8 @@ class Commands:
                 self._player.play(Playlist(((appearance, 0.0, fade_s),), repeat=1), told)
             case protocol.Sequence(items, repeat, rate_hz):
                 self._player.play(Playlist(items, repeat), told, rate_hz=rate_hz)
+            case protocol.Suggested(repeat):
+                self._player.play(self._player.suggested(repeat), told)
             case protocol.Stop(fade_s):
                 self._player.stop(told, fade_s=fade_s)
             case protocol.Identify():

@@ -33,8 +33,8 @@ class PlayerSettings:
 
     ``outputs``: (name, width_px, height_px) in stage order; ``frames``: the memory output's file, None for windows;
     ``where``: connector or display serial number by output name, where that is another; ``trusted``, ``revoked``:
-    public key files; ``resume``: it goes on with what was playing when it was killed; ``rate_hz``: pictures change at
-    multiples of 1 / rate_hz seconds.
+    public key files; ``resume``: it goes on with what was playing when it was killed; ``suggested``: it begins with the
+    bundle's own playlist otherwise; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
     """
 
     outputs: Sequence[tuple[str, int, int]]
@@ -46,6 +46,7 @@ class PlayerSettings:
     revoked: Sequence[Path] = field(default=())
     where: Mapping[str, str] = field(default_factory=dict)
     resume: bool = False
+    suggested: bool = False
 
 
 class PlayerProcess:
@@ -71,6 +72,7 @@ class PlayerProcess:
         command += [word for key in settings.revoked for word in ("--revoked", str(key))]
         command += ["--allow-unsigned"] if settings.allow_unsigned else []
         command += ["--resume"] if settings.resume else []
+        command += ["--suggested"] if settings.suggested else []
         command += ["--rate", f"{settings.rate_hz:g}"]
         with self.log.open("wb") as log:
             # A session of its own: Ctrl-C is for the supervisor, which ends the player when the lamps are safe.

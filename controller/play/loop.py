@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.bundle.reader import Bundle
-from controller.bundle.signing import Trust
+from controller.bundle.signing import Trust, unproven
 from controller.errors import BundleError, UsageError
+from controller.play import protocol
 from controller.play.cache import DecodedAhead, check_fits
 from controller.play.coming import Coming, Told
 from controller.play.frames import FrameSet, OutputSize
-from controller.play.notify import Notifier
+from controller.play.notify import Notifier, tell
 from controller.play.outputs import Output
 from controller.play.pacing import Grid
 from controller.play.playlist import Playlist
@@ -51,6 +52,7 @@ class Player:
         self._decoded: DecodedAhead | None = None
         self._coming: Coming | None = None
         self._playlist: Playlist | None = None
+        self._warning: BundleError | None = None
         self._skipped = 0
         self._showing = "black"
         self._appearance: str | None = None
@@ -93,18 +95,13 @@ class Player:
 
         Raises BundleError if there is no bundle or it has not all of them; then nothing changes.
         """
-        if self._decoded is None:
-            raise BundleError(
-                "bundle-none",
-                what="The player has no bundle to play.",
-                remedy="Install one with 'velatura bundle install', or load one.",
-            )
+        decoded = self._loaded()
         for name in playlist.names:
-            self._decoded.bundle.index.appearance(name)
+            decoded.bundle.index.appearance(name)
         self.withdraw()
         self._presenter.begin_sequence(rate_hz or self.rate_hz)
         self._playlist = playlist
-        playlist.look_ahead = self._decoded.look_ahead
+        playlist.look_ahead = decoded.look_ahead
         self._make_coming(self._presenter.soon(), told)
 
     def withdraw(self) -> None:
@@ -136,6 +133,29 @@ class Player:
                 self.withdraw()
             self._decoded.close()
         self._decoded = DecodedAhead(bundle, self.sizes, self._wake)
+        self._warning = unproven(bundle.signed_by, self._trust)
+        if self._warning is not None:
+            tell(f"WARNING: {self._warning.what} {self._warning.remedy}")
+
+    def suggested(self, repeat: int) -> Playlist:
+        """The playlist of the bundle. Raises BundleError("bundle-none" or "bundle-no-schedule")."""
+        hints = self._loaded().bundle.index.schedule
+        if not hints:
+            raise BundleError(
+                "bundle-no-schedule",
+                what="The bundle suggests no playlist.",
+                remedy="Say what is to be played, or publish it again.",
+            )
+        return Playlist([(hint.appearance, hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints], repeat)
+
+    def _loaded(self) -> DecodedAhead:
+        if self._decoded is None:
+            raise BundleError(
+                "bundle-none",
+                what="The player has no bundle to play.",
+                remedy="Install one with 'velatura bundle install', or load one.",
+            )
+        return self._decoded
 
     @property
     def shown(self) -> FrameSet:
@@ -154,6 +174,7 @@ class Player:
     def status(self) -> dict[str, Any]:
         """What the status request answers (docs/player-protocol.md)."""
         presenter = self._presenter
+        signed_by = None if self._decoded is None else self._decoded.bundle.signed_by
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         return {
             "sequence": presenter.last.sequence,
@@ -169,6 +190,8 @@ class Player:
             "interval_p50_s": presenter.intervals.percentile(50),
             "interval_p99_s": presenter.intervals.percentile(99),
             "bundle": self.bundle_identity,
+            "signed_by": None if signed_by is None else signed_by.hex(),
+            "warning": None if self._warning is None else protocol.told(self._warning),
             "rss_bytes": pages * os.sysconf("SC_PAGESIZE"),
         }
 

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeAlias
 from controller.errors import UsageError, VelaturaError
 
 PROTOCOL: Final = 1
-MINOR: Final = 1
+MINOR: Final = 2
 """Raised when something is added that a client of an earlier one need not know."""
 MAX_LINE_BYTES: Final = 256 * 1024
 MAX_ITEMS: Final = 4096
@@ -53,6 +53,13 @@ class Sequence:
 
 
 @dataclass(frozen=True, slots=True)
+class Suggested:
+    """Present the playlist that the loaded bundle suggests, ``repeat`` times (0: for ever)."""
+
+    repeat: int
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """Present black, ``fade_s`` seconds long over what is shown."""
 
@@ -81,7 +88,7 @@ class Quit:
     """Present black and end."""
 
 
-Request: TypeAlias = Hello | Show | Play | Sequence | Stop | Identify | Status | LoadBundle | Quit
+Request: TypeAlias = Hello | Show | Play | Sequence | Suggested | Stop | Identify | Status | LoadBundle | Quit
 
 
 def parse_request(line: bytes) -> tuple[Any, Request]:
@@ -170,6 +177,10 @@ def _sequence(*, items: Any, repeat: Any = 0, rate_hz: Any = None) -> Sequence:
     )
 
 
+def _suggested(*, repeat: Any = 0) -> Suggested:
+    return Suggested(_whole(repeat, "repeat", 2**31))
+
+
 def _item(item: Any) -> tuple[str, float, float]:
     if not isinstance(item, list) or len(item) not in (2, 3):
         raise ValueError("an item is neither [appearance, seconds] nor [appearance, seconds, fade_s]")
@@ -189,6 +200,7 @@ _READERS: Final[dict[str, Any]] = {
     "show": _show,
     "play": _play,
     "sequence": _sequence,
+    "suggested": _suggested,
     "stop": _stop,
     "identify": Identify,
     "status": Status,
@@ -204,5 +216,9 @@ def answer_line(ticket: Any, values: dict[str, Any]) -> bytes:
 
 def error_line(ticket: Any, error: VelaturaError) -> bytes:
     """A bad answer, as one line."""
-    told = {"code": error.code, "what": error.what, "remedy": error.remedy}
-    return json.dumps({"id": ticket, "ok": False, "error": told}).encode() + b"\n"
+    return json.dumps({"id": ticket, "ok": False, "error": told(error)}).encode() + b"\n"
+
+
+def told(error: VelaturaError) -> dict[str, str]:
+    """An error or a warning, as answers have it."""
+    return {"code": error.code, "what": error.what, "remedy": error.remedy}

@@ -8,28 +8,33 @@ from typing import Final
 
 from controller.errors import VelaturaError
 from controller.play.notify import tell
-from controller.play.protocol import MAX_LINE_BYTES, Play, Request, Sequence, parse_request
+from controller.play.protocol import MAX_LINE_BYTES, Play, Request, Sequence, Stop, Suggested, parse_request
 from controller.storage import write_atomically
 
 SUFFIX: Final = ".playing"
+_BLACK: Final = b'{"op": "stop"}\n'
 
 
 class Kept:
-    """The last request to play, in ``path``; None keeps nothing. No disk ever stops the picture."""
+    """The last request to play, or that nothing is to be played, in ``path``; None keeps nothing.
+
+    No disk ever stops the picture.
+    """
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
+        self._line: bytes | None = None
 
     def accepted(self, request: Request, line: bytes) -> None:
-        """Keep the line of a request to play; forget what was kept when something else is to be shown."""
-        if self._path is None:
+        """Keep the line of a request to play; when something else is to be shown, that the next start is black."""
+        kept = line if isinstance(request, Play | Sequence | Suggested) else _BLACK
+        if self._path is None or kept == self._line:
             return
         try:
-            if isinstance(request, Play | Sequence):
-                write_atomically(self._path, line)
-            else:
-                self._path.unlink(missing_ok=True)
+            write_atomically(self._path, kept)
+            self._line = kept
         except (VelaturaError, OSError) as error:
+            self._line = None
             tell(f"What is playing could not be kept: {error}")
 
     def request(self) -> Request | None:
@@ -38,5 +43,5 @@ class Kept:
             return None
         with contextlib.suppress(OSError, VelaturaError), self._path.open("rb") as file:
             _, request = parse_request(file.read(MAX_LINE_BYTES))
-            return request if isinstance(request, Play | Sequence) else None
+            return request if isinstance(request, Play | Sequence | Suggested | Stop) else None
         return None

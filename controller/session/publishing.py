@@ -16,7 +16,7 @@ from controller.arrays import FloatImage, save_arrays
 from controller.bundle.format import Hint, Index
 from controller.bundle.install import current, install, revision_floor
 from controller.bundle.reader import Bundle
-from controller.bundle.signing import ANYONE, Trust, load_signing_key
+from controller.bundle.signing import ANYONE, Trust, load_signing_key, unproven
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.capture.brackets import merge_brackets
 from controller.config import load_stage
@@ -25,6 +25,7 @@ from controller.errors import BundleError, UsageError
 from controller.session import costs
 from controller.session.capturing import bracket
 from controller.session.live_parts import live_arrays
+from controller.session.progress import Level
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
 from controller.session.shots import keep_if_lit, take_photograph
@@ -90,6 +91,8 @@ def _publish(
     built, slots = context.folder / "bundle.vel", folder / "bundles"
     names = kept_names(folder, context.folder, names)
     trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
+    if (warning := unproven(trusted[0] if trusted else None, Trust(trusted, not trusted))) is not None:
+        context.reporter.say(f"{warning.what} {warning.remedy}", Level.WARNING)
     index = publish_solved(
         built, context.folder, outputs, names, stage=identity[0], calibration=identity[1], key=key, slots=slots,
         live=_holds_live(slots), hints_ms=hints_ms(folder),

@@ -244,3 +244,24 @@ print(sorted({"numpy", "nacl", "cv2", "controller.config", "controller.app"} & s
     assert done.stdout.splitlines()[-1] == "[]"
     for name in ("build", "inspect", "verify", "diff", "sign", "install", "rollback", "export"):
         assert f"\n  {name} " in done.stdout
+
+
+def test_what_anyone_may_have_made_is_refused_or_allowed_loudly(
+    stage: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(stage / "keys")
+    assert told(capsys, "bundle", "build", stage, code=2)["code"] == "no-signing-key"
+    text = (stage / "stage.toml").read_text()
+    open_stage = "\n".join(["[bundle]", "allow_unsigned = true", STAGE])
+    (stage / "stage.toml").write_text(open_stage)
+    assert shell.run(["bundle", "build", str(stage)]) == 0
+    assert "anyone may have made it" in capsys.readouterr().err
+    (stage / "stage.toml").write_text(text)
+    assert told(capsys, "bundle", "install", stage / "bundle.vel", stage, code=1)["code"] == "bundle-unsigned"
+    (stage / "stage.toml").write_text(open_stage)
+    assert "anyone may have made it" in told(capsys, "bundle", "install", stage / "bundle.vel", stage)["warning"]
+    assert shell.run(["bundle", "install", str(stage / "bundle.vel"), str(stage)]) == 0
+    shown = capsys.readouterr()
+    assert shown.err.startswith("WARNING: The bundle carries no signature")
+    assert "warning" not in shown.out
+    assert "anyone may" in told(capsys, "bundle", "verify", stage / "bundle.vel", "--stage", stage)["warning"]

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from controller.errors import UsageError
-from controller.play_services import _programme, read_programme
+from controller.bundle.format import Hint
+from controller.bundle.signing import ANYONE, Trust
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.errors import BundleError, UsageError
+from controller.play_services import Programme, _programme, read_programme, suggested_programme
 
 
 def test_a_sequence_file_says_what_for_how_long_and_how_often(tmp_path: Path) -> None:
@@ -53,10 +58,23 @@ def test_one_name_stays_and_several_take_turns() -> None:
 
 
 def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
-    for names, file in (((), None), (("a",), tmp_path / "s.toml")):
-        with pytest.raises(UsageError, match="Neither"):
-            _programme(names, file, None, 0.0, 0)
+    with pytest.raises(UsageError, match="Appearances and a sequence"):
+        _programme(("a",), tmp_path / "s.toml", None, 0.0, 0)
     with pytest.raises(UsageError, match="does not fit"):
         _programme(("a", "b"), None, 1.0, 2.0, 0)
     with pytest.raises(UsageError, match="can not be read"):
         read_programme(tmp_path / "none.toml")
+
+
+def test_with_nothing_named_the_bundle_s_own_playlist_is_played(tmp_path: Path) -> None:
+    path, black = tmp_path / "b.vel", {"P1": np.zeros((2, 3, 3), np.uint8)}
+    made = [NewAppearance(name, black) for name in ("a", "b")]
+    several: dict[str, Any] = {"stage": "s", "calibration": "c", "created_unix_s": 0, "outputs": [("P1", 3, 2)]}
+    write_bundle(path, **several, appearances=made, schedule=[Hint("b", 9_000, 500), Hint("a", 2_000, 2_000)])
+    assert suggested_programme(path, ANYONE, 3, None) == Programme((("b", 9.0, 0.5), ("a", 2.0, 2.0)), 3)
+    assert suggested_programme(path, ANYONE, 0, 1.0).items == (("b", 1.0, 0.5), ("a", 1.0, 1.0))
+    write_bundle(path, **several, appearances=made)
+    with pytest.raises(UsageError, match="suggests no playlist"):
+        suggested_programme(path, ANYONE, 0, None)
+    with pytest.raises(BundleError, match="no signature"):
+        suggested_programme(path, Trust(), 0, None)

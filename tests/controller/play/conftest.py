@@ -22,8 +22,8 @@ def outputs() -> list[tuple[str, int, int]]:
     return OUTPUTS
 
 
-def write_noise(path: Path) -> Path:
-    """An unsigned bundle with the appearances "0" to "5": noise of that seed."""
+def write_noise(path: Path, **more: Any) -> Path:
+    """An unsigned bundle with the appearances "0" to "5": noise of that seed; ``more`` for ``write_bundle``."""
     write_bundle(
         path,
         stage="s",
@@ -31,6 +31,7 @@ def write_noise(path: Path) -> Path:
         created_unix_s=0,
         outputs=OUTPUTS,
         appearances=[NewAppearance(str(seed), noise(OUTPUTS, seed)) for seed in range(6)],
+        **more,
     )
     return path
 
