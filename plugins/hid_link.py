@@ -98,6 +98,7 @@ class HidLink(WorkerLink[OpenHid]):
 
     def _matching(self) -> list[OpenHid]:
         opened: list[OpenHid] = []
+        refused: DeviceRefused | None = None
         for found in self._listed():
             handle: HidHandle = self._module.device()
             try:
@@ -107,7 +108,10 @@ class HidLink(WorkerLink[OpenHid]):
                 handle.close()
                 if not any(other.path == found.path for other in self._listed()):
                     continue  # it has just left
-                raise self._not_opened(error) from error
+                refused = self._not_opened(error)
+                if self._serial:
+                    continue  # the one that is wanted may be another, which works
+                raise refused from error
             except BaseException:
                 handle.close()
                 raise
@@ -115,6 +119,8 @@ class HidLink(WorkerLink[OpenHid]):
                 handle.close()
                 continue
             opened.append(OpenHid(handle, found, serial))
+        if refused is not None and not opened:
+            raise refused
         return opened
 
     def _listed(self) -> list[HidFound]:

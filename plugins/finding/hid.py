@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from hal import hid_light, hid_relay
-from hal.deadline import Deadline
-from hal.errors import DeviceError
+from hal.deadline import Cancelled, Deadline
+from hal.errors import DeviceError, DeviceTimeout
 from hal.finding import Finder, Found, Problem, Wanted
 from hal.ptp import printable
 from plugins.finding.access import forbidden, holders
@@ -19,13 +19,15 @@ from plugins.worker_link import WorkerLink
 RULES: Final = "70-velatura-hid.rules"
 ELGATO: Final = 0x0FD9
 LISTING_S: Final = 5.0
+ASKING_S: Final = 2.0
+"""For one device: a silent one must not take the time of the others."""
 
 
-class _Listing(WorkerLink[Any]):
-    """hidapi on a thread of its own: its ``enumerate`` can hang."""
+class _Hidapi(WorkerLink[Any]):
+    """hidapi on a thread of its own, because its calls can hang; ``name`` is what is asked, for sentences."""
 
-    def __init__(self) -> None:
-        super().__init__("list of HID devices", broken=(OSError, ValueError))
+    def __init__(self, name: str) -> None:
+        super().__init__(name, broken=(OSError, ValueError))
 
     def find(self) -> Any:
         import importlib
@@ -38,16 +40,13 @@ class _Listing(WorkerLink[Any]):
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
     """Every HID device that could be one of ours. Raises DeviceError where hidapi is missing or hangs."""
-    with contextlib.closing(_Listing()) as listing:
-        return listing.call(_listed, deadline=deadline.within(LISTING_S))
+    with contextlib.closing(_Hidapi("list of HID devices")) as listing:
+        entries = listing.call(lambda hidapi: list(hidapi.enumerate()), deadline=deadline.within(LISTING_S))
+    by_path = {entry["path"]: entry for entry in entries}
+    return [found for entry in by_path.values() if (found := _found(entry, deadline)) is not None]
 
 
-def _listed(hidapi: Any) -> list[Found]:
-    by_path = {entry["path"]: entry for entry in hidapi.enumerate()}
-    return [found for entry in by_path.values() if (found := _found(hidapi, entry)) is not None]
-
-
-def _found(hidapi: Any, entry: Mapping[str, Any]) -> Found | None:
+def _found(entry: Mapping[str, Any], deadline: Deadline) -> Found | None:
     numbers = (entry["vendor_id"], entry["product_id"])
     product, serial = (printable(str(entry[key] or "")[:60]) for key in ("product_string", "serial_number"))
     channels = hid_relay.channels_of(product) if numbers == (hid_relay.VENDOR, hid_relay.PRODUCT) else None
@@ -63,10 +62,14 @@ def _found(hidapi: Any, entry: Mapping[str, Any]) -> Found | None:
     problem = forbidden(node, what, RULES, f"{numbers[0]:04x}") or _held(node, what)
     if problem is None and channels is not None:
         try:
-            serial = _relay_serial(hidapi.device(), entry["path"], channels)
-        except (OSError, ValueError, DeviceError) as error:
+            serial = _relay_serial(f"{what} at {node}", entry["path"], channels, deadline.within(ASKING_S))
+        except Cancelled:
+            raise
+        except DeviceTimeout as error:
+            problem = Problem.of(error)
+        except DeviceError as error:
             problem = Problem(
-                "hid-not-opened", f"The {what} at {node} can't be asked: {error}.", "Plug it out and in again."
+                "hid-not-opened", f"The {what} at {node} can't be asked: {error.what}", "Plug it out and in again."
             )
     settings = {"serial": serial} if serial else {}
     problems = () if problem is None else (problem,)
@@ -75,13 +78,22 @@ def _found(hidapi: Any, entry: Mapping[str, Any]) -> Found | None:
     )
 
 
-def _relay_serial(handle: HidHandle, path: bytes, channels: int) -> str:
+def _relay_serial(name: str, path: bytes, channels: int, deadline: Deadline) -> str:
     """A board tells its serial number only when it is asked; USB's descriptor has none."""
-    handle.open_path(path)
+
+    def ask(hidapi: Any) -> str:
+        handle: HidHandle = hidapi.device()
+        handle.open_path(path)
+        try:
+            return hid_relay.parse_state(handle.get_feature_report(0, hid_relay.REPORT_LENGTH), channels).serial
+        finally:
+            handle.close()
+
+    link = _Hidapi(name)
     try:
-        return hid_relay.parse_state(handle.get_feature_report(0, hid_relay.REPORT_LENGTH), channels).serial
+        return link.call(ask, deadline=deadline)
     finally:
-        handle.close()
+        link.close()
 
 
 def _held(node: Path, what: str) -> Problem | None:

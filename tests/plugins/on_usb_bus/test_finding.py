@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from hal.deadline import in_seconds
 from hal.finding import Found, Wanted
 from plugins.emulated.usb_bus_process import UsbBusProcess
@@ -78,3 +80,21 @@ def test_a_stalled_board_does_not_keep_the_others_from_being_found(bus: UsbBusPr
     found = {one.driver: one for one in looked("hid", tmp_path)}
     assert set(found) == {"usb-relay", "colorhug-als"}
     assert [problem.code for problem in found["usb-relay"].problems] == ["hid-not-opened"]
+
+
+@pytest.mark.parametrize("fault", ["stuck", "silent"])
+def test_a_silent_board_takes_only_its_own_share_of_the_time(bus: UsbBusProcess, tmp_path: Path, fault: str) -> None:
+    """Stuck: the call into the kernel does not come back; silent: it comes back with an error."""
+    bus.add("a", "relay", channels=1, serial="FIRST")
+    bus.add("quiet", "relay", channels=2, serial="QUIET")
+    bus.add("b", "relay", channels=4, serial="THIRD")
+    bus.add("light", "light", lux=0.5)
+    bus.set("quiet", f"faults.{fault}", True)
+    found = looked("hid", tmp_path)
+    assert sorted((one.driver, one.settings.get("serial", "")) for one in found) == [
+        ("colorhug-als", ""), ("usb-relay", ""), ("usb-relay", "FIRST"), ("usb-relay", "THIRD"),
+    ]  # fmt: skip
+    codes = {one.what: [problem.code for problem in one.problems] for one in found}
+    assert codes.pop("relay board with 2 relays") == ["hid-no-answer" if fault == "stuck" else "hid-not-opened"]
+    assert not any(codes.values())
+    bus.set("quiet", f"faults.{fault}", False)

@@ -241,6 +241,18 @@ def test_two_boards_are_told_apart_by_serial_number_only(bus: UsbBusProcess, ope
     assert bus.get("two", "state") == [True, False]
 
 
+def test_a_silent_board_does_not_keep_another_from_being_used(bus: UsbBusProcess, open_relay: OpenRelay) -> None:
+    bus.add("quiet", "relay", channels=2, serial="QUIET")
+    bus.add("relay", "relay", channels=2, serial="RIGHT")
+    bus.set("quiet", "faults.silent", True)
+    board = open_relay(serial="RIGHT")
+    board.switch(1, True, deadline=in_seconds(20))
+    assert bus.get("relay", "state") == [True, False]
+    with pytest.raises(DeviceRefused) as caught:
+        open_relay(serial="QUIET")
+    assert caught.value.code == "hid-not-opened"
+
+
 def test_usbrelay_of_debian_takes_the_emulated_board_for_a_real_one(bus: UsbBusProcess) -> None:
     bus.add("relay", "relay", channels=2, serial="PEER1")
     assert subprocess.run(["usbrelay", "PEER1_2=1"], timeout=20, check=False, capture_output=True).returncode == 0
