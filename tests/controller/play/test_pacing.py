@@ -1,0 +1,161 @@
+"""When pictures become visible: by the monotonic clock alone, at the ticks of the rate, whatever else happens."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.play import pacing, presenting
+from controller.play.coming import Coming
+from controller.play.frames import FrameSet, OutputSize
+from controller.play.presenting import Presenter
+from tests.controller.play.conftest import OUTPUTS, write_noise
+from tests.controller.play.wire import Wire
+
+SIZES = (OutputSize("P1", 2, 2),)
+RATE_HZ = 30.0
+
+
+@dataclass
+class Clocks:
+    """Stands for the module ``time``: the monotonic clock goes by sleeping and by work, the wall clock jumps."""
+
+    now_s: float = 1000.0
+    wall_s: float = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def time(self) -> float:
+        self.wall_s = -self.wall_s - 1e9
+        return self.wall_s
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds >= 0
+        self.now_s += seconds
+
+
+@dataclass
+class Slow:
+    """An output whose preparing takes as long as ``takes_s`` says, once each."""
+
+    clocks: Clocks
+    takes_s: list[float] = field(default_factory=list)
+    flips_s: list[float] = field(default_factory=list)
+
+    def prepare(self, frames: FrameSet) -> None:
+        self.clocks.now_s += self.takes_s.pop(0) if self.takes_s else 0.002
+
+    def load_fade(self, before: FrameSet, after: FrameSet) -> None:
+        self.clocks.now_s += 0.001
+
+    def mix(self, share: float) -> None:
+        self.prepare(FrameSet(()))
+
+    def flip(self) -> float:
+        self.flips_s.append(self.clocks.now_s)
+        return self.clocks.now_s
+
+    def missing(self) -> tuple[str, ...]:
+        return ()
+
+    def pump(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
+    found = Clocks()
+    for module in (presenting, pacing):
+        monkeypatch.setattr(module, "time", found)
+    return found
+
+
+def play(presenter: Presenter, clocks: Clocks, count: int) -> None:
+    """Present ``count`` sets, each at the tick after the one before, looking as often as the player's loop does."""
+    black = FrameSet.black(SIZES)
+    presenter.begin_sequence(RATE_HZ)
+    tick = presenter.soon()
+    for _ in range(count):
+        coming = Coming("appearance", "a", black, tick, None, paced=True)
+        while not presenter.present(coming, black):
+            clocks.sleep(max(presenter.patience_s(coming), 0.0001))
+        tick = coming.first_tick + 1
+
+
+def test_every_picture_comes_at_its_tick(clocks: Clocks) -> None:
+    output = Slow(clocks)
+    presenter = Presenter(output, SIZES, RATE_HZ)
+    play(presenter, clocks, 1000)
+    # How long preparing takes is known from the second on.
+    ticks = np.array(output.flips_s[1:]) * RATE_HZ
+    np.testing.assert_allclose(np.diff(ticks), 1, atol=1e-6)
+    np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
+    assert presenter.late == 0
+    assert presenter.intervals.percentile(99) == pytest.approx(1 / RATE_HZ, abs=1e-9)
+
+
+def test_a_picture_that_is_late_is_counted_once_and_the_next_are_on_the_grid_again(clocks: Clocks) -> None:
+    output = Slow(clocks, takes_s=[0.002] * 10 + [0.12] + [0.002] * 100)
+    presenter = Presenter(output, SIZES, RATE_HZ)
+    play(presenter, clocks, 60)
+    assert presenter.late == 1
+    ticks = np.array(output.flips_s) * RATE_HZ
+    steps = np.diff(ticks)
+    assert 3 < steps.max() < 5
+    np.testing.assert_allclose(steps[12:], 1, atol=1e-6)
+    np.testing.assert_allclose(ticks[12:], np.round(ticks[12:]), atol=1e-6)
+
+
+def test_a_fade_takes_its_time_however_slow_its_steps_are(clocks: Clocks) -> None:
+    for takes_s in (0.002, 0.08):
+        output = Slow(clocks, takes_s=[takes_s] * 200)
+        presenter = Presenter(output, SIZES, RATE_HZ)
+        black = FrameSet.black(SIZES)
+        coming = Coming("appearance", "a", black, presenter.soon(), None, fade_s=2.0)
+        while not presenter.present(coming, black):
+            clocks.sleep(max(presenter.patience_s(coming), 0.0001))
+        assert output.flips_s[-1] - output.flips_s[0] == pytest.approx(2.0, abs=0.15)
+        assert presenter.shown is black
+
+
+@contextmanager
+def deceived_player(folder: Path) -> Iterator[Path]:
+    """The socket of a player in a process whose wall clock jumps."""
+    outputs = ",".join(f"{name}:{width}x{height}" for name, width, height in OUTPUTS)
+    command = [sys.executable, "-m", "tests.controller.play.jumping_clock", "--socket", str(folder / "s")]
+    command += ["--outputs", outputs, "--frames", str(folder / "out.frame"), "--allow-unsigned"]
+    with (folder / "log").open("wb") as log:
+        player = subprocess.Popen([*command, "--bundle", str(write_noise(folder / "b.vel"))], stdout=log, stderr=log)
+    try:
+        ends = time.monotonic() + 20
+        while not (folder / "s").exists() and player.poll() is None and time.monotonic() < ends:
+            time.sleep(0.02)
+        assert player.poll() is None, (folder / "log").read_text()
+        yield folder / "s"
+        player.terminate()
+        assert player.wait(10) == 0, (folder / "log").read_text()
+    finally:
+        player.kill()
+        player.wait()
+
+
+def test_a_wall_clock_that_is_set_back_and_forward_moves_no_picture(tmp_path: Path) -> None:
+    with deceived_player(tmp_path) as path, Wire(path) as wire:
+        first = wire.ask("sequence", items=[[str(seed), 0.04] for seed in range(6)], repeat=5, rate_hz=50)
+        ends = time.monotonic() + 30
+        while (status := wire.ask("status"))["sequence_running"] and time.monotonic() < ends:
+            time.sleep(0.05)
+        assert status["sequence"] - first["sequence"] == 29
+        assert status["presented_at"] - first["presented_at"] >= 29 * 0.04 - 0.02, "nothing comes before its time"
+        faded = wire.ask("play", appearance="2", fade_s=0.5)
+        assert 0.4 < faded["presented_at"] - status["presented_at"] < 20
