@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ SHIFT_HEIGHTS = (-0.8, 1.8)
 _USUAL = tuple((throw, shift) for throw in (1.0, 1.8, 3.5) for shift in (-0.05, 0.5, 1.05))
 _THRESHOLD_PX = 1.5
 _FEWEST = 30
+_SEEDS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +40,35 @@ def fundamental(camera_px: Float64, projector_px: Float64) -> tuple[Float64, Mas
     """
     if len(camera_px) < _FEWEST:
         return None
-    found, inliers = cv2.findFundamentalMat(camera_px, projector_px, cv2.USAC_MAGSAC, _THRESHOLD_PX, 0.9999, 10000)
+    found, inliers = _sought(camera_px, projector_px)
     if found is None or found.shape != (3, 3) or inliers is None or int(inliers.sum()) < _FEWEST:
         return None
     return found.astype(np.float64), inliers.ravel().astype(bool)
+
+
+def _sought(camera_px: Float64, projector_px: Float64) -> tuple[Any, Any]:
+    """What OpenCV finds; None where it finds nothing.
+
+    Its MAGSAC++ (4.14) stops with an internal error when a random sample gives no model, on sound points, too; with
+    another sample it goes on. Where none helps, RANSAC, which has no such fault, says what there is.
+    """
+    for seed in range(_SEEDS):
+        try:
+            if seed == 0:
+                return cv2.findFundamentalMat(camera_px, projector_px, cv2.USAC_MAGSAC, _THRESHOLD_PX, 0.9999, 10000)
+            return cv2.findFundamentalMat(camera_px, projector_px, _magsac(seed))
+        except cv2.error:
+            continue
+    return cv2.findFundamentalMat(camera_px, projector_px, cv2.RANSAC, _THRESHOLD_PX, 0.9999, 10000)
+
+
+def _magsac(seed: int) -> cv2.UsacParams:
+    settings = cv2.UsacParams()
+    settings.score, settings.final_polisher = cv2.SCORE_METHOD_MAGSAC, cv2.MAGSAC
+    settings.loMethod, settings.loIterations, settings.loSampleSize = cv2.LOCAL_OPTIM_SIGMA, 1, 30
+    settings.threshold, settings.confidence, settings.maxIterations = _THRESHOLD_PX, 0.9999, 10000
+    settings.randomGeneratorState = seed
+    return settings
 
 
 def parallax_px(camera_px: Float64, projector_px: Float64) -> float:
