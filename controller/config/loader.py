@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -19,6 +19,7 @@ from controller.errors import UsageError
 from controller.text import printable
 from hal.registry import Driver
 
+Tables = TypeVar("Tables", bound=Table)
 LARGEST_BYTES: Final = 1 << 20
 FILE: Final = "stage.toml"
 
@@ -42,24 +43,41 @@ def load_stage(path: Path) -> Stage:
     "stage-key-missing", "stage-key-type" or "stage-key-value"; all but the first two name the line.
     """
     file = path / FILE if path.is_dir() else path
-    text = _text(file)
-    try:
-        content = tomllib.loads(text)
-        place = Place(file.name, KeyLines(text))
-    except (ValueError, RecursionError) as error:
-        raise _syntax(file, error) from error
+    content, place = read_toml(file)
     return Stage(file.parent.resolve(), parse_stage(content, place))
+
+
+def read_toml(file: Path, kind: str = "stage") -> tuple[dict[str, Any], Place]:
+    """The content of a TOML file, and the place for errors about it.
+
+    ``kind``: what the file is of, which the errors' codes begin with. Raises UsageError "<kind>-missing",
+    "<kind>-unreadable", "<kind>-syntax".
+    """
+    text = _text(file, kind)
+    try:
+        return tomllib.loads(text), Place(file.name, KeyLines(text), kind=kind)
+    except (ValueError, RecursionError) as error:
+        raise _syntax(file, error, kind) from error
 
 
 def parse_stage(content: Mapping[str, Any], place: Place) -> StageTables:
     """Check the parsed content of a stage.toml that stands at ``place``. Raises as ``load_stage``."""
+    tables = parse_tables(StageTables, content, place)
+    _check_agreement(tables)
+    return tables
+
+
+def parse_tables(model: type[Tables], content: Mapping[str, Any], place: Place) -> Tables:
+    """Check the parsed content of a file whose root table is ``model``.
+
+    Raises UsageError "<kind>-key-unknown", "<kind>-key-missing", "<kind>-key-type", "<kind>-key-value" with the line.
+    """
     try:
-        tables = StageTables.model_validate(dict(content))
+        tables = model.model_validate(dict(content))
     except ValidationError as invalid:
-        raise _first_problem(invalid, place) from invalid
+        raise _first_problem(invalid, place, model) from invalid
     for path, table in _tables(tables, ()):
         table.placed(place.at(*path))
-    _check_agreement(tables)
     return tables
 
 
@@ -71,47 +89,56 @@ def check_driver_settings(table: OpenTable, driver: Driver) -> dict[str, Any]:
     return table.settings(driver.settings, driver.required)
 
 
-def _text(file: Path) -> str:
+_EXAMPLES: Final = {
+    "stage": "Give the stage's folder, which holds stage.toml; `velatura demo --prepare-only` writes an example.",
+    "plan": "Give a file that says what is to be planned; `velatura plan --example` writes one.",
+}
+
+
+def _text(file: Path, kind: str) -> str:
     try:
         data = file.read_bytes() if file.stat().st_size <= LARGEST_BYTES else None
     except FileNotFoundError as error:
         raise UsageError(
-            "stage-missing",
+            f"{kind}-missing",
             what=f"There is no {file}.",
-            remedy="Give the stage's folder, which holds stage.toml; `velatura demo --prepare-only` writes an example.",
+            remedy=_EXAMPLES[kind],
         ) from error
     except OSError as error:
-        raise _unreadable(file, f"can't be read: {error.strerror}", "Check the file's permissions.") from error
+        raise _unreadable(file, f"can't be read: {error.strerror}", "Check the file's permissions.", kind) from error
     if data is None:
-        raise _unreadable(file, f"is larger than {LARGEST_BYTES} bytes", "Is it the right file?")
+        raise _unreadable(file, f"is larger than {LARGEST_BYTES} bytes", "Is it the right file?", kind)
     try:
         return data.decode()
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise _unreadable(file, f"is not UTF-8 text (line {line})", "Save it as a text file in UTF-8.") from error
+        raise _unreadable(file, f"is not UTF-8 text (line {line})", "Save it as text in UTF-8.", kind) from error
 
 
-def _unreadable(file: Path, problem: str, remedy: str) -> UsageError:
-    return UsageError("stage-unreadable", what=f"{file} {problem}.", remedy=remedy)
+def _unreadable(file: Path, problem: str, remedy: str, kind: str) -> UsageError:
+    return UsageError(f"{kind}-unreadable", what=f"{file} {problem}.", remedy=remedy)
 
 
-def _syntax(file: Path, error: Exception) -> UsageError:
+def _syntax(file: Path, error: Exception, kind: str) -> UsageError:
     message = printable(str(error)) or "it is nested too deeply"
     where = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
     line = f", line {where[1]}" if where and where[1] else ", at its end" if where else ""
     problem = message[: where.start()] if where else message
     return UsageError(
-        "stage-syntax",
+        f"{kind}-syntax",
         what=f"{file.name}{line}: this is not TOML: {problem}.",
         remedy='Mend the line; text needs quotes (name = "left"), and tables brackets ([camera], [[projectors]]).',
     )
 
 
-def _first_problem(invalid: ValidationError, place: Place) -> UsageError:
+def _first_problem(invalid: ValidationError, place: Place, root: type[BaseModel]) -> UsageError:
     """The problem that stands first in the file; but a misspelt key before the missing one that it stands for."""
-    problems = invalid.errors(include_url=False)
-    first = min(problems, key=lambda found: (found["type"] != "extra_forbidden", place.lines.line(tuple(found["loc"]))))
-    return _problem(first, place)
+    found = invalid.errors(include_url=False)
+    # A list whose only item is wrong counts as empty too.
+    inside = {tuple(one["loc"][:depth]) for one in found for depth in range(1, len(one["loc"]))}
+    problems = [one for one in found if one["type"] != "too_short" or tuple(one["loc"]) not in inside]
+    first = min(problems, key=lambda one: (one["type"] != "extra_forbidden", place.lines.line(tuple(one["loc"]))))
+    return _problem(first, place, root)
 
 
 _PROBLEMS: Final = {
@@ -134,9 +161,9 @@ _PROBLEMS: Final = {
 }
 
 
-def _problem(detail: ErrorDetails, place: Place) -> UsageError:
+def _problem(detail: ErrorDetails, place: Place, root: type[BaseModel]) -> UsageError:
     path: KeyPath = tuple(detail["loc"])
-    model, depth = _model_at(path)
+    model, depth = _model_at(path, root)
     # A position in a list of values (trusted_keys, from_px) is told by the name of the list.
     table, key = place.at(*path[:depth]), str(path[depth]) if depth < len(path) else str(path[-1])
     field = model.model_fields.get(key)
@@ -154,9 +181,9 @@ def _problem(detail: ErrorDetails, place: Place) -> UsageError:
     return kind(key, detail["input"], problem, allowed)
 
 
-def _model_at(path: KeyPath) -> tuple[type[BaseModel], int]:
+def _model_at(path: KeyPath, root: type[BaseModel]) -> tuple[type[BaseModel], int]:
     """The innermost model on the way to ``path``, and how many parts lead to it."""
-    model: type[BaseModel] = StageTables
+    model = root
     depth = 0
     for position, part in enumerate(path):
         if isinstance(part, int):

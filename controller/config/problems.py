@@ -17,15 +17,19 @@ LONGEST_SHOWN = 40
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A table of a file: where errors about its keys point to. ``path`` leads to the table from the file's root."""
+    """A table of a file: where errors about its keys point to.
+
+    ``path`` leads to the table from the file's root; ``kind``: what the errors' codes begin with, e.g. "stage".
+    """
 
     file: str
     lines: KeyLines
     path: KeyPath = ()
+    kind: str = "stage"
 
     def at(self, *keys: str | int) -> Place:
         """A place further in."""
-        return Place(self.file, self.lines, (*self.path, *keys))
+        return Place(self.file, self.lines, (*self.path, *keys), self.kind)
 
     def line(self, key: str | None = None) -> int:
         """The line of a key of this table, or of the table itself."""
@@ -33,16 +37,16 @@ class Place:
 
     def wrong_value(self, key: str, value: object, problem: str, allowed: str) -> UsageError:
         """``problem`` goes on after the value ("is not ..."); ``allowed`` says what the key may be."""
-        return self._error("stage-key-value", key, f"'{key}' = {shown(value)} {problem}", f"'{key}' is {allowed}.")
+        return self._error("key-value", key, f"'{key}' = {shown(value)} {problem}", f"'{key}' is {allowed}.")
 
     def wrong_type(self, key: str, value: object, problem: str, allowed: str) -> UsageError:
-        return self._error("stage-key-type", key, f"'{key}' = {shown(value)} {problem}", f"'{key}' is {allowed}.")
+        return self._error("key-type", key, f"'{key}' = {shown(value)} {problem}", f"'{key}' is {allowed}.")
 
     def missing(self, key: str, allowed: str, written: Collection[str] = ()) -> UsageError:
         """``written`` are the keys that the table has; one of them may be the missing one, misspelt."""
         near = difflib.get_close_matches(key, written, n=1)
         hint = f"; line {self.line(near[0])} has '{printable(near[0])}'" if near else ""
-        return self._error("stage-key-missing", None, f"the key '{key}' is missing{hint}", f"Add '{key}': {allowed}.")
+        return self._error("key-missing", None, f"the key '{key}' is missing{hint}", f"Add '{key}': {allowed}.")
 
     def unknown(self, key: str, allowed: Iterable[str]) -> UsageError:
         """``allowed`` are the keys that the table may have."""
@@ -50,12 +54,12 @@ class Place:
         near = difflib.get_close_matches(key, keys, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         listed = f"Allowed here: {', '.join(keys)}." if keys else "No further key is allowed here."
-        return self._error("stage-key-unknown", key, f"there is no key '{printable(key)}'{hint}", listed)
+        return self._error("key-unknown", key, f"there is no key '{printable(key)}'{hint}", listed)
 
     def _error(self, code: str, key: str | None, problem: str, remedy: str) -> UsageError:
         ending = "" if problem.endswith("?") else "."
         what = f"{self.file}, line {self.line(key)}: in {table_name(self.path)} {problem}{ending}"
-        return UsageError(code, what=what, remedy=remedy)
+        return UsageError(f"{self.kind}-{code}", what=what, remedy=remedy)
 
 
 def check_keys(place: Place, keys: Iterable[str], allowed: Mapping[str, str], required: Sequence[str]) -> None:

@@ -1,0 +1,82 @@
+"""A plan in numbers: stands and lenses in words of a technician, and what the seen surface gets."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from controller.arrays import Float64, Mask
+from controller.plan.search import Chosen
+from controller.plan.values import Goal, Lit, Placement, Surface
+
+
+def figures_of(best: Chosen, surface: Surface, goal: Goal) -> dict[str, Any]:
+    """Placements in words of a stand and a lens, and what the seen surface gets of each and of all."""
+    weight = surface.area_m2 / surface.area_m2.sum()
+    useful = np.stack([one.useful for one in best.candidates])
+    lux = np.where(useful, [one.lit.lux for one in best.candidates], 0.0).sum(axis=0)
+    detail = np.where(useful, [one.lit.detail_mm for one in best.candidates], np.inf).min(axis=0)
+    count = useful.sum(axis=0)
+    return {
+        "quality": best.quality,
+        "tried": best.tried,
+        "seen_area_m2": float(surface.area_m2.sum()),
+        "share_reached": float(weight @ (count > 0)),
+        "share_overlapped": float(weight @ (count >= goal.overlap)),
+        "share_bright_enough": float(weight @ (lux >= goal.lux)),
+        "share_fine_enough": float(weight @ (detail <= goal.detail_mm)),
+        "lux_median": _weighted(lux, weight, 0.5),
+        "lux_p5": _weighted(lux, weight, 0.05),
+        "detail_mm_median": _finite(_weighted(detail, weight, 0.5)),
+        "detail_mm_p95": _finite(_weighted(detail, weight, 0.95)),
+        "projectors": [_placed(one.placement) | _alone(one.useful, one.lit, weight) for one in best.candidates],
+    }
+
+
+def _placed(placement: Placement) -> dict[str, Any]:
+    ahead = placement.rotation[2]
+    return {
+        "model": placement.model.name,
+        "place": placement.spot.name,
+        "position_m": list(placement.spot.position_m),
+        "rotation": placement.rotation.tolist(),
+        "pan_degrees": math.degrees(math.atan2(ahead[0], ahead[2])),
+        "tilt_up_degrees": math.degrees(math.asin(-ahead[1])),
+        "throw_ratio": placement.throw_ratio,
+        "focal_px": placement.focal_px,
+        "centre_px": list(placement.centre_px),
+        "focus_m": placement.focus_m,
+    }
+
+
+def _alone(useful: Mask, lit: Lit, weight: Float64) -> dict[str, Any]:
+    """What one projector does where it is of use."""
+    share = float(weight @ useful)
+    inside = np.where(useful, weight, 0.0)
+    return {
+        "share_reached": share,
+        "lux_median": _of(lit.lux, useful, inside, 0.5),
+        "detail_mm_median": _of(lit.detail_mm, useful, inside, 0.5),
+        "blur_px_median": _of(lit.blur_px, useful, inside, 0.5),
+        "blur_px_p95": _of(lit.blur_px, useful, inside, 0.95),
+        "grazing_loss_mean": float(inside @ (1.0 - lit.cosine)) / share if share else None,
+    }
+
+
+def _of(values: Float64, useful: Mask, inside: Float64, share: float) -> float | None:
+    return _finite(_weighted(np.where(useful, values, 0.0), inside, share))
+
+
+def _weighted(values: Float64, weight: Float64, share: float) -> float:
+    """The value below which ``share`` of the weight lies; of no weight, 0."""
+    order = np.argsort(values, kind="stable")
+    summed = np.cumsum(weight[order])
+    if summed[-1] <= 0:
+        return 0.0
+    return float(values[order[min(int(np.searchsorted(summed, share * summed[-1])), len(order) - 1)]])
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,47 @@
+"""``velatura plan`` from the example to a page."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+
+from controller.errors import UsageError
+from controller.plan_services import plan, write_example
+from controller.session.progress import Progress, Silent
+
+
+class Kept(Silent):
+    def __init__(self) -> None:
+        self.fractions: list[float] = []
+
+    def progress(self, now: Progress) -> None:
+        self.fractions.append(now.fraction)
+
+
+def test_the_example_with_a_mesh_becomes_a_page_and_figures(tmp_path: Path, ball: Path) -> None:
+    file = tmp_path / "plan.toml"
+    write_example(file)
+    with pytest.raises(UsageError, match="already"):
+        write_example(file)
+    text = file.read_text().replace("object.obj", "ball.ply").replace("step_degrees = 10.0", "step_degrees = 20.0")
+    text = re.sub(r"positions_m = .*", "positions_m = [[0.0, -0.2, -1.5]]", text)
+    file.write_text(text + "points = 500\n")
+    shutil.copy(ball, tmp_path / "ball.ply")
+    told = Kept()
+    result = plan(file=file, out=tmp_path / "out", reporter=told, cancel=threading.Event())
+    assert told.fractions == sorted(told.fractions)
+    assert told.fractions[-1] == 1.0
+    figures = json.loads(Path(result["figures"]).read_text())
+    assert result["quality"] == pytest.approx(figures["quality"], abs=1e-3)
+    assert len(figures["projectors"]) == 3
+    assert 0.9 < figures["share_reached"] <= 1
+    assert figures["share_overlapped"] <= figures["share_reached"]
+    page = Path(result["plan"]).read_text()
+    assert not re.search(r"https?:|<script|<link", page)
+    assert page.count("data:image/") == 1 + 5
+    assert all(one["place"] in page for one in figures["projectors"])
