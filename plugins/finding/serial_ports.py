@@ -2,14 +2,15 @@
 
 A port is asked for the power state in the words of every shipped profile, one after another: questions only, never a
 command, each as seldom as the profile wants. What nobody answers at its usual rate is asked at others where stage.toml
-names the port, or where something came back that nobody understood.
+names the port, or where something came back that nobody understood. Ports are looked at side by side.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,7 +32,10 @@ WRITE_S: Final = 1.0
 END: Final = b"\r"
 BAUDS: Final = (9600, 19200, 38400, 57600, 115200)
 MOST_PORTS: Final = 64
+AT_ONCE: Final = 8
 SLOW: Final = 3
+LISTENED: Final = 3
+"""What says something unasked in so many waits in a row speaks by itself, and is no projector at a wrong rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +50,20 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Who answered: a profile at a baud rate (None: nobody), and whether anything at all came back."""
+    """Who answered: a profile at a baud rate (None: nobody), whether anything at all came, and came unasked."""
 
     profile: ProjectorProfile | None
     baud: int = 0
     anything: bool = False
+    unasked: bool = False
 
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
     """Every serial port of this machine and of stage.toml."""
     profiles = [load_profile(name, wanted.stage) for name in shipped_profiles()]
     profiles = [profile for profile in profiles if profile.serial is not None]
-    return [_found(port, wanted, profiles, deadline) for port in _ports(wanted)]
+    with ThreadPoolExecutor(AT_ONCE, thread_name_prefix="ports") as pool:
+        return list(pool.map(lambda port: _found(port, wanted, profiles, deadline), _ports(wanted)))
 
 
 def _ports(wanted: Wanted) -> list[Port]:
@@ -99,11 +105,11 @@ def _asked(
     settings = port.settings or {}
     written = int(settings.get("baud", own.serial.baud if own is not None and own.serial is not None else 0))
     heard = _who(port, _order(own, written, profiles), answer_s, deadline)
-    if heard.profile is None and heard.anything:
+    if heard.profile is None and heard.anything and not heard.unasked:
         # Somebody is there: an adapter or a machine under load may only have been slow to say who.
         usual = ((baud, known, only_if) for baud, known, only_if in _order(own, written, profiles) if not only_if)
         heard = _who(port, usual, SLOW * answer_s, deadline)
-        heard = heard if heard.profile is not None else Heard(None, anything=True)
+        heard = replace(heard, anything=True)
     if heard.profile is None:
         return _nobody(port, own, heard, written)
     profile, baud = heard.profile, heard.baud
@@ -165,7 +171,7 @@ def _order(
 def _who(
     port: Port, order: Iterable[tuple[int, Sequence[ProjectorProfile], bool]], answer_s: float, deadline: Deadline
 ) -> Heard:
-    anything, named = False, port.settings is not None
+    anything, listened, named = False, False, port.settings is not None
     for baud, profiles, only_if in order:
         if only_if and not (anything or named):
             continue
@@ -176,6 +182,10 @@ def _who(
                 continue  # a rate that this adapter does not have
             raise
         try:
+            if only_if and anything and not listened:
+                listened = True
+                if _speaks_unasked(link, answer_s, deadline):
+                    return Heard(None, anything=True, unasked=True)
             # What was asked at another rate arrived as noise: it must not stand before the first question on one line.
             link.write(END, deadline=deadline.within(WRITE_S))
             for profile in profiles:
@@ -186,6 +196,16 @@ def _who(
         finally:
             link.close()
     return Heard(None, anything=anything)
+
+
+def _speaks_unasked(link: SerialLink, answer_s: float, deadline: Deadline) -> bool:
+    """Whether something comes all the time, though nobody asks."""
+    link.drain()
+    for _ in range(LISTENED):
+        deadline.sleep(answer_s)
+        if not link.drain():
+            return False
+    return True
 
 
 def _answers(link: SerialLink, profile: ProjectorProfile, answer_s: float, deadline: Deadline) -> tuple[bool, bool]:
