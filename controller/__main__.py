@@ -29,6 +29,7 @@ from controller.commands.keys import keys
 from controller.commands.live import live
 from controller.commands.report import report
 from controller.commands.running import Json, StageFolder, group, work
+from controller.commands.study import study
 from controller.errors import UsageError, VelaturaError
 
 __all__ = ["COMMANDS", "GROUPS", "Json", "StageFolder", "application", "main", "run", "work"]
@@ -173,6 +174,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     emulate,
     export,
     report,
+    study,
     states,
     *serve_commands.COMMANDS,
 )

@@ -1,0 +1,43 @@
+"""Every experiment, in the order of the index."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from controller.errors import UsageError
+from controller.study.ablation import ABLATION
+from controller.study.earlier import EARLIER
+from controller.study.frequency import FREQUENCY
+from controller.study.regions import REGIONS
+from controller.study.residual import RESIDUAL, RESIDUAL_SIX
+from controller.study.sharpness import SHARPNESS
+from controller.study.values import Experiment
+
+EXPERIMENTS: Final[tuple[Experiment, ...]] = (
+    ABLATION,
+    REGIONS,
+    RESIDUAL,
+    RESIDUAL_SIX,
+    SHARPNESS,
+    FREQUENCY,
+    EARLIER,
+)
+
+
+def chosen(names: Sequence[str]) -> list[Experiment]:
+    """The experiments of these names, in the catalogue's order; without names all that are not optional.
+
+    Raises UsageError("experiment-unknown").
+    """
+    known = {experiment.name: experiment for experiment in EXPERIMENTS}
+    for name in names:
+        if name not in known:
+            raise UsageError(
+                "experiment-unknown",
+                what=f"There is no experiment called {name}.",
+                remedy=f"Choose from {', '.join(known)}.",
+            )
+    if names:
+        return [experiment for experiment in EXPERIMENTS if experiment.name in names]
+    return [experiment for experiment in EXPERIMENTS if not experiment.optional]

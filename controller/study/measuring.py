@@ -1,0 +1,151 @@
+"""How near a photograph is to its target, and the solves that experiments share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, lsmr
+from skimage.metrics import structural_similarity
+
+from controller.arrays import Float64, FloatImage, Mask
+from controller.solve.metrics import EDGE_SIGMA_PX, FAINTEST_EDGE, GRADIENT_SCALE, STRONG, WEAK, compare
+from controller.solve.targets_values import linear_to_srgb
+from controller.study.subject import Subject, Wanted
+from controller.transport import LightTransport
+from controller.transport.planes import image_planes, plane_frames
+
+REGION_PX = 16
+"""The paper's regions (3.2)."""
+LEAST_PIXELS = 32
+"""A region counts where so many of its pixels are compared."""
+NAIVE_ITERATIONS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """Of one photograph, over the pixels of a mask.
+
+    ``delta_e`` median CIEDE2000 and ``delta_e_p95`` its 95th percentile; ``rmse`` of the target's white, linear light;
+    ``ssim`` mean structural similarity of the pictures as a screen shows them (sRGB, 11 px Gaussian window);
+    ``sharpness``: lambda of eq. 9
+    """
+
+    delta_e: float
+    delta_e_p95: float
+    rmse: float
+    ssim: float
+    sharpness: float
+
+
+def quality(subject: Subject, achieved: FloatImage, wanted: Wanted, mask: Mask | None = None) -> Quality:
+    """Compare a photograph with its target where both can be compared."""
+    mask = wanted.mask if mask is None else mask
+    found = compare(achieved, wanted.radiance, subject.calibration.camera_to_xyz, wanted.white, mask)
+    pictures = [
+        np.where(mask[..., None], linear_to_srgb(image / np.float32(wanted.white)), 0)
+        for image in (achieved, wanted.radiance)
+    ]
+    _, local = structural_similarity(  # type: ignore[no-untyped-call]
+        *pictures,
+        channel_axis=2,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    return Quality(
+        found.delta_e00_median, found.delta_e00_p95, found.rmse, float(local[mask].mean()), found.sharpness_lambda
+    )
+
+
+def region_means(values: FloatImage, mask: Mask, size_px: int = REGION_PX) -> FloatImage:
+    """Mean of ``values`` (rows, columns) over the mask's pixels of each square region, NaN where too few are in it."""
+    rows, columns = (-(-side // size_px) for side in mask.shape)
+    y, x = np.nonzero(mask)
+    region = (y // size_px) * columns + x // size_px
+    count = np.bincount(region, minlength=rows * columns)
+    total = np.bincount(region, weights=values[mask].astype(np.float64), minlength=rows * columns)
+    enough = count >= min(LEAST_PIXELS, size_px * size_px // 2)
+    means = np.divide(total, count, out=np.full(total.shape, np.nan), where=enough)
+    return np.asarray(means.reshape(rows, columns), np.float32)
+
+
+def normalised_residual(achieved: FloatImage, wanted: Wanted, mask: Mask) -> FloatImage:
+    """Per region of 16x16 camera pixels: rms difference to the target over its white, (rows, columns), NaN outside."""
+    squared = (((achieved - wanted.radiance) / np.float32(wanted.white)) ** 2).mean(axis=2)
+    return np.asarray(np.sqrt(region_means(squared, mask)), np.float32)
+
+
+def edges(image: FloatImage, white: float, threshold: float) -> Mask:
+    """Edges (rows, columns) as ``solve.metrics.sharpness`` finds them, above a threshold of the gradient."""
+    dx, dy = (np.round(part).astype(np.int16) for part in _gradient(image, white))
+    return np.asarray(cv2.Canny(dx, dy, WEAK * threshold, threshold, L2gradient=True) > 0)
+
+
+def edge_threshold(image: FloatImage, white: float, mask: Mask) -> float:
+    """The target's own threshold for its edges and those of what is compared with it."""
+    strength = np.hypot(*_gradient(image, white))[mask]
+    return max(float(np.quantile(strength, STRONG)) if strength.size else 0.0, FAINTEST_EDGE)
+
+
+def _gradient(image: FloatImage, white: float) -> tuple[FloatImage, FloatImage]:
+    grey = np.clip(image.mean(axis=2) / white, 0, 1) ** np.float32(1 / 2.2)
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
+    dx, dy = (np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1 - i, i) * GRADIENT_SCALE, np.float32) for i in range(2))
+    return dx, dy
+
+
+def sharpness_map(
+    achieved: FloatImage, wanted: Wanted, mask: Mask, size_px: int, least_edges: int = 12
+) -> tuple[FloatImage, float]:
+    """lambda (paper 6, eq. 9) in each square window, NaN where the target has too few edges; and over all of them."""
+    threshold = edge_threshold(wanted.radiance, wanted.white, mask)
+    ours, theirs = (edges(image, wanted.white, threshold) & mask for image in (achieved, wanted.radiance))
+
+    def counted(picture: Mask) -> Float64:
+        rows, columns = (-(-side // size_px) * size_px for side in mask.shape)
+        whole = np.zeros((rows, columns))
+        whole[: mask.shape[0], : mask.shape[1]] = picture
+        return np.asarray(whole.reshape(rows // size_px, size_px, columns // size_px, size_px).sum(axis=(1, 3)))
+
+    common, most = counted(ours & theirs), np.maximum(counted(ours), counted(theirs))
+    enough = counted(theirs) >= least_edges
+    local = np.divide(common, most, out=np.full(most.shape, np.nan), where=enough & (most > 0))
+    total = max(int(ours.sum()), int(theirs.sum()))
+    return local.astype(np.float32), float((ours & theirs).sum() / total) if total else 1.0
+
+
+def unbounded_inverse(
+    transport: LightTransport, wanted: FloatImage, black: FloatImage, *, iterations: int = NAIVE_ITERATIONS
+) -> list[FloatImage]:
+    """Least squares without bounds (paper 2.2, eq. 2), clipped to [0, 1] afterwards.
+
+    By LSMR, which ends at the least-norm solution, the pseudo-inverse's, as it goes on.
+    """
+    mask, shape = transport.object_mask, transport.shape
+    camera = (3, *shape)
+
+    def forward(p: Float64) -> Float64:
+        light = transport.forward_planes(np.ascontiguousarray(p.reshape(3, -1), np.float32))
+        return np.asarray(light * mask, np.float64).ravel()
+
+    def adjoint(r: Float64) -> Float64:
+        image = np.ascontiguousarray(r.reshape(camera) * mask, np.float32)
+        return np.asarray(transport.adjoint_planes(image), np.float64).ravel()
+
+    operator = LinearOperator(
+        (3 * shape[0] * shape[1], 3 * transport.pixels), matvec=forward, rmatvec=adjoint, dtype=np.float64
+    )
+    light = image_planes(np.maximum(wanted - black, 0)) * mask
+    scale = float(light.max(initial=0)) or 1.0
+    found = lsmr(operator, light.astype(np.float64).ravel() / scale, atol=1e-7, btol=1e-7, maxiter=iterations)[0]
+    return plane_frames(np.clip(found.reshape(3, -1) * scale, 0, 1).astype(np.float32), transport.sizes)
+
+
+def predicted(transport: LightTransport, frames: Sequence[FloatImage], black: FloatImage) -> FloatImage:
+    """What the camera should see of these frames by the model: T p + K."""
+    return np.asarray(transport.forward(frames) + black, np.float32)

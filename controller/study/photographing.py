@@ -1,0 +1,169 @@
+"""Photographs for experiments, on the opened stage."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+
+from controller.arrays import ByteImage, Float64, FloatImage, load_arrays
+from controller.calibrate.dots import fit_dots
+from controller.calibrate.guess import guess_metapixels, modelled_correspondence, where_missing
+from controller.calibrate.values import PhaseMap
+from controller.capture.brackets import merge_brackets
+from controller.capture.dots import DotPattern, dot_frame, dot_patterns
+from controller.session import costs
+from controller.session.calibrating import read_correspondence, read_geometry, read_phase_map
+from controller.session.capturing import bracket
+from controller.session.dot_shots import (
+    check_disk,
+    dot_exposure_s,
+    of_sinusoids,
+    planned,
+    read_batches,
+    spacing_of,
+    take_in_batches,
+)
+from controller.session.modes import DotOptions
+from controller.session.publishing import PHOTO_BRACKET
+from controller.session.rig import Rig, RigProjector
+from controller.session.runner import Context, Step
+from controller.session.shots import Developed, keep_if_lit, take_photograph
+from controller.session.solving import Calibrated, device_frames
+from controller.storage import write_atomically
+from controller.study.subject import Dots, Shares
+
+FAINTEST_SHARE = 0.01
+"""A dot's light below this share of white is left out: it is the photograph's noise."""
+DOTS = DotOptions("paper", None)
+
+
+@dataclass(frozen=True, slots=True)
+class RigLight:
+    """``subject.Light`` on real devices; ``name`` is the experiment's."""
+
+    rig: Rig
+    context: Context
+    calibrated: Calibrated
+    name: str
+    longest_exposure_s: float
+
+    def photograph(self, name: str, frames: Sequence[FloatImage], *, white: float) -> FloatImage:
+        shown = device_frames(self.calibrated.calibration, frames)
+        presented = self.rig.display.show(self.rig.on_outputs(shown), deadline=self.context.deadline.within(20))
+        exposures_s = bracket(1 / white, PHOTO_BRACKET, self.rig.acquirer.exposures_s(), self.longest_exposure_s)
+        taken = [
+            take_photograph(
+                self.rig, self.context, f"study-{self.name}-{name}-{number}", exposure_s,
+                shown_at_s=presented.at_s, of={"frames": _digest(shown)},
+            )
+            for number, exposure_s in enumerate(exposures_s)
+        ]  # fmt: skip
+        keep_if_lit(self.rig, self.context, taken)
+        merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
+        # Too bright for the shortest exposure is at least its full scale; black would be the one wrong answer.
+        return np.asarray(np.nan_to_num(merged, nan=1 / min(one.exposure_s for one in taken)), np.float32)
+
+    def dots(self, n: int) -> Dots:
+        folder, name = self.context.folder, self.calibrated.projectors[n]
+        spacing = int(json.loads((folder / f"study-dots-{name}.json").read_text())["spacing_px"])
+        rows, columns = self.calibrated.calibration.projectors[n].metapixels.valid.shape
+        patterns = dot_patterns((columns, rows), spacing)
+        listed = read_batches(folder, f"study-dots-{name}", len(patterns))
+        taken = {item.name.removeprefix(f"{name}-{spacing:02d}-"): item for item in listed}
+        light = load_arrays(folder / f"radiometry-{name}.npz")
+        captures = Developed(taken, {"black": light["black"]})
+        phase_map, _ = read_phase_map(folder, name)
+        assert phase_map is not None
+        white = np.nan_to_num(light["white"])
+        shares = dots_as_shares(captures, white, phase_map, patterns, (rows, columns))
+        model = guess_metapixels(modelled_correspondence(read_geometry(folder), n), (columns, rows))
+        start = where_missing(guess_metapixels(read_correspondence(folder, name), (columns, rows)), model)
+        fitted, _ = fit_dots(captures, light["white"], start, spacing, fallback=model)
+        return Dots(shares, fitted)
+
+
+def dots_as_shares(
+    captures: Mapping[str, FloatImage],
+    white: FloatImage,
+    phase_map: PhaseMap,
+    patterns: Sequence[DotPattern],
+    size: tuple[int, int],
+) -> Shares:
+    """Light transport as dots show it, with no model: what each camera pixel sees of the dot nearest to where it looks.
+
+    Parameters
+    ----------
+    captures : "black" and every pattern, in one unit; NaN where saturated
+    white : (camera rows, columns, 3) less black, in that unit
+    size : (rows, columns) of the projector
+
+    Returns
+    -------
+    (camera pixels, projector pixels): light of the dot over white light, in [0, 1]; nothing farther from the dot than
+    half of the dots' distance
+    """
+    rows, columns = size
+    black = captures["black"].sum(axis=2)
+    whole = white.sum(axis=2)
+    x, y = np.moveaxis(phase_map.projector_px.astype(np.float64), -1, 0)
+    looks = np.isfinite(x) & np.isfinite(y) & (whole > 0)
+    at = np.flatnonzero(looks)
+    x, y, whole, dark = x.ravel()[at], y.ravel()[at], whole.ravel()[at], black.ravel()[at]
+    parts: list[tuple[Float64, Float64, Float64]] = []
+    for pattern in patterns:
+        r = pattern.spacing_px
+        column = np.round((x - pattern.column) / r) * r + pattern.column
+        row = np.round((y - pattern.row) / r) * r + pattern.row
+        seen = np.nan_to_num(captures[pattern.name].sum(axis=2).ravel()[at] - dark, nan=0.0)
+        share = np.clip(seen / whole, 0, 1)
+        ok = (share > FAINTEST_SHARE) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+        parts.append((at[ok], (row * columns + column)[ok], share[ok]))
+    camera, projector, share = (np.concatenate(part) for part in zip(*parts, strict=True))
+    shape = (looks.size, rows * columns)
+    return sp.csr_matrix((share, (camera.astype(np.int64), projector.astype(np.int64))), shape=shape)
+
+
+def dot_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
+    """Photograph the dots of each projector, for ``Light.dots``; the calibration itself stays the fast one."""
+    return [
+        Step(
+            f"study-dots-{projector.name}",
+            partial(_photograph_dots, rig, projector, longest_exposure_s),
+            inputs={"longest_exposure_s": repr(longest_exposure_s), **DOTS.inputs()},
+            after=("exposure", f"pixels-{projector.name}"),
+            title=f"Photographing the dots of {projector.name}",
+            weight=49 * costs.shot_s(costs.scale([projector.size_px])),
+        )
+        for projector in rig.projectors
+    ]
+
+
+def _photograph_dots(rig: Rig, projector: RigProjector, longest_s: float, context: Context) -> Sequence[Path]:
+    name = projector.name
+    known = of_sinusoids(context.folder, name)
+    spacing = spacing_of(DOTS, known)
+    patterns = dot_patterns(projector.size_px, spacing)
+    check_disk(context.folder, projector, len(patterns))
+    exposure_s = dot_exposure_s(rig, context.folder, name, known, longest_s)
+    plan = [
+        planned(projector, f"{spacing:02d}-{pattern.name}", partial(dot_frame, pattern, projector.size_px), exposure_s)
+        for pattern in patterns
+    ]
+    paths = take_in_batches(rig, context, plan, index=f"study-dots-{name}")
+    notes = context.folder / f"study-dots-{name}.json"
+    write_atomically(notes, json.dumps({"spacing_px": spacing, "exposure_s": exposure_s}, indent=1).encode())
+    return [notes, *paths]
+
+
+def _digest(frames: Mapping[str, ByteImage]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(frames):
+        digest.update(np.ascontiguousarray(frames[name]).tobytes())
+    return digest.hexdigest()
