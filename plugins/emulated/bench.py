@@ -35,6 +35,7 @@ from plugins.emulated.staging import (
     random_truth,
     size_named,
 )
+from plugins.emulated.stands import SETTINGS, Stands, read_stands
 from plugins.emulated.truth import FOLDER, ObjectTruth, read_truth, write_truth
 from plugins.emulated.world import World, object_of
 
@@ -44,7 +45,10 @@ HOST: Final = "127.0.0.1"
 
 
 class EmulatedBench:
-    """``hal.interfaces.Bench``."""
+    """``hal.interfaces.Bench``. ``stands``: where the projectors of a stage that it prepares shall stand."""
+
+    def __init__(self, stands: Stands | None = None) -> None:
+        self._stands = stands or Stands()
 
     def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
         """Write ``bench.toml`` and ``bench/``; return the device tables of stage.toml (see ``hal.interfaces.Bench``).
@@ -59,7 +63,7 @@ class EmulatedBench:
             thing = load_object(object_file)
             kept = ObjectTruth("mesh", OBJECT_FILE, seed)
         shape = thing if thing is not None else object_of(stage, kept)
-        truth = random_truth(size, seed, shape, kept, _free_ports())
+        truth = random_truth(size, seed, shape, kept, _free_ports(), self._stands)
         profile = quick_profile(LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s), stable_s=FAST_LAMP.stable_s)
         with _explained(stage):
             for folder in (FOLDER, "run"):
@@ -251,7 +255,7 @@ def _stop_on_signals(stopped: threading.Event) -> Iterator[None]:
 
 
 def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> EmulatedBench:
-    return EmulatedBench()
+    return EmulatedBench(read_stands(settings, context.stage))
 
 
 DRIVER: Final = Driver(
@@ -259,4 +263,5 @@ DRIVER: Final = Driver(
     name="emulated",
     summary="A whole stage in one process: three projectors, a camera and an object, with their optics.",
     open=_open,
+    settings=SETTINGS,
 )

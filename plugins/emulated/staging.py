@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from hal.errors import DeviceError
 from plugins.emulated.objects import StageObject
 from plugins.emulated.rays import project
+from plugins.emulated.stands import Stands
 from plugins.emulated.truth import (
     BenchTruth,
     CameraTruth,
@@ -50,8 +51,6 @@ FOCAL_REL_SIGMA, CENTRE_SIGMA_PX, K1_SIGMA = 0.001, 3.0, 0.01
 """How well a session with a ChArUco board tells a lens at the size ``paper``; the centre scales with the picture."""
 FRAMES: Final = "run/outputs.frame"
 FAST_PROFILE: Final = "bench/optoma-fast.toml"
-PLACES: Final = (("left", -29.0, 6.0), ("right", 27.0, 3.0), ("above", 2.0, 27.0))
-"""Name, degrees to the right of the camera and above it, as seen from the object."""
 CAMERA_FILL: Final = 0.90
 PROJECTOR_FILL: Final = 0.88
 FAST_LAMP: Final = LampTruth(warm_up_s=2.0, stable_s=2.0, cool_down_s=1.0)
@@ -72,12 +71,16 @@ def size_named(name: str) -> Size:
     return SIZES[name]
 
 
-def random_truth(size: str, seed: int, thing: StageObject, kept: ObjectTruth, ports: tuple[int, int]) -> BenchTruth:
+def random_truth(
+    size: str, seed: int, thing: StageObject, kept: ObjectTruth, ports: tuple[int, int], stands: Stands | None = None
+) -> BenchTruth:
     """A plausible stage round ``thing``; the same arguments give the same stage."""
     sizes, rng = size_named(size), np.random.default_rng(seed)
     points = thing.vertices[:: max(1, len(thing.vertices) // 6000)].astype(np.float64)
     camera = _camera(sizes, rng, points, ports)
-    projectors = tuple(_projector(index, *place, sizes, rng, points) for index, place in enumerate(PLACES))
+    stands = stands or Stands()
+    drawn = (_projector(index, *place, sizes, rng, points) for index, place in enumerate(stands.places))
+    projectors = tuple(stands.put(index, projector) for index, projector in enumerate(drawn))
     return BenchTruth(
         size=size,
         frames=FRAMES,
