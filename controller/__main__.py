@@ -27,6 +27,7 @@ from controller.commands.drift import drift
 from controller.commands.export import export
 from controller.commands.keys import keys
 from controller.commands.live import live
+from controller.commands.plan import plan
 from controller.commands.report import report
 from controller.commands.running import Json, StageFolder, group, work
 from controller.commands.study import study
@@ -105,12 +106,18 @@ def calibrate(
         str | None, typer.Option(help='Projector pixels between dots, or "auto" for what the blur needs.')
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Look what has changed, and repeat only that.")] = False,
+    projector: Annotated[
+        str | None, typer.Option(help="Measure this projector anew, and keep what is known of the others.")
+    ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
     """Photograph patterns and calibrate the stage; goes on with an unfinished calibration."""
-    if quick:
-        work("controller.drift_services:recalibrate", as_json=as_json, stage=stage, accept_grade=accept_grade)
+    if quick or projector is not None:
+        work(
+            "controller.drift_services:recalibrate", as_json=as_json,
+            stage=stage, accept_grade=accept_grade, projector=projector,
+        )  # fmt: skip
         return
     work(
         "controller.services:calibrate", as_json=as_json,
@@ -173,6 +180,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     keys,
     emulate,
     export,
+    plan,
     report,
     study,
     states,

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from controller.app import Checked, check_stage, marker, run_on_stage
-from controller.services import finished_calibration, worst_grade
+from controller.calibrations import finished_calibration, worst_grade
+from controller.errors import UsageError
 from controller.session.calibrating import calibration_steps
 from controller.session.darkness import dark_after
 from controller.session.dotting import dot_steps
@@ -19,6 +20,7 @@ from controller.session.grading import accept, below_grade, compare_with_last, g
 from controller.session.journal import Journal
 from controller.session.machine import Event
 from controller.session.modes import MODES, CalibrationMode, DotOptions, mode_of
+from controller.session.one_projector import one_projector_steps
 from controller.session.progress import Level, Reporter
 from controller.session.quick import quick_steps
 from controller.session.rig import Rig
@@ -47,14 +49,23 @@ def check_drift(*, stage: Path, details: bool, reporter: Reporter, cancel: threa
 
 
 def recalibrate(
-    *, stage: Path, reporter: Reporter, cancel: threading.Event, accept_grade: bool = False
+    *,
+    stage: Path,
+    reporter: Reporter,
+    cancel: threading.Event,
+    accept_grade: bool = False,
+    projector: str | None = None,
 ) -> Mapping[str, Any]:
     """Bring the last calibration up to date, repeating only what has changed; goes on with an unfinished one.
 
-    Raises UsageError("not-calibrated"), CalibrationError("projector-dark"), CalibrationError("calibration-below-grade")
-    for a result that may not replace the last calibration, and what the devices raise.
+    ``projector``: all of that one is measured anew, whatever has changed, and nothing of the others but one photograph
+    each for the grade.
+    Raises UsageError("not-calibrated", "projector-unknown"), CalibrationError("projector-dark"),
+    CalibrationError("calibration-below-grade") for a result that may not replace the last calibration, and what the
+    devices raise.
     """
     checked = check_stage(stage)
+    check_name(checked, projector)
     last = finished_calibration(checked.stage.folder)
     calibrated = Calibrated(last, checked.names)
 
@@ -63,24 +74,37 @@ def recalibrate(
         mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
         full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
                 *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
+        repeated = (
+            quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)
+            if projector is None
+            else one_projector_steps(rig, run, calibrated, full, projector, longest_exposure_s=longest_s)
+        )
         return [
             marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
-            *quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s),
+            *repeated,
             *dark_after(rig.darkness, rig.display),
             _take_over_step(worst_grade(checked), reporter, accept_grade=accept_grade),
             marker("recalibrated", "Recalibrated", leave=Event.CALIBRATED),
         ]
 
-    run = run_on_stage(checked, steps, name="recalibrate", reporter=reporter, cancel=cancel, dark=True)
+    name = "recalibrate" if projector is None else "projector"
+    run = run_on_stage(checked, steps, name=name, reporter=reporter, cancel=cancel, dark=True)
     compare_with_last(run, last, reporter)
     if not passes(run, worst_grade(checked)):
         raise below_grade(run, worst_grade(checked))
-    content = json.loads((run / FILE).read_text())
     with Journal(run) as journal:
         seconds = sum(value for name, value in journal.steps().items() if name.endswith("photographs"))
         shots = journal.shot_count()
-    return {"run": str(run), **grade_figures(run), "advice": content["advice"], "photographs": shots,
+    advice = "projector" if projector is not None else json.loads((run / FILE).read_text())["advice"]
+    return {"run": str(run), **grade_figures(run), "advice": advice, "photographs": shots,
             "check_and_grade_seconds": seconds}  # fmt: skip
+
+
+def check_name(checked: Checked, projector: str | None) -> None:
+    """Raises UsageError("projector-unknown"), before a lamp is struck."""
+    if projector is not None and projector not in checked.names:
+        raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
+                         remedy=f"It is one of {', '.join(checked.names)}.")  # fmt: skip
 
 
 def _take_over_step(worst: float, reporter: Reporter, *, accept_grade: bool) -> Step:

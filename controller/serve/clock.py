@@ -5,15 +5,18 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Final
 
 from controller.serve.eventlog import Decision, EventLog
-from controller.serve.planner import DOUBT_S, believed
+from controller.serve.planner import DOUBT_S, HOLD_S, believed
 
 _UNSYNCHRONISED: Final = 0x40
 _KEEP_EVERY_S: Final = 60.0
 _PROVE_S: Final = 3600.0
 """A clock that jumped far ahead is remembered only when it stays there for so long: a glitch must leave no trace."""
+_SET_S: Final = 30.0
+"""A clock that moves by more than this between two looks was set; one that is disciplined moves by less."""
 
 
 def synchronised() -> bool:
@@ -44,10 +47,13 @@ class Clockwork:
         self._kept = self._latest
         self._ahead_since_s: float | None = None
         self._known: bool | None = None
+        self._offset_s: float | None = None
 
     def now(self) -> float | None:
         """Unix seconds to plan with, or None while nobody knows the time; says so when that changes."""
-        now_s = believed(self._wall(), self._latest, synchronised=self._synchronised())
+        wall_s = self._wall()
+        self._notice(wall_s - self._monotonic())
+        now_s = believed(wall_s, self._latest, synchronised=self._synchronised())
         if (now_s is not None) is not self._known and (self._known is not None or now_s is None):
             self._log.tell(_LOST if now_s is None else _FOUND)
         self._known = now_s is not None
@@ -67,6 +73,11 @@ class Clockwork:
             self._log.keep("since", kept)
         return float("inf") if kept is None else float(kept)
 
+    def _notice(self, offset_s: float) -> None:
+        before_s, self._offset_s = self._offset_s, offset_s
+        if before_s is not None and abs(offset_s - before_s) > _SET_S:
+            self._log.tell(_set(offset_s - before_s))
+
     def _proven(self, now_s: float) -> bool:
         if self._latest is None or now_s - self._latest <= DOUBT_S or self._synchronised():
             self._ahead_since_s = None
@@ -76,6 +87,31 @@ class Clockwork:
         return self._monotonic() - self._ahead_since_s >= _PROVE_S
 
 
+def beginning(log: EventLog) -> Decision:
+    """What a service says as it begins, so that the log accounts for the time in which none ran."""
+    last = next((row.code for row in reversed(log.after(0)) if row.code in (_BEGAN, "service-ended")), "")
+    if last != _BEGAN:
+        return Decision(_BEGAN, "The kiosk begins.")
+    latest = log.value("latest")
+    when = "" if latest is None else f", after {datetime.fromtimestamp(float(latest), UTC):%Y-%m-%d %H:%M} UTC"
+    return Decision(
+        _BEGAN, f"The kiosk begins; the one before was cut off{when}.",
+        "If there was no power cut, see the machine's own log.", "warning",
+    )  # fmt: skip
+
+
+def _set(by_s: float) -> Decision:
+    how = f"The clock was set {'ahead' if by_s > 0 else 'back'} by {_span(abs(by_s))}."
+    held = -HOLD_S <= by_s < 0
+    then = "The kiosk's time stands still until the clock has caught up." if held else ""
+    return Decision("clock-set", how, then, "warning")
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds / 86_400:.0f} days" if seconds > 2 * 86_400 else f"{max(1, round(seconds / 60))} min"
+
+
+_BEGAN: Final = "service-started"
 _LOST: Final = Decision(
     "clock-unknown",
     "Nobody knows what time it is: the clock was lost.",

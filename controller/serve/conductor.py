@@ -16,6 +16,7 @@ from controller.panel.kiosk import Schedule
 from controller.serve.agenda import Agenda
 from controller.serve.clock import Clockwork
 from controller.serve.eventlog import Decision, EventLog
+from controller.serve.pictures import Pictures
 from controller.serve.planner import Plan, plan
 from controller.serve.ports import (
     BLACK,
@@ -25,7 +26,6 @@ from controller.serve.ports import (
     PlayerView,
     ProjectorView,
     Request,
-    Showing,
     Stock,
     Works,
 )
@@ -69,18 +69,17 @@ class Conductor:
         without_time: bool = False,
         limits: Limits | None = None,
     ) -> None:
-        self._keepers, self._player, self._stock, self._log = keepers, player, stock, log
+        self._keepers, self._player, self._log = keepers, player, log
         self._schedule, self._clock, self._monotonic = schedule, clock, monotonic
         self._limits = limits or Limits()
         self._agenda = Agenda(works, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
         self.machine = Machine(self._changed)
         self.wishes = Wishes(log, without_time=without_time)
+        self._pictures = Pictures(stock, self.wishes, self._agenda, log)
         self._lock = threading.RLock()
-        self._empty = False
         self._plan = Plan(None)
         self._since_s = monotonic()
         self._attempts, self._missing = 0, frozenset[str]()
-        self._asked_for: set[frozenset[str]] = set()
 
     # -- asked from outside
 
@@ -137,7 +136,7 @@ class Conductor:
             wanted_open = self.wishes.open(self._plan)
             self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
             views = [keeper.view for keeper in self._keepers]
-            open_now = wanted_open and self._something_to_play(wanted_open)
+            open_now = self._pictures.something(wanted_open)
             light = open_now or self._agenda.needs_light
             self._move(views, light, open_now)
             cooling = self.machine.state in (State.COOLING, State.OFF)
@@ -266,30 +265,9 @@ class Conductor:
         state = self.machine.state
         if state is State.CALIBRATING:
             return
-        self._player.want = self._picture(views) if open_now and state in _ON else BLACK
-
-    def _picture(self, views: Sequence[ProjectorView]) -> Showing:
-        names = self._stock.names()
-        name = self.wishes.appearance(self._plan, names)
-        bundle = self._stock.bundle()
-        if not self._missing or len(self._missing) == len(views):
-            return Showing(bundle, name)
-        instead = self._stock.without(self._missing)
-        if instead is not None:
-            return Showing(instead, name)
-        # The whole stage's frames go on meanwhile: dimmer, but there.
-        if self._missing not in self._asked_for:
-            request = Request("takeover", arguments=tuple(sorted(self._missing)))
-            if self._agenda.offer(request):
-                self._asked_for.add(self._missing)
-        return Showing(bundle, name)
-
-    def _something_to_play(self, wanted_open: bool) -> bool:
-        found = self._stock.bundle() is not None
-        if wanted_open and not found and not self._empty:
-            self._log.tell(_EMPTY)
-        self._empty = wanted_open and not found
-        return found
+        # Where every lamp is dark, nobody takes over.
+        missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
+        self._player.want = self._pictures.of(self._plan, missing) if open_now and state in _ON else BLACK
 
     @property
     def player(self) -> PlayerView:
@@ -300,10 +278,6 @@ def _reasons(views: Sequence[ProjectorView]) -> str:
     return " ".join(view.problem.text for view in views if view.problem is not None)
 
 
-_EMPTY: Final = Decision(
-    "nothing-installed", "The stage should be open, and no bundle is installed.",
-    "Calibrate the stage and compute appearances; the lamps stay off until then.", "error",
-)  # fmt: skip
 _FAULTY: Final = Decision(
     "work-impossible", "The work was given up: the stage is in a fault.",
     "See what the fault is, mend that, and ask again.", "error",

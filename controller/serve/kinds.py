@@ -43,6 +43,7 @@ class Kinds:
         return {
             "drift": Kind(self._drift, lit),
             "quick": Kind(self._quick, lit),
+            "projector": Kind(self._projector, lit),
             "full": Kind(self._full, lambda request: self._missing_device()),
             "publish": Kind(self._publish, known),
             "compute": Kind(self._publish, known),
@@ -80,6 +81,14 @@ class Kinds:
 
         with self._lend() as rig, holding(Held(self._stage, rig)):
             found = recalibrate(stage=self._stage, reporter=reporter, cancel=cancel)
+        return self._calibrated_anew(request, reporter, found)
+
+    def _projector(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.drift_services import recalibrate
+
+        (name,) = request.arguments
+        with self._lend() as rig, holding(Held(self._stage, rig)):
+            found = recalibrate(stage=self._stage, projector=name, reporter=reporter, cancel=cancel)
         return self._calibrated_anew(request, reporter, found)
 
     def _full(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:

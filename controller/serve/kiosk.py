@@ -33,6 +33,7 @@ from controller.serve import aim, archive, finding, runs, settings
 from controller.serve.control import plain
 from controller.serve.ports import Request
 from controller.serve.service import Service
+from controller.serve.works import title_of
 from controller.storage import write_atomically
 
 GRADES_EVERY_S: Final = 10.0
@@ -156,13 +157,14 @@ class StageKiosk:
     # -- commands
 
     def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
-        """``projector``: the quick way, which finds by itself what changed of it. Raises WorkError("busy"), ..."""
+        """``projector``: all of that one, whatever ``kind``. Raises UsageError("projector-unknown"), WorkError."""
         service = self.service
         if projector is not None and projector not in service.checked.names:
             raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
                              remedy=f"It is one of {', '.join(service.checked.names)}.")  # fmt: skip
-        service.ask(Request("quick" if projector is not None else kind, light=True))
-        return self._job(service, "Quick recalibration" if kind == "quick" else "Full recalibration")
+        asked = Request(kind, light=True) if projector is None else Request("projector", True, arguments=(projector,))
+        service.ask(asked)
+        return self._job(service, title_of(asked))
 
     def _job(self, service: Service, name: str) -> Job:
         last = service.works.job

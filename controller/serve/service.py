@@ -14,7 +14,7 @@ from controller.calibrations import finished_calibrations, stage_trust
 from controller.errors import UsageError, VelaturaError, WorkError
 from controller.play.launch import PlayerSettings
 from controller.play.notify import Notifier
-from controller.serve.clock import Clockwork
+from controller.serve.clock import Clockwork, beginning
 from controller.serve.conductor import Conductor, Limits
 from controller.serve.devices import Devices
 from controller.serve.eventlog import Decision, EventLog
@@ -66,7 +66,7 @@ class Service:
 
     def start(self) -> None:
         """Begin: the player first, so that there are pictures before any device has answered."""
-        self.log.tell(Decision("service-started", "The kiosk begins."))
+        self.log.tell(beginning(self.log))
         if self.schedule.problem is not None:
             problem = self.schedule.problem
             self.log.tell(Decision(problem.code, problem.what, problem.remedy, "error"))

@@ -19,12 +19,18 @@ from hal.errors import DeviceError
 TITLES: Final[Mapping[str, str]] = {
     "drift": "Drift check",
     "quick": "Quick recalibration",
+    "projector": "Recalibration of projector",
     "full": "Full recalibration",
     "publish": "Appearances",
     "compute": "New appearance",
     "takeover": "Frames without a projector",
     "variants": "Frames for the loss of a projector",
 }
+
+
+def title_of(request: Request) -> str:
+    """What people read of it."""
+    return " ".join((TITLES.get(request.kind, request.kind), *request.arguments))
 
 
 class JobReporter:
@@ -89,9 +95,8 @@ class ThreadWorks:
     def begin(self, request: Request) -> None:
         self._number += 1
         self._request, self._cancel = request, threading.Event()
-        title = TITLES.get(request.kind, request.kind)
-        run = " ".join(request.arguments)
-        self._reporter = JobReporter(Job(self._number, f"{title} {run}".strip()), self._log, self._changed)
+        title = title_of(request)
+        self._reporter = JobReporter(Job(self._number, title), self._log, self._changed)
         self._log.tell(Decision("work-begins", f"{title} begins."))
         self._thread = threading.Thread(
             target=self._run, args=(request, self._reporter, self._cancel), name=f"work-{request.kind}", daemon=True

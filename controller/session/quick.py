@@ -88,7 +88,7 @@ def _chosen(rig: Rig, last: Calibrated, step: Step) -> Step:
         way = way_of(step.name, read_drift(context.folder), mode_of(last.folder))
         if way is Way.RUN:
             return step.run(context)
-        kept = _keep(last.folder, step.name, context)
+        kept = keep(last.folder, step.name, context)
         if kept is None:  # the last calibration had no such step
             return step.run(context)
         return kept if way is Way.KEEP else _correct(rig, last, step.name, kept, context)
@@ -122,7 +122,7 @@ def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
     return Way.CORRECT if kind == "pixels" and one.moved else Way.KEEP
 
 
-def _keep(last: Path, step: str, context: Context) -> list[Path] | None:
+def keep(last: Path, step: str, context: Context) -> list[Path] | None:
     """The artefacts of the last calibration's step, in this run's folder; None if it had no such step."""
     with Journal(last) as journal:
         artefacts = journal.latest(step)
@@ -178,4 +178,4 @@ def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
     return {name: image}
 
 
-__all__ = ["Way", "quick_steps", "way_of"]
+__all__ = ["Way", "keep", "quick_steps", "way_of"]

@@ -97,6 +97,22 @@ def test_a_turned_projector_is_corrected_without_new_codes_as_well_as_it_was(bum
     assert (run / "verification.png").stat().st_size > 0
 
 
+def test_one_projector_is_measured_anew_and_the_others_are_kept(bumpy: Bumpy) -> None:
+    bumpy.bump(LEFT)
+    last = finished_calibration(bumpy.stage)
+    asked = recalibrate(stage=bumpy.stage, projector="left", reporter=Silent(), cancel=threading.Event())
+    run = Path(asked["run"])
+    now, then = graded(run), graded(bumpy.first)
+    assert now is not None
+    assert then is not None
+    assert all(percent < 1.2 * then[name] for name, percent in now.items()), (now, then)
+    taken = {path.name.partition("-")[0] for path in (run / "captures").iterdir() if path.stat().st_nlink == 1}
+    assert taken == {"left", "black", "verify"}, "of the others only the grade's pattern is photographed"
+    for name, kept in (("left", False), ("right", True), ("above", True)):
+        assert (run / f"pixels-{name}.npz").samefile(last / f"pixels-{name}.npz") is kept
+    assert finished_calibration(bumpy.stage) == run
+
+
 @pytest.mark.parametrize(
     ("bump", "culprit"),
     [(Bump("camera", shift_px=(2.0, 1.0)), "camera"), (Bump("object", move_mm=(2.0, 0.0, 1.0)), "object")],

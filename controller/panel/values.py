@@ -1,0 +1,258 @@
+"""The values that a kiosk gives and takes: what the panel shows, the API answers, and the command line prints.
+
+Every text may hold what a device or a file said: it is hostile, and whoever shows it escapes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+RecalibrationKind = Literal["full", "quick"]
+EventLevel = Literal["info", "warning", "error"]
+Unsubscribe = Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True)
+class LiveValue:
+    """One value of a device in words: label "Lamp", text "1,204 h"."""
+
+    label: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceRow:
+    """One device. ``kind`` is "projector", "camera", "display", "relay", "sensor" or "buttons"; ``problem`` a
+    sentence or None.
+
+    ``remedy`` says what to do about the problem, or is empty.
+    """
+
+    name: str
+    kind: str
+    driver: str
+    values: tuple[LiveValue, ...] = ()
+    problem: str | None = None
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class JobStep:
+    """``done`` is the share of this step that is done, 0..1."""
+
+    title: str
+    done: float
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Work that is going on, or that ended last (``ended`` True).
+
+    ``number`` grows with every job; ``left_s`` None until it can be told; ``run`` the run's folder name where the job
+    makes one; ``outcome`` a sentence when it ended, with ``failed`` when it did not do what was asked
+    """
+
+    number: int
+    name: str
+    steps: tuple[JobStep, ...] = ()
+    left_s: float | None = None
+    cancellable: bool = True
+    run: str = ""
+    ended: bool = False
+    failed: bool = False
+    outcome: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NextEvent:
+    """The next thing that the schedule does: ``what`` "opens", "closes", "drift check", ...; ``at_unix_s`` seconds."""
+
+    what: str
+    at_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class BundleIdentity:
+    """The bundle that is installed: its version, its digest in hex, and when it was built."""
+
+    version: int
+    digest: str
+    built_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """``hours`` lit and ``strikes`` as counted; ``life_hours`` what the maker promises, or None."""
+
+    projector: str
+    hours: float
+    strikes: int
+    lit: bool
+    life_hours: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Grade:
+    """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False where the older one stayed.
+
+    ``delta_e`` is the median colour difference against the target (CIEDE2000), None where nothing was played.
+    """
+
+    run: str
+    unix_s: float
+    kind: str
+    grade: str
+    kept: bool
+    delta_e: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class KioskState:
+    """Everything that the panel's first page shows, as of one moment.
+
+    ``state`` is a value of ``controller.session.machine.State``; ``reason`` one sentence; ``since_unix_s`` when it
+    began. ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the
+    stage has no valid stage.toml.
+    """
+
+    revision: int
+    stage: str
+    state: str
+    reason: str
+    since_unix_s: float
+    devices: tuple[DeviceRow, ...] = ()
+    job: Job | None = None
+    playing: str = ""
+    next_event: NextEvent | None = None
+    bundle: BundleIdentity | None = None
+    lamps: tuple[Lamp, ...] = ()
+    grades: tuple[Grade, ...] = ()
+    identifying: bool = False
+    needs_setup: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class EventRow:
+    """One line of the event log; numbers grow by one and never begin anew."""
+
+    number: int
+    unix_s: float
+    level: EventLevel
+    text: str
+    code: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """A solved appearance; ``preview`` is a PNG of how the object will look, or None."""
+
+    name: str
+    made_unix_s: float
+    delta_e: float | None = None
+    playing: bool = False
+    preview: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ComputeSettings:
+    """How a target is fitted. ``brightness`` 0.05..1 of what the projectors can do, None to choose the brightest that
+    fits.
+    """
+
+    brightness: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduleRow:
+    """Opening hours of one weekday ("mon".."sun") or of one date ("2026-12-24", which takes precedence over weekdays).
+
+    ``opens`` and ``closes`` are local times "HH:MM"; both empty means closed. ``closes`` at or before ``opens`` is on
+    the next day. ``appearance`` empty: what was played last.
+    """
+
+    day: str
+    opens: str
+    closes: str
+    appearance: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """``time_zone`` is an IANA name ("Europe/Vienna"); ``drift_check`` the nightly check's local time, or empty."""
+
+    time_zone: str
+    rows: tuple[ScheduleRow, ...] = ()
+    drift_check: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One finding of the doctor."""
+
+    level: EventLevel
+    title: str
+    what: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorAim:
+    """``coverage`` the share of the object that this projector lights, 0..1; ``focus`` 0 (soft) to 1 (sharp)."""
+
+    projector: str
+    coverage: float
+    focus: float
+
+
+@dataclass(frozen=True, slots=True)
+class Aiming:
+    """What the aiming page shows. Shares are of the object's area in the camera's picture, 0..1.
+
+    ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing`` where nothing can be done;
+    ``camera_focus`` 0..1; ``exposure`` the brightest hundredth's level, 0..1 of full scale; ``hints`` sentences on
+    what to turn which way
+    """
+
+    projectors: tuple[ProjectorAim, ...]
+    overlap: float
+    too_dark: float
+    too_grazing: float
+    camera_focus: float
+    exposure: float
+    hints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FoundDevice:
+    """A device that a search found: ``key`` names it to ``try_device``; ``table`` is its text for stage.toml."""
+
+    key: str
+    kind: str
+    driver: str
+    label: str
+    table: str
+
+
+@dataclass(frozen=True, slots=True)
+class TriedDevice:
+    """What came of trying a device: ``works``, and a sentence in either case (the remedy in it)."""
+
+    works: bool
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """Pictures of one run, as files the kiosk made itself (PNG or JPEG), by name.
+
+    Names in use: "before", "target", "achieved", "error", "resolution". ``figures`` are (label, value text).
+    """
+
+    run: str
+    grade: Grade | None
+    pictures: dict[str, Path] = field(default_factory=dict)
+    figures: tuple[tuple[str, str], ...] = ()
