@@ -86,10 +86,15 @@ def sha256_of(path: Path) -> str:
 def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
     """Hold the lock file ``path`` for the duration, or raise UsageError("already-running").
 
-    The lock dies with the process, so a power cut leaves none behind.
+    The lock dies with the process, so a power cut leaves none behind. Raises WorkError("no-space" or "cannot-write")
+    where the file can not be made.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        opened = path.open("a")
+    except OSError as error:
+        raise _explained(error, path) from error
+    with opened as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -42,10 +42,9 @@ def install(
     neither current nor previous are removed. ``accept`` raises to refuse a sound bundle that does not fit.
 
     Raises BundleError as ``Bundle.open`` and ``Bundle.verify`` do, and ("bundle-older") for a lower revision than
-    those of the installed bundles; WorkError("no-space"). The folder then plays what it played before.
+    those of the installed bundles; WorkError("no-space" or "cannot-write"). The folder plays what it played before.
     """
     trust = Trust(tuple(trusted), allow_unsigned, tuple(revoked))
-    folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder / _LOCK, what_is_running="Another installation"):
         incoming = folder / _INCOMING
         _clear_unfinished(folder)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,14 +16,23 @@ from tests.controller.bundle.power_cuts import every_cut
 from tests.controller.bundle.test_install import made, plays
 
 
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder in memory where there is one: to wait for a real disk some ten thousand times is slow."""
+    memory = Path("/dev/shm")
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    with tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None) as folder:
+        yield Path(folder)
+
+
 def leftovers(folder: Path) -> list[str]:
     kept = ("current", "previous", "starts.json", ".install.lock")
     return [path.name for path in folder.iterdir() if path.name not in kept and path.suffix != ".vel"]
 
 
 @pytest.mark.parametrize("first", [False, True])
-def test_after_a_cut_of_an_installation_the_old_or_the_new_bundle_plays(tmp_path: Path, first: bool) -> None:
-    files = [made(tmp_path / f"{value}.vel", value) for value in (1, 2, 3)]
+def test_after_a_cut_of_an_installation_the_old_or_the_new_bundle_plays(disk: Path, first: bool) -> None:
+    files = [made(disk / f"{value}.vel", value) for value in (1, 2, 3)]
 
     def begin(folder: Path) -> None:
         for file in files[: 0 if first else 2]:
@@ -28,7 +40,7 @@ def test_after_a_cut_of_an_installation_the_old_or_the_new_bundle_plays(tmp_path
 
     seen: dict[int | None, int] = {}
     for number, folder in enumerate(
-        every_cut(tmp_path, begin, lambda folder: install(files[2], folder, allow_unsigned=True), outcomes=50)
+        every_cut(disk, begin, lambda folder: install(files[2], folder, allow_unsigned=True), outcomes=50)
     ):
         value = None if current(folder) is None else plays(folder)
         seen[value] = seen.get(value, 0) + 1
@@ -42,8 +54,8 @@ def test_after_a_cut_of_an_installation_the_old_or_the_new_bundle_plays(tmp_path
     assert sum(seen.values()) > (400 if first else 1000)
 
 
-def test_the_simulated_disk_punishes_a_forgotten_sync(tmp_path: Path) -> None:
-    files = [made(tmp_path / f"{value}.vel", value) for value in (1, 2, 3)]
+def test_the_simulated_disk_punishes_a_forgotten_sync(disk: Path) -> None:
+    files = [made(disk / f"{value}.vel", value) for value in (1, 2, 3)]
 
     def begin(folder: Path) -> None:
         for file in files[:2]:
@@ -54,11 +66,11 @@ def test_the_simulated_disk_punishes_a_forgotten_sync(tmp_path: Path) -> None:
             patch.setattr("controller.bundle.install.sync_folder", lambda _: None)
             install(files[2], folder, allow_unsigned=True)
 
-    assert any(current(folder) is None for folder in every_cut(tmp_path, begin, hasty, outcomes=20))
+    assert any(current(folder) is None for folder in every_cut(disk, begin, hasty, outcomes=20))
 
 
-def test_after_a_cut_of_a_fall_back_one_of_the_two_plays_and_the_count_is_sound(tmp_path: Path) -> None:
-    files = [made(tmp_path / f"{value}.vel", value) for value in (1, 2)]
+def test_after_a_cut_of_a_fall_back_one_of_the_two_plays_and_the_count_is_sound(disk: Path) -> None:
+    files = [made(disk / f"{value}.vel", value) for value in (1, 2)]
 
     def begin(folder: Path) -> None:
         for file in files:
@@ -67,7 +79,7 @@ def test_after_a_cut_of_a_fall_back_one_of_the_two_plays_and_the_count_is_sound(
         assert now is not None
         Starts(now.name, 3).write(folder)
 
-    for folder in every_cut(tmp_path, begin, lambda folder: CountedStart(folder, lambda _: None), outcomes=12):
+    for folder in every_cut(disk, begin, lambda folder: CountedStart(folder, lambda _: None), outcomes=12):
         assert plays(folder) in (1, 2)
         for _ in range(4):
             CountedStart(folder, lambda _: None)
