@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from controller.play import pacing, presenting
 from controller.play.coming import Coming
@@ -101,7 +103,7 @@ def test_every_picture_comes_at_its_tick(clocks: Clocks) -> None:
     np.testing.assert_allclose(np.diff(ticks), 1, atol=1e-6)
     np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
     assert presenter.late == 0
-    assert presenter.intervals.percentile(99) == pytest.approx(1 / RATE_HZ, abs=1e-9)
+    assert presenter.intervals.percentile(99) == pytest.approx(1 / RATE_HZ, rel=2e-4)
 
 
 def test_a_picture_that_is_late_is_counted_once_and_the_next_are_on_the_grid_again(clocks: Clocks) -> None:
@@ -126,6 +128,25 @@ def test_a_fade_takes_its_time_however_slow_its_steps_are(clocks: Clocks) -> Non
             clocks.sleep(max(presenter.patience_s(coming), 0.0001))
         assert output.flips_s[-1] - output.flips_s[0] == pytest.approx(2.0, abs=0.15)
         assert presenter.shown is black
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(1e-5, 3e7), min_size=1, max_size=300), st.sampled_from([1, 50, 99, 100]))
+def test_percentiles_of_any_number_of_intervals_are_those_of_a_sorted_list(seconds: list[float], percent: int) -> None:
+    intervals = pacing.Intervals()
+    for interval in seconds:
+        intervals.add(interval)
+    rank = max(1, -(-percent * len(seconds) // 100))
+    assert intervals.percentile(percent) == pytest.approx(sorted(seconds)[rank - 1], rel=2e-4)
+
+
+def test_intervals_beyond_all_classes_are_counted_in_the_nearest() -> None:
+    intervals = pacing.Intervals()
+    assert intervals.percentile(50) is None
+    for interval in (0.0, -1.0, 1e12):
+        intervals.add(interval)
+    assert intervals.percentile(1) == pytest.approx(1e-5, rel=1e-3)
+    assert 3e7 < (intervals.percentile(100) or 0) < 1e8
 
 
 @contextmanager
