@@ -18,7 +18,7 @@ class DeviceConformance:
 
     patience_s: ClassVar[float] = 30.0
     """Deadline of an ordinary call."""
-    prompt_s: ClassVar[float] = 2.0
+    prompt_s: ClassVar[float] = 6.0
     """A call whose deadline has passed, or that was cancelled, must have ended after this."""
 
     def soon(self) -> Deadline:

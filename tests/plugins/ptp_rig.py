@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from hal.deadline import in_seconds
@@ -16,7 +19,11 @@ from plugins.ptpip import PtpIpLink
 from plugins.ptpip_wire import PtpIpAddress
 
 FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old")
-QUICK = Timing(answer_s=1.0, busy_s=0.6, margin_s=0.5, grace_s=0.1, come_back_s=0.3, reconnect_s=3.0, keep_alive_s=0.05)
+PATIENT = Timing(answer_s=20.0, busy_s=20.0, margin_s=20.0, grace_s=0.1, come_back_s=20.0, reconnect_s=20.0,
+                 keep_alive_s=0.05)  # fmt: skip
+"""Nothing but ``grace_s`` is waited for in vain where a camera answers, however loaded the machine is."""
+HASTY = replace(PATIENT, busy_s=1.0, margin_s=2.0, come_back_s=0.5)
+"""For tests of what comes when the driver's patience ends."""
 SHORT = ExposureSettings(0.125, 200, 8.0, raw=False)
 
 
@@ -47,7 +54,7 @@ class Rig:
         self.studio = studio
         self.driver = driver
 
-    def capture(self, folder: Path, name: str = "shot", *, seconds: float = 10.0) -> bytes:
+    def capture(self, folder: Path, name: str = "shot", *, seconds: float = 60.0) -> bytes:
         files = self.driver.capture(folder / name, deadline=in_seconds(seconds))
         assert len(files) == 1
         return files[0].path.read_bytes()
@@ -62,7 +69,7 @@ def connect(emulator: EmulatedPtpCamera, **options: object) -> PtpCamera:
     return PtpCamera(
         lambda until: PtpIpLink.connect(address, deadline=until),
         deadline=in_seconds(5),
-        **{"timing": QUICK, **options},  # type: ignore[arg-type]
+        **{"timing": PATIENT, **options},  # type: ignore[arg-type]
     )
 
 
@@ -77,6 +84,17 @@ def running(flavour: Flavour, *, studio: Studio | None = None, **options: object
             yield Rig(emulator, studio, driver)
         finally:
             driver.close()
+
+
+def when(so: Callable[[], bool], do: Callable[[], object]) -> None:
+    """Does something as soon as something is so, on a thread of its own."""
+
+    def watch() -> None:
+        while not so():
+            time.sleep(0.005)
+        do()
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def left_behind(folder: Path) -> list[str]:

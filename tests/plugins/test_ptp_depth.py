@@ -14,7 +14,7 @@ from hal.interfaces import LiveViewCamera, WatchedCamera
 from hal.ptp_eos import exposure_of
 from hal.values import ExposureSettings
 from plugins.ptp_shot import Timing
-from tests.plugins.ptp_rig import FLAVOURS, QUICK, Rig, running
+from tests.plugins.ptp_rig import FLAVOURS, Rig, running, when
 
 BULB_S = 0.7
 
@@ -29,11 +29,13 @@ def test_bulb_exposes_for_the_asked_time_where_the_shutter_has_none_so_long(tmp_
     with running("eos-new", time_scale=1.0) as rig:
         assert rig.driver.capabilities.bulb
         short_shutter(rig)
-        confirmed = rig.driver.configure(ExposureSettings(BULB_S, 200, raw=False), deadline=in_seconds(5))
+        confirmed = rig.driver.configure(ExposureSettings(BULB_S, 200, raw=False), deadline=in_seconds(20))
         assert confirmed.exposure_s == BULB_S
+        began_s = time.monotonic()
         assert rig.capture(tmp_path) == rig.latest()
-        assert rig.studio.shots[-1].exposure_s == pytest.approx(BULB_S, abs=0.08)
-        rig.driver.configure(ExposureSettings(0.125, 200, raw=False), deadline=in_seconds(5))
+        # A loaded machine closes the shutter late, never early.
+        assert BULB_S - 0.02 <= rig.studio.shots[-1].exposure_s <= time.monotonic() - began_s
+        rig.driver.configure(ExposureSettings(0.125, 200, raw=False), deadline=in_seconds(20))
         assert rig.capture(tmp_path, "next") == rig.latest()
         assert rig.studio.shots[-1].exposure_s == pytest.approx(0.125)
 
@@ -41,25 +43,25 @@ def test_bulb_exposes_for_the_asked_time_where_the_shutter_has_none_so_long(tmp_
 def test_a_cancelled_bulb_exposure_closes_the_shutter(tmp_path: Path) -> None:
     with running("eos-new", time_scale=1.0) as rig:
         short_shutter(rig)
-        rig.driver.configure(ExposureSettings(5.0, 200, raw=False), deadline=in_seconds(5))
+        rig.driver.configure(ExposureSettings(60.0, 200, raw=False), deadline=in_seconds(20))
         stop = threading.Event()
-        threading.Timer(0.2, stop.set).start()
+        when(lambda: rig.emulator.exposures == 1, stop.set)
         with pytest.raises(Cancelled):
-            rig.driver.capture(tmp_path / "shot", deadline=in_seconds(30, stop))
-        rig.driver.configure(ExposureSettings(0.125, 200, raw=False), deadline=in_seconds(5))
+            rig.driver.capture(tmp_path / "shot", deadline=in_seconds(200, stop))
+        rig.driver.configure(ExposureSettings(0.125, 200, raw=False), deadline=in_seconds(20))
         assert rig.capture(tmp_path) == rig.latest()
-        assert rig.studio.shots[0].exposure_s < 1.0
+        assert rig.studio.shots[0].exposure_s < 30.0
 
 
 def test_a_bulb_exposure_whose_connection_is_lost_is_told_and_not_kept(tmp_path: Path) -> None:
     with running("eos-new", time_scale=1.0) as rig:
         short_shutter(rig)
-        rig.driver.configure(ExposureSettings(BULB_S, 200, raw=False), deadline=in_seconds(5))
-        threading.Timer(0.2, rig.emulator.drop_connection).start()
+        rig.driver.configure(ExposureSettings(BULB_S, 200, raw=False), deadline=in_seconds(20))
+        when(lambda: rig.emulator.exposures == 1, rig.emulator.drop_connection)
         with pytest.raises(DeviceGone):
             rig.capture(tmp_path)
         assert rig.capture(tmp_path, "again") == rig.latest()
-        assert rig.studio.shots[-1].exposure_s == pytest.approx(BULB_S, abs=0.08)
+        assert rig.studio.shots[-1].exposure_s >= BULB_S - 0.02
         assert [path.name for path in tmp_path.iterdir()] == ["again.jpg"]
 
 
@@ -69,9 +71,9 @@ def test_bodies_without_bulb_and_live_view_say_so(flavour: str) -> None:
         assert not rig.driver.capabilities.bulb
         assert not rig.driver.capabilities.live_view
         with pytest.raises(DeviceRefused) as caught:
-            rig.driver.live_view(deadline=in_seconds(5))
+            rig.driver.live_view(deadline=in_seconds(20))
         assert caught.value.code == "camera-no-live-view"
-        rig.driver.end_live_view(deadline=in_seconds(5))
+        rig.driver.end_live_view(deadline=in_seconds(20))
 
 
 def test_live_view_gives_frames_and_is_off_for_a_picture(tmp_path: Path) -> None:
@@ -79,13 +81,13 @@ def test_live_view_gives_frames_and_is_off_for_a_picture(tmp_path: Path) -> None
         assert isinstance(rig.driver, LiveViewCamera)
         assert rig.driver.capabilities.live_view
         for _ in range(3):
-            frame = rig.driver.live_view(deadline=in_seconds(5))
+            frame = rig.driver.live_view(deadline=in_seconds(20))
             assert frame.startswith(b"\xff\xd8")
             assert frame.endswith(b"\xff\xd9")
         assert rig.emulator.exposures == 0
         assert rig.capture(tmp_path) == rig.latest()
-        assert rig.driver.live_view(deadline=in_seconds(5)).startswith(b"\xff\xd8")
-        rig.driver.end_live_view(deadline=in_seconds(5))
+        assert rig.driver.live_view(deadline=in_seconds(20)).startswith(b"\xff\xd8")
+        rig.driver.end_live_view(deadline=in_seconds(20))
         assert rig.capture(tmp_path, "next") == rig.latest()
 
 
@@ -93,13 +95,13 @@ def test_live_view_gives_frames_and_is_off_for_a_picture(tmp_path: Path) -> None
 def test_the_status_tells_battery_card_and_what_to_look_after(flavour: str) -> None:
     with running(flavour) as rig:  # type: ignore[arg-type]
         assert isinstance(rig.driver, WatchedCamera)
-        status = rig.driver.status(deadline=in_seconds(5))
+        status = rig.driver.status(deadline=in_seconds(20))
         assert (status.battery_percent or 0) >= 75
         assert status.free_bytes == 4 << 30
         assert status.warnings == ()
         rig.emulator.battery_percent = 12
         rig.emulator.body.card.capacity = 1 << 20
-        status = rig.driver.status(deadline=in_seconds(5))
+        status = rig.driver.status(deadline=in_seconds(20))
         assert set(status.warnings) == {"battery-low", "card-nearly-full"}
 
 
@@ -111,7 +113,7 @@ def test_a_target_that_flips_silently_loses_no_picture_and_is_set_again(flavour:
             assert rig.capture(tmp_path, f"shot{number}") == rig.latest()
             assert rig.emulator.exposures == number + 1
         assert rig.emulator.pictures_on_card == 0
-        assert rig.driver.status(deadline=in_seconds(5)).warnings == ("target-changed",)
+        assert rig.driver.status(deadline=in_seconds(20)).warnings == ("target-changed",)
         assert "camera-target-changed" in [code for code, _ in rig.driver.troubles()]
 
 
@@ -130,7 +132,9 @@ def test_a_camera_that_nobody_talks_to_is_kept_awake() -> None:
     timing = Timing(idle_s=0.05)
     with running("eos-new", timing=timing) as rig:
         before = rig.emulator.body.answered.get(0x911D, 0)
-        time.sleep(0.4)
+        ends_s = time.monotonic() + 30
+        while rig.emulator.body.answered.get(0x911D, 0) - before < 3 and time.monotonic() < ends_s:
+            time.sleep(0.02)
         assert rig.emulator.body.answered[0x911D] - before >= 3
 
 
@@ -138,12 +142,12 @@ def test_a_body_that_is_about_to_fall_asleep_is_told_to_stay_awake_at_once() -> 
     with running("eos-new", timing=Timing()) as rig:
         before = rig.emulator.body.answered.get(0x911D, 0)
         rig.emulator.body.falls_asleep_soon()  # type: ignore[attr-defined]
-        rig.driver.status(deadline=in_seconds(5))
+        rig.driver.status(deadline=in_seconds(20))
         assert rig.emulator.body.answered[0x911D] == before + 1
 
 
 def test_mended_faults_are_told_for_the_journal_once(tmp_path: Path) -> None:
-    with running("generic", timing=QUICK) as rig:
+    with running("generic") as rig:
         rig.emulator.faults.busy = 1
         rig.capture(tmp_path)
         rig.emulator.faults.drop_in_transfer = 1

@@ -13,19 +13,16 @@ from typing import Any
 import pytest
 
 from hal.deadline import in_seconds
-from hal.values import ExposureSettings
 from plugins.emulated.ptp_usb_camera import numbered_files
 from plugins.emulated.shot import ShotSettings
 from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.ptp_shot import Timing
 from plugins.ptp_still import PtpCamera
 from plugins.ptp_usb_bus import UsbAddress, UsbFinder
+from tests.plugins.ptp_rig import PATIENT, SHORT
 
 SIZE = 300_000
 NAMES = ("camera", "other", "relay", "a", "b")
 """Of the devices in these tests."""
-QUICK = Timing(answer_s=1.5, busy_s=1.0, margin_s=0.6, grace_s=0.1, come_back_s=1.0, reconnect_s=5.0, keep_alive_s=0.05)
-SHORT = ExposureSettings(0.125, 200, 8.0, raw=False)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +46,7 @@ class Rig:
     bus: UsbBusProcess
     driver: PtpCamera
 
-    def capture(self, folder: Path, name: str = "shot", *, seconds: float = 10.0) -> bytes:
+    def capture(self, folder: Path, name: str = "shot", *, seconds: float = 60.0) -> bytes:
         files = self.driver.capture(folder / name, deadline=in_seconds(seconds))
         assert len(files) == 1
         return files[0].path.read_bytes()
@@ -71,8 +68,8 @@ def running(bus: UsbBusProcess, flavour: str, *, address: str = "usb:", **option
     camera = options.pop("camera", {})
     bus.add("camera", "camera", flavour=flavour, size=SIZE, time_scale=0.2, **camera)
     finder = UsbFinder(UsbAddress.parse(address))
-    driver = PtpCamera(finder.connect, deadline=in_seconds(10), **{"timing": QUICK, **options})
-    driver.configure(SHORT, deadline=in_seconds(5))
+    driver = PtpCamera(finder.connect, deadline=in_seconds(60), **{"timing": PATIENT, **options})
+    driver.configure(SHORT, deadline=in_seconds(20))
     try:
         yield Rig(bus, driver)
     finally:

@@ -20,13 +20,13 @@ __all__ = ["bus", "lasting_bus"]
 
 class EveryFlavour(CameraConformance):
     flavour: ClassVar[str]
-    patience_s = 20.0
+    patience_s = 60.0
 
     @pytest.fixture
     def camera(self, bus: UsbBusProcess, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PtpCamera]:
         bus.add("camera", "camera", flavour=self.flavour, size=50_000, time_scale=0.01)
         context = OpenContext(tmp_path_factory.mktemp("stage"), transcripts=tmp_path_factory.mktemp("transcripts"))
-        camera = open_camera({"address": "usb:"}, context, in_seconds(5))
+        camera = open_camera({"address": "usb:"}, context, in_seconds(20))
         yield camera
         camera.close()
 
