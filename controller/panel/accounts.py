@@ -93,11 +93,17 @@ class Accounts:
         The password is kept nowhere but in whoever shows it. As long as nobody used it, every start makes a new one.
         """
         with self._lock:
-            if any(not account.one_time for account in self._accounts.values()):
+            if self.entered:
                 return None
             password = "-".join("".join(secrets.choice(_READABLE) for _ in range(4)) for _ in range(4))
             self._put(Account(FIRST_ACCOUNT, Role.TECHNICIAN, self._hasher.hash(password), one_time=True))
             return password
+
+    @property
+    def entered(self) -> bool:
+        """Whether somebody has a password of their own."""
+        with self._lock:
+            return any(not account.one_time for account in self._accounts.values())
 
     def all(self) -> list[Account]:
         with self._lock:
@@ -111,6 +117,8 @@ class Accounts:
         """The account, if the password is right. Takes as long for a name that does not exist."""
         account = self.get(name)
         stored = self._nobody if account is None else account.password_hash
+        if account is not None and account.one_time:
+            password = password.lower()  # projectors show it in capitals
         try:
             self._hasher.verify(stored, password[:LONGEST_PASSWORD])
         except (VerificationError, InvalidHashError):

@@ -18,9 +18,9 @@ _GLYPHS: Final = (
     "S0F10100E01011E T1F040404040404 U1111111111110E V11111111110A04 W1111111515150A X11110A040A1111 "
     "Y11110A04040404 Z1F01020408101F 00E11131519110E 1040C040404040E 20E11010608101F 30E11010601110E "
     "402060A121F0202 51F101E0101110E 60608101E11110E 71F010204080808 80E11110E11110E 90E11110F01020C "
-    "-0000001F000000 _0000000000001F .00000000000C0C ?0E110102040004"
+    "-0000001F000000 _0000000000001F .00000000000C0C ?0E110102040004 :000C0C000C0C00 /01010204081010"
 )
-_FONT: Final = {glyph[0]: glyph[1:] for glyph in _GLYPHS.split()}
+_FONT: Final = {glyph[0]: glyph[1:] for glyph in _GLYPHS.split()} | {" ": "00" * 7}
 """Characters of 5 x 7 dots: seven rows from the top, two hexadecimal digits each, the leftmost dot worth 16."""
 _COLUMNS, _ROWS, _ADVANCE = 5, 7, 6
 
@@ -39,14 +39,14 @@ def _picture(number: int, output: OutputSize) -> npt.NDArray[np.uint8]:
     band = height // 12
     if band:
         image[height - 2 * band : height - band] = (np.arange(width) * 16 // width * 17).astype(np.uint8)[None, :, None]
-    _write(image, str(number), centre_row=height * 2 // 5, tall_px=height // 2)
-    _write(image, output.name, centre_row=height * 3 // 4, tall_px=height // 14)
-    _write(image, f"{width}X{height}", centre_row=height // 10, tall_px=height // 14)
+    write_text(image, str(number), centre_row=height * 2 // 5, tall_px=height // 2)
+    write_text(image, output.name, centre_row=height * 3 // 4, tall_px=height // 14)
+    write_text(image, f"{width}X{height}", centre_row=height // 10, tall_px=height // 14)
     image[[0, -1], :] = image[:, [0, -1]] = 255
     return image
 
 
-def _write(image: npt.NDArray[np.uint8], text: str, *, centre_row: int, tall_px: int) -> None:
+def write_text(image: npt.NDArray[np.uint8], text: str, *, centre_row: int, tall_px: int) -> None:
     """Write white on black round the middle column, as tall as given or smaller where it would not fit."""
     text = text.upper()
     dots = np.zeros((_ROWS + 2, _ADVANCE * len(text) + 1), np.uint8)

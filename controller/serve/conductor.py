@@ -80,6 +80,7 @@ class Conductor:
         self._plan = Plan(None)
         self._since_s = monotonic()
         self._attempts, self._missing = 0, frozenset[str]()
+        self._lit_until_s = float("-inf")
 
     # -- asked from outside
 
@@ -109,6 +110,11 @@ class Conductor:
         with self._lock:
             self.wishes.choose(appearance, self._plan)
 
+    def light_for(self, seconds: float) -> None:
+        """Light while the stage is open, also with nothing to play; 0 ends it."""
+        with self._lock:
+            self._lit_until_s = self._monotonic() + seconds
+
     def ask(self, *requests: Request) -> None:
         """Queue work. Raises WorkError("busy") while other work runs or waits, and with the reason it can't be done."""
         with self._lock:
@@ -137,7 +143,8 @@ class Conductor:
             self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
             views = [keeper.view for keeper in self._keepers]
             open_now = self._pictures.something(wanted_open)
-            light = open_now or self._agenda.needs_light
+            lit_anyway = wanted_open and self._monotonic() < self._lit_until_s
+            light = open_now or lit_anyway or self._agenda.needs_light
             self._move(views, light, open_now)
             cooling = self.machine.state in (State.COOLING, State.OFF)
             for keeper in self._keepers:

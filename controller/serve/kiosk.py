@@ -37,6 +37,8 @@ from controller.serve.works import title_of
 from controller.storage import write_atomically
 
 GRADES_EVERY_S: Final = 10.0
+NOTICE_S: Final = 900.0
+"""How long a notice may stay; a lamp should not burn for it all night."""
 _REVISIONS: Final = 1_000_000_000
 
 
@@ -56,6 +58,8 @@ class StageKiosk:
         self._last = KioskState(0, stage.name, "off", "The stage is not set up yet.", time.time(), needs_setup=True)
         self._events = 0
         self._since = ("", 0.0)
+        self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
+        self._notice_ends_s = float("inf")
 
     def attach(self, service: Service | None, reason: str = "") -> None:
         """The service that runs from now on, or why there is none."""
@@ -70,6 +74,7 @@ class StageKiosk:
                 service.log.keep("starts", str(starts))
                 self._last = replace(self._last, revision=starts * _REVISIONS)
                 service.changed = self._refresh
+                self._show_notice()
         self._notify()
 
     @property
@@ -79,6 +84,27 @@ class StageKiosk:
         if service is None:
             raise WorkError("not-set-up", what=self._last.reason, remedy="Set the stage up first.")
         return service
+
+    def announce(self, lines: tuple[str, ...], until: Callable[[], bool]) -> None:
+        """Show text on the projectors in turn, with their lamps lit, until ``until`` is true or it is too late.
+
+        Only on a stage with nothing to play yet: its audience is whoever sets it up.
+        """
+        self._notice = (lines, until)
+        self._show_notice()
+
+    def _show_notice(self) -> None:
+        service = self._service
+        if service is not None and self._notice is not None and service.stock.bundle() is None:
+            service.player.notice = self._notice[0]
+            service.conductor.light_for(NOTICE_S)
+            self._notice_ends_s = time.monotonic() + NOTICE_S
+
+    def _end_notice(self, service: Service) -> None:
+        if self._notice is not None and (self._notice[1]() or time.monotonic() > self._notice_ends_s):
+            self._notice = None
+            service.player.notice = ()
+            service.conductor.light_for(0.0)
 
     # -- asked often
 
@@ -97,6 +123,7 @@ class StageKiosk:
         service = self._service
         if service is None:
             return
+        self._end_notice(service)
         now = self._made(service)
         with self._lock:
             same = replace(now, revision=self._last.revision) == self._last and self._events == service.log.number

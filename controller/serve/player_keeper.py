@@ -15,6 +15,7 @@ from typing import Any, Final
 from controller.errors import VelaturaError, WorkError
 from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover
 from controller.serve.eventlog import Decision
+from controller.serve.notice import notice, outputs_of, put
 from controller.serve.ports import BLACK, PlayerView, Showing
 
 ANSWER_S: Final = 0.8
@@ -24,6 +25,8 @@ READY_S: Final = 8.0
 HEALTHY_S: Final = 20.0
 """A player that ran for so long is started again at once when it dies."""
 BACK_OFF_S: Final = (0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 15.0, 30.0)
+NOTICE_TURN_S: Final = 10.0
+"""On an object that all projectors light, the text of several at once could not be read."""
 STARTS_WITH_BUNDLE: Final = 4
 """Failed starts in a row after which the player is started without the installed bundle, so that it shows black."""
 
@@ -31,7 +34,8 @@ STARTS_WITH_BUNDLE: Final = 4
 class PlayerKeeper:
     """The player of a stage; see ``ports.PlayerPort``.
 
-    ``settings`` is asked at each start (the flag: with the installed bundle); ``tell`` hears what happens.
+    ``settings`` is asked at each start (the flag: with the installed bundle); ``tell`` hears what happens. ``notice``:
+    lines of text that one projector after the other shows as long as nothing else is wanted than black.
     """
 
     def __init__(
@@ -45,6 +49,7 @@ class PlayerKeeper:
         self._runtime, self._settings, self._tell, self._monotonic = runtime, settings, tell, monotonic
         self.want: Showing | None = BLACK
         self.identifying = False
+        self.notice: tuple[str, ...] = ()
         self._process: PlayerProcess | None = None
         self._channel: socket.socket | None = None
         self._view = PlayerView()
@@ -53,6 +58,8 @@ class PlayerKeeper:
         self._start_at_s, self._started_at_s = 0.0, 0.0
         self._numbers = 0
         self._identified = False
+        self._noticed: tuple[int, tuple[str, ...]] | None = None
+        self._hello: dict[str, Any] = {}
 
     @property
     def view(self) -> PlayerView:
@@ -106,6 +113,7 @@ class PlayerKeeper:
             self._trouble(Decision("player-not-started", what, remedy or "It is tried again.", "error"))
             return
         self._started_at_s, self._misses, self._identified = self._monotonic(), 0, False
+        self._noticed, self._hello = None, hello
         self._identities = {}
         installed = self._settings(True).bundle
         if hello.get("bundle") and installed is not None:
@@ -140,8 +148,10 @@ class PlayerKeeper:
             if not self._identified:
                 self._ask({"op": "identify"}, 3.0)
                 self._identified = True
-        elif want is not None and (shown != want or self._identified):
-            self._identified = False
+        elif want == BLACK and self.notice:
+            self._tell_all()
+        elif want is not None and (shown != want or self._identified or self._noticed is not None):
+            self._identified, self._noticed = False, None
             self._put(want, path)
             shown = want
         if self._monotonic() - self._started_at_s >= HEALTHY_S:
@@ -149,6 +159,15 @@ class PlayerKeeper:
         if self._view.problem is not None:
             self._tell(Decision("player-well", "The player shows what it should again."))
         self._view = replace(self._view, shown=shown, problem=None)
+
+    def _tell_all(self) -> None:
+        outputs = outputs_of(self._hello)
+        turn = int(self._monotonic() / NOTICE_TURN_S) % len(outputs)
+        if self._noticed == (turn, self.notice) and not self._identified:
+            return
+        sequence = put(Path(self._hello["inbox"]), outputs, notice(outputs, self.notice, turn))
+        self._ask({"op": "show", "sequence": sequence}, 3.0)
+        self._identified, self._noticed = False, (turn, self.notice)
 
     def _put(self, want: Showing, loaded: Path | None) -> None:
         if not want.appearance or want.bundle is None:

@@ -98,6 +98,7 @@ def _open_panel(stack: contextlib.ExitStack, kiosk: StageKiosk, panel: PanelAddr
 @contextlib.contextmanager
 def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterator[None]:
     """The panel in a thread of its own. The player is another process, so that no page delays a picture."""
+    from controller.panel.accounts import FIRST_ACCOUNT
     from controller.panel.app import make_panel
     from controller.panel.context import PanelOptions
     from controller.panel.server import PanelServer
@@ -111,9 +112,12 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
     accounts = options.accounts()
     password = accounts.first_start()
     server = PanelServer(make_panel(kiosk, accounts, options), options)
-    reporter.say(f"The panel is at {server.start()}.")
+    address = server.start()
+    reporter.say(f"The panel is at {address}.")
     if password is not None:
-        reporter.say(f"First login: technician, password {password} (once).", Level.WARNING)
+        reporter.say(f"First login: {FIRST_ACCOUNT}, password {password} (once).", Level.WARNING)
+        # Only capitals can be shown, and the one-time password is taken in capitals, too.
+        kiosk.announce(("velatura", address, FIRST_ACCOUNT, password), lambda: accounts.entered)
     try:
         yield
     finally:
