@@ -21,6 +21,15 @@ from plugins.emulated.serial_projector import Board, EmulatedSerialProjector
 from plugins.pjlink_projector import PjLinkProjector, open_pjlink_projector
 from plugins.profile_files import load_profile
 from plugins.serial_projector import SerialProjector, open_serial_projector
+from tests.plugins.pjlink_advance import NOTICE, pjlink_advance_python
+
+collect_ignore = [] if pjlink_advance_python() else ["test_pjlink_advance_peer.py"]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if collect_ignore:
+        terminalreporter.write_line(NOTICE)
+
 
 LAMP = LampTiming(warm_up_s=0.25, cool_down_s=0.4)
 BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {

@@ -1,16 +1,14 @@
 """Our PJLink driver against the emulator of ``pjlink-advance``, which nobody here wrote.
 
 It needs Python 3.13 or later, so it runs in an interpreter of its own: the one that PJLINK_ADVANCE_PYTHON names, or a
-python3.13 or later on the PATH, if it has the package (docs/drivers.md). Elsewhere these tests are skipped.
+python3.13 or later on the PATH, if it has the package (docs/drivers.md). Where none is at hand, ``conftest.py`` leaves
+these tests out, and says so.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -25,6 +23,7 @@ from plugins.emulated.lamp import LampTiming
 from plugins.emulated.quick_profile import quick_profile
 from plugins.pjlink_listener import PjLinkListener
 from plugins.pjlink_projector import open_pjlink_projector
+from tests.plugins.pjlink_advance import NOTICE, pjlink_advance_python
 
 SERVER = """
 import asyncio, sys
@@ -40,27 +39,13 @@ asyncio.run(serve())
 LAMP = LampTiming(warm_up_s=1.0, cool_down_s=1.0)
 
 
-@cache
-def interpreter() -> str:
-    """A Python that has the package; "" if none is at hand."""
-    named = os.environ.get("PJLINK_ADVANCE_PYTHON")
-    for name in [named] if named else ["python3.13", "python3.14"]:
-        if not (path := shutil.which(name)):
-            continue
-        tried = subprocess.run([path, "-c", "import pjlink_advance.emulator"], capture_output=True, check=False)
-        if tried.returncode == 0:
-            return path
-    return ""
-
-
 class Served:
     """The emulator in its own process, for as long as the context lasts."""
 
     def __init__(self, password: str) -> None:
-        if not interpreter():
-            pytest.skip("no Python >= 3.13 with pjlink-advance is at hand (PJLINK_ADVANCE_PYTHON names one)")
+        assert pjlink_advance_python(), NOTICE
         self._process = subprocess.Popen(
-            [interpreter(), "-c", SERVER, password], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [pjlink_advance_python(), "-c", SERVER, password], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         assert self._process.stdout is not None
         self.port, self.udp_port = map(int, self._process.stdout.readline().split())
