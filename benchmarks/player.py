@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import statistics
 import subprocess
@@ -71,8 +72,13 @@ def _frames(size: str) -> list[dict[str, ByteImage]]:
     """
     (solved,) = compensation_frames(size, 1)
     set_bytes = sum(frame.nbytes for frame in solved.values())
-    sets = min(MOST_CACHED, CACHE_BYTES // set_bytes) + BEYOND_CACHE
+    sets = more_than_kept(set_bytes)
     return [{name: np.roll(frame, 3 * number, axis=1) for name, frame in solved.items()} for number in range(sets)]
+
+
+def more_than_kept(set_bytes: int) -> int:
+    """So many sets that a player which shows them in turn decodes each one anew."""
+    return min(MOST_CACHED, CACHE_BYTES // set_bytes) + BEYOND_CACHE
 
 
 def _settings(place: Path, swaps: Sequence[dict[str, ByteImage]]) -> PlayerSettings:
@@ -88,11 +94,13 @@ def _imports() -> Row:
     def seconds(module: str) -> tuple[float, float]:
         """Wall and processor time."""
         began, used = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run([sys.executable, "-c", f"import {module}"], check=True)
+        subprocess.run([sys.executable, "-c", f"import {module}"], check=True, env=environment)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu = after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime
         return time.perf_counter() - began, cpu
 
+    # As launch.py and the service's unit start it.
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     seconds("controller.play.__main__")
     plain, ours = (
         [1000 * float(value) for value in np.median([seconds(module) for _ in range(STARTS)], axis=0)]
@@ -182,9 +190,9 @@ def _memory(player: PlayerProcess, display: PlayerDisplay, sets: int) -> list[Ro
     """Private memory while every set is decoded anew, and its growth in that time."""
     _play(display, AS_FAST_HZ, sets)
     time.sleep(2.0)
-    first, begin = _anonymous_bytes(player.pid), display.playing(deadline=in_seconds(5)).swaps
+    first, begin = private_bytes(player.pid), display.playing(deadline=in_seconds(5)).swaps
     time.sleep(SUSTAINED_S)
-    last, status = _anonymous_bytes(player.pid), display.playing(deadline=in_seconds(5))
+    last, status = private_bytes(player.pid), display.playing(deadline=in_seconds(5))
     mapped, passed = status.rss_bytes - last, status.swaps - begin
     growth = at_most("memory, growth", (last - first) / 1e6, 0.0, unit="MB",
                      how=f"over {passed} swaps, each decoded; the goal is for {MANY_SWAPS}")  # fmt: skip
@@ -195,9 +203,16 @@ def _memory(player: PlayerProcess, display: PlayerDisplay, sets: int) -> list[Ro
     ]  # fmt: skip
 
 
-def _anonymous_bytes(pid: int) -> int:
+def private_bytes(pid: int) -> int:
+    """Memory of a process that is its own: not the mapped files."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("RssAnon:")).split()[1]) * 1024
+
+
+def processor_s(pid: int) -> float:
+    """Processor time that a process has used, all its threads."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _play(display: PlayerDisplay, rate_hz: float, sets: int) -> None:
