@@ -32,9 +32,8 @@ class Shadows(Protocol):
 
 def lit_by(placement: Placement, surface: Surface, shadows: Shadows) -> Lit:
     """What ``placement`` does at each point of ``surface``."""
-    local = (surface.points_m - placement.position_m) @ placement.rotation.T
+    at_px, local = pixels_of(placement, surface.points_m)
     depth = np.maximum(local[:, 2], NEAREST_M)
-    at_px = placement.focal_px * local[:, :2] / depth[:, None] + placement.centre_px
     towards = placement.position_m - surface.points_m
     cosine = np.sum(surface.normals * towards, axis=1) / np.maximum(np.linalg.norm(towards, axis=1), NEAREST_M)
     size = np.asarray(placement.model.size_px)
@@ -53,6 +52,13 @@ def lit_by(placement: Placement, surface: Surface, shadows: Shadows) -> Lit:
         pixel_mm=pixel_mm,
         detail_mm=np.where(reached, FWHM * np.sqrt(PIXEL_VARIANCE_PX2 + blur_px**2) * pixel_mm[:, 0], np.inf),
     )
+
+
+def pixels_of(placement: Placement, points_m: Float64) -> tuple[Float64, Float64]:
+    """Pixels (N, 2) and places in the projector's own frame (N, 3) of points (N, 3); what is behind it is near it."""
+    local = (points_m - placement.position_m) @ placement.rotation.T
+    at_px = placement.focal_px * local[:, :2] / np.maximum(local[:, 2:], NEAREST_M) + placement.centre_px
+    return np.asarray(at_px), np.asarray(local)
 
 
 def blur(placement: Placement, depth_m: Float64) -> Float64:

@@ -7,6 +7,7 @@ area is the plan's quality.
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -100,29 +101,28 @@ def candidates_of(
     Where its body would stand between audience and object is no place. Raises UsageError("plan-no-place") if a model
     has none, WorkError("cancelled").
     """
-    found: list[list[Candidate]] = []
+    known: dict[ProjectorModel, list[Candidate]] = {}
     steepest = np.cos(np.deg2rad(goal.steepest_degrees))
-    done, total = 0, len(models) * len(spots)
-    for model in models:
-        found.append([])
-        for spot in spots:
-            check(cancel)
-            tell(done / total, f"{model.name} at {spot.name}")
-            done += 1
-            placement = aimed(model, spot, surface, goal.fill)
-            if placement is None or in_the_way(placement.position_m, audience_m, surface, goal.body_m):
-                continue
-            lit = lit_by(placement, surface, shadows)
-            useful = lit.reached & (lit.cosine >= steepest)
-            if np.any(useful & (surface.area_m2 > 0)):
-                found[-1].append(Candidate(placement, lit, useful))
-        if not found[-1]:
+    different = list(dict.fromkeys(models))
+    for number, (model, spot) in enumerate(itertools.product(different, spots)):
+        check(cancel)
+        tell(number / (len(different) * len(spots)), f"{model.name} at {spot.name}")
+        found = known.setdefault(model, [])
+        placement = aimed(model, spot, surface, goal.fill)
+        if placement is None or in_the_way(placement.position_m, audience_m, surface, goal.body_m):
+            continue
+        lit = lit_by(placement, surface, shadows)
+        useful = lit.reached & (lit.cosine >= steepest)
+        if np.any(useful & (surface.area_m2 > 0)):
+            found.append(Candidate(placement, lit, useful))
+    for model, found in known.items():
+        if not found:
             raise UsageError(
                 "plan-no-place",
                 what=f"No place is fit for {model.name}: from each, it reaches nothing or hides the object.",
                 remedy="Give more places, farther to the side of the audience, or a smaller [goal] body_m.",
             )
-    return found
+    return [known[model] for model in models]
 
 
 def chosen(

@@ -9,6 +9,7 @@ from controller.errors import UsageError
 from controller.study.ablation import ABLATION
 from controller.study.earlier import EARLIER
 from controller.study.frequency import FREQUENCY
+from controller.study.placement import PLACEMENT
 from controller.study.regions import REGIONS
 from controller.study.residual import RESIDUAL, RESIDUAL_SIX
 from controller.study.sharpness import SHARPNESS
@@ -22,6 +23,7 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     SHARPNESS,
     FREQUENCY,
     EARLIER,
+    PLACEMENT,
 )
 
 

@@ -46,9 +46,19 @@ def curved_object(path: Path, *, columns: int = 121, rows: int = 101) -> None:
     write_atomically(path, ("\n".join([*head, *body, *triangles]) + "\n").encode())
 
 
+def planned_object(path: Path) -> None:
+    """Write the shell, and beside it where the projectors stand that were planned for it."""
+    from controller.study import placement  # which stands on this module
+
+    placement.planned_object(path)
+
+
 _ALL: Final = (
     Scene("painted", "a painted vase and bust, three projectors"),
     Scene("curved", "a pale curved shell, three projectors", curved_object),
     Scene("curved-six", "a pale curved shell, six projectors", curved_object, {"projectors": 6}),
+    Scene(
+        "planned", "the shell, three projectors where they were planned", planned_object, {"stands": "../stands.toml"}
+    ),
 )
 SCENES: Final[Mapping[str, Scene]] = {scene.name: scene for scene in _ALL}
