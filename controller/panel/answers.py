@@ -16,7 +16,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from controller.errors import UsageError, VelaturaError
 from controller.panel.context import Panel, Values
 from controller.panel.fields import Field, parse
-from controller.panel.operations import BytesAnswer, FileAnswer, Operation
+from controller.panel.operation import BytesAnswer, FileAnswer, Operation
 from hal.errors import DeviceError
 
 FAILURES: Final = (VelaturaError, DeviceError)

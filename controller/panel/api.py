@@ -16,7 +16,8 @@ from controller.panel import answers
 from controller.panel.accounts import Role
 from controller.panel.context import Panel
 from controller.panel.fields import object_schema
-from controller.panel.operations import OPERATIONS, Operation
+from controller.panel.operation import Operation
+from controller.panel.operations import OPERATIONS
 from controller.panel.visitors import Endpoint, Entry, Visitor
 from controller.session.machine import State
 

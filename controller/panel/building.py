@@ -100,6 +100,7 @@ class BuildingControl:
             "reason": now.reason,
             "since_unix_s": now.since_unix_s,
             "playing": now.playing,
+            "warnings": list(now.warnings),
             "problems": [{"device": row.name, "problem": row.problem} for row in now.devices if row.problem],
         }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,6 +69,7 @@ class Panel:
     by_token: LoginLimit = field(default_factory=lambda: LoginLimit(burst=20, refill_s=5.0))
     # Argon2 takes 64 MiB each: two at a time are enough for people.
     hashing: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(2))
+    costly: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
     working: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(16))
     form_key: bytes = field(default_factory=lambda: secrets.token_bytes(32))
 

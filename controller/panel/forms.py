@@ -15,7 +15,8 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from controller.panel import answers
 from controller.panel.context import Panel, Values
 from controller.panel.fields import parse
-from controller.panel.operations import COMMANDS, ROW, FileAnswer, Operation
+from controller.panel.operation import FileAnswer, Operation
+from controller.panel.operations import COMMANDS, ROW
 from controller.panel.pages import Pages
 from controller.panel.visitors import Entry, Visitor, same_origin
 

@@ -30,6 +30,7 @@ from controller.panel.values import (
     JobStep,
     KioskState,
     Lamp,
+    LampDay,
     LiveValue,
     NextEvent,
     ProjectorAim,
@@ -84,6 +85,9 @@ class Kiosk(Protocol):
 
     def remove_appearance(self, name: str) -> None:
         """Raises UsageError for the one that is playing, or that the schedule names."""
+
+    def lamp_history(self) -> Sequence[LampDay]:
+        """Each lamp's last days, at most 400, oldest first; a day without light is left out."""
 
     def schedule(self) -> Schedule: ...
 
@@ -151,6 +155,7 @@ __all__ = [
     "Kiosk",
     "KioskState",
     "Lamp",
+    "LampDay",
     "LiveValue",
     "NextEvent",
     "ProjectorAim",

@@ -2,62 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from controller.errors import UsageError
+from controller.panel.account_operations import ACCOUNT_COMMANDS, ACCOUNT_QUESTIONS
 from controller.panel.accounts import Role
 from controller.panel.context import Panel, Values
 from controller.panel.fields import NAME, Field
 from controller.panel.kiosk import ComputeSettings, Schedule, ScheduleRow
+from controller.panel.operation import BytesAnswer, FileAnswer, Operation, done, plain
 from controller.panel.uploads import KEY
-
-
-@dataclass(frozen=True, slots=True)
-class FileAnswer:
-    """A file that the kiosk or the panel made; ``download`` its name where it is to be saved."""
-
-    path: Path
-    media_type: str
-    download: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class BytesAnswer:
-    content: bytes
-    media_type: str
-
-
-@dataclass(frozen=True, slots=True)
-class Operation:
-    """One thing that can be asked.
-
-    ``path`` below /api/v1; ``upload`` names the field that is the request's whole body; ``media`` what a file answer
-    is; ``then`` the page that a form goes on to, and ``said`` the sentence that it shows; empty ``then``: no form
-    asks this
-    """
-
-    name: str
-    method: str
-    path: str
-    role: Role
-    about: str
-    run: Callable[[Panel, Values], Any]
-    fields: tuple[Field, ...] = ()
-    media: str = "application/json"
-    then: str = ""
-    said: str = "Done."
-
-    @property
-    def upload(self) -> Field | None:
-        return next((field for field in self.fields if field.kind == "file"), None)
-
-    @property
-    def changes(self) -> bool:
-        return self.method != "GET"
-
 
 APPEARANCE: Final = Field("name", "an appearance's name, 1 to 64 letters, digits, spaces, dots, dashes", pattern=NAME)
 TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9])?$"
@@ -76,27 +31,6 @@ SCHEDULE: Final = (
 TARGET: Final = Field("target", "the key of an uploaded target", pattern=KEY, longest=24)
 SETTINGS: Final = Field("text", "the text of stage.toml", longest=1 << 20)
 RUN: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,95}$"
-
-
-def plain(value: Any) -> Any:
-    """Values as JSON has them; paths are left out, since they are nobody's business."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {key: plain(inner) for key, inner in asdict(value).items() if not isinstance(inner, Path)}
-    if isinstance(value, dict):
-        return {str(key): plain(inner) for key, inner in value.items() if not isinstance(inner, Path)}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    return value
-
-
-def _done(run: Callable[[Panel, Values], object]) -> Callable[[Panel, Values], Any]:
-    """For commands that answer nothing."""
-
-    def answered(panel: Panel, values: Values) -> Any:
-        run(panel, values)
-        return {"done": True}
-
-    return answered
 
 
 def _events(panel: Panel, values: Values) -> Any:
@@ -174,6 +108,8 @@ QUESTIONS: Final = (
               lambda p, v: plain(p.kiosk.appearances())),
     Operation("preview", "GET", "/appearances/{name}/preview", VIEWER, "How it will look", _preview,
               (_NAME_IN_PATH,), "image/png"),
+    Operation("lamp-history", "GET", "/lamps", VIEWER, "Each lamp's hours and strikes at the end of its last days",
+              lambda p, v: plain(p.kiosk.lamp_history())),
     Operation("schedule", "GET", "/schedule", VIEWER, "Opening hours", lambda p, v: plain(p.kiosk.schedule())),
     Operation("runs", "GET", "/runs", VIEWER, "Runs with results, newest first", lambda p, v: list(p.kiosk.runs())),
     Operation("results", "GET", "/runs/{run}", VIEWER, "Grade and figures of a run",
@@ -192,6 +128,7 @@ QUESTIONS: Final = (
               lambda p, v: plain(p.kiosk.aiming())),
     Operation("settings", "GET", "/settings", TECHNICIAN, "The text of stage.toml",
               lambda p, v: {"text": p.kiosk.settings()}),
+    *ACCOUNT_QUESTIONS,
 )  # fmt: skip
 """What only looks."""
 
@@ -201,16 +138,16 @@ COMMANDS: Final = (
                Field("projector", "only this projector", required=False, pattern=r"^[^\u0000-\u001f\u007f/\\]+$")),
               then="/", said="The recalibration has begun."),
     Operation("cancel", "POST", "/cancel", OPERATOR, "End the running job at its next safe point",
-              _done(lambda p, v: p.kiosk.cancel()), then="/", said="The job ends at its next safe point."),
-    Operation("start", "POST", "/start", OPERATOR, "Lamps on, and play", _done(lambda p, v: p.kiosk.start()),
+              done(lambda p, v: p.kiosk.cancel()), then="/", said="The job ends at its next safe point."),
+    Operation("start", "POST", "/start", OPERATOR, "Lamps on, and play", done(lambda p, v: p.kiosk.start()),
               then="/", said="The stage opens."),
-    Operation("stop", "POST", "/stop", OPERATOR, "Stop playing, and cool down", _done(lambda p, v: p.kiosk.stop()),
+    Operation("stop", "POST", "/stop", OPERATOR, "Stop playing, and cool down", done(lambda p, v: p.kiosk.stop()),
               then="/", said="The stage closes; the lamps cool down."),
     Operation("play", "POST", "/play", OPERATOR, "Show this appearance now",
-              _done(lambda p, v: p.kiosk.play(v["name"])),
+              done(lambda p, v: p.kiosk.play(v["name"])),
               (APPEARANCE,), then="/appearances", said="It is on the projectors."),
     Operation("identify", "POST", "/identify", OPERATOR, "Show each projector's name on it, or end that",
-              _done(lambda p, v: p.kiosk.identify(v["on"])),
+              done(lambda p, v: p.kiosk.identify(v["on"])),
               (Field("on", "true or false", "boolean"),), then="/", said="Look at the projectors."),
     Operation("upload-target", "POST", "/targets", OPERATOR, "Upload a picture as a target",
               lambda p, v: {"target": p.targets.add(v["file"])},
@@ -220,28 +157,29 @@ COMMANDS: Final = (
               (APPEARANCE, TARGET, Field("brightness", "0.05 to 1; left out: the brightest that fits", "number", False,
                                          least=0.05, most=1)), then="/", said="The computation has begun."),
     Operation("remove-appearance", "DELETE", "/appearances/{name}", TECHNICIAN, "Remove an appearance",
-              _done(lambda p, v: p.kiosk.remove_appearance(v["name"])), (_NAME_IN_PATH,),
+              done(lambda p, v: p.kiosk.remove_appearance(v["name"])), (_NAME_IN_PATH,),
               then="/appearances", said="Removed."),
-    Operation("set-schedule", "PUT", "/schedule", OPERATOR, "Replace the opening hours", _done(_set_schedule), SCHEDULE,
+    Operation("set-schedule", "PUT", "/schedule", OPERATOR, "Replace the opening hours", done(_set_schedule), SCHEDULE,
               then="/schedule", said="The schedule is in use."),
     Operation("doctor", "POST", "/doctor", OPERATOR, "Look for what is wrong", lambda p, v: plain(p.kiosk.doctor())),
     Operation("backup", "POST", "/backup", TECHNICIAN, "A file with settings, calibration and appearances",
               lambda p, v: _saved(p.kiosk.backup()), media=_FILE, then="/care"),
     Operation("restore", "POST", "/restore", TECHNICIAN, "Replace everything by a backup",
-              _done(lambda p, v: p.kiosk.restore(v["file"])), (Field("file", "a backup of ours", "file"),),
+              done(lambda p, v: p.kiosk.restore(v["file"])), (Field("file", "a backup of ours", "file"),),
               then="/care", said="The backup is in use."),
     Operation("diagnostics", "POST", "/diagnostics", TECHNICIAN, "A file for whoever helps from afar",
               lambda p, v: _saved(p.kiosk.diagnostics()), media=_FILE, then="/care"),
     Operation("check-settings", "POST", "/settings/check", TECHNICIAN, "Check a stage.toml without saving it",
-              _done(lambda p, v: p.kiosk.validate_settings(v["text"])), (SETTINGS,)),
+              done(lambda p, v: p.kiosk.validate_settings(v["text"])), (SETTINGS,)),
     Operation("save-settings", "PUT", "/settings", TECHNICIAN, "Check stage.toml, save it, take it into use",
-              _done(lambda p, v: p.kiosk.save_settings(v["text"])), (SETTINGS,), then="/settings",
+              done(lambda p, v: p.kiosk.save_settings(v["text"])), (SETTINGS,), then="/settings",
               said="The settings are in use."),
     Operation("find-devices", "POST", "/devices/found", TECHNICIAN, "Search for devices",
               lambda p, v: plain(p.kiosk.find_devices())),
     Operation("try-device", "POST", "/devices/tried", TECHNICIAN, "Ask a found device who it is",
               lambda p, v: plain(p.kiosk.try_device(v["key"])),
               (Field("key", "the key of a found device", longest=256),)),
+    *ACCOUNT_COMMANDS,
 )  # fmt: skip
 """What changes or costs something."""
 

@@ -13,6 +13,7 @@ from controller.panel.accounts import Role
 from controller.panel.context import Panel
 from controller.panel.drawing import EVENTS_SHOWN, Drawing
 from controller.panel.fields import parse
+from controller.panel.lamp_days import stories
 from controller.panel.operations import OPERATIONS, QUESTIONS
 from controller.panel.visitors import Entry, Visitor
 
@@ -21,6 +22,7 @@ NAVIGATION: Final = (
     ("/appearances", "Appearances", Role.VIEWER),
     ("/schedule", "Schedule", Role.VIEWER),
     ("/results", "Results", Role.VIEWER),
+    ("/lamps", "Lamps", Role.VIEWER),
     ("/events", "Events", Role.VIEWER),
     ("/doctor", "Doctor", Role.OPERATOR),
     ("/aiming", "Aiming", Role.TECHNICIAN),
@@ -47,6 +49,7 @@ class Pages:
             ("/results", Role.VIEWER, "results.html", self._results),
             ("/results/{run}", Role.VIEWER, "results.html", self._results),
             ("/events", Role.VIEWER, "events.html", self._events),
+            ("/lamps", Role.VIEWER, "lamps.html", self._lamps),
             ("/password", Role.VIEWER, "password.html", lambda _: {}),
             ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None}),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
@@ -126,6 +129,10 @@ class Pages:
 
     def _appearances(self, _: Request) -> dict[str, Any]:
         return {"appearances": list(self._panel.kiosk.appearances())}
+
+    def _lamps(self, _: Request) -> dict[str, Any]:
+        kiosk = self._panel.kiosk
+        return {"stories": stories(kiosk.snapshot().lamps, kiosk.lamp_history(), kiosk.events())}
 
     def _schedule(self, _: Request) -> dict[str, Any]:
         schedule = self._panel.kiosk.schedule()

@@ -95,6 +95,16 @@ class Lamp:
 
 
 @dataclass(frozen=True, slots=True)
+class LampDay:
+    """A lamp at the end of one day (local date, "2026-12-24"): ``hours`` lit and ``strikes`` as counted by then."""
+
+    projector: str
+    day: str
+    hours: float
+    strikes: int
+
+
+@dataclass(frozen=True, slots=True)
 class Grade:
     """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False where the older one stayed.
 
@@ -115,8 +125,8 @@ class KioskState:
     """Everything that the panel's first page shows, as of one moment.
 
     ``state`` is a value of ``controller.session.machine.State``; ``reason`` one sentence; ``since_unix_s`` when it
-    began. ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the
-    stage has no valid stage.toml.
+    began. ``warnings``: sentences on what is wrong with no device (light in the room). ``revision`` grows with every
+    change, also over restarts of the service. ``needs_setup`` is True while the stage has no valid stage.toml.
     """
 
     revision: int
@@ -133,6 +143,7 @@ class KioskState:
     grades: tuple[Grade, ...] = ()
     identifying: bool = False
     needs_setup: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

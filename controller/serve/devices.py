@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Final, cast
 
 from controller.app import Checked, light_sensor, mains_circuits, open_device, rig_of
 from controller.panel.kiosk import DeviceRow, LiveValue
@@ -16,7 +16,7 @@ from controller.serve.eventlog import Decision
 from controller.serve.mains_keeper import Boards, MainsKeeper
 from controller.serve.ports import Condition, ProjectorView
 from controller.serve.projector_keeper import ProjectorKeeper
-from controller.session.darkness import Darkness
+from controller.session.darkness import Darkness, LightWatch
 from controller.session.lamps import LampFile
 from controller.session.rig import Rig
 from controller.session.safety import LampGuard
@@ -30,7 +30,10 @@ Tell = Callable[[Decision], object]
 
 
 class Devices:
-    """Made from a checked stage; opens nothing by itself. ``step`` functions are in ``steps``, one a thread."""
+    """Made from a checked stage; opens nothing by itself. ``step`` functions are in ``steps``, one a thread.
+
+    ``scene`` names what lights the object for longer than a moment, for the light sensor; None: nothing that lasts.
+    """
 
     def __init__(self, checked: Checked, runtime: Path, tell: Tell) -> None:
         self._checked, self._tell = checked, tell
@@ -41,6 +44,8 @@ class Devices:
         if self.mains is not None:
             self.mains.keepers = self.projectors
         tables = checked.stage.tables
+        self.scene: Callable[[], str | None] = lambda: None
+        self._room: str | None = None
         self.camera = DeviceKeeper(
             "camera", "camera", tables.camera.driver, self._open_camera, _look_at_camera, tell, every_s=60.0
         )
@@ -50,6 +55,11 @@ class Devices:
     def others(self) -> tuple[DeviceKeeper, ...]:
         """Every keeper of a device that is no projector."""
         return tuple(keeper for keeper in (self.camera, self.sensor, self.mains) if keeper is not None)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with no device, and yet worth a look."""
+        return () if self._room is None else (f"{self._room} {_DARKEN}",)
 
     def rows(self) -> tuple[DeviceRow, ...]:
         """As the panel shows them."""
@@ -125,12 +135,22 @@ class Devices:
             assert found is not None
             return found.sensor
 
+        watch = LightWatch(table.most_lux)
+
         def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
             lux = cast("LightSensor", device).illuminance_lux(deadline=deadline)
+            self._tell_of_light(watch.saw(lux, self.scene()))
             dark = "dark enough to calibrate" if lux <= table.most_lux else "too bright to calibrate"
             return (LiveValue("Light", f"{lux:.2f} lux ({dark})"),)
 
         return DeviceKeeper("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0)
+
+    def _tell_of_light(self, room: str | None) -> None:
+        before, self._room = self._room, room
+        if room is not None and before is None:
+            self._tell(Decision("room-bright", room, _DARKEN, "warning"))
+        elif room is None and before is not None:
+            self._tell(Decision("room-dark", "Nothing but the projectors lights the object any more."))
 
     def _darkness(self) -> Darkness | None:
         table = self._checked.stage.tables.light_sensor
@@ -149,6 +169,9 @@ class Devices:
             return Boards(circuits, stack)
 
         return MainsKeeper(drivers, open_circuits, self._tell)
+
+
+_DARKEN: Final = "Switch the lights off and close the blinds: the appearance is pale in other light."
 
 
 def projector_row(view: ProjectorView, driver: str) -> DeviceRow:

@@ -22,7 +22,7 @@ from controller.panel.kiosk import (
     Grade,
     Job,
     KioskState,
-    Lamp,
+    LampDay,
     RecalibrationKind,
     Results,
     Schedule,
@@ -150,10 +150,6 @@ class StageKiosk:
         identity = None
         if index is not None and bundle is not None:
             identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
-        lamps = tuple(
-            Lamp(view.name, view.hours, view.strikes, view.condition.value == "lit")
-            for view in (keeper.view for keeper in service.devices.projectors)
-        )
         return KioskState(
             revision=self._last.revision + 1,
             stage=service.checked.stage.tables.stage.name,
@@ -165,9 +161,10 @@ class StageKiosk:
             playing=shown.appearance if shown is not None else "",
             next_event=service.conductor.plan.next,
             bundle=identity,
-            lamps=lamps,
+            lamps=service.lamps,
             grades=grades,
             identifying=service.player.identifying,
+            warnings=service.devices.warnings,
         )
 
     def _player_row(self, service: Service) -> DeviceRow:
@@ -248,6 +245,9 @@ class StageKiosk:
                              remedy="Play another one, and take it out of the schedule.")  # fmt: skip
         settings.remove_picture(self.stage, name)
         service.ask(Request("publish"))
+
+    def lamp_history(self) -> Sequence[LampDay]:
+        return () if self._service is None else self._service.lamp_history.days()
 
     def schedule(self) -> Schedule:
         return Schedule("UTC") if self._service is None else self._service.schedule.now

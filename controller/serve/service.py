@@ -6,12 +6,14 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
+from datetime import date
 from pathlib import Path
 from typing import Final
 
 from controller.app import Checked, check_stage, player_settings, stage_lock, technicians_panel
 from controller.calibrations import finished_calibrations, stage_trust
 from controller.errors import UsageError, VelaturaError, WorkError
+from controller.panel.kiosk import Lamp
 from controller.play.launch import PlayerSettings
 from controller.play.notify import Notifier
 from controller.serve.clock import Clockwork, beginning
@@ -19,8 +21,9 @@ from controller.serve.conductor import Conductor, Limits
 from controller.serve.devices import Devices
 from controller.serve.eventlog import Decision, EventLog
 from controller.serve.kinds import Kinds
+from controller.serve.lamp_history import LampHistory
 from controller.serve.player_keeper import PlayerKeeper
-from controller.serve.ports import BLACK, Request
+from controller.serve.ports import BLACK, Condition, Request
 from controller.serve.schedule_file import ScheduleFile
 from controller.serve.stock import BundleStock
 from controller.serve.works import ThreadWorks
@@ -45,6 +48,8 @@ class Service:
         self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
         self.player = PlayerKeeper(self.runtime, self._settings, log.tell)
         self.devices = Devices(checked, self.runtime, log.tell)
+        self.devices.scene = self._scene
+        self.lamp_history = LampHistory(stage.folder)
         kinds = Kinds(
             stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated
         )
@@ -88,6 +93,7 @@ class Service:
                 self.devices.mains.want_on = self._light_wanted()
             if self.works.job is not None:
                 self.log.keep("job", str(self.works.job.number))
+            self.lamp_history.note(self.lamps, date.today())
             self.changed()
             if not ready and self.player.view.shown is not None:
                 ready = True
@@ -109,6 +115,7 @@ class Service:
             thread.join(5.0)
         if self._keys is not None:
             self._keys.close()
+        self.lamp_history.note(self.lamps, date.today(), now=True)
         self.player.close()
         self.devices.close()
         self.log.tell(Decision("service-ended", "The kiosk ends."))
@@ -120,6 +127,22 @@ class Service:
 
     def _settings(self, with_bundle: bool) -> PlayerSettings:
         return player_settings(self.checked.stage, self.runtime, plays=with_bundle)
+
+    @property
+    def lamps(self) -> tuple[Lamp, ...]:
+        views = [keeper.view for keeper in self.devices.projectors]
+        return tuple(Lamp(one.name, one.hours, one.strikes, one.condition is Condition.LIT) for one in views)
+
+    def _scene(self) -> str | None:
+        """What has lit the object since a while, for the light sensor."""
+        shown = self.player.view.shown
+        if self.conductor.machine.state not in (State.PLAYING, State.DEGRADED) or shown is None or not shown.appearance:
+            return None
+        views = [keeper.view for keeper in self.devices.projectors]
+        if any(view.coming or (view.shines and view.stable_left_s > 0) for view in views):
+            return None
+        lit = " ".join(view.name for view in views if view.shines)
+        return f"{shown.bundle} {shown.appearance} {lit}"
 
     def _calibrated(self) -> bool:
         # Asked four times a second while a task is due; opening every journal each time would be a waste.

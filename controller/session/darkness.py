@@ -44,6 +44,41 @@ class Darkness:
         return None
 
 
+class LightWatch:
+    """Tells the room's light from the projectors' own while something is played.
+
+    The sensor stands at the object and sees both. What it saw least under one picture counts as that picture's own
+    light; what comes on top of it is the room's. A room that was bright ever since is therefore not noticed before the
+    picture changes; whoever calibrates is told by ``Darkness``.
+
+    Parameters
+    ----------
+    most_lux : more than this on top of the picture's own light is told
+    looks : so many in a row, so that nobody is told of a visitor's torch
+    """
+
+    def __init__(self, most_lux: float, *, looks: int = 2) -> None:
+        self._most_lux, self._looks = most_lux, looks
+        self._least: dict[str, float] = {}
+        self._in_a_row = 0
+        self._bright = False
+
+    def saw(self, lux: float, scene: str | None) -> str | None:
+        """What to tell people for as long as it holds; ``scene`` names what is shown, None: nothing that lasts."""
+        if scene is None:
+            self._in_a_row, self._bright = 0, False
+            return None
+        own = min(lux, self._least.get(scene, lux))
+        self._least = {**dict(list(self._least.items())[-99:]), scene: own}
+        room = lux - own
+        # Half of it must be gone before all is well: light that flickers about the limit is told once.
+        self._in_a_row = self._in_a_row + 1 if room > self._most_lux else 0
+        self._bright = self._in_a_row >= self._looks or (self._bright and room > self._most_lux / 2)
+        if not self._bright:
+            return None
+        return f"There is light in the room: {room:.1f} lux at the object that are not the projectors'."
+
+
 def dark_before(darkness: Darkness | None) -> list[Step]:
     """The step that refuses a bright room, for before the lamps are struck: their light must not count."""
     if darkness is None:

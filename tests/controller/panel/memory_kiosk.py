@@ -26,6 +26,7 @@ from controller.panel.kiosk import (
     JobStep,
     KioskState,
     Lamp,
+    LampDay,
     LiveValue,
     NextEvent,
     ProjectorAim,
@@ -202,6 +203,11 @@ class MemoryKiosk:
     def remove_appearance(self, name: str) -> None:
         self._known(name)
         del self._appearances[name]
+
+    def lamp_history(self) -> Sequence[LampDay]:
+        days = ("2026-01-02", "2026-01-03", "2026-01-05")
+        left = [LampDay("left", day, 1190.0 + 7 * at, 84 + at) for at, day in enumerate(days)]
+        return [*left, LampDay("right", days[0], 3120.0, 203)]
 
     def schedule(self) -> Schedule:
         return self._schedule
