@@ -103,7 +103,7 @@ def test_every_picture_comes_at_its_tick(clocks: Clocks) -> None:
     np.testing.assert_allclose(np.diff(ticks), 1, atol=1e-6)
     np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
     assert presenter.late == 0
-    assert presenter.intervals.percentile(99) == pytest.approx(1 / RATE_HZ, rel=2e-4)
+    assert presenter.intervals.percentile(99) == pytest.approx(1 / RATE_HZ, rel=3e-4)
 
 
 def test_a_picture_that_is_late_is_counted_once_and_the_next_are_on_the_grid_again(clocks: Clocks) -> None:
@@ -137,7 +137,7 @@ def test_percentiles_of_any_number_of_intervals_are_those_of_a_sorted_list(secon
     for interval in seconds:
         intervals.add(interval)
     rank = max(1, -(-percent * len(seconds) // 100))
-    assert intervals.percentile(percent) == pytest.approx(sorted(seconds)[rank - 1], rel=2e-4)
+    assert intervals.percentile(percent) == pytest.approx(sorted(seconds)[rank - 1], rel=3e-4)
 
 
 def test_intervals_beyond_all_classes_are_counted_in_the_nearest() -> None:
