@@ -2,26 +2,57 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from controller.app import Checked, check_stage, run_on_stage
-from controller.arrays import ByteImage, FloatImage
-from controller.errors import UsageError
-from controller.live.scaling import LiveScaler
-from controller.live.sources import open_source
-from controller.services import usable_calibration
-from controller.session.live import LiveFigures, run_live
+from controller.arrays import FloatImage
+from controller.bundle.install import CURRENT, current
+from controller.bundle.live_maps import LiveMaps
+from controller.bundle.reader import Bundle
+from controller.errors import BundleError
+from controller.live.sources import LiveSource, open_source
+from controller.live_files import FileSource, holds_frames
+from controller.play.frames import FrameFile, FrameSet, OutputSize
+from controller.play.live import TARGET
+from controller.services import stage_trust, usable_calibration
+from controller.session.live import FrameMaker, Frames, LiveFigures, Maker, TargetMaker, run_live
+from controller.session.live_parts import live_maps
 from controller.session.machine import Event
-from controller.session.progress import Reporter
+from controller.session.progress import Level, Reporter
+from controller.session.publishing import bundle_display
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
 from controller.session.solving import Calibrated
 from controller.solve.feasibility import choose_exposure
+from controller.solve.interactive import Interactive
+from controller.storage import runtime_folder
+from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.errors import DeviceError, DeviceRefused
+from hal.values import LiveStatus
+
+FRAMES_FILE: Final = "live.frame"
+TARGETS_FILE: Final = "live-targets.frame"
+"""In the stage's runtime folder: what the player shows live."""
+NO_SHADERS: Final = {"live-no-shaders", "display-unfit", "bundle-not-live", "bundle-none"}
+"""What a player refuses targets with where it would take finished frames."""
+LAST_S: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class _Ready:
+    """What is worked out before the lamps are lit. ``shaded``: the installed bundle has the maps for shaders."""
+
+    maps: LiveMaps
+    brightness: float
+    shaded: bool
 
 
 def live(
@@ -36,36 +67,19 @@ def live(
 ) -> Mapping[str, Any]:
     """Light the projectors and show ``source`` until it ends, ``seconds`` have passed or it is stopped.
 
-    Raises UsageError "live-source-unreadable" or "no-base", what ``usable_calibration`` raises, and what devices raise.
+    Raises UsageError "live-source-unreadable" or "live-file-unfit", WorkError "base-not-solved", what
+    ``usable_calibration`` raises, and what devices raise.
     """
     checked = check_stage(stage)
     run = usable_calibration(checked, reporter)
-    if not (run / "base.npz").exists():
-        raise UsageError(
-            "no-base",
-            what="The last calibration has no solved base image yet.",
-            remedy="Run `velatura appearance` on the stage first; it solves the base that live pictures scale.",
-        )
-    pictures = open_source(source, loop=loop, rate_hz=rate_hz)
-    pictures.close()
-    scaler = _scaler(checked, run)
+    ready = _ready(checked, run)
+    open_it = partial(_opened, source, ready.maps.target_px, loop=loop, rate_hz=rate_hz)
+    open_it().close()
     told: dict[str, Any] = {}
 
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
         def show(context: Context) -> Sequence[Path]:
-            def tell(figures: LiveFigures) -> None:
-                now = figures.told()
-                context.advance(
-                    0.0 if seconds is None else min(figures.seconds / seconds, 1.0),
-                    f"{now['pictures_per_s']:.1f} pictures a second, {figures.late} late",
-                )
-
-            def present(frames: Mapping[str, ByteImage]) -> None:
-                rig.display.show(rig.on_outputs(dict(frames)), deadline=context.deadline.within(20))
-
-            opened = open_source(source, loop=loop, rate_hz=rate_hz)
-            figures = run_live(opened, scaler, present, rate_hz=rate_hz, seconds=seconds, tell=tell)
-            told.update(figures.told())
+            told.update(_show(rig, context, ready, open_it, rate_hz=rate_hz, seconds=seconds))
             return ()
 
         return [Step("live", show, title=f"Live: {source.name}", enter=Event.PLAY, leave=Event.PAUSE, always=True)]
@@ -74,11 +88,173 @@ def live(
     return told
 
 
-def _scaler(checked: Checked, run: Path) -> LiveScaler:
-    """Scales pictures whose white is the brightest that the stated share of the object can show."""
+def _opened(source: Path, target_px: tuple[int, int], *, loop: bool, rate_hz: float) -> LiveSource:
+    if holds_frames(source):
+        return FileSource(source, OutputSize(TARGET, *target_px))
+    return open_source(source, loop=loop, rate_hz=rate_hz)
+
+
+def _ready(checked: Checked, run: Path) -> _Ready:
+    """The maps, and the brightest white that the stated share of the object can show."""
     calibrated = Calibrated(run, checked.names)
-    transport, black = calibrated.transport, calibrated.calibration.black
+    maps = live_maps(calibrated, {table.name: table.output for table in checked.stage.tables.projectors})
+    black = calibrated.calibration.black
     white: FloatImage = np.ones_like(black)
     share = checked.stage.tables.solve.exposure_share
-    exposure = choose_exposure(transport, white, black, share=share, drive=calibrated.drive)
-    return LiveScaler(calibrated.calibration, transport, calibrated.base, exposure=exposure)
+    brightness = choose_exposure(calibrated.transport, white, black, share=share, drive=calibrated.drive)
+    return _Ready(maps, brightness, _in_bundle(checked, run.name))
+
+
+def _in_bundle(checked: Checked, calibration: str) -> bool:
+    """Whether the installed bundle has a live section of this calibration."""
+    file = current(checked.stage.folder / "bundles")
+    with contextlib.suppress(BundleError):
+        if file is not None:
+            with Bundle.open_trusted(file, stage_trust(checked.stage)) as bundle:
+                return bundle.index.live is not None and bundle.index.calibration == calibration
+    return False
+
+
+def _show(
+    rig: Rig,
+    context: Context,
+    ready: _Ready,
+    open_it: Callable[[], LiveSource],
+    *,
+    rate_hz: float,
+    seconds: float | None,
+) -> dict[str, Any]:
+    display = bundle_display(rig)
+    status: LiveStatus | None = None
+
+    def tell(figures: LiveFigures) -> None:
+        nonlocal status
+        status = display.playing(deadline=context.deadline.within(20)).live or status
+        context.advance(
+            0.0 if seconds is None else min(figures.seconds / seconds, 1.0),
+            f"{figures.made / max(figures.seconds, 1e-3):.1f} pictures a second, {figures.late} late",
+        )
+
+    try:
+        with _way(rig, context, ready) as way:
+            figures = run_live(open_it(), way.maker, way.write, rate_hz=rate_hz, seconds=seconds, tell=tell)
+            # the last one is shown at the next tick of the player's clock
+            context.deadline.sleep(LAST_S)
+            tell(figures)
+    finally:
+        # The lamps shine on for a while: black. A player that is gone is black as soon as it is back.
+        with contextlib.suppress(DeviceError):
+            display.stop(deadline=in_seconds(20))
+    if figures.bad:
+        context.reporter.say(f"{figures.bad} pictures could not be shown; the last: {figures.trouble}", Level.WARNING)
+    return figures.told() | _told(figures, status)
+
+
+def _told(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any]:
+    """What the player made of it; pictures that it did not get to show were replaced by newer ones."""
+    if status is None:
+        return {"shown": 0, "by": None, "shown_after_p50_ms": None, "shown_after_p99_ms": None}
+    p50_ms, p99_ms = (None if s is None else 1e3 * s for s in (status.delay_p50_s, status.delay_p99_s))
+    late = figures.late + max(figures.made - status.shown, 0)
+    return {"shown": status.shown, "late": late, "by": status.by,
+            "shown_after_p50_ms": p50_ms, "shown_after_p99_ms": p99_ms}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """How pictures become light: targets to the player's shaders, or finished frames."""
+
+    maker: Maker
+    write: Callable[[Frames], object]
+
+
+@contextlib.contextmanager
+def _way(rig: Rig, context: Context, ready: _Ready) -> Iterator[_Way]:
+    display, folder = bundle_display(rig), runtime_folder(rig.stage)
+    deadline = context.deadline.within(60)
+    if ready.shaded:
+        size = OutputSize(TARGET, *ready.maps.target_px)
+        with _fresh(folder / TARGETS_FILE, [size]) as file:
+            if _takes_targets(rig, file.path, ready.brightness, deadline):
+                yield _Way(TargetMaker(ready.maps.target_px), _target_writer(file))
+                return
+    outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in display.outputs(deadline=deadline)]
+    with _fresh(folder / FRAMES_FILE, outputs) as file:
+        display.live(file.path, deadline=deadline)
+        yield _Way(FrameMaker(Interactive(ready.maps), ready.brightness), _writer(file, outputs, ready.maps))
+
+
+def _takes_targets(rig: Rig, path: Path, white: float, deadline: Deadline) -> bool:
+    display = bundle_display(rig)
+    display.load_bundle(rig.stage / "bundles" / CURRENT, deadline=deadline)
+    try:
+        display.live(path, white=white, deadline=deadline)
+    except DeviceRefused as error:
+        if error.code not in NO_SHADERS:
+            raise
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _fresh(path: Path, outputs: Sequence[OutputSize]) -> Iterator[FrameFile]:
+    """A frame file without an old picture in it, removed again on leaving."""
+    path.unlink(missing_ok=True)
+    file = FrameFile(path, outputs)
+    try:
+        yield file
+    finally:
+        file.close()
+        path.unlink(missing_ok=True)
+
+
+def _writer(file: FrameFile, outputs: Sequence[OutputSize], maps: LiveMaps) -> Callable[[Frames], object]:
+    """Writes frames in the maps' order to a file of ``outputs``; those without a projector stay black."""
+    black = {output.name: image for output, image in zip(outputs, FrameSet.black(outputs).pixels, strict=True)}
+    names = [output.name for output in maps.outputs]
+
+    def write(frames: Frames) -> None:
+        found = black | dict(zip(names, frames, strict=True))
+        file.write(FrameSet(tuple(found[output.name] for output in outputs)))
+
+    return write
+
+
+def feed(
+    *,
+    stage: Path,
+    source: Path,
+    into: Path,
+    targets: bool,
+    rate_hz: float,
+    loop: bool,
+    seconds: float | None,
+    reporter: Reporter,
+    cancel: threading.Event,
+) -> Mapping[str, Any]:
+    """Write what ``source`` shows to the frame file ``into``, for a player that is asked elsewhere to show it live.
+
+    Finished frames, or with ``targets`` those of the bundle's live section. No device is touched. Ends with the source,
+    after ``seconds``, or when it is stopped; the file stays, with its last picture.
+    """
+    checked = check_stage(stage)
+    ready = _ready(checked, usable_calibration(checked, reporter))
+    pictures = _opened(source, ready.maps.target_px, loop=loop, rate_hz=rate_hz)
+    outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in checked.stage.tables.display.outputs]
+    if targets:
+        outputs = [OutputSize(TARGET, *ready.maps.target_px)]
+    reporter.say(f"A target's white is a radiance of {ready.brightness:.6g}.")
+    with contextlib.closing(FrameFile(into, outputs)) as file:
+        maker = TargetMaker(ready.maps.target_px) if targets else FrameMaker(Interactive(ready.maps), ready.brightness)
+        write = _target_writer(file) if targets else _writer(file, outputs, ready.maps)
+
+        def tell(figures: LiveFigures) -> None:
+            if cancel.is_set():
+                raise Cancelled
+
+        figures = run_live(pictures, maker, write, rate_hz=rate_hz, seconds=seconds, tell=tell)
+    return {"white": ready.brightness, **figures.told()}
+
+
+def _target_writer(file: FrameFile) -> Callable[[Frames], object]:
+    return lambda frames: file.write(FrameSet(tuple(frames)))

@@ -150,6 +150,13 @@ class BundleDisplay(Display, Protocol):
     def stop(self, *, deadline: Deadline) -> Presented:
         """Show black."""
 
+    def live(self, file: Path, *, deadline: Deadline, white: float | None = None) -> None:
+        """Show what is written to a shared frame file as it comes, until something else is asked for.
+
+        The file holds one 8-bit frame an output; with ``white`` it holds targets (sRGB) instead, whose white has this
+        radiance, and the display makes the frames of the bundle's live section. Raises DeviceRefused where it can't.
+        """
+
     def playing(self, *, deadline: Deadline) -> PlaybackStatus:
         """What is shown now, and how evenly."""
 

@@ -150,12 +150,28 @@ class Presented:
 
 
 @dataclass(frozen=True, slots=True)
+class LiveStatus:
+    """How a display shows what comes live.
+
+    ``shown`` pictures so far; ``source_there`` whether somebody still writes them; ``delay_p50_s``, ``delay_p99_s``
+    from when one was written to when it was presented, None before any; ``by``: who makes frames ("shaders"), or that
+    they come made ("frames").
+    """
+
+    shown: int
+    source_there: bool
+    by: str
+    delay_p50_s: float | None
+    delay_p99_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class PlaybackStatus:
     """How a display plays its bundle.
 
     ``swaps`` since its start, the last ``presented_at_s`` (monotonic clock); ``running`` whether a sequence has more
     items; ``late`` items presented more than a tick after their time in this sequence; intervals between presentations
-    of this or the last sequence, None before any.
+    of this or the last sequence, None before any; ``live`` is None where nothing comes live.
     """
 
     swaps: int
@@ -167,3 +183,4 @@ class PlaybackStatus:
     interval_p50_s: float | None
     interval_p99_s: float | None
     rss_bytes: int
+    live: LiveStatus | None = None

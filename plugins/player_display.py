@@ -12,7 +12,7 @@ import numpy.typing as npt
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused, PluginError
 from hal.registry import Driver, OpenContext
-from hal.values import DeviceIdentity, OutputInfo, PlaybackStatus, Presented
+from hal.values import DeviceIdentity, LiveStatus, OutputInfo, PlaybackStatus, Presented
 from plugins.player_link import PlayerLink, broken
 
 
@@ -75,6 +75,10 @@ class PlayerDisplay:
         """Show black."""
         return _presented(self._link.ask({"op": "stop"}, deadline))
 
+    def live(self, file: Path, *, deadline: Deadline, white: float | None = None) -> None:
+        """Show what is written to a shared frame file as it comes; see ``hal.interfaces.BundleDisplay.live``."""
+        self._link.ask({"op": "live", "file": str(file.resolve()), "white": white}, deadline)
+
     def identify(self, *, deadline: Deadline) -> Presented:
         """Show each output's number, name and size."""
         return _presented(self._link.ask({"op": "identify"}, deadline))
@@ -97,6 +101,7 @@ class PlayerDisplay:
                 interval_p50_s=answer["interval_p50_s"],
                 interval_p99_s=answer["interval_p99_s"],
                 rss_bytes=int(answer["rss_bytes"]),
+                live=_live(answer.get("live")),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise broken("its status lacks something") from error
@@ -128,6 +133,14 @@ def _presented(answer: Mapping[str, Any]) -> Presented:
     if not isinstance(sequence, int) or not isinstance(at_s, float):
         raise broken("an answer of it does not say when it presented")
     return Presented(sequence, at_s)
+
+
+def _live(told: Mapping[str, Any] | None) -> LiveStatus | None:
+    if told is None:
+        return None
+    return LiveStatus(
+        int(told["shown"]), told["source"] == "there", str(told["by"]), told["delay_p50_s"], told["delay_p99_s"]
+    )
 
 
 def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PlayerDisplay:

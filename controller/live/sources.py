@@ -13,7 +13,7 @@ import numpy as np
 
 from controller.arrays import ByteImage
 from controller.errors import UsageError
-from controller.solve.targets_files import read_picture
+from controller.solve.targets_files import check_picture, read_picture
 from controller.solve.targets_values import linear_to_srgb
 
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".exr")
@@ -107,7 +107,10 @@ class FolderSource:
         self._known = 0
 
     def next(self, at_s: float) -> LivePicture | None:
-        """See ``LiveSource``. A damaged picture raises UsageError("target-unreadable") once it is surely whole."""
+        """See ``LiveSource``. Once it is surely whole, a damaged picture raises UsageError, but only once.
+
+        "target-unreadable", or "target-not-finite" where it has NaN or infinite pixels.
+        """
         names = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in PICTURES)
         if not names:
             return None
@@ -152,6 +155,16 @@ def open_source(path: Path, *, loop: bool, rate_hz: float) -> LiveSource:
     return VideoSource(path, loop=loop)
 
 
+def fitted(picture: ByteImage, size: tuple[int, int]) -> ByteImage:
+    """A picture (rows, columns, 3) scaled to ``size`` (width, height)."""
+    if picture.shape[1::-1] == size:
+        return picture
+    smaller = picture.shape[1] > size[0]
+    return np.asarray(
+        cv2.resize(picture, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR), np.uint8
+    )
+
+
 def unreadable(path: Path, why: str) -> UsageError:
     """The error of a source that can't be used."""
     return UsageError(
@@ -170,4 +183,5 @@ def _as_srgb(path: Path) -> ByteImage:
             raise unreadable(path, "a picture in it could not be decoded")
         return np.ascontiguousarray(image[..., ::-1])
     light = read_picture(path)[..., :3]
-    return np.round(linear_to_srgb(np.nan_to_num(light)) * np.float32(255)).astype(np.uint8)
+    check_picture(path, light, (light.shape[1], light.shape[0]))
+    return np.round(linear_to_srgb(light) * np.float32(255)).astype(np.uint8)

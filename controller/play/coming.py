@@ -28,7 +28,7 @@ class Coming:
 
     ``frames`` None: the appearance is taken from the cache once it is decoded. ``fade_s``: it comes in over what is
     shown, in ``steps``, the first at ``begun_tick``; ``share`` of it is shown already. ``paced``: it is one of a
-    sequence, whose intervals are measured.
+    sequence, whose intervals are measured. ``prepare``: makes the output ready where that does not take ``frames``.
     """
 
     showing: str
@@ -38,6 +38,7 @@ class Coming:
     told: Told | None
     fade_s: float = 0.0
     paced: bool = False
+    prepare: Callable[[], None] | None = None
     begun_tick: int | None = None
     steps: int = 1
     share: float = 0.0

@@ -84,6 +84,8 @@ class Commands:
                 self._player.play(Playlist(items, repeat), told, rate_hz=rate_hz)
             case protocol.Suggested(repeat):
                 self._player.play(self._player.suggested(repeat), told)
+            case protocol.Live(file, white):
+                return self._player.live(Path(file), white)
             case protocol.Stop(fade_s):
                 self._player.stop(told, fade_s=fade_s)
             case protocol.Identify():

@@ -1,24 +1,127 @@
-"""Live targets on an output: from a shared file of targets, by shaders where the output has them, else by numpy.
+"""Live pictures: what another process writes to a shared frame file, shown as it comes (docs/player-protocol.md).
 
-The file of targets is a frame file (docs/player-protocol.md) with one output, ``target``, of the size that the bundle's
-live section says. Whoever makes targets (a program, or a reader of a video file) writes them there, sRGB, 8 bits.
+The file holds finished frames, one an output, or targets, of which the output's shaders make frames. Whoever writes
+holds an flock on it, so that its end is noticed however it ends; the last whole picture stays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import fcntl
+import mmap
+import os
+import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from controller.errors import WorkError
-from controller.play.frames import FrameFile, FrameSet, OutputSize
-from controller.play.live_maps import LiveMaps, compensate
+from controller.bundle.live_maps import LiveMaps
+from controller.errors import UsageError, WorkError
+from controller.play.coming import Coming, Presented
+from controller.play.frames import ENTRY, HEAD, PRESENTED_AT, SEQUENCE_AT, FrameSet, OutputSize, layout_bytes
 from controller.play.outputs import Output
+from controller.play.pacing import Intervals
 
 TARGET: Final = "target"
+SILENT_S: Final = 1.0
+"""After so long without a picture it is looked whether its writer is still there."""
+
+
+class LiveFile:
+    """A frame file that another process writes, read as ``outputs``."""
+
+    def __init__(self, path: Path, outputs: Sequence[OutputSize]) -> None:
+        """Raises UsageError("live-file-unfit"), naming what the file has and what it should have."""
+        self._path, self._outputs = path, tuple(outputs)
+        head, offsets = layout_bytes(outputs)
+        size = offsets[-1] + outputs[-1].width_px * outputs[-1].height_px * 3
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise _unfit(path, f"it can not be opened ({error.strerror})", outputs) from error
+        try:
+            found = self._file.read(len(head))
+            self._inode = os.fstat(self._file.fileno())
+            if _constant(found) != _constant(head) or self._inode.st_size != size:
+                raise _unfit(path, _described(found), outputs)
+            self._map = mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ)
+        except BaseException:
+            self._file.close()
+            raise
+        self._sequence = np.frombuffer(self._map, "<u8", 1, SEQUENCE_AT)
+        self._written_at = np.frombuffer(self._map, "<f8", 1, PRESENTED_AT)
+        self._pixels = [
+            np.frombuffer(self._map, np.uint8, output.width_px * output.height_px * 3, offset).reshape(output.shape)
+            for output, offset in zip(outputs, offsets, strict=True)
+        ]
+        self._seen = 0
+
+    def newest(self, into: FrameSet) -> float | None:
+        """Copy the set out if it is another than before and whole; when it was written, None if there is none."""
+        before = int(self._sequence[0])
+        if before % 2 or before == self._seen:
+            return None
+        written_at = float(self._written_at[0])
+        for image, source in zip(into.pixels, self._pixels, strict=True):
+            np.copyto(image, source)
+        if int(self._sequence[0]) != before:
+            return None
+        self._seen = before
+        return written_at
+
+    def has_writer(self) -> bool:
+        """Whether a process holds the file's lock."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        fcntl.flock(self._file, fcntl.LOCK_UN)
+        return False
+
+    def reopened(self) -> Self | None:
+        """The file of that name, if it is another one by now and fits; this one is closed then."""
+        try:
+            if os.path.samestat(self._path.stat(), self._inode):
+                return None
+            found = type(self)(self._path, self._outputs)
+        except (OSError, UsageError):
+            return None
+        self.close()
+        return found
+
+    def close(self) -> None:
+        """Release the mapping; the file stays."""
+        del self._sequence, self._written_at, self._pixels
+        with contextlib.suppress(BufferError):
+            self._map.close()
+        self._file.close()
+
+
+def _constant(head: bytes) -> bytes:
+    return head[:SEQUENCE_AT] + head[PRESENTED_AT + 8 :]
+
+
+def _described(head: bytes) -> str:
+    """What a frame file that begins like this holds."""
+    if len(head) < HEAD.size + ENTRY.size or head[:8] != b"VELFRAME":
+        return "it is no frame file"
+    entries = (ENTRY.unpack_from(head, at) for at in range(HEAD.size, len(head) - ENTRY.size + 1, ENTRY.size))
+    sizes = [
+        f"{name.rstrip(bytes(1)).decode(errors='replace')} {width}x{height}" for name, width, height, _, _ in entries
+    ]
+    return f"it holds {', '.join(sizes)}"
+
+
+def _unfit(path: Path, why: str, wanted: Sequence[OutputSize]) -> UsageError:
+    sizes = ", ".join(f"{one.name} {one.width_px}x{one.height_px}" for one in wanted)
+    return UsageError(
+        "live-file-unfit",
+        what=f"{path} can not be shown live: {why}.",
+        remedy=f"Let its writer make a frame file with {sizes} first.",
+    )
 
 
 @runtime_checkable
@@ -31,56 +134,114 @@ class LiveOutput(Protocol):
     def prepare_live(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
         """As ``Output.prepare``, with the frames for this target (height, width, 3) uint8 sRGB."""
 
-
-class LivePicture:
-    """Prepares live targets on an output; ``on_gpu`` says how.
-
-    ``tell`` gets a sentence where shaders were expected and the processor does their work.
-    """
-
-    def __init__(self, output: Output, maps: LiveMaps, tell: Callable[[str], None]) -> None:
-        self._output, self._maps = output, maps
-        self._shader: LiveOutput | None = None
-        if isinstance(output, LiveOutput):
-            try:
-                output.load_live(maps)
-                self._shader = output
-            except WorkError as error:
-                tell(f"{error.what} The processor makes the live frames, which takes far longer.")
-
-    @property
-    def on_gpu(self) -> bool:
-        """Whether shaders make the frames."""
-        return self._shader is not None
-
-    def prepare(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
-        """Make the frames for a target (height, width, 3) uint8 sRGB ready; ``Output.flip`` then shows them."""
-        if self._shader is not None:
-            self._shader.prepare_live(target, brightness)
-        else:
-            self._output.prepare(compensate(self._maps, target, brightness))
+    def live_frames(self) -> FrameSet:
+        """The frames of the last target, read back."""
 
 
-class LiveTargets:
-    """The shared file of targets: ``newest`` is what was last written whole."""
+class LiveStream:
+    """What a ``live`` request asked for, until something else is asked for."""
 
-    def __init__(self, path: Path, maps: LiveMaps) -> None:
-        """Map ``path``, making it where it is missing. Raises as ``FrameFile``."""
-        size = OutputSize(TARGET, *maps.target_px)
-        self._file = FrameFile(path, [size])
-        self._set = FrameSet.black([size])
-        self._seen = self._file.sequence
+    by = "frames"
 
-    def newest(self) -> npt.NDArray[np.uint8] | None:
-        """The target (height, width, 3), valid until the next call; None where there is none since, or it changes."""
-        if self._file.sequence in (self._seen, self._seen | 1):
+    def __init__(self, path: Path, sizes: Sequence[OutputSize]) -> None:
+        """Raises UsageError("live-file-unfit")."""
+        self._file = LiveFile(path, sizes)
+        self._path = path
+        # One may be on the outputs while the other is read into.
+        self._sets = [FrameSet.black(sizes), FrameSet.black(sizes)]
+        self._delays = Intervals()
+        self._shown, self._written_at, self._presented_at = 0, 0.0, 0.0
+        self._heard_s = self._looked_s = time.monotonic()
+        self._gone = False
+
+    def coming(self, tick: int) -> Coming | None:
+        """The newest picture to be presented at a tick; None where there is no other than the last."""
+        written_at = self._file.newest(self._sets[0])
+        now_s = time.monotonic()
+        if written_at is None:
+            self._look(now_s)
             return None
-        try:
-            self._seen = self._file.read(self._set)
-        except WorkError:
-            return None
-        return self._set.pixels[0]
+        self._heard_s, self._gone, self._written_at = now_s, False, written_at
+        self._sets.reverse()
+        return self._made(self._sets[1], tick)
 
-    def close(self) -> None:
-        """Release the mapping; the file stays."""
+    def _made(self, frames: FrameSet, tick: int) -> Coming:
+        return Coming("live", None, frames, tick, None, paced=True)
+
+    def _look(self, now_s: float) -> None:
+        """Long without a picture: is its writer there, or is there another file of that name?"""
+        if now_s - max(self._heard_s, self._looked_s) < SILENT_S:
+            return
+        self._looked_s = now_s
+        self._file = self._file.reopened() or self._file
+        self._gone = not self._file.has_writer()
+
+    def presented(self, last: Presented) -> None:
+        """What ``coming`` gave is on the outputs."""
+        self._shown += 1
+        self._presented_at = last.at_s
+        if self._written_at > 0:
+            self._delays.add(last.at_s - self._written_at)
+
+    def status(self) -> dict[str, Any]:
+        """The key ``live`` of the status (docs/player-protocol.md)."""
+        return {
+            "file": str(self._path),
+            "by": self.by,
+            "shown": self._shown,
+            "presented_at": self._presented_at if self._shown else None,
+            "source": "gone" if self._gone else "there",
+            "delay_p50_s": self._delays.percentile(50),
+            "delay_p99_s": self._delays.percentile(99),
+        }
+
+    def end(self) -> FrameSet | None:
+        """Let go of the file; the frames that are shown, where the presenter does not have them."""
         self._file.close()
+        return None
+
+
+class ShadedStream(LiveStream):
+    """The same for targets, of which the output makes the frames."""
+
+    by = "shaders"
+
+    def __init__(self, path: Path, output: LiveOutput, maps: LiveMaps, white: float) -> None:
+        """``white``: the radiance of a target's white. Raises also WorkError("display-unfit")."""
+        super().__init__(path, [OutputSize(TARGET, *maps.target_px)])
+        self._output, self._white = output, white
+        try:
+            output.load_live(maps)
+        except WorkError:
+            self._file.close()
+            raise
+        self._nothing = FrameSet(())
+
+    def _made(self, frames: FrameSet, tick: int) -> Coming:
+        def prepare() -> None:
+            self._output.prepare_live(frames.pixels[0], self._white)
+
+        return Coming("live", None, self._nothing, tick, None, paced=True, prepare=prepare)
+
+    def end(self) -> FrameSet | None:
+        """See ``LiveStream``."""
+        super().end()
+        return self._output.live_frames() if self._shown else None
+
+
+def open_live(
+    path: Path, output: Output, sizes: Sequence[OutputSize], maps: LiveMaps | None, white: float | None
+) -> LiveStream:
+    """Finished frames of ``sizes``, or with ``white`` targets for the bundle's ``maps``.
+
+    Raises UsageError("live-file-unfit" or "live-no-shaders"), WorkError("display-unfit").
+    """
+    if white is None:
+        return LiveStream(path, sizes)
+    if not isinstance(output, LiveOutput) or maps is None:
+        raise UsageError(
+            "live-no-shaders",
+            what="This player shows in memory, where no shaders make frames of targets.",
+            remedy="Write finished frames instead, as 'velatura live' does by itself.",
+        )
+    return ShadedStream(path, output, maps, white)

@@ -1,7 +1,7 @@
 """Live targets in shaders: OpenGL 3.3, in the context that is current; the player's window gives one.
 
-What is drawn differs from ``live_maps.compensate`` by at most one device value: where a driver's exponential rounds
-otherwise, a pixel on the edge of a dithering threshold falls on its other side.
+What is drawn differs from ``bundle.live_maps.compensate`` by at most one device value: where a driver's
+exponential rounds otherwise, a pixel on the edge of a dithering threshold falls on its other side.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from pyglet import gl
 
+from controller.bundle.live_maps import LiveMaps, LiveOutput, brightness_factor, light_table, sigma_table
 from controller.errors import WorkError
-from controller.play.frames import FrameSet
-from controller.play.live_maps import LiveMaps, LiveOutput, brightness_factor, light_table, sigma_table
+from controller.play.frames import FrameSet, OutputSize
 from controller.play.live_shaders import FRAME, SCALE, VERTEX
 
 _FORMATS: Final[Mapping[tuple[str, int], tuple[int, int, int]]] = {
@@ -35,7 +35,7 @@ class LiveRenderer:
     """The maps of a bundle as textures, and the two programs that make frames of a target with them."""
 
     def __init__(self, maps: LiveMaps) -> None:
-        """Raises WorkError("display-unfit") where the driver can not do it: use ``live_maps.compensate`` then."""
+        """Raises WorkError("display-unfit") where the driver can not do it."""
         self._maps = maps
         width, height = maps.target_px
         kept = _state()
@@ -74,10 +74,13 @@ class LiveRenderer:
 
     def frames(self, target: npt.NDArray[np.uint8], brightness: float) -> FrameSet:
         """As ``render``, read back to memory; slower, for outputs that are no windows, and for tests."""
-        textures = self.render(target, brightness)
+        return self.read_back(self.render(target, brightness))
+
+    def read_back(self, textures: Sequence[int]) -> FrameSet:
+        """What textures of the outputs' sizes hold."""
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
         gl.glActiveTexture(gl.GL_TEXTURE0)
-        found = FrameSet.black([output.size for output in self._maps.outputs])
+        found = FrameSet.black([OutputSize(output.name, *output.size_px) for output in self._maps.outputs])
         for texture, image in zip(textures, found.pixels, strict=True):
             gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
             gl.glGetTexImage(gl.GL_TEXTURE_2D, 0, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, image.ctypes.data_as(ctypes.c_void_p))
@@ -111,7 +114,7 @@ class LiveRenderer:
         gl.glUniformMatrix3fv(program.at("unmix"), 1, gl.GL_TRUE, matrix)
         gl.glUniform2f(program.at("range"), *values.base_range)
         gl.glUniform2i(program.at("phase"), values.dither[1], values.dither[0])
-        _draw_to(into, values.size.width_px, values.size.height_px)
+        _draw_to(into, *values.size_px)
 
 
 class _OutputTextures:
@@ -120,7 +123,7 @@ class _OutputTextures:
         self.tables = _texture(np.vstack([light_table(), sigma_table(), values.response]).astype(np.float32))
         maps: dict[str, npt.NDArray[Any]] = {"base": values.base, "centre": values.centre, "shape": values.shape}
         self.inputs = {"tables": self.tables, **{name: _texture(array) for name, array in maps.items()}}
-        self.frame = _empty(values.size.width_px, values.size.height_px, gl.GL_RGBA8)
+        self.frame = _empty(*values.size_px, gl.GL_RGBA8)
 
 
 class _Program:

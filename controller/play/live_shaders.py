@@ -1,4 +1,4 @@
-"""The shaders of the live mode (GLSL 3.30). They compute what ``live_maps.compensate`` does, step for step."""
+"""The shaders of the live mode (GLSL 3.30). They compute what ``bundle.live_maps.compensate`` does, step for step."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from controller.bundle.live_maps import LiveMaps
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust, unproven
 from controller.errors import BundleError, UsageError
@@ -14,6 +15,7 @@ from controller.play import protocol
 from controller.play.cache import DecodedAhead, check_fits
 from controller.play.coming import Coming, Told
 from controller.play.frames import FrameSet, OutputSize
+from controller.play.live import LiveStream, open_live
 from controller.play.notify import Notifier, tell
 from controller.play.outputs import Output
 from controller.play.pacing import Grid
@@ -22,6 +24,7 @@ from controller.play.presenting import Presenter
 
 _IDLE_S: Final = 0.1
 _DECODE_WAIT_S: Final = 0.02
+_LIVE_WAIT_S: Final = 0.004
 
 
 class Player:
@@ -52,6 +55,7 @@ class Player:
         self._decoded: DecodedAhead | None = None
         self._coming: Coming | None = None
         self._playlist: Playlist | None = None
+        self._live: LiveStream | None = None
         self._warning: BundleError | None = None
         self._skipped = 0
         self._showing = "black"
@@ -67,6 +71,7 @@ class Player:
         while not self._ending:
             serve(self._patience_s())
             self._output.pump()
+            self._take_live()
             self._present_if_due()
             self._notifier.alive()
         self._notifier.stopping()
@@ -104,9 +109,24 @@ class Player:
         playlist.look_ahead = decoded.look_ahead
         self._make_coming(self._presenter.soon(), told)
 
+    def live(self, path: Path, white: float | None) -> dict[str, Any]:
+        """Show what is written to a frame file as it comes: finished frames, or with ``white`` targets.
+
+        Returns what the request answers. Raises as ``open_live`` and ``LiveMaps.read``; then nothing changes.
+        """
+        maps = None if white is None else LiveMaps.read(self._loaded().bundle)
+        stream = open_live(path, self._output, self.sizes, maps, white)
+        self.withdraw()
+        self._presenter.begin_sequence(self.rate_hz)
+        self._live = stream
+        return {"by": stream.by}
+
     def withdraw(self) -> None:
         """Present nothing more, keep the picture; whoever waits for a presentation is told."""
+        live, self._live = self._live, None
         coming, self._coming, self._playlist = self._coming, None, None
+        if live is not None:
+            self._presenter.shown = live.end() or self.shown
         self._presenter.grid = Grid(self.rate_hz)
         if coming is not None:
             self._presenter.freeze(coming)
@@ -129,13 +149,17 @@ class Player:
             bundle.close()
             raise
         if self._decoded is not None:
-            if self._playlist is not None or (self._coming is not None and self._coming.appearance is not None):
+            if self._busy_with_bundle():
                 self.withdraw()
             self._decoded.close()
         self._decoded = DecodedAhead(bundle, self.sizes, self._wake)
         self._warning = unproven(bundle.signed_by, self._trust)
         if self._warning is not None:
             tell(f"WARNING: {self._warning.what} {self._warning.remedy}")
+
+    def _busy_with_bundle(self) -> bool:
+        coming = self._coming is not None and self._coming.appearance is not None
+        return coming or self._playlist is not None or self._live is not None
 
     def suggested(self, repeat: int) -> Playlist:
         """The playlist of the bundle. Raises BundleError("bundle-none" or "bundle-no-schedule")."""
@@ -182,6 +206,7 @@ class Player:
             "swaps": presenter.last.sequence,
             "showing": self._showing,
             "appearance": self._appearance,
+            "live": None if self._live is None else self._live.status(),
             "fading": self._coming is not None and self._coming.share > 0,
             "missing_outputs": list(self._output.missing()),
             "sequence_running": self._playlist is not None,
@@ -200,10 +225,16 @@ class Player:
     def _patience_s(self) -> float:
         """How long the loop may wait for requests before it must look again."""
         if self._coming is None:
-            return min(_IDLE_S, self._notifier.interval_s or _IDLE_S)
+            idle_s = _IDLE_S if self._live is None else _LIVE_WAIT_S
+            return min(idle_s, self._notifier.interval_s or idle_s)
         if not self._take_frames():
             return _DECODE_WAIT_S if self._coming is not None else 0.0
         return min(_IDLE_S, self._presenter.patience_s(self._coming))
+
+    def _take_live(self) -> None:
+        """Make the newest live picture coming; one that is not yet presented goes first."""
+        if self._live is not None and self._coming is None:
+            self._coming = self._live.coming(self._presenter.soon())
 
     def _take_frames(self) -> bool:
         """Whether the coming set has its frames; takes them from the cache once they are there."""
@@ -244,6 +275,8 @@ class Player:
     def _presented(self, coming: Coming) -> None:
         self._coming = None
         self._hold_shown()
+        if self._live is not None:
+            self._live.presented(self._presenter.last)
         if coming.appearance is not None and self._on_appearance is not None:
             self._on_appearance()
             self._on_appearance = None

@@ -74,7 +74,9 @@ class Presenter:
         if coming.begun_tick is None and steps > 1:
             self._output.load_fade(self.shown, frames)
             coming.begin(steps)
-        if coming.begun_tick is None:
+        if coming.prepare is not None:
+            coming.prepare()
+        elif coming.begun_tick is None:
             self._output.prepare(frames)
         else:
             self._output.mix(coming.next_share)

@@ -10,13 +10,14 @@ from typing import Any, Final, TypeAlias
 from controller.errors import UsageError, VelaturaError
 
 PROTOCOL: Final = 1
-MINOR: Final = 2
+MINOR: Final = 3
 """Raised when something is added that a client of an earlier one need not know."""
 MAX_LINE_BYTES: Final = 256 * 1024
 MAX_ITEMS: Final = 4096
 MAX_RATE_HZ: Final = 1000.0
 MAX_SECONDS: Final = 7 * 24 * 3600.0
 MAX_FADE_S: Final = 600.0
+MAX_RADIANCE: Final = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,17 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True)
+class Live:
+    """Present what is written to the frame file ``file`` as it comes, until something else is asked for.
+
+    ``white``: it holds targets, whose white has this radiance, for the loaded bundle's live section; None: frames.
+    """
+
+    file: str
+    white: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Identify:
     """Present each output's number, name and size, in a test pattern."""
 
@@ -88,7 +100,7 @@ class Quit:
     """Present black and end."""
 
 
-Request: TypeAlias = Hello | Show | Play | Sequence | Suggested | Stop | Identify | Status | LoadBundle | Quit
+Request: TypeAlias = Hello | Show | Play | Sequence | Suggested | Live | Stop | Identify | Status | LoadBundle | Quit
 
 
 def parse_request(line: bytes) -> tuple[Any, Request]:
@@ -167,6 +179,10 @@ def _fade(value: Any) -> float:
     return 0.0 if value == 0 and not isinstance(value, bool) else _number(value, "fade_s", MAX_FADE_S)
 
 
+def _live(*, file: Any, white: Any = None) -> Live:
+    return Live(_text(file, "file"), None if white is None else _number(white, "white", MAX_RADIANCE))
+
+
 def _sequence(*, items: Any, repeat: Any = 0, rate_hz: Any = None) -> Sequence:
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ITEMS:
         raise ValueError(f"items is not a list of 1 to {MAX_ITEMS}")
@@ -201,6 +217,7 @@ _READERS: Final[dict[str, Any]] = {
     "play": _play,
     "sequence": _sequence,
     "suggested": _suggested,
+    "live": _live,
     "stop": _stop,
     "identify": Identify,
     "status": Status,

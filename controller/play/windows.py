@@ -16,11 +16,11 @@ pyglet.options["shadow_window"] = False
 
 from pyglet import gl  # noqa: E402
 
+from controller.bundle.live_maps import LiveMaps  # noqa: E402
 from controller.errors import WorkError  # noqa: E402
 from controller.play.drawing import Canvas  # noqa: E402
 from controller.play.frames import FrameSet, OutputSize  # noqa: E402
 from controller.play.live_gl import LiveRenderer  # noqa: E402
-from controller.play.live_maps import LiveMaps  # noqa: E402
 from controller.play.places import check_connectors, find_connectors, fits  # noqa: E402
 from controller.play.x11 import Connector, XServer  # noqa: E402
 
@@ -116,6 +116,12 @@ class WindowOutput:
         self._live.render(target, brightness, self._canvas.pictures)
         self._share = 0.0
         self._draw()
+
+    def live_frames(self) -> FrameSet:
+        """As ``live.LiveOutput``."""
+        assert self._live is not None
+        self._window.switch_to()
+        return self._live.read_back(self._canvas.pictures)
 
     def load_fade(self, before: FrameSet, after: FrameSet) -> None:
         self._window.switch_to()

@@ -1,43 +1,87 @@
-"""Live: pictures of a source scaled into frames and shown, the newest first, those that come too late told of."""
+"""Live: pictures of a source made into frames and handed on, the newest first; told of: what is late, what is bad."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from controller.arrays import ByteImage
-from controller.live.scaling import LiveScaler, fitted
-from controller.live.sources import LiveSource
+from controller.errors import UsageError
+from controller.live.sources import LivePicture, LiveSource, fitted
+from controller.solve.interactive import Interactive
 
 IDLE_S: Final = 0.002
 TOLD_EVERY_S: Final = 1.0
 BUFFERS: Final = 3
 """One that is shown, one that waits, one that is being made."""
 
-Frames = dict[str, ByteImage]
+Frames = list[ByteImage]
+
+
+class Maker(Protocol):
+    """Makes of a source's picture what is handed on."""
+
+    def blank(self) -> Frames:
+        """What ``make`` writes to; its content is not defined."""
+
+    def make(self, picture: LivePicture, into: Frames) -> None: ...
+
+
+class FrameMaker:
+    """Makes the projectors' frames, by base and scale on the processor; ``brightness``: the radiance of white."""
+
+    def __init__(self, scaler: Interactive, brightness: float) -> None:
+        self._scaler, self._brightness = scaler, brightness
+
+    def blank(self) -> Frames:
+        """See ``Maker``."""
+        return self._scaler.blank()
+
+    def make(self, picture: LivePicture, into: Frames) -> None:
+        """See ``Maker``."""
+        self._scaler.show_picture(fitted(picture.pixels, self._scaler.maps.target_px), self._brightness, into)
+
+
+class TargetMaker:
+    """Scales pictures to the targets' size, (width, height), for a player that makes the frames in shaders."""
+
+    def __init__(self, target_px: tuple[int, int]) -> None:
+        self._target_px = target_px
+
+    def blank(self) -> Frames:
+        """See ``Maker``."""
+        return [np.empty((self._target_px[1], self._target_px[0], 3), np.uint8)]
+
+    def make(self, picture: LivePicture, into: Frames) -> None:
+        """See ``Maker``."""
+        np.copyto(into[0], fitted(picture.pixels, self._target_px))
 
 
 @dataclass(slots=True)
 class LiveFigures:
-    """What became of the pictures of a source."""
+    """What became of the pictures of a source; ``trouble``: what was wrong with the last ``bad`` one."""
 
-    shown: int = 0
+    made: int = 0
     late: int = 0
+    bad: int = 0
+    trouble: str | None = None
     seconds: float = 0.0
     delays_s: list[float] = field(default_factory=list)
 
     def told(self) -> dict[str, Any]:
-        """For a person or a machine; ``delay`` is from when a picture was due to when it was presented."""
+        """For a person or a machine; ``delay`` is from when a picture was due to when its frames were handed on."""
         delays = np.array(self.delays_s[-4096:] or [0.0])
         return {
-            "shown": self.shown,
+            "made": self.made,
             "late": self.late,
-            "pictures_per_s": self.shown / self.seconds if self.seconds > 0 else 0.0,
+            "bad": self.bad,
+            "trouble": self.trouble,
+            "pictures_per_s": self.made / self.seconds if self.seconds > 0 else 0.0,
             "delay_p50_ms": 1e3 * float(np.percentile(delays, 50)),
             "delay_p99_ms": 1e3 * float(np.percentile(delays, 99)),
         }
@@ -52,6 +96,8 @@ class _Mailbox:
         self._full: tuple[Frames, float, int] | None = None
         self.ended = False
         self.error: BaseException | None = None
+        self.bad = 0
+        self.trouble: str | None = None
 
     def buffer(self) -> Frames:
         with self._changed:
@@ -76,6 +122,10 @@ class _Mailbox:
             found, self._full = self._full, None
             return found
 
+    def pass_over(self, error: UsageError) -> None:
+        """A picture that can't be shown: the last good one stays."""
+        self.bad, self.trouble = self.bad + 1, f"{error.what} {error.remedy}"
+
     def end(self, error: BaseException | None) -> None:
         with self._changed:
             self.ended, self.error = True, error
@@ -84,27 +134,28 @@ class _Mailbox:
 
 def run_live(
     source: LiveSource,
-    scaler: LiveScaler,
-    show: Callable[[Mapping[str, ByteImage]], object],
+    maker: Maker,
+    show: Callable[[Frames], object],
     *,
     rate_hz: float,
     seconds: float | None = None,
     tell: Callable[[LiveFigures], None] = lambda figures: None,
 ) -> LiveFigures:
-    """Show the pictures of ``source`` until it ends, ``seconds`` have passed or ``tell`` raises.
+    """Hand on what ``maker`` makes of ``source`` until it ends, ``seconds`` have passed or ``tell`` raises.
 
     Parameters
     ----------
-    show : called with frames by projector name; returns once they are presented
+    show : called with what was made; it may be overwritten after that
     rate_hz : pictures are taken at most so often; those that are due between two of them count as late
     tell : called about once a second, and may raise to stop
 
-    Raises what the source, ``show`` and ``tell`` raise; the source is closed by then.
+    A picture for which the source raises UsageError is passed over and counted as bad. Raises what else the source
+    raises, and ``show`` and ``tell``; the source is closed by then.
     """
-    box = _Mailbox([scaler.blank() for _ in range(BUFFERS)])
+    box = _Mailbox([maker.blank() for _ in range(BUFFERS)])
     stop = threading.Event()
     began_s = time.monotonic()
-    worker = threading.Thread(target=_make, args=(source, scaler, box, stop, rate_hz, began_s), name="live")
+    worker = threading.Thread(target=_make, args=(source, maker, box, stop, rate_hz, began_s), name="live")
     worker.start()
     figures = LiveFigures()
     told_s = began_s
@@ -115,12 +166,13 @@ def run_live(
                 frames, due_s, late = taken
                 show(frames)
                 box.give_back(frames)
-                figures.shown += 1
+                figures.made += 1
                 figures.late += late
                 figures.delays_s.append(time.monotonic() - due_s)
             elif box.ended:
                 break
             figures.seconds = time.monotonic() - began_s
+            figures.bad, figures.trouble = box.bad, box.trouble
             if time.monotonic() - told_s >= TOLD_EVERY_S:
                 told_s = time.monotonic()
                 tell(figures)
@@ -134,7 +186,7 @@ def run_live(
 
 
 def _make(
-    source: LiveSource, scaler: LiveScaler, box: _Mailbox, stop: threading.Event, rate_hz: float, began_s: float
+    source: LiveSource, maker: Maker, box: _Mailbox, stop: threading.Event, rate_hz: float, began_s: float
 ) -> None:
     error: BaseException | None = None
     number = -1
@@ -145,13 +197,17 @@ def _make(
             if turn == number:
                 stop.wait(min(IDLE_S, 0.25 / rate_hz))
                 continue
-            picture = source.next(now_s)
+            try:
+                picture = source.next(now_s)
+            except UsageError as bad:
+                box.pass_over(bad)
+                continue
             if picture is None:
                 stop.wait(IDLE_S)
                 continue
             number = turn
             frames = box.buffer()
-            scaler.frames(fitted(picture.pixels, scaler.size), frames)
+            maker.make(picture, frames)
             box.put(frames, began_s + now_s, picture.skipped)
     except BaseException as raised:  # noqa: BLE001 - raised again where the pictures are shown
         error = raised

@@ -1,9 +1,9 @@
-"""Base times scale at interactive speed: from a float picture in memory to 8-bit frames (paper 3, eqs 4-6).
+"""Base times scale at interactive speed, on the processor (paper 3, eqs 4-6; ``bundle.live_maps`` is the definition).
 
-The scale image has no detail finer than a projector's pixels (paper 3.3), so it is made from means over blocks of
-camera pixels nearly a projector pixel wide, and each projector pixel's mean of it is a Gaussian over four by four
-such blocks. Base frames, colours, response and dither follow in the same pass. ``appearance.scale_frames`` is the
-reference: it takes every camera sample with its own share.
+What the reference gathers pixel by pixel is prepared: each projector pixel's Gaussian as sixteen 8-bit shares of the
+blocks around it, what these add up to in the factor of its base, the response as a table over the square root of light.
+A block is a target pixel, or several where these are much finer than the projectors' (paper 3.3: the scale has no
+detail finer than a projector pixel).
 """
 
 from __future__ import annotations
@@ -14,270 +14,205 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
-from controller.arrays import ByteImage, FloatImage, Mask
+from controller.arrays import ByteImage, FloatImage
+from controller.bundle.live_maps import (
+    FULL,
+    LiveMaps,
+    LiveOutput,
+    base_light,
+    brightness_factor,
+    device_level,
+    light_table,
+    sigma_table,
+    thresholds,
+)
 from controller.calibrate.values import Radiometry
-from controller.capture.encoding import checked_response
-from controller.compiled import compiled
 from controller.errors import UsageError
 from controller.solve.appearance import Base
 from controller.solve.bounded import check_target
-from controller.solve.dither import TILE, blue_noise
+from controller.solve.scaling import reduction, scaling_maps
+from controller.solve.scaling_kernels import (
+    MARGIN,
+    scale_blocks,
+    scale_picture,
+    scale_plainly,
+    scale_twos,
+    shares_of,
+    show,
+    sums_of,
+)
+from controller.solve.scaling_lanes import STEPS
 from controller.transport import LightTransport
-from controller.transport.profiles import LANES, PHASES, Profiles, build_profiles
-from controller.transport.window_lanes import small_sum
-from controller.transport.windows import kind_of
 
-BLOCKS_A_PIXEL: Final = 1.25
-"""About so many blocks is a projector pixel wide, where there are enough camera pixels."""
-SPREAD_PX2: Final = 0.2
-"""Variance of a projector pixel's light, in projector pixels squared."""
-MARGIN: Final = 4
-"""Blocks around the picture that are 0, so that no window ends outside."""
-LEVELS: Final = 4096
-"""Steps of the table from the square root of light to device values; between them it is interpolated."""
-LEAST_PART: Final = 0.02
-"""A pixel less of whose window has base light stays dark."""
+BLOCK_SIGMA_PX: Final = 0.56
+"""A projector pixel's light is about so many blocks wide, as a standard deviation: four blocks hold it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Interactive:
-    """A base ready to be scaled on the clock.
+class _Output:
+    """One projector, ready.
 
-    ``block``: camera pixels a block is wide; ``black``, ``inverse`` (3, block rows, block columns) the black image and
-    1 / base light; ``at`` (pixels,) int32, ``across``, ``down`` uint16: each projector pixel's window in the blocks
-    ``gain`` (3, pixels): M p_b over the part of the window that has base light; ``unmix`` (projectors, 3, 3)
-    ``levels`` (projectors, 3, LEVELS + 2): continuous device value by the square root of light
-    ``start``, ``sizes``: each projector's first pixel, and (rows, columns); ``scale``: room for the blocks
+    ``at`` (pixels,) int32: first block of the window, -1 for a pixel that stays dark; ``shares`` (pixels x 16) uint8
+    ``gain`` (3 pixels + 1,) float32; ``unmix`` (12,) float32, by columns of four
+    ``levels`` (3 x (STEPS + 1),) uint16: 256 times the device value; ``noise`` (64 x 64 x 3,) uint8
     """
 
-    shape: tuple[int, int]
-    block: int
-    black: FloatImage
-    inverse: FloatImage
+    rows: int
+    columns: int
     at: npt.NDArray[np.int32]
-    across: npt.NDArray[np.uint16]
-    down: npt.NDArray[np.uint16]
+    shares: ByteImage
     gain: FloatImage
     unmix: FloatImage
-    levels: FloatImage
-    start: npt.NDArray[np.int64]
-    sizes: tuple[tuple[int, int], ...]
-    table: Profiles
-    scale: FloatImage
+    levels: npt.NDArray[np.uint16]
+    noise: ByteImage
 
-    def frames(self, target: FloatImage, *, phases: Sequence[tuple[int, int]] | None = None) -> list[ByteImage]:
+
+class Interactive:
+    """Frames of a stage for one target after another. Not for two threads at once: working memory is kept.
+
+    ``maps``: those of the stage; ``camera``: (rows, columns) of the radiances that ``frames`` takes
+    """
+
+    def __init__(self, maps: LiveMaps, camera: tuple[int, int] | None = None) -> None:
+        self.maps = maps
+        rows, columns = maps.present.shape
+        self.camera = (rows, columns) if camera is None else camera
+        self._factor = reduction(self.camera, max(rows, columns)) if camera is not None else 1
+        self._block = _block(maps)
+        self._size = -(-rows // self._block), -(-columns // self._block)
+        self._side = self._size[1] + 2 * MARGIN
+        blocks = (self._size[0] + 2 * MARGIN) * self._side
+        self._scale = np.zeros(4 * blocks + 16, np.float32)
+        # radiance to scale; a spare float, because four are read where three are meant
+        self._gain = _spare(maps.gain.astype(np.float32) * brightness_factor(maps, 1.0))
+        self._offset = _spare(maps.offset.astype(np.float32))
+        self._used = _used(maps)
+        self._outputs = tuple(self._prepared(output) for output in maps.outputs)
+        self._table = light_table()
+
+    def frames(self, target: FloatImage) -> list[ByteImage]:
         """Device values (rows, columns, 3) uint8 of each projector for a radiance (rows, columns, 3) float32.
 
-        ``phases``: where in the blue-noise tile each projector begins. Not for two threads at once: the blocks are kept
-        between calls. Raises UsageError("image-wrong-size", "target-not-finite").
+        Raises UsageError("image-wrong-size", "target-not-finite").
         """
-        if target.shape != (*self.shape, 3):
-            raise UsageError(
-                "image-wrong-size",
-                what=f"The target is {' x '.join(map(str, target.shape))} instead of {self.shape[0]} x "
-                f"{self.shape[1]} x 3.",
-                remedy="Make the target as large as this stage's camera image.",
-            )
+        _check_size(target.shape, (*self.camera, 3), "this stage's camera image")
         picture = np.ascontiguousarray(target, np.float32)
-        flat = picture.reshape(self.shape[0], -1)
-        blocks = _blocks_of_two if self.block == 2 else _blocks
-        if not blocks(flat, self.block, self.black, self.inverse, self.scale):
+        factor, block = self._factor, self._block
+        maps = self._gain, self._offset, self._used
+        if factor == 2 and block == 1 and not (self.camera[0] % 2 or self.camera[1] % 2):
+            finite = scale_twos(picture.ravel(), *maps, self.camera[1], self._side, self._scale)
+        elif factor == 1:
+            finite = scale_plainly(picture, block, *maps, self._side, self._scale)
+        else:
+            finite = scale_blocks(picture, factor, block, *maps, self._side, self._scale)
+        if not finite:
             raise UsageError(
                 "target-not-finite",
                 what="The target has pixels that are not finite numbers.",
                 remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
             )
-        made = []
-        for n, (rows, columns) in enumerate(self.sizes):
-            out = np.empty((rows, columns, 3), np.uint8)
-            down, along = (17 * n, 29 * n) if phases is None else phases[n]
-            windows = self.at, self.across, self.down, self.gain
-            colours = self.unmix[n], self.levels[n], blue_noise()
-            _show(self.scale, self.table, *windows, *colours, int(self.start[n]), down % TILE, along % TILE, out)
-            made.append(out)
+        made = self.blank()
+        self._show(made)
         return made
+
+    def blank(self) -> list[ByteImage]:
+        """Frames of the projectors' sizes for ``show_picture`` to write to; their content is not defined."""
+        return [np.empty((output.rows, output.columns, 3), np.uint8) for output in self._outputs]
+
+    def show_picture(self, picture: ByteImage, brightness: float, into: Sequence[ByteImage]) -> None:
+        """Write the frames for a picture (height, width, 3) uint8 sRGB of the targets' size.
+
+        ``brightness``: the radiance of its white. Raises UsageError("image-wrong-size").
+        """
+        width, height = self.maps.target_px
+        _check_size(picture.shape, (height, width, 3), "the targets of this stage's live mode")
+        light = np.float32(brightness) * self._table
+        pixels = np.ascontiguousarray(picture, np.uint8)
+        scale_picture(pixels, light, self._block, self._gain, self._offset, self._used, self._side, self._scale)
+        self._show(into)
+
+    def _show(self, into: Sequence[ByteImage]) -> None:
+        for output, frame in zip(self._outputs, into, strict=True):
+            show(self._scale, self._side, output.at, output.shares, output.gain, output.unmix, output.levels,
+                 output.noise, output.columns, frame.reshape(-1))  # fmt: skip
+
+    def _prepared(self, output: LiveOutput) -> _Output:
+        width, height = self.maps.target_px
+        sides = np.array([width - 1, height - 1], np.float32)
+        centre = (output.centre.reshape(-1, 2).astype(np.float32) / FULL * sides).astype(np.float32)
+        pixels = len(centre)
+        at, shares = np.empty(pixels, np.int32), np.zeros((pixels, 16), np.uint8)
+        shares_of(
+            centre, output.shape.reshape(-1, 3), sigma_table(), self._block, (height, width), self._side, at, shares
+        )
+        present = self._present()
+        whole = np.zeros(pixels, np.float32)
+        sums_of(present, self._side, at, shares, whole)
+        at[whole <= 0] = -1
+        gain = np.divide(base_light(output).reshape(-1, 3), whole[:, None],
+                         out=np.zeros((pixels, 3), np.float32), where=whole[:, None] > 0)  # fmt: skip
+        unmix = np.zeros((3, 4), np.float32)
+        unmix[:, :3] = output.unmix.T
+        noise = np.stack([thresholds(self.maps.noise, output, c) for c in range(3)], -1)
+        return _Output(
+            output.size_px[1], output.size_px[0], at, shares.ravel(), _spare(gain), unmix.ravel(),
+            _levels(output.response), np.asarray(255 - np.floor(256 * noise), np.uint8).ravel(),
+        )  # fmt: skip
+
+    def _present(self) -> FloatImage:
+        """What the blocks have of base light, as their scale lies in memory, flat."""
+        rows, columns = self.maps.present.shape
+        padded = np.zeros((self._size[0] * self._block, self._size[1] * self._block), np.float32)
+        padded[:rows, :columns] = self.maps.present / np.float32(255)
+        means = padded.reshape(self._size[0], self._block, self._size[1], self._block).mean(axis=(1, 3))
+        return np.pad(means, MARGIN).astype(np.float32).ravel()
 
 
 def interactive(
     transport: LightTransport, base: Base, black: FloatImage, radiometries: Sequence[Radiometry]
 ) -> Interactive:
-    """Prepare ``base`` to be scaled on the clock.
+    """Prepare ``base`` to be scaled on the clock, by radiances of the camera's size.
 
     ``black`` (rows, columns, 3); one radiometry a projector. Raises UsageError("response-not-rising"), and as
     ``check_target`` for ``black``.
     """
     check_target(transport, black)
-    pixels = transport.per_weight > 0
-    area = _areas(transport, pixels)
-    pitch = float(np.sqrt(area[pixels].min())) if pixels.any() else 1.0
-    block = int(max(1, min(np.rint(pitch / BLOCKS_A_PIXEL), *transport.shape)))
-    rows, columns = transport.shape[0] // block, transport.shape[1] // block
-    base_light = _means(np.maximum(base.image - black, 0), block)
-    present = _means(np.moveaxis(base.inverse > 0, 0, 2).astype(np.float32), block) > 0.5
-    inverse = np.divide(1, base_light, out=np.zeros_like(base_light), where=present & (base_light > 0))
-    table = build_profiles()
-    side = columns + 2 * MARGIN
-    at, across, down = _windows(transport, area, block, (rows, columns), table)
-    scale = np.zeros((3, (rows + 2 * MARGIN) * side), np.float32)
-    scale.reshape(3, -1, side)[:, MARGIN:-MARGIN, MARGIN:-MARGIN] = inverse > 0
-    part = np.empty((3, transport.pixels), np.float32)
-    _sums(scale, side, table, at, across, down, part)
-    usable = (part > LEAST_PART) & pixels
-    gain = np.divide(base.mixed, part, out=np.zeros_like(part), where=usable)
-    scale[:] = 0
-    unmix = np.stack([np.linalg.inv(M.astype(np.float64)) for M in transport.mixing]).astype(np.float32)
-    levels = np.stack([_levels(r) for r in radiometries])
-    start = np.array([transport.span(n).start for n in range(len(transport.sizes))], np.int64)
-    shaped = scale.reshape(3, -1, side)
-    kept = transport.shape, block, _means(black, block), inverse, at, across, down, gain, unmix, levels, start
-    return Interactive(*kept, transport.sizes, table, shaped)
+    return Interactive(scaling_maps(transport, base, black, radiometries), transport.shape)
 
 
-def _areas(transport: LightTransport, pixels: Mask) -> FloatImage:
-    """(pixels,): how many camera pixels a pixel of its projector covers on average."""
-    area = np.zeros(transport.pixels, np.float32)
-    for n, lit in enumerate(transport.lit):
-        count = int(np.count_nonzero(pixels[transport.span(n)]))
-        area[transport.span(n)] = np.count_nonzero(lit) / count if count else 1.0
-    return area
+def _check_size(found: tuple[int, ...], wanted: tuple[int, ...], what: str) -> None:
+    if found != wanted:
+        raise UsageError(
+            "image-wrong-size",
+            what=f"The target is {' x '.join(map(str, found))} instead of {' x '.join(map(str, wanted))}.",
+            remedy=f"Make it as large as {what}.",
+        )
 
 
-def _means(image: FloatImage, block: int) -> FloatImage:
-    """(rows, columns, 3) to planes (3, block rows, block columns): means over blocks of camera pixels."""
-    rows, columns = image.shape[0] // block, image.shape[1] // block
-    whole = image[: rows * block, : columns * block].reshape(rows, block, columns, block, 3)
-    return np.ascontiguousarray(np.moveaxis(whole.mean(axis=(1, 3), dtype=np.float32), 2, 0))
+def _block(maps: LiveMaps) -> int:
+    """How many target pixels a block is wide."""
+    shapes = np.concatenate([output.shape.reshape(-1, 3) for output in maps.outputs])
+    lit = shapes[shapes[:, 0] > 0, :2]
+    sigma = float(np.exp2((np.median(lit) - 96) / 32)) if lit.size else 1.0
+    return max(1, min(round(sigma / BLOCK_SIGMA_PX), *maps.target_px))
 
 
-def _windows(
-    transport: LightTransport, area: FloatImage, block: int, size: tuple[int, int], table: Profiles
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
-    """Where each projector pixel's window begins in the blocks with their margin, and its rows of the table."""
-    y, x = np.mgrid[0 : transport.shape[0], 0 : transport.shape[1]].astype(np.float32)
-    # the mean over three colours' samples places a pixel better than that of one
-    mean_x, mean_y = (transport.gaussian_mean_planes(np.stack([v, v, v])).mean(axis=0) for v in (x, y))
-    place = [((v + 0.5) / block - 0.5).astype(np.float64) for v in (mean_x, mean_y)]
-    kinds = np.array([kind_of(float(v)) for v in np.linspace(0, 1, 65)])
-    kinds = np.minimum(kinds, int(table.small[0]) - 1)
-    # blocks are themselves means over an area
-    variance = np.clip(SPREAD_PX2 * area / block**2 - 1 / 12, 0, 1)
-    kind = kinds[np.rint(64 * variance).astype(np.int64)]
-    found = []
-    for v, most in zip(place, (size[1], size[0]), strict=True):
-        inside = np.clip(v, -1.0, float(most))
-        low = np.floor(inside)
-        phase = np.minimum(((inside - low) * PHASES).astype(np.int64), PHASES - 1)
-        found.append((low.astype(np.int64) - (LANES // 2 - 1) + MARGIN, (kind * PHASES + phase).astype(np.uint16)))
-    (left, across), (top, down) = found
-    return (top * (size[1] + 2 * MARGIN) + left).astype(np.int32), across, down
+def _used(maps: LiveMaps) -> npt.NDArray[np.int32]:
+    """(height, 2): the first column with base light in each row, and the one after the last."""
+    lit = maps.gain.max(axis=2) > 0
+    found = lit.any(axis=1)
+    first, last = lit.argmax(axis=1), lit.shape[1] - lit[:, ::-1].argmax(axis=1)
+    return np.stack([np.where(found, first, 0), np.where(found, last, 0)], 1).astype(np.int32)
 
 
-def _levels(radiometry: Radiometry) -> FloatImage:
-    """(3, LEVELS + 2): the device value, with its fraction, whose light is (i / LEVELS) squared."""
-    light = checked_response(radiometry.response).astype(np.float64)
-    wanted = np.linspace(0, 1, LEVELS + 1) ** 2
-    rows = []
-    for channel in light:
-        rising = np.flatnonzero(np.diff(channel, prepend=-1.0) > 0)
-        rows.append(np.interp(wanted, channel[rising], rising))
-    found = np.stack(rows)
-    return np.concatenate([found, found[:, -1:]], axis=1).astype(np.float32)
+def _spare(values: FloatImage) -> FloatImage:
+    """Flat, with room for one more."""
+    return np.append(values.ravel(), np.float32(0)).astype(np.float32)
 
 
-@compiled(parallel=True)
-def _blocks_of_two(picture: FloatImage, block: int, black: FloatImage, inverse: FloatImage, scale: FloatImage) -> bool:
-    """Write max(mean of block - black, 0) inverse inside the margin; return whether all is finite."""
-    rows, columns = black.shape[1:]
-    good = np.ones(rows, np.bool_)
-    quarter = np.float32(0.25)
-    for y in prange(rows):
-        a, b = picture[2 * y], picture[2 * y + 1]
-        total = np.float32(0)
-        for c in range(3):
-            out, dark, factor = scale[c, y + MARGIN], black[c, y], inverse[c, y]
-            for x in range(columns):
-                k = 6 * x + c
-                light = quarter * (a[k] + a[k + 3] + b[k] + b[k + 3])
-                total += light * np.float32(0)
-                out[x + MARGIN] = max(light - dark[x], np.float32(0)) * factor[x]
-        good[y] = total == 0
-    return bool(good.all())
-
-
-@compiled(parallel=True)
-def _blocks(picture: FloatImage, block: int, black: FloatImage, inverse: FloatImage, scale: FloatImage) -> bool:
-    """The same for blocks of any size."""
-    rows, columns = black.shape[1:]
-    good = np.ones(rows, np.bool_)
-    share = np.float32(1 / (block * block))
-    for y in prange(rows):
-        total = np.float32(0)
-        for c in range(3):
-            for x in range(columns):
-                light = np.float32(0)
-                for j in range(block):
-                    for i in range(block):
-                        light += picture[y * block + j, 3 * (x * block + i) + c]
-                light *= share
-                total += light * np.float32(0)
-                scale[c, y + MARGIN, x + MARGIN] = max(light - black[c, y, x], np.float32(0)) * inverse[c, y, x]
-        good[y] = total == 0
-    return bool(good.all())
-
-
-@compiled(parallel=True, fastmath=True)
-def _sums(
-    scale: FloatImage,
-    side: int,
-    table: Profiles,
-    at: npt.NDArray[np.int32],
-    across: npt.NDArray[np.uint16],
-    down: npt.NDArray[np.uint16],
-    out: FloatImage,
-) -> None:
-    """Each pixel's mean of ``scale`` (3, blocks), to ``out`` (3, pixels)."""
-    for i in prange(at.size):
-        for c in range(3):
-            a, b = LANES * np.int64(across[i]), LANES * np.int64(down[i])
-            out[c, i] = small_sum(scale[c], np.int64(at[i]), side, table.table, a, b)
-
-
-@compiled(parallel=True, fastmath=True)
-def _show(
-    scale: FloatImage,
-    table: Profiles,
-    at: npt.NDArray[np.int32],
-    across: npt.NDArray[np.uint16],
-    down: npt.NDArray[np.uint16],
-    gain: FloatImage,
-    unmix: FloatImage,
-    levels: FloatImage,
-    noise: FloatImage,
-    start: int,
-    below: int,
-    along: int,
-    out: ByteImage,
-) -> None:
-    rows, columns, _ = out.shape
-    side = scale.shape[2]
-    flat = scale.reshape(3, -1)
-    red, green, blue = flat[0], flat[1], flat[2]
-    shares, top = table.table, np.float32(LEVELS)
-    for y in prange(rows):
-        for x in range(columns):
-            i = start + y * columns + x
-            k, a, b = np.int64(at[i]), LANES * np.int64(across[i]), LANES * np.int64(down[i])
-            r = gain[0, i] * small_sum(red, k, side, shares, a, b)
-            g = gain[1, i] * small_sum(green, k, side, shares, a, b)
-            s = gain[2, i] * small_sum(blue, k, side, shares, a, b)
-            for c in range(3):
-                value = unmix[c, 0] * r + unmix[c, 1] * g + unmix[c, 2] * s
-                step = top * np.sqrt(min(max(value, np.float32(0)), np.float32(1)))
-                j = int(step)
-                low = levels[c, j]
-                level = low + (step - np.float32(j)) * (levels[c, j + 1] - low)
-                # Channels read the tile at different places, or colours would speckle together as grey does.
-                limit = noise[(y + below + 21 * c) & (TILE - 1), (x + along + 43 * c) & (TILE - 1)]
-                out[y, x, c] = np.uint8(min(level + (np.float32(1) - limit), np.float32(255)))
+def _levels(response: FloatImage) -> npt.NDArray[np.uint16]:
+    """Flat, by channel: 256 times the device value, with its fraction, whose light is (i / STEPS) squared."""
+    light = ((np.arange(STEPS + 1) / STEPS) ** 2).astype(np.float32)
+    levels = np.concatenate([device_level(light, channel) for channel in response])
+    return np.asarray(np.rint(256 * levels), np.uint16)

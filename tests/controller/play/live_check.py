@@ -22,9 +22,9 @@ pyglet.options["shadow_window"] = False
 
 from pyglet import gl  # noqa: E402
 
+from controller.bundle.live_maps import LiveMaps  # noqa: E402
 from controller.bundle.reader import Bundle  # noqa: E402
 from controller.play.live_gl import LiveRenderer  # noqa: E402
-from controller.play.live_maps import LiveMaps  # noqa: E402
 
 
 def main(bundle: Path, asked: Path, out: Path) -> None:

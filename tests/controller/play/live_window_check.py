@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from controller.bundle.live_maps import LiveMaps
 from controller.bundle.reader import Bundle
-from controller.play.frames import FrameSet
-from controller.play.live import LivePicture
-from controller.play.live_maps import LiveMaps
+from controller.play.frames import FrameSet, OutputSize
 from controller.play.windows import WindowOutput
 
 
@@ -21,14 +20,15 @@ def main(bundle: Path, asked: Path) -> None:
     with Bundle.open(bundle, allow_unsigned=True) as opened, np.load(asked) as values:
         maps = LiveMaps.read(opened)
         target, brightness = values["target"], float(values["brightness"])
-    output = WindowOutput([one.size for one in maps.outputs])
-    picture = LivePicture(output, maps, print)
-    picture.prepare(target, brightness)
+    output = WindowOutput([OutputSize(one.name, *one.size_px) for one in maps.outputs])
+    output.load_live(maps)
+    output.prepare_live(target, brightness)
     output.flip()
-    print("on the screen", picture.on_gpu, flush=True)
+    np.savez(asked.with_name("read.npz"), *output.live_frames().pixels)
+    print("on the screen", flush=True)
     sys.stdin.readline()
     # An ordinary picture after it: the window's own drawing is as it was.
-    output.prepare(FrameSet(tuple(np.full(one.size.shape, 77, np.uint8) for one in maps.outputs)))
+    output.prepare(FrameSet(tuple(np.full(one.base.shape, 77, np.uint8) for one in maps.outputs)))
     output.flip()
     print("on the screen", flush=True)
     sys.stdin.readline()

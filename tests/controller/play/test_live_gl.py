@@ -15,13 +15,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from controller.bundle.live_maps import LiveMaps, compensate, light_table, sigma_table
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, NewLive, write_bundle
-from controller.errors import BundleError, WorkError
-from controller.play.frames import FrameSet
-from controller.play.live import LivePicture, LiveTargets
-from controller.play.live_maps import LiveMaps, compensate, light_table, sigma_table
-from tests.controller.play.wire import Frames
+from controller.errors import BundleError
 
 ROOT = Path(__file__).parents[3]
 OUTPUTS = (("P1", 37, 29), ("P2", 30, 41))
@@ -88,7 +85,7 @@ def test_frames_by_shaders_are_those_of_the_reference_to_one_device_value(tmp_pa
     with np.load(tmp_path / "out.npz") as found:
         assert found["same"], "the same target gives the same frames, whatever was drawn between"
         assert int(found["error"]) == 0
-        for number, image in enumerate(wanted.pixels):
+        for number, image in enumerate(wanted):
             drawn = found[str(number)]
             assert len(np.unique(image)) > 100
             away = np.abs(drawn.astype(int) - image)
@@ -108,7 +105,7 @@ def test_the_reference_is_the_weighted_mean_written_down_pixel_by_pixel(tmp_path
         for row, column in np.random.default_rng(4).integers(0, (rows, columns), (60, 2)):
             shape = arrays[f"{name}.shape"][row, column]
             if shape[0] == 0:
-                assert frames.pixels[number][row, column].max() <= 1
+                assert frames[number][row, column].max() <= 1
                 continue
             cx, cy = arrays[f"{name}.centre"][row, column] / 65535 * (np.array(TARGET) - 1)
             sx, sy = sigma_table()[shape[:2]]
@@ -125,7 +122,7 @@ def test_the_reference_is_the_weighted_mean_written_down_pixel_by_pixel(tmp_path
             light = np.clip(arrays[f"{name}.unmix"] @ (mean * base), 0, 1)
             for channel in range(3):
                 table = arrays[f"{name}.response"][channel]
-                shown = int(frames.pixels[number][row, column, channel])
+                shown = int(frames[number][row, column, channel])
                 assert table[max(shown - 1, 0)] - 1e-5 <= light[channel] <= table[min(shown + 1, 255)] + 1e-5
 
 
@@ -154,60 +151,3 @@ def test_a_bundle_without_a_live_section_says_how_to_get_one(tmp_path: Path) -> 
     with pytest.raises(BundleError, match="--live") as wrong:
         maps_of(write(tmp_path / "live.vel", arrays))
     assert wrong.value.code == "bundle-not-live"
-
-
-class Memory:
-    """An output without shaders."""
-
-    def __init__(self) -> None:
-        self.shown: FrameSet | None = None
-
-    def prepare(self, frames: FrameSet) -> None:
-        self.shown = frames
-
-
-class Shaders(Memory):
-    def __init__(self, fit: bool) -> None:
-        super().__init__()
-        self.fit, self.targets = fit, 0
-
-    def load_live(self, maps: LiveMaps) -> None:
-        if not self.fit:
-            raise WorkError("display-unfit", what="No.", remedy="None.")
-
-    def prepare_live(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
-        self.targets += 1
-
-
-def test_without_shaders_the_processor_makes_the_same_frames_and_says_so(tmp_path: Path) -> None:
-    maps = maps_of(write(tmp_path / "live.vel", random_live(1)))
-    target = np.random.default_rng(1).integers(0, 256, (*TARGET[::-1], 3), dtype=np.uint8)
-    wanted = compensate(maps, target, 1.0)
-    told: list[str] = []
-    for output, sentences in ((Memory(), 0), (Shaders(fit=False), 1)):
-        picture = LivePicture(output, maps, told.append)  # type: ignore[arg-type]
-        picture.prepare(target, 1.0)
-        assert not picture.on_gpu
-        assert len(told) == sentences
-        assert output.shown is not None
-        for shown, image in zip(output.shown.pixels, wanted.pixels, strict=True):
-            np.testing.assert_array_equal(shown, image)
-    able = Shaders(fit=True)
-    picture = LivePicture(able, maps, told.append)  # type: ignore[arg-type]
-    picture.prepare(target, 1.0)
-    assert (picture.on_gpu, able.targets, able.shown, len(told)) == (True, 1, None, 1)
-
-
-def test_targets_pass_through_a_shared_file_each_once_and_whole(tmp_path: Path) -> None:
-    maps = maps_of(write(tmp_path / "live.vel", random_live(1)))
-    targets = LiveTargets(tmp_path / "targets", maps)
-    writer = Frames(tmp_path / "targets")
-    assert targets.newest() is None
-    for value in (1, 2, 3):
-        picture = np.full((*TARGET[::-1], 3), value, np.uint8)
-        writer.write({"target": picture})
-        found = targets.newest()
-        assert found is not None
-        np.testing.assert_array_equal(found, picture)
-        assert targets.newest() is None
-    targets.close()

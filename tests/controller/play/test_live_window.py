@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.play.live_maps import compensate
+from controller.bundle.live_maps import compensate
 from tests.controller.play.test_live_gl import OUTPUTS, TARGET, maps_of, random_live, write
 from tests.controller.play.test_windows import Framebuffer, framebuffer
 
@@ -36,13 +36,15 @@ def test_a_live_target_reaches_the_screen_and_ordinary_pictures_follow(
     ) as process:  # fmt: skip
         assert process.stdin is not None
         assert process.stdout is not None
-        assert process.stdout.readline() == "on the screen True\n"
+        assert process.stdout.readline() == "on the screen\n"
         screen = framebuffer.picture()
         left = 0
-        for image, (_, columns, rows) in zip(wanted.pixels, OUTPUTS, strict=True):
+        read = np.load(tmp_path / "read.npz")
+        for number, (image, (_, columns, rows)) in enumerate(zip(wanted, OUTPUTS, strict=True)):
             shown = screen[: min(rows, len(screen)), left : left + columns]
             away = np.abs(shown.astype(int) - image[: len(shown)])
             assert away.max() <= 1
+            np.testing.assert_array_equal(read[f"arr_{number}"][: len(shown)], shown)
             assert np.mean(away > 0) < 0.002
             left += columns
         process.stdin.write("\n")

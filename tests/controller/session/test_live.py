@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
 
 import numpy as np
 import pytest
 
 from benchmarks._synthetic import synthetic_calibration
-from controller.arrays import ByteImage
 from controller.errors import UsageError
-from controller.live.scaling import LiveScaler
 from controller.live.sources import LivePicture
-from controller.session.live import LiveFigures, run_live
+from controller.session.live import FrameMaker, Frames, LiveFigures, TargetMaker, run_live
 from controller.solve.appearance import base_image, solve_base
+from controller.solve.interactive import interactive
 from controller.transport import LightTransport
 
 CALIBRATION = synthetic_calibration(projector=(34, 40), camera=(96, 120))
 
 
 @pytest.fixture(scope="module")
-def scaler() -> LiveScaler:
+def maker() -> FrameMaker:
     transport = LightTransport.build(CALIBRATION)
     base = solve_base(transport, base_image(CALIBRATION), CALIBRATION.black)
-    made = LiveScaler(CALIBRATION, transport, base, exposure=0.3)
-    made.frames(np.zeros((48, 60, 3), np.uint8), made.blank())
+    scaler = interactive(transport, base, CALIBRATION.black, [part.radiometry for part in CALIBRATION.projectors])
+    made = FrameMaker(scaler, 0.3)
+    made.make(LivePicture(np.zeros((48, 60, 3), np.uint8), 0, 0), made.blank())
     return made
 
 
@@ -37,9 +36,9 @@ class Numbers:
         self.count, self.fails_at, self.at, self.closed = count, fails_at, 0, False
 
     def next(self, at_s: float) -> LivePicture | None:
+        self.at += 1
         if self.at == self.fails_at:
             raise UsageError("target-unreadable", what="Damaged.", remedy="Write it again.")
-        self.at += 1
         return LivePicture(np.full((48, 60, 3), 20 + self.at, np.uint8), self.at - 1, 0)
 
     @property
@@ -50,28 +49,28 @@ class Numbers:
         self.closed = True
 
 
-def test_every_picture_of_a_slow_source_is_shown_in_order(scaler: LiveScaler) -> None:
+def test_every_picture_of_a_slow_source_is_shown_in_order(maker: FrameMaker) -> None:
     seen: list[int] = []
     source = Numbers(12)
-    figures = run_live(source, scaler, lambda frames: seen.append(_level(frames)), rate_hz=40)
-    assert figures.shown == 12
+    figures = run_live(source, maker, lambda frames: seen.append(_level(frames)), rate_hz=40)
+    assert figures.made == 12
     assert figures.late == 0
     assert seen == sorted(seen)
     assert len(set(seen)) > 6
     assert source.closed
 
 
-def test_a_slow_display_drops_what_came_too_late_and_counts_it(scaler: LiveScaler) -> None:
+def test_a_slow_display_drops_what_came_too_late_and_counts_it(maker: FrameMaker) -> None:
     source = Numbers(40)
-    figures = run_live(source, scaler, lambda frames: time.sleep(0.08), rate_hz=100)
-    assert figures.shown + figures.late == 40
+    figures = run_live(source, maker, lambda frames: time.sleep(0.08), rate_hz=100)
+    assert figures.made + figures.late == 40
     assert figures.late > 10
     told = figures.told()
     assert told["pictures_per_s"] < 14
     assert told["delay_p50_ms"] > 0
 
 
-def test_a_stop_takes_hold_and_leaves_no_thread(scaler: LiveScaler) -> None:
+def test_a_stop_takes_hold_and_leaves_no_thread(maker: FrameMaker) -> None:
     class Stopped(Exception):
         pass
 
@@ -81,30 +80,41 @@ def test_a_stop_takes_hold_and_leaves_no_thread(scaler: LiveScaler) -> None:
     source = Numbers(10**6)
     before = threading.active_count()
     with pytest.raises(Stopped):
-        run_live(source, scaler, lambda frames: None, rate_hz=50, tell=tell)
+        run_live(source, maker, lambda frames: None, rate_hz=50, tell=tell)
     assert source.closed
     assert threading.active_count() == before
 
 
-def test_a_source_or_a_display_that_fails_ends_it_with_the_error(scaler: LiveScaler) -> None:
-    with pytest.raises(UsageError):
-        run_live(Numbers(9, fails_at=3), scaler, lambda frames: None, rate_hz=100)
+def test_a_bad_picture_is_passed_over_and_told_of(maker: FrameMaker) -> None:
+    figures = run_live(Numbers(9, fails_at=3), maker, lambda frames: None, rate_hz=100)
+    assert (figures.made, figures.bad) == (8, 1)
+    assert figures.told()["trouble"] == "Damaged. Write it again."
 
-    def broken(frames: Mapping[str, ByteImage]) -> None:
+
+def test_targets_are_handed_on_at_their_size() -> None:
+    seen: list[tuple[tuple[int, ...], int]] = []
+    run_live(
+        Numbers(3), TargetMaker((30, 24)), lambda frames: seen.append((frames[0].shape, _level(frames))), rate_hz=99
+    )
+    assert seen == [((24, 30, 3), 21), ((24, 30, 3), 22), ((24, 30, 3), 23)]
+
+
+def test_a_display_that_fails_ends_it_with_the_error(maker: FrameMaker) -> None:
+    def broken(frames: Frames) -> None:
         raise OSError("gone")
 
     source = Numbers(10**6)
     with pytest.raises(OSError, match="gone"):
-        run_live(source, scaler, broken, rate_hz=100)
+        run_live(source, maker, broken, rate_hz=100)
     assert source.closed
 
 
-def test_it_ends_after_the_time_that_was_asked_for(scaler: LiveScaler) -> None:
+def test_it_ends_after_the_time_that_was_asked_for(maker: FrameMaker) -> None:
     began_s = time.monotonic()
-    figures = run_live(Numbers(10**6), scaler, lambda frames: None, rate_hz=30, seconds=0.5)
+    figures = run_live(Numbers(10**6), maker, lambda frames: None, rate_hz=30, seconds=0.5)
     assert 0.4 < time.monotonic() - began_s < 1.5
-    assert 8 <= figures.shown <= 16
+    assert 8 <= figures.made <= 16
 
 
-def _level(frames: Mapping[str, ByteImage]) -> int:
-    return int(sum(int(frame.max()) for frame in frames.values()))
+def _level(frames: Frames) -> int:
+    return int(sum(int(frame.max()) for frame in frames))

@@ -1,11 +1,12 @@
-"""Live targets: frames from a picture by base and scale (paper eqs 4-6), from what a bundle's live section holds.
+"""Base times scale (paper eqs 4-6): what is kept of a stage for it, and the frames of a target computed from that.
 
-``compensate`` is the reference in numpy for the shaders of ``live_gl``, and what is left where there is no OpenGL.
-docs/bundle-format.md, "Live section", has the formulas.
+This is the definition (docs/bundle-format.md, "Live section"). ``compensate`` is the reference in numpy; what makes
+frames at speed is held against it: ``solve.interactive`` on the processor, ``play.live_gl`` in shaders.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -14,14 +15,13 @@ import numpy.typing as npt
 
 from controller.bundle.format import damaged
 from controller.bundle.reader import Bundle
-from controller.play.frames import FrameSet, OutputSize
 
 MOST_RADIUS_PX: Final = 12
 REACH: Final = np.float32(3)
 """Standard deviations at which a Gaussian is cut."""
 MOST_CORRELATION: Final = np.float32(0.96)
 TILE: Final = 64
-_FULL: Final = np.float32(65535)
+FULL: Final = np.float32(65535)
 
 Float = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
@@ -29,13 +29,13 @@ Bytes = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveOutput:
-    """One output's maps, as the bundle holds them.
+    """One output's maps.
 
     ``base`` (rows, columns, 3) uint16 over ``base_range``; ``centre`` (rows, columns, 2) uint16; ``shape``
     (rows, columns, 3) uint8; ``unmix`` (3, 3); ``response`` (3, 256); ``dither`` (rows, columns) into the tile.
     """
 
-    size: OutputSize
+    name: str
     base: npt.NDArray[np.uint16]
     base_range: tuple[float, float]
     centre: npt.NDArray[np.uint16]
@@ -44,10 +44,24 @@ class LiveOutput:
     response: Float
     dither: tuple[int, int]
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height)."""
+        rows, columns, _ = self.base.shape
+        return columns, rows
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """As a bundle holds them, by key."""
+        return {
+            "base": self.base, "range": np.array(self.base_range, np.float32), "centre": self.centre,
+            "shape": self.shape, "unmix": self.unmix, "response": self.response,
+            "dither": np.array(self.dither, np.uint16),
+        }  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveMaps:
-    """A bundle's live section. ``gain``, ``offset`` (height, width, 3) float16, ``present`` (height, width) uint8."""
+    """A stage's maps. ``gain``, ``offset`` (height, width, 3) float16, ``present`` (height, width) uint8."""
 
     target_px: tuple[int, int]
     gain: npt.NDArray[np.float16]
@@ -64,9 +78,7 @@ class LiveMaps:
         live = bundle.index.live
         assert live is not None
         width, height = live.target_px
-        outputs = tuple(
-            _output(bundle, OutputSize(o.name, o.width_px, o.height_px), (width, height)) for o in bundle.index.outputs
-        )
+        outputs = tuple(_output(bundle, o.name, (o.width_px, o.height_px)) for o in bundle.index.outputs)
         found = cls(
             (width, height), gain, bundle.live_array("offset"), bundle.live_array("present"),
             float(_shaped(bundle.live_array("unit"), (1,), "f4", "unit")[0]),
@@ -77,16 +89,22 @@ class LiveMaps:
         _shaped(found.present, (height, width), "u1", "present")
         return found
 
+    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+        """The bundle's live section: every array by its name in it."""
+        parts = {f"{output.name}.{key}": values for output in self.outputs for key, values in output.arrays().items()}
+        whole: dict[str, npt.NDArray[Any]] = {"gain": self.gain, "offset": self.offset, "present": self.present}
+        return whole | {"unit": np.array([self.unit], np.float32), "noise": self.noise} | parts
 
-def _output(bundle: Bundle, size: OutputSize, target_px: tuple[int, int]) -> LiveOutput:
+
+def _output(bundle: Bundle, name: str, size_px: tuple[int, int]) -> LiveOutput:
     def array(key: str, shape: tuple[int, ...], dtype: str) -> npt.NDArray[Any]:
-        return _shaped(bundle.live_array(f"{size.name}.{key}"), shape, dtype, key)
+        return _shaped(bundle.live_array(f"{name}.{key}"), shape, dtype, key)
 
-    rows, columns = size.height_px, size.width_px
+    columns, rows = size_px
     low, high = map(float, array("range", (2,), "f4"))
     down, along = (int(value) % TILE for value in array("dither", (2,), "u2"))
     return LiveOutput(
-        size, array("base", (rows, columns, 3), "u2"), (low, high), array("centre", (rows, columns, 2), "u2"),
+        name, array("base", (rows, columns, 3), "u2"), (low, high), array("centre", (rows, columns, 2), "u2"),
         array("shape", (rows, columns, 3), "u1"), array("unmix", (3, 3), "f4"), array("response", (3, 256), "f4"),
         (down, along),
     )  # fmt: skip
@@ -113,29 +131,65 @@ def sigma_table() -> Float:
     return table
 
 
+def packed_shape(sigma: Float, correlation: Float) -> Bytes:
+    """Standard deviations (pixels, 2), 0 where a pixel lights nothing, and correlations (pixels,), as ``shape``."""
+    lit = sigma[:, :1] > 0
+    logarithm = 96 + 32 * np.log2(sigma, out=np.zeros_like(sigma), where=sigma > 0)
+    packed = np.concatenate([np.clip(np.rint(logarithm), 1, 255), 128 + np.rint(127 * correlation[:, None])], axis=1)
+    return np.asarray(np.where(lit, packed, 0), np.uint8)
+
+
 def brightness_factor(maps: LiveMaps, brightness: float) -> np.float32:
     """What a target's linear light is multiplied with before ``gain``."""
     return np.float32(brightness / maps.unit)
 
 
-def compensate(maps: LiveMaps, target: Bytes, brightness: float) -> FrameSet:
-    """The frames for a target (height, width, 3) uint8 sRGB; ``brightness``: the radiance of its white."""
-    light = light_table()[target]
-    factor = brightness_factor(maps, brightness)
-    scale = np.maximum(light * (maps.gain.astype(np.float32) * factor) - maps.offset.astype(np.float32), 0)
-    return FrameSet(tuple(_frame(maps, output, scale) for output in maps.outputs))
+def compensate(maps: LiveMaps, target: Bytes, brightness: float) -> tuple[Bytes, ...]:
+    """The frames, one an output, for a target (height, width, 3) uint8 sRGB; ``brightness``: radiance of its white."""
+    return compensate_light(maps, light_table()[target] * np.float32(brightness))
+
+
+def compensate_light(maps: LiveMaps, light: Float) -> tuple[Bytes, ...]:
+    """The frames for a radiance (height, width, 3)."""
+    gain = maps.gain.astype(np.float32) * brightness_factor(maps, 1.0)
+    scale = np.maximum(light * gain - maps.offset.astype(np.float32), 0)
+    return tuple(_frame(maps, output, scale) for output in maps.outputs)
+
+
+def base_light(output: LiveOutput) -> Float:
+    """M p_b, (rows, columns, 3)."""
+    low, high = (np.float32(value) for value in output.base_range)
+    return np.asarray(low + output.base.astype(np.float32) / FULL * (high - low), np.float32)
 
 
 def _frame(maps: LiveMaps, output: LiveOutput, scale: Float) -> Bytes:
-    frame = np.empty(output.size.shape, np.uint8)
-    low, high = (np.float32(value) for value in output.base_range)
-    base = low + output.base.astype(np.float32) / _FULL * (high - low)
-    means = _means(maps, output, scale) * base
+    frame: Bytes = np.empty(output.base.shape, np.uint8)
+    means = _means(maps, output, scale) * base_light(output)
+    rows, columns = frame.shape[:2]
     for channel in range(3):
         u = output.unmix[channel]
         part = u[0] * means[..., 0] + u[1] * means[..., 1] + u[2] * means[..., 2]
-        frame[..., channel] = _device(np.clip(part, 0, 1), output, channel, maps.noise)
+        level = device_level(np.clip(part, 0, 1), output.response[channel])
+        below = np.floor(level)
+        limit = thresholds(maps.noise, output, channel)[np.ix_(np.arange(rows) % TILE, np.arange(columns) % TILE)]
+        frame[..., channel] = np.where(level - below > limit, below + 1, below)
     return frame
+
+
+def thresholds(noise: Float, output: LiveOutput, channel: int) -> Float:
+    """(64, 64): the dither's tile as a channel of an output reads it from its upper left corner on."""
+    down, along = output.dither
+    # Channels read the tile at different places, or colours would speckle together as grey does.
+    return np.roll(noise, (-(down + 21 * channel), -(along + 43 * channel)), (0, 1))
+
+
+def device_level(light: Float, response: Float) -> Float:
+    """The device value whose light it is, between two of them the part of the way; ``response`` (256,)."""
+    value = np.clip(light, response[0], response[255])
+    below = np.clip(np.searchsorted(response, value, side="right") - 1, 0, 254)
+    gap = response[below + 1] - response[below]
+    part = np.divide(value - response[below], gap, out=np.zeros_like(value), where=gap > 0)
+    return np.asarray(below + part, np.float32)
 
 
 def _means(maps: LiveMaps, output: LiveOutput, scale: Float) -> Float:
@@ -144,7 +198,7 @@ def _means(maps: LiveMaps, output: LiveOutput, scale: Float) -> Float:
     present = maps.present.astype(np.float32) / np.float32(255)
     lit = output.shape[..., 0] > 0
     sides = np.array([width - 1, height - 1], np.float32)
-    middle = output.centre[lit].astype(np.float32) / _FULL * sides
+    middle = output.centre[lit].astype(np.float32) / FULL * sides
     sigma = sigma_table()[output.shape[..., :2][lit]]
     correlation = (output.shape[..., 2][lit].astype(np.float32) - np.float32(128)) / np.float32(127)
     correlation = np.clip(correlation, -MOST_CORRELATION, MOST_CORRELATION)
@@ -164,17 +218,3 @@ def _means(maps: LiveMaps, output: LiveOutput, scale: Float) -> Float:
     found = np.zeros((*lit.shape, 3), np.float32)
     found[lit] = np.divide(total, weight[:, None], out=np.zeros_like(total), where=weight[:, None] > 0)
     return found
-
-
-def _device(light: Float, output: LiveOutput, channel: int, noise: Float) -> Bytes:
-    """As ``solve.dither`` with thresholds from the blue-noise tile."""
-    table = output.response[channel]
-    value = np.clip(light, table[0], table[255])
-    below = np.clip(np.searchsorted(table, value, side="right") - 1, 0, 254)
-    gap = table[below + 1] - table[below]
-    part = np.divide(value - table[below], gap, out=np.zeros_like(value), where=gap > 0)
-    rows, columns = light.shape
-    down, along = output.dither
-    row = (np.arange(rows) + down + 21 * channel) % TILE
-    column = (np.arange(columns) + along + 43 * channel) % TILE
-    return np.asarray(np.where(part > noise[np.ix_(row, column)], below + 1, below), np.uint8)
