@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from controller.panel.kiosk import Schedule
-from controller.serve.clock import Clockwork
+from controller.serve.clock import Clockwork, beginning
 from controller.serve.conductor import Conductor, Limits
 from controller.serve.eventlog import Decision, EventLog
 from controller.serve.ports import BLACK, Finished, PlayerView, Request, Showing
@@ -153,6 +153,7 @@ class Kiosk:
     def boot(self) -> None:
         """The service begins, after whatever ended it; lamps, ledger and disk are as they were."""
         self.log = EventLog(self.folder / "events.sqlite", wall=self.wall, durable=False)
+        self.log.tell(beginning(self.log))
         self.works = ModelWorks(self.world, camera=self.works.camera, done=self.works.done, drifted=self.works.drifted)
         self.player = ModelPlayer(self.world)
         self.keepers = [self._keeper(name) for name in NAMES]
