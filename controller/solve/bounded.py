@@ -1,7 +1,7 @@
 """Compensation images by a global, bounded, smooth least-squares solve (paper 2.2-2.4, eqs 2 and 3).
 
 Minimise  sum_u w_u |T p + K - C|^2  +  s sum over adjacent pixels of alpha^2 (p_i - p_j)^2   subject to 0 <= p <= 1
-by accelerated projected gradient, one projector after the other (``descent``, docs/decisions/0022). T is (nearly)
+by accelerated projected gradient, one projector after the other (``descent``, docs/decisions/0022, 0025). T is (nearly)
 non-negative, so the row sums |T_n|' w |T_n| 1 majorise the data part of the Hessian of projector n, and give every one
 of its pixels a step of its own.
 """
@@ -15,10 +15,10 @@ from typing import Final
 
 import numpy as np
 
-from controller.arrays import FloatImage, Mask
+from controller.arrays import FloatImage
 from controller.errors import UsageError
 from controller.solve.descent import Watch, descend
-from controller.solve.gradient import weighted_residual
+from controller.solve.gradient import inner, share_of, tie, weighted_residual
 from controller.solve.smoothness import squared_edges
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
@@ -156,12 +156,9 @@ def posed(transport: LightTransport, wanted: FloatImage, counted: FloatImage, sm
     """The equations for planes ``wanted`` (3, rows, columns) and weights (rows, columns) that are 0 off the object."""
     diagonal, scale = _majoriser(transport, counted)
     across, down = squared_edges(transport, wanted)
-    across *= np.float32(smoothness * scale)
-    down *= np.float32(smoothness * scale)
-    active = diagonal > 0
-    for n in range(len(transport.sizes)):
-        lit = active[:, transport.span(n)].reshape(3, *transport.sizes[n])
-        _tie(lit, *(_frame_view(transport, n, planes) for planes in (across, down, diagonal)))
+    data = diagonal.copy()
+    for n, (rows, columns) in enumerate(transport.sizes):
+        tie(data, across, down, smoothness * scale, transport.span(n).start, rows, columns, diagonal)
     return Problem(transport, wanted, counted, across, down, diagonal)
 
 
@@ -170,34 +167,30 @@ def _majoriser(transport: LightTransport, counted: FloatImage) -> tuple[FloatIma
     magnitude = transport.with_absolute_mixing()
     ones = np.ones((3, transport.pixels), np.float32)
     diagonal = np.zeros_like(ones)
-    reach, light = np.zeros((3, *transport.shape), np.float32), np.empty((3, *transport.shape), np.float32)
+    light, reach, nothing = transport.sheet(), transport.sheet(), transport.sheet()
+    weighed = np.empty_like(light)
     for n in range(len(transport.sizes)):
-        magnitude.forward_planes(ones, projectors=(n, n + 1), out=light)
+        light[:] = 0
+        magnitude.add_light(n, ones, light)
         reach += light
-        magnitude.pull(n, magnitude.aim(light, counted), diagonal)
+        magnitude.weigh(light, counted, nothing, weighed)
+        magnitude.pull(n, weighed, diagonal)
+    magnitude.weigh(reach, counted, nothing, weighed)
     pixels = max(int(np.count_nonzero(diagonal > 0)), 1)
     # 1' T' w T 1 is the sum of all row sums
-    return diagonal, weighted_residual(reach, np.zeros_like(reach), counted, light) / pixels
+    return diagonal, inner(reach.reshape(-1), weighed.reshape(-1)) / pixels
 
 
 def _frame_view(transport: LightTransport, n: int, planes: FloatImage) -> FloatImage:
     return planes[:, transport.span(n)].reshape(3, *transport.sizes[n])
 
 
-def _tie(active: Mask, across: FloatImage, down: FloatImage, diagonal: FloatImage) -> None:
-    """Cut the ties of dark pixels and add the rest, twice, to the majoriser; all (3, rows, columns)."""
-    across[:, :, :-1] *= active[:, :, :-1] & active[:, :, 1:]
-    down[:, :-1] *= active[:, :-1] & active[:, 1:]
-    diagonal += 2 * (across + down)
-    diagonal[:, :, 1:] += 2 * across[:, :, :-1]
-    diagonal[:, 1:] += 2 * down[:, :-1]
-
-
 def first_guess(problem: Problem) -> FloatImage:
     """All projectors at the same share of their light: right wherever the target is smooth."""
-    reach = problem.transport.reach_planes()
-    share = np.divide(problem.wanted, reach, out=np.zeros_like(reach), where=reach > 0)
-    return np.clip(problem.transport.gaussian_mean_planes(np.minimum(share, 1)), 0, 1)
+    share = problem.transport.reach_planes()
+    share_of(problem.wanted, share)
+    guess = problem.transport.gaussian_mean_planes(share)
+    return np.clip(guess, 0, 1, out=guess)
 
 
 def roughness(problem: Problem, x: FloatImage) -> float:

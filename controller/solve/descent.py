@@ -2,7 +2,8 @@
 
 Each projector takes a projected gradient step against what the others show by then, scaled by a diagonal that bounds
 its own part of the Hessian alone; with n projectors alike that is n times as far as a step of all at once could go.
-Momentum carries on from sweep to sweep and starts anew where it points uphill (O'Donoghue and Candes 2015).
+Momentum carries on from sweep to sweep, with part of the sweep's own step again (Kim and Fessler 2016), and starts anew
+where it points uphill (O'Donoghue and Candes 2015). What the constants are worth: docs/decisions/0025.
 """
 
 from __future__ import annotations
@@ -23,22 +24,29 @@ if TYPE_CHECKING:
 MOST_GROWTH: Final = 5.0
 """Without momentum sweeps never go uphill; with it nothing is proven, so it ends where the residual grows as much."""
 
+AGAIN: Final = 0.9
+"""Part of a sweep's step that is taken once more: 1 is optimal for steps of all at once, and too far from 1.2 on."""
+
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """When to stop, and whom to tell; see ``solve_bounded``."""
+    """When to stop, and whom to tell; see ``solve_bounded``.
+
+    ``look`` is shown each sweep's point (3, pixels), to be read before it returns
+    """
 
     tolerance: float
     most_iterations: int
     progress: Callable[[int, float], None] | None = None
     cancelled: Callable[[], bool] | None = None
+    look: Callable[[int, FloatImage], None] | None = None
 
 
 def descend(problem: Problem, x: FloatImage, watch: Watch) -> tuple[FloatImage, float, int]:
     """Sweep from ``x`` (3, pixels), which is overwritten; returns the last point, its KKT residual and the sweeps."""
     transport = problem.transport
     aim = transport.aim(problem.wanted, problem.weights)
-    light, ahead, residual = transport.sheet(), transport.sheet(), np.empty_like(aim)
+    light, ahead, before, residual = transport.sheet(), transport.sheet(), transport.sheet(), np.empty_like(aim)
     for n in range(len(transport.sizes)):
         transport.add_light(n, x, light)
     ahead[:] = light
@@ -49,6 +57,7 @@ def descend(problem: Problem, x: FloatImage, watch: Watch) -> tuple[FloatImage, 
         if watch.cancelled is not None and watch.cancelled():
             raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again when wanted.")
         squared_step = uphill = 0.0
+        before[:] = ahead
         for n, (rows, columns) in enumerate(transport.sizes):
             transport.weigh(ahead, problem.weights, aim, residual)
             transport.pull(n, residual, step)
@@ -59,15 +68,17 @@ def descend(problem: Problem, x: FloatImage, watch: Watch) -> tuple[FloatImage, 
             transport.add_light(n, step, ahead)
         kkt = float(np.sqrt(squared_step / total))
         following = (1 + np.sqrt(1 + 4 * inertia**2)) / 2
-        momentum = (inertia - 1) / following
+        momentum, again = (inertia - 1) / following, AGAIN * inertia / following
         inertia = following
         least = min(least, kkt)
         if uphill > 0 or kkt > MOST_GROWTH * least:
-            momentum, inertia = 0.0, 1.0
-        extrapolate(new, x, momentum, y)
+            momentum, again, inertia = 0.0, 0.0, 1.0
+        if watch.look is not None:
+            watch.look(iteration, new)
+        extrapolate(new, x, step, momentum, again, y)
         x, new = new, x
         # the sheets follow: ``ahead`` is the light of the new point by now, and becomes that of y
-        carry_on(ahead.reshape(-1), light.reshape(-1), momentum)
+        carry_on(ahead.reshape(-1), light.reshape(-1), before.reshape(-1), momentum, again)
         if watch.progress is not None:
             watch.progress(iteration, kkt)
         if kkt <= watch.tolerance:

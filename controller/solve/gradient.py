@@ -91,21 +91,21 @@ def projected_step(
 
 
 @compiled(parallel=True, fastmath=True)
-def extrapolate(new: FloatImage, x: FloatImage, momentum: float, y: FloatImage) -> None:
-    """Write new + momentum (new - x) to ``y``; all (3, pixels)."""
-    beta = np.float32(momentum)
+def extrapolate(new: FloatImage, x: FloatImage, step: FloatImage, momentum: float, again: float, y: FloatImage) -> None:
+    """Write new + momentum (new - x) + again step to ``y``; all (3, pixels)."""
+    beta, gamma = np.float32(momentum), np.float32(again)
     for i in prange(new.shape[1]):
         for c in range(3):
-            y[c, i] = new[c, i] + beta * (new[c, i] - x[c, i])
+            y[c, i] = new[c, i] + beta * (new[c, i] - x[c, i]) + gamma * step[c, i]
 
 
 @compiled(parallel=True, fastmath=True)
-def carry_on(new: FloatImage, last: FloatImage, momentum: float) -> None:
-    """Write new + momentum (new - last) to ``new``, and what was there to ``last``; both flat."""
-    beta = np.float32(momentum)
+def carry_on(new: FloatImage, last: FloatImage, before: FloatImage, momentum: float, again: float) -> None:
+    """Write new + momentum (new - last) + again (new - before) to ``new``, what was there to ``last``; all flat."""
+    beta, gamma = np.float32(momentum), np.float32(again)
     for i in prange(new.size):
         value = new[i]
-        new[i] = value + beta * (value - last[i])
+        new[i] = value + beta * (value - last[i]) + gamma * (value - before[i])
         last[i] = value
 
 
@@ -127,3 +127,60 @@ def scale_base(
         for k in range(3):
             value = unmix[k, 0] * a + unmix[k, 1] * b + unmix[k, 2] * c
             out[k, i] = min(max(value, np.float32(0)), np.float32(1))
+
+
+@compiled(parallel=True, fastmath=True)
+def tie(
+    data: FloatImage,
+    across: FloatImage,
+    down: FloatImage,
+    strength: float,
+    start: int,
+    rows: int,
+    columns: int,
+    majoriser: FloatImage,
+) -> None:
+    """Scale the ties of one projector and cut those of dark pixels; write data + twice a pixel's ties to ``majoriser``.
+
+    All (3, pixels of all projectors); dark is a pixel without ``data``. ``start``, ``rows``, ``columns``: the projector
+    """
+    s = np.float32(strength)
+    for v in prange(rows):
+        for c in range(3):
+            for x in range(columns):
+                i = start + v * columns + x
+                lit = data[c, i] > 0
+                across[c, i] *= s if lit and x + 1 < columns and data[c, i + 1] > 0 else np.float32(0)
+                down[c, i] *= s if lit and v + 1 < rows and data[c, i + columns] > 0 else np.float32(0)
+    for v in prange(rows):
+        for c in range(3):
+            for x in range(columns):
+                i = start + v * columns + x
+                ties = across[c, i] + down[c, i]
+                ties += across[c, i - 1] if x > 0 else np.float32(0)
+                ties += down[c, i - columns] if v > 0 else np.float32(0)
+                majoriser[c, i] = data[c, i] + np.float32(2) * ties
+
+
+@compiled(parallel=True, fastmath=True)
+def share_of(wanted: FloatImage, reach: FloatImage) -> None:
+    """Write min(wanted / reach, 1) over ``reach``, 0 where there is none; both (3, rows, columns)."""
+    one, none = np.float32(1), np.float32(0)
+    for y in prange(reach.shape[1]):
+        for c in range(3):
+            for x in range(reach.shape[2]):
+                light = reach[c, y, x]
+                reach[c, y, x] = min(wanted[c, y, x] / light, one) if light > 0 else none
+
+
+@compiled(parallel=True, fastmath=True)
+def inner(a: FloatImage, b: FloatImage) -> float:
+    """The inner product of two flat arrays, added up in blocks so that it is the same for any number of threads."""
+    block = 1 << 14
+    sums = np.zeros((a.size + block - 1) // block, np.float64)
+    for k in prange(sums.size):
+        total = np.float32(0)
+        for i in range(k * block, min((k + 1) * block, a.size)):
+            total += a[i] * b[i]
+        sums[k] = total
+    return float(sums.sum())
