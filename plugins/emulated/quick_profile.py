@@ -9,10 +9,11 @@ from hal.errors import PluginError
 from plugins.emulated.lamp import LampTiming
 
 _TIMING_S = {
-    "answer_s": 0.5,
-    "late_s": 1.0,
-    "command_s": 1.0,
-    "confirm_s": 3.0,
+    # An emulated projector answers at once, but the machine that it is emulated on may be loaded.
+    "answer_s": 2.0,
+    "late_s": 3.0,
+    "command_s": 3.0,
+    "confirm_s": 15.0,
     "interval_s": 0.005,
     "boot_interval_s": 0.05,
 }

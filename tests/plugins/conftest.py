@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,25 @@ class PjLinkPair:
     stage: Path
 
 
+def hasty(text: str) -> str:
+    """The profile of a projector that loses patience sooner, for tests in which answers do not come."""
+    times = {"answer_s": (2.0, 0.4), "late_s": (3.0, 0.8), "command_s": (3.0, 0.8), "confirm_s": (15.0, 5.0)}
+    for key, (slow_s, quick_s) in times.items():
+        text = text.replace(f"{key} = {slow_s}", f"{key} = {quick_s}")
+    return text
+
+
+def each(names: Iterable[str], work: Callable[[str], object]) -> None:
+    """Do ``work`` for each of them side by side, because most of it is waiting."""
+    with ThreadPoolExecutor(16) as pool:
+        for name, outcome in [(name, pool.submit(work, name)) for name in names]:
+            try:
+                outcome.result()
+            except BaseException as error:
+                error.add_note(f"for {name}")
+                raise
+
+
 OpenSerial = Callable[..., SerialPair]
 OpenPjLink = Callable[..., PjLinkPair]
 
@@ -72,7 +92,7 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
     """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator.
 
     ``profile`` is a shipped one, ``edit`` changes its text, ``timing`` is its lamp's; ``board`` makes another board
-    than the profile's.
+    than the profile's; ``name`` tells several apart.
     """
     opened: list[SerialPair] = []
 
@@ -81,16 +101,17 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
         lamp = kwargs.pop("lamp", None) or EmulatedLamp(timing)
         profile = kwargs.pop("profile", "optoma-later")
         edit = kwargs.pop("edit", lambda text: text)
+        name = kwargs.pop("name", "left")
         if (board := kwargs.pop("board", BOARDS.get(profile))) is not None:
             kwargs["board"] = board(lamp)
-        (tmp_path / "quick.toml").write_text(edit(quick_profile(timing, base=profile)))
-        table_read = load_profile("quick.toml", tmp_path).serial
+        (tmp_path / f"{name}.toml").write_text(edit(quick_profile(timing, base=profile)))
+        table_read = load_profile(f"{name}.toml", tmp_path).serial
         assert table_read is not None
-        emulator = EmulatedSerialProjector(tmp_path / "run" / "tty-left", lamp, baud=table_read.baud, **kwargs)
+        emulator = EmulatedSerialProjector(tmp_path / "run" / f"tty-{name}", lamp, baud=table_read.baud, **kwargs)
         emulator.start()
-        table = {"profile": "quick.toml", "port": "run/tty-left", **(settings or {})}
+        table = {"profile": f"{name}.toml", "port": f"run/tty-{name}", **(settings or {})}
         context = OpenContext(tmp_path, transcripts=tmp_path / "transcripts")
-        pair = SerialPair(open_serial_projector(table, context, in_seconds(5)), emulator, tmp_path)
+        pair = SerialPair(open_serial_projector(table, context, in_seconds(20)), emulator, tmp_path)
         opened.append(pair)
         return pair
 
@@ -106,12 +127,13 @@ def open_pjlink(tmp_path: Path) -> Iterator[OpenPjLink]:
     opened: list[PjLinkPair] = []
 
     def make(*, settings: dict[str, Any] | None = None, **kwargs: Any) -> PjLinkPair:
+        edit = kwargs.pop("edit", lambda text: text)
         emulator = EmulatedPjLinkProjector(kwargs.pop("lamp", None) or EmulatedLamp(LAMP), **kwargs)
         emulator.start()
-        (tmp_path / "quick.toml").write_text(quick_profile(LAMP, base="pjlink"))
+        (tmp_path / "quick.toml").write_text(edit(quick_profile(LAMP, base="pjlink")))
         table = {"address": emulator.address, "profile": "quick.toml", **(settings or {})}
         try:
-            driver = open_pjlink_projector(table, OpenContext(tmp_path), in_seconds(5))
+            driver = open_pjlink_projector(table, OpenContext(tmp_path), in_seconds(20))
         except BaseException:
             emulator.stop()
             raise

@@ -9,8 +9,8 @@ from functools import cache
 from typing import Final
 
 NOTICE: Final = (
-    "No Python >= 3.13 with pjlink-advance is at hand (PJLINK_ADVANCE_PYTHON names one): our driver was not run against "
-    "its emulator; docs/drivers.md says how."
+    "No Python >= 3.13 with pjlink-advance is at hand (PJLINK_ADVANCE_PYTHON names one): our driver was not run "
+    "against its emulator; docs/drivers.md says how."
 )
 
 

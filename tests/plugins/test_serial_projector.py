@@ -30,8 +30,9 @@ from plugins.emulated.optoma import OptomaQuirks
 from plugins.emulated.quick_profile import quick_profile
 from plugins.profile_files import load_profile, shipped_profiles
 from plugins.serial_projector import SerialProjector, open_serial_projector
+from tests.plugins.conftest import hasty
 
-SOON = 5.0
+SOON = 30.0
 
 
 def wait_for(driver: SerialProjector, power: Power) -> None:
@@ -42,7 +43,7 @@ def wait_for(driver: SerialProjector, power: Power) -> None:
 
 
 def test_a_lost_answer_is_asked_again_and_never_mistaken_for_the_next(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(edit=hasty)
     pair.emulator.faults.drop_next_reply()
     status = pair.driver.status(deadline=in_seconds(SOON))
     assert (status.power, status.lamp_hours) == (Power.OFF, 1200)
@@ -50,36 +51,36 @@ def test_a_lost_answer_is_asked_again_and_never_mistaken_for_the_next(open_seria
 
 def test_a_late_answer_is_not_taken_for_the_answer_to_the_next_question(open_serial: Any) -> None:
     # The model's answer, OK1, would read as the firmware, or as the power state "on".
-    pair = open_serial(quirks=OptomaQuirks(model_code=1))
-    pair.emulator.faults.set(slow_s=0.6)  # later than the driver waits for an answer (0.5 s)
-    who = pair.driver.identity(deadline=in_seconds(10))
+    pair = open_serial(quirks=OptomaQuirks(model_code=1), edit=hasty)
+    pair.emulator.faults.set(slow_s=0.6)  # later than the driver waits for an answer (0.4 s)
+    who = pair.driver.identity(deadline=in_seconds(SOON))
     assert (who.model[-1], who.firmware) == ("1", "C07")
     pair.emulator.faults.clear()
     assert pair.driver.status(deadline=in_seconds(SOON)).power is Power.OFF
 
 
 def test_a_silent_projector_is_a_timeout_with_a_remedy_well_before_the_deadline(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(edit=hasty)
     pair.emulator.faults.set(silent=True)
-    started = time.monotonic()
+    until = in_seconds(60)
     with pytest.raises(DeviceTimeout) as caught:
-        pair.driver.status(deadline=in_seconds(20))
+        pair.driver.status(deadline=until)
     assert caught.value.code == "projector-no-answer"
     assert "power" in caught.value.remedy
-    assert time.monotonic() - started < 5
+    assert until.left_s() > 30
 
 
 def test_a_deadline_shorter_than_the_projectors_patience_is_kept(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(edit=lambda text: re.sub("(answer|late)_s = .*", r"\1_s = 60.0", text))
     pair.emulator.faults.set(silent=True)
     started = time.monotonic()
     with pytest.raises(DeviceTimeout):
         pair.driver.status(deadline=in_seconds(0.2))
-    assert time.monotonic() - started < 0.6
+    assert time.monotonic() - started < 30
 
 
 def test_garbage_is_a_protocol_error_and_recovers(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(edit=hasty)
     pair.emulator.faults.set(garbage=True)
     with pytest.raises(ProtocolError) as caught:
         pair.driver.status(deadline=in_seconds(SOON))
@@ -89,7 +90,7 @@ def test_garbage_is_a_protocol_error_and_recovers(open_serial: Any) -> None:
 
 
 def test_a_wrong_baud_rate_is_reported_as_such(open_serial: Any) -> None:
-    pair = open_serial(settings={"baud": 19200})
+    pair = open_serial(settings={"baud": 19200}, edit=hasty)
     with pytest.raises(DeviceError) as caught:
         pair.driver.status(deadline=in_seconds(SOON))
     assert "baud rate" in caught.value.remedy
@@ -103,7 +104,7 @@ def test_a_busy_projector_is_busy_and_not_broken(open_serial: Any) -> None:
 
 
 def test_on_while_cooling_is_refused_even_by_a_driver_that_did_not_see_it_burn(open_serial: Any) -> None:
-    lamp = EmulatedLamp(LampTiming(0.25, 5.0))
+    lamp = EmulatedLamp(LampTiming(0.25, 600.0))
     lamp.warm_now()
     lamp.extinguish()
     pair = open_serial(lamp=lamp)
@@ -113,7 +114,7 @@ def test_on_while_cooling_is_refused_even_by_a_driver_that_did_not_see_it_burn(o
 
 
 def test_a_lost_reply_to_on_strikes_the_lamp_once_and_is_confirmed_by_the_power_state(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(edit=hasty)
     pair.driver.status(deadline=in_seconds(SOON))
     # The first answer is to the power question; the second, to the command, is the one to lose.
     original = pair.emulator.faults.loses_this_one
@@ -124,7 +125,7 @@ def test_a_lost_reply_to_on_strikes_the_lamp_once_and_is_confirmed_by_the_power_
         return answers[-1] or original()
 
     pair.emulator.faults.loses_this_one = lose_the_second
-    pair.driver.switch_on(deadline=in_seconds(10))
+    pair.driver.switch_on(deadline=in_seconds(SOON))
     assert pair.emulator.lamp.strikes == 1
     assert len(re.findall(r"> ~0000 1\\r", pair.transcript())) == 1
     assert pair.driver.status(deadline=in_seconds(SOON)).power in (Power.WARMING, Power.ON)
@@ -146,14 +147,15 @@ def test_overheating_is_told_by_the_next_status(open_serial: Any) -> None:
     pair = open_serial()
     pair.driver.switch_on(deadline=in_seconds(SOON))
     pair.emulator.lamp.overheat()
-    time.sleep(0.1)
-    status = pair.driver.status(deadline=in_seconds(SOON))
-    assert "over-temperature" in status.faults
+    until = in_seconds(SOON)
+    while "over-temperature" not in (status := pair.driver.status(deadline=in_seconds(SOON))).faults:
+        assert not until.passed
+        time.sleep(0.02)
     assert status.power in (Power.COOLING, Power.FAULT)
 
 
 def test_an_unplugged_port_comes_back_as_another_tty_and_is_found_by_its_name(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(edit=hasty)
     pair.driver.status(deadline=in_seconds(SOON))
     before = pair.emulator.path
     pair.emulator.unplug()
@@ -163,18 +165,18 @@ def test_an_unplugged_port_comes_back_as_another_tty_and_is_found_by_its_name(op
 
 
 def test_a_port_that_stays_away_is_gone_and_comes_back_later(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(edit=hasty)
     pair.emulator.unplug()
     started = time.monotonic()
     with pytest.raises((DeviceGone, DeviceTimeout)):
         pair.driver.status(deadline=in_seconds(0.5))
-    assert time.monotonic() - started < 1.5
+    assert time.monotonic() - started < 10
     pair.emulator.replug()
     assert pair.driver.status(deadline=in_seconds(SOON)).power is Power.OFF
 
 
 def test_a_starting_projector_is_not_asked_more_often_than_its_profile_allows(open_serial: Any) -> None:
-    pair = open_serial()
+    pair = open_serial(timing=LampTiming(1.5, 0.4))
     pair.driver.switch_on(deadline=in_seconds(SOON))
     wait_for(pair.driver, Power.ON)
     sent = [
@@ -183,7 +185,7 @@ def test_a_starting_projector_is_not_asked_more_often_than_its_profile_allows(op
         if entry.way.value == ">" and entry.data.startswith(b"~")
     ]
     strike = next(entry.at_s for entry in parse_transcript(pair.transcript()) if entry.data == b"~0000 1\r")
-    booting = [at for at in sent if strike <= at < strike + 0.25]
+    booting = [at for at in sent if strike <= at < strike + 1.4]
     gaps = [later - earlier for earlier, later in itertools.pairwise(booting)]
     assert gaps
     assert min(gaps) >= 0.049
@@ -238,7 +240,7 @@ def test_the_shutter_blocks_the_light(open_serial: Any) -> None:
 
 
 def test_another_projectors_number_gets_no_answer(open_serial: Any) -> None:
-    pair = open_serial(number=3, settings={"address": "04"})
+    pair = open_serial(number=3, settings={"address": "04"}, edit=hasty)
     with pytest.raises(DeviceTimeout):
         pair.driver.status(deadline=in_seconds(SOON))
 
@@ -248,7 +250,7 @@ def test_a_recorded_conversation_replays_without_a_projector(open_serial: Any, t
     told = pair.driver.identity(deadline=in_seconds(SOON))
     status = pair.driver.status(deadline=in_seconds(SOON))
     link = ReplayLink(parse_transcript(pair.transcript()))
-    profile = load_profile("quick.toml", tmp_path)
+    profile = load_profile("left.toml", tmp_path)
     replayed = SerialProjector(lambda deadline: link, profile, name="a recording")
     assert replayed.identity(deadline=in_seconds(SOON)) == told
     assert replayed.status(deadline=in_seconds(SOON)) == status

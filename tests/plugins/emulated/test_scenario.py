@@ -153,16 +153,17 @@ def scripted(tmp_path: Path) -> Iterator[EmulatedSerialProjector]:
 
 def test_a_projector_on_a_pty_follows_its_script(scripted: EmulatedSerialProjector) -> None:
     before = scripted.path
-    with serial.Serial(str(scripted.port), 9600, timeout=0.2) as line:
+    with serial.Serial(str(scripted.port), 9600, timeout=20) as line:
         answers = []
-        for _ in range(3):
+        for timeout_s in (20, 0.5, 20):
+            line.timeout = timeout_s
             line.write(b"~00124 1\r")
             answers.append(bytes(line.read_until(b"\r")))
         assert answers == [b"OK0\r", b"", b"OK0\r"]
         line.write(b"~00124 1\r")
         with pytest.raises((serial.SerialException, OSError)):
             line.read(10)
-    deadline = in_seconds(3)
+    deadline = in_seconds(30)
     while scripted.path in (None, before) and not deadline.passed:
         time.sleep(0.02)
     assert scripted.path not in (None, before)
