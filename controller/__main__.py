@@ -19,8 +19,10 @@ from typing import Annotated, Any, Final
 import typer
 
 from controller import console
+from controller.commands import accounts as account_commands
 from controller.commands import bundle as bundle_commands
 from controller.commands import camera as camera_commands
+from controller.commands import kiosk as kiosk_commands
 from controller.commands import serve as serve_commands
 from controller.commands.doctor import doctor
 from controller.commands.drift import drift
@@ -29,7 +31,7 @@ from controller.commands.keys import keys
 from controller.commands.live import live
 from controller.commands.plan import plan
 from controller.commands.report import report
-from controller.commands.running import Json, StageFolder, group, work
+from controller.commands.running import Json, StageFolder, group, projector_names, work
 from controller.commands.study import study
 from controller.errors import UsageError, VelaturaError
 
@@ -107,7 +109,10 @@ def calibrate(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Look what has changed, and repeat only that.")] = False,
     projector: Annotated[
-        str | None, typer.Option(help="Measure this projector anew, and keep what is known of the others.")
+        str | None,
+        typer.Option(
+            help="Measure this projector anew, and keep what is known of the others.", autocompletion=projector_names
+        ),
     ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
@@ -185,10 +190,12 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     study,
     states,
     *serve_commands.COMMANDS,
+    *kiosk_commands.COMMANDS,
 )
 """Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
 
 GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
+    "account": (account_commands.SUMMARY, account_commands.COMMANDS),
     "bundle": (bundle_commands.SUMMARY, bundle_commands.COMMANDS),
     "camera": (camera_commands.SUMMARY, camera_commands.COMMANDS),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +14,30 @@ from controller import console
 
 StageFolder = Annotated[Path, typer.Argument(metavar="STAGE", help="The stage's folder, which holds stage.toml.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object a line, for machines.")]
+
+
+def projector_names(incomplete: str) -> list[str]:
+    """For the shell's completion: the projectors of the stage that was typed before."""
+    return _completed(incomplete, "projectors")
+
+
+def appearance_names(incomplete: str) -> list[str]:
+    """As above, its appearances."""
+    return _completed(incomplete, "appearances")
+
+
+def _completed(incomplete: str, tables: str) -> list[str]:
+    from controller.config import load_stage
+    from controller.errors import VelaturaError
+
+    # The line that was typed, as each shell gives it: an option without its value hides the arguments before it.
+    typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""
+    stages = [Path(word) for word in typed.split() if (Path(word) / "stage.toml").is_file()]
+    try:
+        rows = getattr(load_stage(stages[0]).tables, tables) if stages else ()
+    except (VelaturaError, OSError):
+        return []  # a shell that completes has nowhere to show an error
+    return [row.name for row in rows if row.name.startswith(incomplete)]
 
 
 def work(target: str, *, as_json: bool, **arguments: Any) -> None:

@@ -22,6 +22,15 @@ def serve(
     ] = None,
     certificate: Annotated[Path | None, typer.Option(help="TLS certificate (PEM) of the panel.")] = None,
     key: Annotated[Path | None, typer.Option(help="TLS key (PEM) of the panel.")] = None,
+    mqtt: Annotated[str | None, typer.Option(help="HOST[:PORT] of the building control's MQTT broker.")] = None,
+    mqtt_topic: Annotated[str, typer.Option(help="The first part of all MQTT topics.")] = "velatura",
+    mqtt_user: Annotated[str | None, typer.Option(help="User name at the broker.")] = None,
+    mqtt_password_file: Annotated[
+        Path | None, typer.Option(help="File that holds the password at the broker, and nothing else.")
+    ] = None,
+    mqtt_certificates: Annotated[
+        Path | None, typer.Option(help="Authorities (PEM) with which the broker's TLS is checked; without it no TLS.")
+    ] = None,
     leave_lit: Annotated[
         bool, typer.Option("--leave-lit", help="Leave the lamps lit at the end, for a service that starts again.")
     ] = False,
@@ -31,10 +40,19 @@ def serve(
     as_json: Json = False,
 ) -> None:
     """Run the stage by its schedule, unattended, with the technician's panel, until Ctrl-C."""
+    from controller.panel.broker import BrokerOptions
     from controller.serve.program import PanelAddress, parse_address
 
     host, port = parse_address(panel)
-    address = None if no_panel else PanelAddress(host, port, certificate, key, tuple(name or ()))
+    broker = None
+    if mqtt is not None:
+        if no_panel:
+            raise UsageError("mqtt-without-panel", what="MQTT is the panel's, and --no-panel leaves it out.",
+                             remedy="Leave out --no-panel; the panel may listen on this machine alone.")  # fmt: skip
+        usual = 1883 if mqtt_certificates is None else 8883
+        where = parse_address(mqtt if ":" in mqtt else f"{mqtt}:{usual}")
+        broker = BrokerOptions(*where, mqtt_topic, mqtt_user, mqtt_password_file, mqtt_certificates)
+    address = None if no_panel else PanelAddress(host, port, certificate, key, tuple(name or ()), broker)
     work(
         "controller.serve.program:serve", as_json=as_json, stage=stage, panel=address, leave_lit=leave_lit, setup=setup
     )

@@ -52,7 +52,8 @@ class Job:
     """Work that is going on, or that ended last (``ended`` True).
 
     ``number`` grows with every job; ``left_s`` None until it can be told; ``run`` the run's folder name where the job
-    makes one; ``outcome`` a sentence when it ended, with ``failed`` when it did not do what was asked
+    makes one; ``outcome`` a sentence when it ended, with ``failed`` when it did not do what was asked; ``count`` how
+    many steps it will have, 0 until that is known, and ``steps`` those up to the present one
     """
 
     number: int
@@ -64,6 +65,7 @@ class Job:
     ended: bool = False
     failed: bool = False
     outcome: str = ""
+    count: int = 0
 
 
 @dataclass(frozen=True, slots=True)

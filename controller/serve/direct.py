@@ -7,15 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from controller.app import stage_lock
-from controller.calibrations import stage_trust
+from controller.app import check_stage, stage_lock
+from controller.calibrations import stage_trust, worst_grade
 from controller.config import load_stage
 from controller.errors import UsageError
 from controller.panel.kiosk import Schedule, ScheduleRow
-from controller.serve import archive
+from controller.serve import archive, runs, settings
+from controller.serve.account_ops import account_operations, stage_accounts
 from controller.serve.control import ask, is_running, plain
 from controller.serve.eventlog import EventLog
 from controller.serve.hours import check_schedule
+from controller.serve.lamp_history import LampHistory
 from controller.serve.schedule_file import ScheduleFile
 from controller.serve.stock import BundleStock
 
@@ -122,8 +124,57 @@ def schedule_text(schedule: Mapping[str, Any]) -> str:
     return "\n".join([*lines, f"Drift check at {check}" if check else "No nightly drift check"])
 
 
+def _appearances(folder: Path) -> Any:
+    index = (stock := BundleStock(folder, stage_trust(load_stage(folder)))).index(stock.bundle())
+    if index is None:
+        return []
+    return [{"name": one.name, "made_unix_s": index.created_unix_s, "playing": False} for one in index.appearances]
+
+
+def _settings(folder: Path, text: str) -> None:
+    with stage_lock(folder):
+        settings.save(folder, text)
+
+
+def _feasibility(folder: Path, target: str) -> str:
+    from controller.serve.aim import feasibility_map
+
+    return str(feasibility_map(folder, Path(target)))
+
+
+def _results(folder: Path, run: str) -> Any:
+    return plain(runs.results(folder, run, worst_grade(check_stage(folder))))
+
+
+def _account(name: str) -> Callable[..., Any]:
+    def do(folder: Path, **arguments: Any) -> Any:
+        accounts = stage_accounts(folder)
+        with stage_lock(folder):
+            return account_operations(lambda: accounts, lambda _: None)[name](**arguments)
+
+    return do
+
+
+def aiming_text(found: Mapping[str, Any]) -> str:
+    """For people."""
+    lines = [f"{one['projector']}: {one['coverage']:.0%} of the object, focus {one['focus']:.0%}"
+             for one in found["projectors"]]  # fmt: skip
+    lines.append(f"Lit by two or more {found['overlap']:.0%}, too dark {found['too_dark']:.0%}, "
+                 f"too grazing {found['too_grazing']:.0%}")  # fmt: skip
+    return "\n".join([*lines, *found["hints"]])
+
+
 _DIRECT.update(
     {
+        **{name: _account(name) for name in account_operations(lambda: stage_accounts(Path()), lambda _: None)},
+        "appearances": _appearances,
+        "lamp-history": lambda folder: plain(LampHistory(folder).days()),
+        "runs": lambda folder: list(runs.names(folder)),
+        "results": _results,
+        "settings": settings.text,
+        "validate-settings": lambda folder, text: settings.validate(text),
+        "save-settings": _settings,
+        "feasibility": _feasibility,
         "events": _events,
         "schedule": lambda folder: plain(_schedule(folder).now),
         "set-schedule": _set_schedule,

@@ -92,10 +92,15 @@ def rows_of(schedule: Schedule, day: date) -> Sequence[ScheduleRow]:
     return own or [row for row in schedule.rows if row.day == WEEKDAYS[day.weekday()]]
 
 
-def openings(schedule: Schedule, around_s: float, *, days: int = 8) -> list[Opening]:
+def openings(schedule: Schedule, around_s: float, *, days: int = 8) -> Sequence[Opening]:
     """Those that begin on the day before ``around_s`` or on one of ``days`` days from then on, by their beginning."""
-    zone = zone_of(schedule.time_zone)
-    first, found = local_day(around_s, zone) - timedelta(days=1), []
+    return _openings(schedule, local_day(around_s, zone_of(schedule.time_zone)) - timedelta(days=1), days)
+
+
+@lru_cache(maxsize=8)
+def _openings(schedule: Schedule, first: date, days: int) -> tuple[Opening, ...]:
+    # Asked four times a second, and the same all day.
+    zone, found = zone_of(schedule.time_zone), []
     for number in range(days + 1):
         day = first + timedelta(days=number)
         for row in rows_of(schedule, day):
@@ -105,7 +110,7 @@ def openings(schedule: Schedule, around_s: float, *, days: int = 8) -> list[Open
             begins_s, ends_s = moment(day, row.opens, zone), moment(last, row.closes, zone)
             if ends_s > begins_s:
                 found.append(Opening(begins_s, ends_s, row.appearance))
-    return sorted(found, key=lambda opening: (opening.begins_s, opening.ends_s))
+    return tuple(sorted(found, key=lambda opening: (opening.begins_s, opening.ends_s)))
 
 
 def always_open(schedule: Schedule) -> bool:

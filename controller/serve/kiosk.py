@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.errors import UsageError, WorkError
+from controller.panel.accounts import Accounts
 from controller.panel.kiosk import (
     Aiming,
     Appearance,
@@ -45,12 +46,15 @@ _REVISIONS: Final = 1_000_000_000
 class StageKiosk:
     """Goes on while the service is made anew; ``service`` None while stage.toml is missing or wrong.
 
-    ``reload`` is set when somebody changed the settings: whoever runs the service then starts it again.
+    ``accounts`` and ``sessions_ended`` are the panel's, where there is one. ``reload`` is set when somebody changed the
+    settings: whoever runs the service then starts it again.
     """
 
     def __init__(self, stage: Path) -> None:
         self.stage = stage
         self.reload = threading.Event()
+        self.accounts: Accounts | None = None
+        self.sessions_ended: Callable[[str], object] = lambda name: None
         self._service: Service | None = None
         self._lock = threading.RLock()
         self._callbacks: list[Callable[[], None]] = []

@@ -6,9 +6,10 @@ a key with its date; whoever did it, or could not, writes the key down, so nothi
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import date, timedelta
+from functools import lru_cache
 from typing import Final
 
 from controller.panel.kiosk import NextEvent, Schedule
@@ -70,7 +71,7 @@ def plan(now_s: float | None, schedule: Schedule, done: Collection[str], *, sinc
     return Plan(bool(present), present[-1].appearance if present else "", due, expired, _next(known, now_s, schedule))
 
 
-def merged(known: list[Opening]) -> list[Opening]:
+def merged(known: Sequence[Opening]) -> list[Opening]:
     """Without overlaps: times at which the stage really opens and closes."""
     found: list[Opening] = []
     for opening in known:
@@ -81,24 +82,27 @@ def merged(known: list[Opening]) -> list[Opening]:
     return found
 
 
-def _next(known: list[Opening], now_s: float, schedule: Schedule) -> NextEvent | None:
+def _next(known: Sequence[Opening], now_s: float, schedule: Schedule) -> NextEvent | None:
     coming = [NextEvent("opens", one.begins_s) for one in merged(known)]
     coming += [NextEvent("closes", one.ends_s) for one in merged(known)]
     coming += [NextEvent(task.what, task.begins_s) for task in _all_tasks(now_s, schedule)]
     return min((event for event in coming if event.at_unix_s > now_s), key=lambda event: event.at_unix_s, default=None)
 
 
-def _all_tasks(now_s: float, schedule: Schedule) -> list[Task]:
+def _all_tasks(now_s: float, schedule: Schedule) -> tuple[Task, ...]:
     if not schedule.drift_check:
-        return []
-    zone = zone_of(schedule.time_zone)
-    today = local_day(now_s, zone)
+        return ()
+    return _checks(schedule.drift_check, schedule.time_zone, local_day(now_s, zone_of(schedule.time_zone)))
+
+
+@lru_cache(maxsize=8)
+def _checks(clock: str, zone: str, today: date) -> tuple[Task, ...]:
     found = []
     for number in range(-LOOK_BACK_DAYS, 2):
         day = today + timedelta(days=number)
-        begins_s = moment(day, schedule.drift_check, zone)
+        begins_s = moment(day, clock, zone_of(zone))
         found.append(Task(f"drift-check {day.isoformat()}", "drift check", begins_s, begins_s + WINDOW_S))
-    return found
+    return tuple(found)
 
 
 def _tasks(

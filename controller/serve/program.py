@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import threading
 from collections.abc import Iterator, Mapping
@@ -10,7 +11,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.errors import UsageError, VelaturaError
+from controller.panel.broker import BrokerOptions
 from controller.panel.kiosk import ComputeSettings, Schedule, ScheduleRow
+from controller.serve.account_ops import FOLDER, account_operations, stage_accounts
 from controller.serve.control import NAME, ControlServer, Operation
 from controller.serve.kiosk import StageKiosk
 from controller.serve.service import serving
@@ -24,13 +27,16 @@ PORT: Final = 8377
 
 @dataclass(frozen=True, slots=True)
 class PanelAddress:
-    """Where the panel listens. ``names``: under which browsers may reach it, besides the host."""
+    """Where the panel listens. ``names``: under which browsers may reach it, besides the host; ``broker``: of the
+    building's control.
+    """
 
     host: str = "127.0.0.1"
     port: int = PORT
     certificate: Path | None = None
     key: Path | None = None
     names: tuple[str, ...] = ()
+    broker: BrokerOptions | None = None
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -104,14 +110,16 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
     from controller.panel.server import PanelServer
 
     options = PanelOptions(
-        folder=kiosk.stage / "kiosk" / "panel", host=where.host, port=where.port,
-        tls_certificate=where.certificate, tls_key=where.key,
+        folder=kiosk.stage / FOLDER, host=where.host, port=where.port,
+        tls_certificate=where.certificate, tls_key=where.key, broker=where.broker,
     )  # fmt: skip
     options = replace(options, hosts=(*options.hosts, where.host, *where.names))
     options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     accounts = options.accounts()
     password = accounts.first_start()
-    server = PanelServer(make_panel(kiosk, accounts, options), options)
+    app = make_panel(kiosk, accounts, options)
+    kiosk.accounts, kiosk.sessions_ended = accounts, app.state.panel.sessions.end_all
+    server = PanelServer(app, options)
     address = server.start()
     reporter.say(f"The panel is at {address}.")
     if password is not None:
@@ -136,6 +144,16 @@ def operations(kiosk: StageKiosk) -> dict[str, Operation]:
     def restore(backup: str) -> None:
         kiosk.restore(Path(backup))
 
+    def sessions_ended(name: str) -> None:
+        kiosk.sessions_ended(name)
+
+    def feasibility(target: str) -> Path:
+        return kiosk.feasibility(Path(target))
+
+    def camera_picture() -> str | None:
+        jpeg = kiosk.camera_picture()
+        return None if jpeg is None else base64.b64encode(jpeg).decode()
+
     same = (
         kiosk.recalibrate, kiosk.cancel, kiosk.play, kiosk.stop, kiosk.start, kiosk.appearances, kiosk.events,
         kiosk.remove_appearance, kiosk.schedule, kiosk.lamp_history, kiosk.identify, kiosk.doctor, kiosk.backup,
@@ -145,4 +163,6 @@ def operations(kiosk: StageKiosk) -> dict[str, Operation]:
     table: dict[str, Operation] = {method.__name__.replace("_", "-"): method for method in same}
     return table | {
         "status": kiosk.snapshot, "set-schedule": set_schedule, "compute": compute, "restore": restore,
+        "feasibility": feasibility, "camera-picture": camera_picture,
+        **account_operations(lambda: kiosk.accounts or stage_accounts(kiosk.stage), sessions_ended),
     }  # fmt: skip
