@@ -6,7 +6,7 @@ from tests.campaigns.camera_faults import CAMERAS, run
 
 
 def test_no_picture_is_lost_or_doubled_whatever_befalls_the_camera_and_every_fault_is_told() -> None:
-    outcomes = run(150, seed=3)
+    outcomes = run(96, seed=3)
     assert [outcome.camera for outcome in outcomes] == sorted(CAMERAS)
     for outcome in outcomes:
         assert outcome.wrong == [], outcome
