@@ -52,7 +52,7 @@ def ablation(subject: Subject) -> Result:
         seconds = time.perf_counter() - began_s
         picture = subject.light.photograph(f"{number}", frames, white=wanted.white)
         steps.append(Step(name, frames, seconds, picture, quality(subject, picture, wanted)))
-    return Result(_criteria(steps), (_table(steps),), _figures(subject, wanted, steps), TEXT)
+    return Result(_criteria(steps), (_table(steps),), _figures(subject, wanted, steps))
 
 
 def _ways(subject: Subject, wanted: Wanted) -> list[tuple[str, Callable[[], Sequence[FloatImage]]]]:
@@ -132,7 +132,7 @@ def _better(after: Step, before: Step, what: str) -> Criterion:
         "SSIM": a.ssim > b.ssim,
     }
     missed = [name for name, better in pairs.items() if not better]
-    reason = "" if not missed else f"{' and '.join(missed)} not better. {REASONS.get(after.name, '')}".strip()
+    reason = "" if not missed else f"{' and '.join(missed)} not better."
     return Criterion(f"{what}: CIEDE2000, RMSE and SSIM", told, not missed, reason)
 
 
@@ -173,10 +173,6 @@ def _figures(subject: Subject, wanted: Wanted, steps: Sequence[Step]) -> tuple[F
         )
     return tuple(figures)
 
-
-REASONS: dict[str, str] = {}
-
-TEXT = ""
 
 ABLATION = Experiment(
     name="ablation",

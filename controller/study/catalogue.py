@@ -7,6 +7,7 @@ from typing import Final
 
 from controller.errors import UsageError
 from controller.study.ablation import ABLATION
+from controller.study.adaptation import ADAPTATION
 from controller.study.earlier import EARLIER
 from controller.study.frequency import FREQUENCY
 from controller.study.placement import PLACEMENT
@@ -24,6 +25,7 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     FREQUENCY,
     EARLIER,
     PLACEMENT,
+    ADAPTATION,
 )
 
 

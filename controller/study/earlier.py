@@ -53,7 +53,7 @@ def earlier_systems(subject: Subject) -> Result:
         seconds = time.perf_counter() - began_s
         picture = subject.light.photograph(f"{number}", frames, white=wanted.white)
         made.append(Made(name, seconds, picture, quality(subject, picture, wanted)))
-    return Result(_criteria(made), (_table(made),), _figures(subject, wanted, made), TEXT)
+    return Result(_criteria(made), (_table(made),), _figures(subject, wanted, made))
 
 
 def _ways(subject: Subject, wanted: Wanted, best: int) -> list[tuple[str, Callable[[], Sequence[FloatImage]]]]:
@@ -151,14 +151,6 @@ def _figures(subject: Subject, wanted: Wanted, made: Sequence[Made]) -> tuple[Fi
                strip(errors, columns=3)),
     )  # fmt: skip
 
-
-TEXT = """\
-The same target at an exposure that the best projector can reach alone, so that brightness decides nothing. *One
-projector* divides at each pixel (Nayar 2003, Grossberg 2004). *Feathered* gives each place to its brightest
-projector and blends the seams, in the spirit of Raskar 2001. *Unconstrained inverse* inverts the light of
-photographed dots and clips afterwards, in the spirit of Wetzstein and Bimber 2007. *Bounded, no pixel model* keeps
-the bounds inside the solve on the same dots. These are our own implementations on our calibration, which is better
-than theirs was; none of their code was run."""
 
 EARLIER = Experiment(
     name="earlier",

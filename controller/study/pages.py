@@ -10,9 +10,11 @@ from pathlib import Path
 
 from controller.storage import write_atomically
 from controller.study.keeping import Kept, read_result
-from controller.study.values import Cell, Criterion, Experiment, Table
+from controller.study.values import Cell, Experiment, Table
+from controller.study.words import said, why
 
 DATA, PICTURES, INDEX = "data", "pictures", "README.md"
+HOLDS = {True: "yes", False: "**no**", None: "not told"}
 
 
 def publish(made: Iterable[Path], pages: Path, experiments: Sequence[Experiment]) -> Path:
@@ -54,9 +56,10 @@ def page(experiment: Experiment, kept: Kept) -> str:
         f"# {experiment.title}",
         f"{experiment.paper}. Must show: {experiment.shows}",
         _facts(kept.facts),
+        said(kept.name),
         kept.text,
         "## What was asked, and what was reached",
-        _criteria(kept.criteria),
+        _criteria(kept),
     ]
     for file, caption in kept.figures:
         parts.append(f"![{_plain(caption)}]({PICTURES}/{file})\n\n*{caption}*")
@@ -116,9 +119,11 @@ def _facts(facts: Mapping[str, object]) -> str:
     return "; ".join(told) + "." if told else ""
 
 
-def _criteria(criteria: Sequence[Criterion]) -> str:
-    said = {True: "yes", False: "**no**", None: "not told"}
-    rows = [(one.asked, one.reached, said[one.holds], one.reason if one.holds is not True else "") for one in criteria]
+def _criteria(kept: Kept) -> str:
+    rows = []
+    for one in kept.criteria:
+        reason = "" if one.holds else f"{one.reason} {why(kept.name, one.asked)}".strip()
+        rows.append((one.asked, one.reached, HOLDS[one.holds], reason))
     return _markdown(("asked", "reached", "holds", "why not"), rows)
 
 

@@ -49,7 +49,7 @@ def local_sharpness(subject: Subject) -> Result:
         frames = subject.frames_of(which, _frames(subject, which, wanted, naive=naive))
         picture = subject.light.photograph(f"{len(which)}-{'naive' if naive else 'full'}", frames, white=wanted.white)
         made.append(Made(name, picture, *sharpness_map(picture, wanted, wanted.mask, window_px)))
-    return Result(_criteria(made), (_table(made),), _figures(subject, wanted, made, window_px), TEXT)
+    return Result(_criteria(made), (_table(made),), _figures(subject, wanted, made, window_px))
 
 
 def _frames(subject: Subject, which: Sequence[int], wanted: Wanted, *, naive: bool) -> Sequence[FloatImage]:
@@ -121,12 +121,6 @@ def _figures(subject: Subject, wanted: Wanted, made: Sequence[Made], window_px: 
         ),
     )
 
-
-TEXT = """\
-lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels (eq.
-9), in windows; edges are Canny's, at the target's own threshold. *Naive* is the light of photographed dots,
-inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated shares. All
-four make the same target at an exposure that one projector can reach."""
 
 SHARPNESS = Experiment(
     name="sharpness",

@@ -54,7 +54,7 @@ class Figure:
 class Result:
     """What an experiment came to.
 
-    ``text``: a short honest paragraph, Markdown: what this shows and what it does not
+    ``text``: what of the page's paragraph depends on the run; the paragraph itself is in ``words``
     """
 
     criteria: tuple[Criterion, ...]

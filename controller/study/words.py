@@ -1,0 +1,64 @@
+"""What pages say in words: what an experiment shows and what it does not, and why its misses are missed.
+
+Apart from the experiments, so that a better sentence does not make an experiment be done again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+SAID: Final[Mapping[str, str]] = {
+    "ablation": """\
+The same target, solved with more and more of the method and photographed. *Naive inverse*: the light of
+photographed dots as it is, inverted without bounds (LSMR) and clipped afterwards. *Gaussian metapixels*: fitted
+to the same dots, centres as found. *Regularisation*: centres moved by priority, gaps filled. *Smoothness*: eq.
+3 at its default strength. *Quadrilaterals* take the place of the Gaussians, all else as in the step before.
+Rows of each light transport are scaled so that all pixels at white give the white image (decision 1); the
+paper's are not, so that the early steps are better here than there.""",
+    "regions": """\
+A piece of the camera's picture of one target, solved in four phases of regions (paper 3.2; they overlap by 25
+%), and globally. Differences are over the piece less a rim of half of the largest region. Times are wall times
+on a busy machine, of this piece: they say which way is slower, not how long the paper's would take here;
+`benchmarks/README.md` has times of the whole.""",
+    "residual": """\
+A checkerboard on a pale curved shell, at an exposure that one projector alone can reach, so that more
+projectors bring resolution and freedom and not only light. *Normalised residual*: rms difference of photograph
+and target in a region of 16x16 camera pixels, over the target's white; the mean is over regions. The paper says
+neither what it normalises by nor whether its figures are of the solve or of photographs; both are given here.
+Pixels that one projector cannot make bright enough are left out for all. The smaller the squares, the more of
+the regions hold an edge, and the larger every figure.""",
+    "sharpness": """\
+lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels
+(eq. 9), in windows; edges are Canny's, at the target's own threshold. *Naive* is the light of photographed
+dots, inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated
+shares. All four make the same target at an exposure that one projector can reach.""",
+    "frequency": """\
+Bands of upright waves around a grey, faint and bold, their frequency rising downwards, over the middle of a
+pale shell, at an exposure that one projector can reach. *Contrast kept* is the amplitude in phase with the
+target's wave, in the photograph's green channel, over the target's own as the camera sees it; what comes out at
+another phase or frequency counts as lost. F is where it first falls below a half. The paper says neither which
+contrast nor which criterion it used. The bases, for the faint waves, hold the target's detail above a
+frequency, or only what is below it, and are multiplied with the scale that remains (eqs 4-6).""",
+    "earlier": """\
+The same target at an exposure that the best projector can reach alone, so that brightness decides nothing. *One
+projector* divides at each pixel (Nayar 2003, Grossberg 2004). *Feathered* gives each place to its brightest
+projector and blends the seams, in the spirit of Raskar 2001. *Unconstrained inverse* inverts the light of
+photographed dots and clips afterwards, in the spirit of Wetzstein and Bimber 2007. *Bounded, no pixel model*
+keeps the bounds inside the solve on the same dots. These are our own implementations on our calibration, which
+is better than theirs was; none of their code was run.""",
+}
+SAID_OF_SIX: Final = SAID["residual"]
+
+WHY: Final[Mapping[tuple[str, str], str]] = {}
+"""Why a criterion of an experiment is missed, by the experiment's name and the beginning of what is asked."""
+
+
+def said(name: str) -> str:
+    """The paragraph of an experiment, or nothing."""
+    return SAID_OF_SIX if name == "residual-six" else SAID.get(name, "")
+
+
+def why(name: str, asked: str) -> str:
+    """Why the criterion is missed, as far as it was found; nothing where nothing was written down."""
+    return " ".join(text for (one, begins), text in WHY.items() if one == name and asked.startswith(begins))

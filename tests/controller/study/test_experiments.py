@@ -1,0 +1,77 @@
+"""Experiments on a stage in arrays: that they run, measure what they say, and tell misses as misses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller.calibrate.values import PhaseMap
+from controller.capture.dots import dot_patterns
+from controller.study.catalogue import EXPERIMENTS
+from controller.study.earlier import feathered
+from controller.study.measuring import Quality
+from controller.study.photographing import dots_as_shares
+from controller.study.residual import PAPER, Made, _criteria, residual
+from controller.study.values import column
+from tests.controller.study.array_stage import ArrayLight, array_subject
+
+
+def test_the_residual_falls_with_projectors_and_each_count_is_photographed() -> None:
+    subject = array_subject()
+    result = residual(subject)
+    (table,) = result.tables
+    assert column(table, "projectors") == [1, 2, 3]
+    photographed = [float(value or 0) for value in column(table, "photographed, mean")]
+    assert photographed[2] < 0.8 * photographed[0]
+    assert result.criteria[-1].holds == (photographed[0] > photographed[1] > photographed[2])
+    assert isinstance(subject.light, ArrayLight)
+    assert subject.light.names == ["1", "1-again", "2", "2-again", "3", "3-again"]
+
+
+def test_a_figure_above_the_papers_is_a_miss_with_its_reason() -> None:
+    nothing = np.zeros((2, 2, 3), np.float32)
+    made = [
+        Made(count, nothing, np.full((3, 3), model, np.float32), np.full((3, 3), shown, np.float32), 0.004,
+             Quality(0, 0, 0, 1, 1))
+        for count, model, shown in ((1, 0.02, 0.03), (2, 0.012, 0.02), (3, 0.009, 0.01))
+    ]  # fmt: skip
+    one, two, three, falls = _criteria(made, 0.004)
+    assert [one.holds, two.holds, three.holds, falls.holds] == [True, False, False, True]
+    assert "the calibration's error and noise" in two.reason
+    assert "finer than these projectors' pixels" in three.reason
+    assert PAPER[3] == 0.007
+
+
+def test_feathered_projectors_together_make_an_even_target() -> None:
+    subject = array_subject()
+    black = subject.calibration.black
+    target = np.where(subject.mask[..., None], np.float32(0.3), black)
+    frames = feathered(subject.calibration, target)
+    light = subject.transport.forward(frames) + black
+    inner = np.zeros_like(subject.mask)
+    inner[16:-16, 16:-16] = True
+    assert np.abs(light - target)[inner].max() < 0.03
+
+
+def test_dots_become_the_shares_that_made_them() -> None:
+    rows, columns, spacing = 10, 12, 4
+    y, x = np.mgrid[0:40, 0:48] / 4.0 - 0.375
+    seen = PhaseMap(np.stack([x, y], -1).astype(np.float32), np.zeros((rows, columns, 3), np.float32))
+    white = np.full((40, 48, 3), 0.8, np.float32)
+    patterns = dot_patterns((columns, rows), spacing)
+    captures = {"black": np.full((40, 48, 3), 0.01, np.float32)}
+    for pattern in patterns:
+        near = [(np.asarray(v) - first + spacing / 2) % spacing - spacing / 2
+                for v, first in ((x, pattern.column), (y, pattern.row))]  # fmt: skip
+        share = np.exp(-0.5 * (near[0] ** 2 + near[1] ** 2) / 0.5**2)
+        captures[pattern.name] = (0.01 + 0.8 * share[..., None] * np.ones(3)).astype(np.float32)
+    shares = dots_as_shares(captures, white, seen, patterns, (rows, columns)).toarray().reshape(40, 48, rows, columns)
+    assert shares.max() <= 1
+    middle = shares[20, 24]
+    expected = np.exp(
+        -0.5 * ((np.arange(columns) - x[20, 24]) ** 2 + (np.arange(rows)[:, None] - y[20, 24]) ** 2) / 0.25
+    )
+    assert np.abs(middle - np.where(expected > 0.01, expected, 0)).max() < 0.01
+
+
+def test_every_experiment_says_what_it_does_not_show() -> None:
+    assert all(one.shows.endswith(".") and one.paper and one.title for one in EXPERIMENTS)
