@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,12 @@ from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANYONE, BLOCK_BYTES, UNSIGNED_BLOCK, sign
 from controller.errors import BundleError
 from controller.storage import stream_atomically
+
+STRIPE_PARAMETERS: Final = zstandard.ZstdCompressionParameters(
+    strategy=zstandard.STRATEGY_LAZY2, window_log=20, hash_log=18, chain_log=18, search_log=5, min_match=6,
+    target_length=32, write_content_size=True, write_checksum=False,
+)  # fmt: skip
+"""Five times the work of level 1, once; then 6 % smaller and unpacked a quarter quicker (docs/bundle-format.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +153,7 @@ def _unfit(appearance: NewAppearance, detail: str) -> BundleError:
 
 def compress_image(frame: npt.NDArray[np.uint8], layout: fmt.OutputLayout) -> Iterable[bytes]:
     """The compressed stripes of one (rows, columns, 3) uint8 image: rows less the row above, modulo 256, then zstd."""
-    packer = zstandard.ZstdCompressor(level=1, write_checksum=False, write_content_size=True)
+    packer = zstandard.ZstdCompressor(compression_params=STRIPE_PARAMETERS)
     for top in range(0, layout.height_px, layout.stripe_rows):
         stripe = frame[top : top + layout.stripe_rows]
         delta = stripe.copy()

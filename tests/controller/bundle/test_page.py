@@ -50,11 +50,17 @@ def blobs_of(index: Document) -> dict[int, tuple[list[Any], Any]]:
     return dict(sorted(found.items()))
 
 
-def packed(values: Any, level: int, *, differences: bool) -> bytes:
+STRIPES = zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters(
+    strategy=zstandard.STRATEGY_LAZY2, window_log=20, hash_log=18, chain_log=18, search_log=5, min_match=6,
+    target_length=32, write_content_size=True, write_checksum=False,
+))  # fmt: skip
+ARRAYS = zstandard.ZstdCompressor(level=3, write_checksum=False, write_content_size=True)
+
+
+def packed(values: Any, packer: zstandard.ZstdCompressor, *, differences: bool) -> bytes:
     rows = np.array(values)
     if differences:
         rows[1:] = np.diff(values, axis=0)
-    packer = zstandard.ZstdCompressor(level=level, write_checksum=False, write_content_size=True)
     return bytes(packer.compress(rows.tobytes()))
 
 
@@ -68,10 +74,10 @@ def test_a_bundle_is_rebuilt_from_the_page_byte_by_byte(full: Path, key: Signing
         if kind[0] == "stripe":
             rows = next(output["stripe_rows"] for output in index["outputs"] if output["name"] == kind[2])
             image = reader["read_image"](data, index, kind[1], kind[2])[kind[3] : kind[3] + rows]
-            content = packed(image, 1, differences=True)
+            content = packed(image, STRIPES, differences=True)
         elif kind[0] == "live":
             values = reader["read_live_array"](data, index, kind[1])
-            content = packed(values, 3, differences=values.dtype.kind == "u")
+            content = packed(values, ARRAYS, differences=values.dtype.kind == "u")
         else:
             content = PNG
         assert blob[1:] == [len(content), xxhash.xxh3_64_hexdigest(content), hashlib.sha256(content).hexdigest()]
