@@ -163,14 +163,7 @@ class Player:
 
     def suggested(self, repeat: int) -> Playlist:
         """The playlist of the bundle. Raises BundleError("bundle-none" or "bundle-no-schedule")."""
-        hints = self._loaded().bundle.index.schedule
-        if not hints:
-            raise BundleError(
-                "bundle-no-schedule",
-                what="The bundle suggests no playlist.",
-                remedy="Say what is to be played, or publish it again.",
-            )
-        return Playlist([(hint.appearance, hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints], repeat)
+        return Playlist.suggested(self._loaded().bundle.index.schedule, repeat)
 
     def _loaded(self) -> DecodedAhead:
         if self._decoded is None:
@@ -214,6 +207,7 @@ class Player:
             "skipped": self._skipped,
             "interval_p50_s": presenter.intervals.percentile(50),
             "interval_p99_s": presenter.intervals.percentile(99),
+            "interval_longest_s": presenter.intervals.percentile(100),
             "bundle": self.bundle_identity,
             "signed_by": None if signed_by is None else signed_by.hex(),
             "warning": None if self._warning is None else protocol.told(self._warning),

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice
+from typing import Self
+
+from controller.bundle.format import Hint
+from controller.errors import BundleError
 
 
 class Playlist:
@@ -14,6 +18,17 @@ class Playlist:
         self._rounds_left = repeat if repeat else None
         self._at = 0
         self.look_ahead = 2
+
+    @classmethod
+    def suggested(cls, hints: Sequence[Hint], repeat: int) -> Self:
+        """What a bundle suggests. Raises BundleError("bundle-no-schedule") if that is nothing."""
+        if not hints:
+            raise BundleError(
+                "bundle-no-schedule",
+                what="The bundle suggests no playlist.",
+                remedy="Say what is to be played, or publish it again.",
+            )
+        return cls([(hint.appearance, hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints], repeat)
 
     @property
     def names(self) -> frozenset[str]:
