@@ -22,8 +22,8 @@ CAMERAS: list[EmulatedPtpCamera] = []
 
 
 class KnownProjector(EmulatedSerialProjector):
-    def __init__(self, port: Path, lamp: EmulatedLamp) -> None:
-        super().__init__(port, lamp)
+    def __init__(self, port: Path, lamp: EmulatedLamp, **settings: Any) -> None:
+        super().__init__(port, lamp, **settings)
         PROJECTORS[port.name.removeprefix("tty-")] = self
 
 
