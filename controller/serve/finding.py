@@ -35,6 +35,9 @@ def findings(stage: Path, service: Service | None) -> Sequence[Finding]:
     if service is not None and service.player.view.problem is not None:
         problem = service.player.view.problem
         found.append(Finding("error", "player", problem.reason, problem.remedy))
+    if service is not None and service.player.view.warning is not None:
+        warning = service.player.view.warning
+        found.append(Finding("warning", "player", warning.reason, warning.remedy))
     if shutil.disk_usage(stage).free < LOW_DISK_BYTES:
         found.append(Finding("warning", "disk", "Less than 2 GiB are free on the stage's disk.",
                              "Delete old runs or backups; playback goes on, calibrating may not."))  # fmt: skip

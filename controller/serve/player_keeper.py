@@ -158,7 +158,16 @@ class PlayerKeeper:
             self._failed = 0
         if self._view.problem is not None:
             self._tell(Decision("player-well", "The player shows what it should again."))
-        self._view = replace(self._view, shown=shown, problem=None)
+        self._view = replace(self._view, shown=shown, problem=None, warning=self._warning(status))
+
+    def _warning(self, status: dict[str, Any]) -> Decision | None:
+        told = status.get("warning")
+        if told is None:
+            return None
+        warning = Decision(str(told["code"]), str(told["what"]), str(told["remedy"]), "warning")
+        if self._view.warning != warning:
+            self._tell(warning)
+        return warning
 
     def _tell_all(self) -> None:
         outputs = outputs_of(self._hello)

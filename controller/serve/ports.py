@@ -72,11 +72,15 @@ BLACK: Final = Showing(None)
 
 @dataclass(frozen=True, slots=True)
 class PlayerView:
-    """``shown``: what the player showed when it was last asked; ``problem`` why it does not show what it should."""
+    """``shown``: what the player showed when it was last asked; ``problem`` why it does not show what it should.
+
+    ``warning``: what people must know although it plays: nobody signed its bundle.
+    """
 
     shown: Showing | None = None
     problem: Decision | None = None
     restarts: int = 0
+    warning: Decision | None = None
 
 
 class PlayerPort(Protocol):
