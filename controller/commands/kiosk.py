@@ -91,11 +91,14 @@ def lamps(stage: StageFolder, as_json: Json = False) -> None:
 def aim(
     stage: StageFolder,
     picture: Annotated[Path | None, typer.Option(help="Write what the camera sees into this JPEG file.")] = None,
+    shots: Annotated[bool, typer.Option("--shots", help="Take test shots first, with every lamp lit.")] = False,
     as_json: Json = False,
 ) -> None:
     """What the running kiosk's projectors cover, and what is too dark, too grazing or out of focus."""
     from controller.serve.direct import aiming_text
 
+    if shots:
+        _job(stage, "test-shots", {}, no_wait=False, as_json=as_json)
     if picture is not None:
         data = _call(stage, "camera-picture")
         if data is None:

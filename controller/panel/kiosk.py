@@ -130,7 +130,10 @@ class Kiosk(Protocol):
         """Raises UsageError("run-unknown")."""
 
     def aiming(self) -> Aiming:
-        """The newest measurement; the first call begins measuring, which ends some seconds after the last call."""
+        """The newest measurement: of the last test shots, or of the calibration if that is newer. Seconds."""
+
+    def test_shots(self) -> Job:
+        """Begin to photograph some patterns that tell how projectors and camera are aimed. Raises WorkError."""
 
     def find_devices(self) -> Sequence[FoundDevice]:
         """Search ports, network and USB. Seconds."""

@@ -10,6 +10,7 @@ from controller.panel.kiosk import EventRow, Lamp, LampDay
 
 SHOWN_DAYS: Final = 21
 SHOWN_EVENTS: Final = 12
+OFTEN: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,12 @@ class LampStory:
     def hours_a_strike(self) -> float | None:
         """Lamps age by strikes as well as by hours; a few minutes a strike wear one out. None before the first."""
         return self.lamp.hours / self.lamp.strikes if self.lamp.strikes else None
+
+    @property
+    def worn_by_strikes(self) -> bool:
+        """Whether it was struck often, and burnt less than half an hour each time."""
+        hours = self.hours_a_strike
+        return hours is not None and hours < 0.5 and self.lamp.strikes >= OFTEN
 
 
 def stories(lamps: Sequence[Lamp], history: Sequence[LampDay], events: Sequence[EventRow]) -> list[LampStory]:

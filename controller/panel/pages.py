@@ -54,7 +54,7 @@ class Pages:
             ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None}),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
             ("/doctor", Role.OPERATOR, "doctor.html", lambda _: {"findings": list(self._panel.kiosk.doctor())}),
-            ("/aiming", Role.TECHNICIAN, "aiming.html", lambda _: {"aiming": self._panel.kiosk.aiming()}),
+            ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
             (
                 "/settings",
                 Role.TECHNICIAN,
@@ -126,6 +126,10 @@ class Pages:
 
     def _now(self, _: Request) -> dict[str, Any]:
         return {"picture": self._panel.kiosk.camera_picture() is not None}
+
+    def _aiming(self, _: Request) -> dict[str, Any]:
+        kiosk = self._panel.kiosk
+        return {"aiming": kiosk.aiming(), "live": kiosk.camera_picture() is not None}
 
     def _appearances(self, _: Request) -> dict[str, Any]:
         return {"appearances": list(self._panel.kiosk.appearances())}

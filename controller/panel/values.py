@@ -227,16 +227,20 @@ class Aiming:
 
     ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing`` where nothing can be done;
     ``camera_focus`` 0..1; ``exposure`` the brightest hundredth's level, 0..1 of full scale; ``hints`` sentences on
-    what to turn which way
+    what to turn which way; ``source`` "test shots", "calibration", or empty where nothing was measured yet (there are
+    no projectors then); ``picture`` an overview that the kiosk drew (PNG), or None
     """
 
-    projectors: tuple[ProjectorAim, ...]
-    overlap: float
-    too_dark: float
-    too_grazing: float
-    camera_focus: float
-    exposure: float
+    projectors: tuple[ProjectorAim, ...] = ()
+    overlap: float = 0.0
+    too_dark: float = 0.0
+    too_grazing: float = 0.0
+    camera_focus: float = 0.0
+    exposure: float = 0.0
     hints: tuple[str, ...] = ()
+    source: str = ""
+    measured_unix_s: float = 0.0
+    picture: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)

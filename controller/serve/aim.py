@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import threading
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.app import Checked, check_stage
-from controller.calibrations import finished_calibration
+from controller.arrays import Mask
+from controller.calibrations import finished_calibration, finished_calibrations
 from controller.errors import WorkError
 from controller.panel.kiosk import Aiming, ProjectorAim
 from controller.serve.devices import Devices
+from controller.serve.runs import began_s
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import LiveViewCamera
 
 if TYPE_CHECKING:
+    from controller.calibrate.values import Geometry
     from controller.session.solving import Calibrated
 
+GRAZING: Final = 0.25
+"""Cosine of the angle to the normal, below which light grazes."""
+LEAST_COVERAGE, SOFT_FOCUS, MUCH = 0.5, 0.4, 0.1
+DIM, BURNT = 0.25, 0.98
 DARK = 0.1
 """Below this share of the median light of the object, a place is too dark to work with."""
+FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
+"""As ``controller.session.aiming`` writes them, which is not loaded before there is something to photograph."""
 _ANSWER_S = 5.0
 _measured: dict[Path, Aiming] = {}
 _lock = threading.Lock()
@@ -49,19 +61,57 @@ def camera_picture(devices: Devices) -> bytes | None:
     return encoded.tobytes() if done else None
 
 
-def aiming(checked: Checked, devices: Devices) -> Aiming:
-    """Coverage, overlap and focus as of the newest calibration. Raises UsageError("not-calibrated")."""
+def aiming(checked: Checked) -> Aiming:
+    """Coverage, overlap and focus by the newest test shots, or by the calibration where that is newer or alone."""
+    folder = checked.stage.folder
+    shots = _of_shots(folder / FOLDER)
+    run = next(iter(finished_calibrations(folder)), None)
+    if run is None or (shots is not None and shots.measured_unix_s > began_s(run.name)):
+        return shots or Aiming()
     from controller.session.solving import Calibrated
 
-    run = finished_calibration(checked.stage.folder)
     with _lock:
         if run not in _measured:
             _measured.clear()
-            _measured[run] = _of(Calibrated(run, checked.names))
+            _measured[run] = _of_calibration(Calibrated(run, checked.names))
         return _measured[run]
 
 
-def _of(calibrated: Calibrated) -> Aiming:
+def _of_shots(folder: Path) -> Aiming | None:
+    try:
+        found: dict[str, Any] = json.loads((folder / FIGURES).read_text())
+    except (OSError, ValueError):
+        return None
+    aims = tuple(ProjectorAim(**row) for row in found["projectors"])
+    exposure, camera = found["exposure"], found["camera_focus"]
+    hints = [*_hints(aims), *_shared_hints(found["too_dark"], found["too_soft"])]
+    if exposure < DIM or exposure > BURNT:
+        word = "dark" if exposure < DIM else "bright"
+        hints.append(f"The camera's picture is too {word}: change its aperture, or the ISO in stage.toml.")
+    if camera < SOFT_FOCUS:
+        hints.append("No pattern is sharp anywhere: focus the camera first.")
+    return Aiming(aims, found["overlap"], found["too_dark"], found["too_soft"], camera, exposure, tuple(hints),
+                  "test shots", found["measured_unix_s"], folder / PICTURE)  # fmt: skip
+
+
+def _hints(aims: Sequence[ProjectorAim]) -> list[str]:
+    hints = [f"{aim.projector} lights {aim.coverage:.0%} of the object: turn it, or move it further away."
+             for aim in aims if aim.coverage < LEAST_COVERAGE]  # fmt: skip
+    return hints + [f"{aim.projector} is out of focus." for aim in aims if aim.focus < SOFT_FOCUS]
+
+
+def _shared_hints(dark: float, grazing: float) -> list[str]:
+    hints = []
+    if dark > MUCH:
+        hints.append(f"{dark:.0%} of the object is too dark: turn a projector towards it, or clear what shades it.")
+    if grazing > MUCH:
+        hints.append(
+            f"Light grazes, or is soft, on {grazing:.0%} of the object: move a projector more to the front of it."
+        )
+    return hints
+
+
+def _of_calibration(calibrated: Calibrated) -> Aiming:
     transport, calibration = calibrated.transport, calibrated.calibration
     mask = calibration.object_mask
     lit = np.stack([np.asarray(one, bool) & mask for one in transport.lit])
@@ -77,16 +127,33 @@ def _of(calibrated: Calibrated) -> Aiming:
         # A sharp pixel's light has a standard deviation of about a third of the distance to the next.
         focus = float(np.clip(pitch_px / max(3 * size_px, 1e-6), 0, 1))
         aims.append(ProjectorAim(part.name, float(lit[number].sum() / area), focus))
-    overlap = float((lit.sum(axis=0) >= 2).sum() / area)
     dark = float((on_object < DARK * usual).mean()) if on_object.size else 0.0
-    blur = max(calibration.camera_blur_px)
-    hints = [f"{aim.projector} lights {aim.coverage:.0%} of the object: turn it, or move it further away."
-             for aim in aims if aim.coverage < 0.5]  # fmt: skip
-    hints += [f"{aim.projector} is out of focus." for aim in aims if aim.focus < 0.4]
+    grazing = grazing_share(read_geometry_of(calibrated), lit, mask)
     exposure = float(np.quantile(on_object, 0.99) / max(float(on_object.max()), 1e-9)) if on_object.size else 0.0
-    grazing = float(1 - np.mean(np.max(lit, axis=0)[mask])) if area else 0.0
-    camera_focus = float(np.clip(1 / (1 + blur), 0, 1))
-    return Aiming(tuple(aims), overlap, dark, grazing, camera_focus, exposure, tuple(hints))
+    return Aiming(
+        tuple(aims), float((lit.sum(axis=0) >= 2).sum() / area), dark, grazing,
+        float(np.clip(1 / (1 + max(calibration.camera_blur_px)), 0, 1)), exposure,
+        (*_hints(aims), *_shared_hints(dark, grazing)), "calibration", began_s(calibrated.folder.name),
+    )  # fmt: skip
+
+
+def grazing_share(geometry: Geometry, lit: npt.NDArray[np.bool_], mask: Mask) -> float:
+    """The share of the object that is lit, and by no projector steeper than ``GRAZING`` (a cosine)."""
+    steepest = np.zeros(mask.shape)
+    for part, pinhole in zip(lit, geometry.projectors, strict=True):
+        centre_m = -pinhole.rotation.T @ pinhole.translation_m
+        towards = centre_m - geometry.points_m
+        cosine = np.einsum("ijk,ijk->ij", towards, geometry.normals) / np.maximum(np.linalg.norm(towards, axis=2), 1e-9)
+        steepest = np.maximum(steepest, np.where(part, np.nan_to_num(cosine), 0))
+    known = lit.any(axis=0) & mask & np.isfinite(geometry.normals).all(axis=2)
+    return float((steepest[known] < GRAZING).mean()) if known.any() else 0.0
+
+
+def read_geometry_of(calibrated: Calibrated) -> Geometry:
+    """As ``session.calibrating.read_geometry``."""
+    from controller.session.calibrating import read_geometry
+
+    return read_geometry(calibrated.folder)
 
 
 def feasibility_map(stage: Path, target: Path) -> Path:

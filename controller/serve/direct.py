@@ -161,7 +161,10 @@ def aiming_text(found: Mapping[str, Any]) -> str:
              for one in found["projectors"]]  # fmt: skip
     lines.append(f"Lit by two or more {found['overlap']:.0%}, too dark {found['too_dark']:.0%}, "
                  f"too grazing {found['too_grazing']:.0%}")  # fmt: skip
-    return "\n".join([*lines, *found["hints"]])
+    if not found["source"]:
+        return "Nothing has been measured yet. Take test shots: `velatura aim STAGE --shots`."
+    pictures = [f"Picture: {found['picture']}"] if found["picture"] else []
+    return "\n".join([*lines, *found["hints"], *pictures])
 
 
 _DIRECT.update(

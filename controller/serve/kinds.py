@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -13,8 +14,11 @@ from controller.app import Held, check_stage, holding
 from controller.serve.eventlog import Decision
 from controller.serve.ports import Finished, Request
 from controller.serve.works import JobReporter, Kind, run_name
+from controller.session.progress import Phase, Progress
 from controller.session.rig import Rig
+from hal.deadline import in_seconds
 
+AIM_S: Final = 300.0
 QUICK: Final = Request("quick", light=True)
 PUBLISH: Final = Request("publish")
 VARIANTS: Final = Request("variants")
@@ -41,6 +45,7 @@ class Kinds:
         """Every kind by its name."""
         lit, known = self._needs_camera, self._needs_calibration
         return {
+            "aim": Kind(self._aim, lambda request: self._missing_device()),
             "drift": Kind(self._drift, lit),
             "quick": Kind(self._quick, lit),
             "projector": Kind(self._projector, lit),
@@ -75,6 +80,24 @@ class Kinds:
                                               "Look at the stage; then calibrate anew.", "warning"))  # fmt: skip
         told = Decision("drift-found", "The stage has changed since its calibration.", "It is recalibrated.", "warning")
         return Finished(request, told, then=(replace(QUICK, key=request.key),))
+
+    def _aim(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.session.aiming import take_test_shots
+
+        began_s = time.monotonic()
+
+        def advance(share: float, note: str) -> None:
+            left_s = None if share <= 0 else (time.monotonic() - began_s) * (1 - share) / share
+            running = Progress(
+                "Test shots", 0, 1, Phase.RUNNING, share, share, time.monotonic() - began_s, left_s, note
+            )
+            reporter.progress(running)
+
+        capture = check_stage(self._stage).stage.tables.capture
+        with self._lend() as rig:
+            take_test_shots(rig, longest_exposure_s=capture.longest_exposure_s,
+                            deadline=in_seconds(AIM_S, cancel), advance=advance)  # fmt: skip
+        return Finished(request, Decision("aimed", "The test shots are taken; see the aiming page."))
 
     def _quick(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         from controller.drift_services import recalibrate

@@ -168,7 +168,7 @@ class StageKiosk:
             lamps=service.lamps,
             grades=grades,
             identifying=service.player.identifying,
-            warnings=service.devices.warnings,
+            warnings=(*service.devices.warnings, *([player.warning.text] if player.warning is not None else ())),
         )
 
     def _player_row(self, service: Service) -> DeviceRow:
@@ -299,7 +299,12 @@ class StageKiosk:
         return runs.results(self.stage, run, self.service.checked.stage.tables.calibration.worst_grade)
 
     def aiming(self) -> Aiming:
-        return aim.aiming(self.service.checked, self.service.devices)
+        return aim.aiming(self.service.checked)
+
+    def test_shots(self) -> Job:
+        service, asked = self.service, Request("aim", light=True)
+        service.ask(asked)
+        return self._job(service, title_of(asked))
 
     def find_devices(self) -> Sequence[FoundDevice]:
         return finding.find(self.stage)

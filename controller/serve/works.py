@@ -17,6 +17,7 @@ from hal.deadline import Cancelled
 from hal.errors import DeviceError
 
 TITLES: Final[Mapping[str, str]] = {
+    "aim": "Test shots",
     "drift": "Drift check",
     "quick": "Quick recalibration",
     "projector": "Recalibration of projector",

@@ -7,11 +7,14 @@
   const cancel = document.getElementById("cancel");
   const sees = document.getElementById("sees");
   let running = false;
+  const measured = document.querySelector('form[action="/do/test-shots"]');
 
   function follow() {
     // What the server sends is its own HTML, escaped by the same templates as the page.
     const job = document.getElementById("live-job");
     const line = job && job.querySelector("[data-running]");
+    // The aiming page shows what the work has measured as soon as it is done.
+    if (measured && running && !line) location.reload();
     running = Boolean(line);
     if (cancel) cancel.hidden = !line || line.dataset.running !== "yes";
   }
@@ -60,19 +63,6 @@
     next.src = camera.dataset.src + "?t=" + Date.now();
   }
 
-  async function aim() {
-    // The tables of the aiming page, measured anew.
-    const answer = await fetch(location.pathname, { headers: { accept: "text/html" } });
-    if (!answer.ok) return;
-    const page = new DOMParser().parseFromString(await answer.text(), "text/html");
-    for (const place of ["hints", "aim"]) {
-      const [here, there] = [document.getElementById(place), page.getElementById(place)];
-      if (here && there) here.replaceChildren(...there.childNodes);
-    }
-    const [here, there] = [document.querySelector("dl.figures"), page.querySelector("dl.figures")];
-    if (here && there) here.replaceChildren(...there.childNodes);
-  }
-
   // A second press while the first one is on its way would begin the work twice.
   document.addEventListener("submit", (event) => {
     if (event.target.dataset.sent) { event.preventDefault(); return; }
@@ -84,6 +74,4 @@
   if (here) here.parentElement.scrollLeft = here.offsetLeft - 24;
 
   if (body.dataset.live) { follow(); listen(); setInterval(look, 2000); }
-  const again = document.querySelector("[data-again]");
-  if (again) setInterval(() => { if (!document.hidden) aim().catch(() => say("No connection, trying again")); }, 1000 * again.dataset.again);
 })();

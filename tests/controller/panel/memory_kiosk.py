@@ -266,7 +266,11 @@ class MemoryKiosk:
 
     def aiming(self) -> Aiming:
         aims = (ProjectorAim("left", 0.82, 0.9), ProjectorAim("middle", 0.9, 0.7), ProjectorAim("right", 0.4, 0.2))
-        return Aiming(aims, 0.77, 0.04, 0.06, 0.8, 0.93, ("Turn right's focus ring; its pixels are soft.",))
+        hints = ("Turn right's focus ring; its pixels are soft.",)
+        return Aiming(aims, 0.77, 0.04, 0.06, 0.8, 0.93, hints, "test shots", BORN, self._drawn("aiming"))
+
+    def test_shots(self) -> Job:
+        return self._begin("Test shots", "calibrating", lambda run: None)
 
     def find_devices(self) -> Sequence[FoundDevice]:
         return [
