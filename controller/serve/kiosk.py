@@ -168,8 +168,12 @@ class StageKiosk:
             lamps=service.lamps,
             grades=grades,
             identifying=service.player.identifying,
-            warnings=(*service.devices.warnings, *([player.warning.text] if player.warning is not None else ())),
+            warnings=self._warnings(service),
         )
+
+    def _warnings(self, service: Service) -> tuple[str, ...]:
+        said = service.player.view.warning
+        return service.devices.warnings if said is None else (*service.devices.warnings, said.text)
 
     def _player_row(self, service: Service) -> DeviceRow:
         problem = service.player.view.problem
