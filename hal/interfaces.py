@@ -208,6 +208,13 @@ class Bench(Protocol):
         technician of a real stage would know. The truth stays in the bench's own file, which no controller reads.
         """
 
+    def disturb(self, stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:
+        """Do to a stage what somebody might: bump, dim or turn its things. Replaces what was done before; () mends all.
+
+        Each change is a table that the bench explains; one that serves the stage follows within a second or two. Raises
+        DeviceError for a change that it does not know.
+        """
+
     def serve(self, stage: Path, *, json_lines: bool, scenario: Path | None = None) -> int:
         """Serve every device of ``stage`` until SIGINT/SIGTERM, printing each address; return the exit code.
 

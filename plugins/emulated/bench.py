@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from plugins.emulated.bench_usb import UsbDevices, read_usb
+from plugins.emulated.bumps import bumps_of, write_bumps
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.mains import Mains, boot_times, check_mains
 from plugins.emulated.objects import load_object
@@ -74,6 +75,12 @@ class EmulatedBench:
             write_truth(stage, truth)
             (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
         return device_tables(truth, shape)
+
+    def disturb(self, stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:
+        """``changes``: tables of bench/bumps.toml (``plugins.emulated.bumps``). Raises as ``read_bumps``."""
+        bumps = bumps_of(changes, read_truth(stage))
+        with _explained(stage):
+            write_bumps(stage, *bumps.bump)
 
     def serve(self, stage: Path, *, json_lines: bool, scenario: Path | None = None) -> int:
         """Serve the stage's devices until SIGINT or SIGTERM; returns 0, or 3 when a device can't be served.

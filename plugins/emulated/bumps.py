@@ -8,6 +8,11 @@ turn_deg = [0, 0, 0.2]  # turned about its own axes (x right, y down, z along th
 move_mm = [0, 0, 0]     # moved along them
 dim = 0.1               # share of the light that is lost
 dim_channels = [0, 0, 0.2]  # and of its red, green and blue
+defocus_mm = 20.0       # its focus lies that much farther away
+gamma = 1.05            # its response's exponents are so many times as large
+
+More for the others: ``noise`` times the camera's read noise, ``gloss`` of the object, ``factor`` times the ambient
+light and ``indirect`` for the share of all light that comes back from object and room (see ``truth``).
 
 The file holds everything that is otherwise than in ``bench.toml``; without it, all is as it was set up.
 """
@@ -15,9 +20,10 @@ The file holds everything that is otherwise than in ``bench.toml``; without it, 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +45,9 @@ class Bump:
 
     ``shift_px``: where a point of the object lies in the device's image, the image's middle exactly, moves by that;
     ``turn_deg``, ``move_mm``: about and along the device's own axes, the object's are the world's; ``dim``,
-    ``dim_channels``: shares of a projector's light that are lost; ``factor``: of the ambient light.
+    ``dim_channels``: shares of a projector's light that are lost; ``defocus_mm``: how much farther away its focus lies;
+    ``gamma``: factor of its response's exponents; ``noise``: of the camera's read noise; ``factor``: of the ambient
+    light; ``indirect``, ``gloss``: as in ``truth``, of the stage where ``what`` is "ambient", and of the "object".
     """
 
     what: str
@@ -50,6 +58,11 @@ class Bump:
     dim: Annotated[float, Between(0.0, 1.0)] = 0.0
     dim_channels: Annotated[Three, Between(0.0, 1.0)] = (0.0, 0.0, 0.0)
     factor: Annotated[float, Between(0.0, 1e3)] = 1.0
+    defocus_mm: Annotated[float, Between(-1e4, 1e4)] = 0.0
+    gamma: Annotated[float, Between(0.2, 5.0)] = 1.0
+    noise: Annotated[float, Between(0.0, 1e3)] = 1.0
+    indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
+    gloss: Annotated[float, Between(0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +81,22 @@ def read_bumps(path: Path, truth: BenchTruth) -> Bumps:
     except (OSError, UnicodeDecodeError) as error:
         raise _wrong(path, f"it can't be read ({error})") from error
     bumps = load(text, Bumps, file=str(path))
+    _check(path, bumps, truth)
+    return bumps
+
+
+def bumps_of(changes: Sequence[Mapping[str, Any]], truth: BenchTruth) -> Bumps:
+    """Bumps from tables as a file has them. Raises DeviceError as ``read_bumps``."""
+    try:
+        bumps = Bumps(tuple(Bump(**change) for change in changes))
+    except TypeError as error:
+        raise _wrong(Path(FILE), str(error)) from error
+    checked = load(dump(bumps), Bumps, file=FILE) if changes else bumps
+    _check(Path(FILE), checked, truth)
+    return checked
+
+
+def _check(path: Path, bumps: Bumps, truth: BenchTruth) -> None:
     names = [projector.name for projector in truth.projectors]
     for number, bump in enumerate(bumps.bump, start=1):
         if bump.what not in KINDS:
@@ -76,7 +105,6 @@ def read_bumps(path: Path, truth: BenchTruth) -> Bumps:
             raise _wrong(path, f"bump {number}: {bump.name!r} is not one of {', '.join(names)}")
         if bump.what in ("object", "ambient") and any(bump.shift_px):
             raise _wrong(path, f"bump {number}: {bump.what} has no image that could shift")
-    return bumps
 
 
 def write_bumps(stage: Path, *bumps: Bump) -> None:
@@ -103,14 +131,17 @@ def bumped(truth: BenchTruth, bumps: Bumps) -> BenchTruth:
 
 def _bumped(truth: BenchTruth, bump: Bump) -> BenchTruth:
     if bump.what == "ambient":
-        return dataclasses.replace(truth, ambient=_three(bump.factor * np.asarray(truth.ambient)))
+        ambient = _three(bump.factor * np.asarray(truth.ambient))
+        return dataclasses.replace(truth, ambient=ambient, indirect=truth.indirect + bump.indirect)
     if bump.what == "camera":
         camera = truth.camera
-        return dataclasses.replace(
-            truth, camera=dataclasses.replace(camera, pose=_device(camera.pose, camera.lens, bump))
-        )
+        sensor = dataclasses.replace(camera.sensor, read_noise_e=camera.sensor.read_noise_e * bump.noise)
+        camera = dataclasses.replace(camera, pose=_device(camera.pose, camera.lens, bump), sensor=sensor)
+        return dataclasses.replace(truth, camera=camera)
     if bump.what == "object":
-        return _object_moved(truth, bump)
+        glossy = dataclasses.replace(truth.object, gloss=truth.object.gloss + bump.gloss)
+        moved = _object_moved(truth, bump) if any((*bump.turn_deg, *bump.move_mm)) else truth
+        return dataclasses.replace(moved, object=glossy)
     projectors = tuple(_projector(one, bump) if one.name == bump.name else one for one in truth.projectors)
     return dataclasses.replace(truth, projectors=projectors)
 
@@ -119,8 +150,17 @@ def _projector(projector: ProjectorTruth, bump: Bump) -> ProjectorTruth:
     light = projector.light
     mixing = np.asarray(light.mixing) * (1.0 - np.asarray(bump.dim_channels))
     rows: Matrix = (_three(mixing[0]), _three(mixing[1]), _three(mixing[2]))
-    light = dataclasses.replace(light, brightness=light.brightness * (1.0 - bump.dim), mixing=rows)
-    return dataclasses.replace(projector, light=light, pose=_device(projector.pose, projector.lens, bump))
+    light = dataclasses.replace(
+        light,
+        brightness=light.brightness * (1.0 - bump.dim),
+        mixing=rows,
+        gamma=_three(bump.gamma * np.asarray(light.gamma)),
+    )
+    focus = dataclasses.replace(
+        projector.focus, distance_m=max(0.01, projector.focus.distance_m + 1e-3 * bump.defocus_mm)
+    )
+    pose = _device(projector.pose, projector.lens, bump)
+    return dataclasses.replace(projector, light=light, focus=focus, pose=pose)
 
 
 def _device(pose: Pose, lens: Lens, bump: Bump) -> Pose:

@@ -24,7 +24,7 @@ from plugins.emulated.tables import dump
 from plugins.emulated.truth import BenchTruth, Lens, Pose, ProjectorTruth
 
 CACHE: Final = "rays.npz"
-VERSION: Final = 1
+VERSION: Final = 2
 ROWS_AT_ONCE: Final = 1 << 20
 SHADOW_BIAS_M: Final = 2e-4
 SIGMA_STEP_PX: Final = 1.0 / 64.0
@@ -45,6 +45,7 @@ class Samples:
     ``at_px`` (projectors, N, 2) float32: x, y in projector pixels;
     ``gain`` (projectors, N) float32: light on the point per linear light 1, 0 in shadow;
     ``blur`` (projectors, N) uint8: in SIGMA_STEP_PX
+    ``gloss`` (projectors, N) float32: what highlights add to the albedo, divided by S * S too; (projectors, 0) without
     """
 
     pixels: npt.NDArray[np.int32]
@@ -53,6 +54,7 @@ class Samples:
     at_px: npt.NDArray[np.float32]
     gain: npt.NDArray[np.float32]
     blur: npt.NDArray[np.uint8]
+    gloss: npt.NDArray[np.float32]
 
 
 def samples_of(truth: BenchTruth, thing: StageObject, cache: Path | None, progress: Progress) -> Samples:
@@ -91,6 +93,7 @@ def cast(truth: BenchTruth, thing: StageObject, progress: Progress) -> Samples:
         at_px=np.concatenate([block["at_px"] for block in blocks], axis=1),
         gain=np.concatenate([block["gain"] for block in blocks], axis=1),
         blur=np.concatenate([block["blur"] for block in blocks], axis=1),
+        gloss=np.concatenate([block["gloss"] for block in blocks], axis=1),
     )
 
 
@@ -133,12 +136,14 @@ def _cast_rows(truth: BenchTruth, thing: StageObject, scene: Any, first: int, la
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     normals *= _facing(found["Ng"][hit].astype(np.float64), normals, ray)[:, None]
     lit = [_lit(projector, scene, points, normals) for projector in truth.projectors]
+    gloss = [_highlight(truth, projector, points, normals, ray) / (s * s) for projector in truth.projectors]
     return {
         "counts": counts,
         "albedo": (thing.albedo(points, faces, weights) / (s * s)).astype(np.float32),
         "at_px": np.stack([at for at, _, _ in lit]),
         "gain": np.stack([gain for _, gain, _ in lit]),
         "blur": np.stack([blur for _, _, blur in lit]),
+        "gloss": np.stack(gloss).astype(np.float32),
     }
 
 
@@ -170,6 +175,18 @@ def _lit(
     return at.astype(np.float32), np.where(reach, gain, 0.0).astype(np.float32), blur
 
 
+def _highlight(truth: BenchTruth, projector: ProjectorTruth, points: Floats, normals: Floats, ray: Floats) -> Floats:
+    """What a highlight adds to the albedo at points, in the direction of the camera; nothing (0,) without gloss."""
+    strength, exponent = truth.object.gloss, truth.object.gloss_exponent
+    if strength <= 0.0:
+        return np.zeros(0)
+    towards = np.asarray(projector.pose.position_m) - points
+    half = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9) - ray
+    half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
+    cosine = np.clip(np.sum(half * normals, axis=1), 0.0, 1.0)
+    return np.asarray(strength * (exponent + 8.0) / 8.0 * cosine**exponent)
+
+
 def _in_shadow(projector: ProjectorTruth, scene: Any, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:
     """Rays from the lens: in shadow when something is hit clearly before the point itself."""
     lens = np.asarray(projector.pose.position_m)
@@ -185,7 +202,7 @@ def _key(truth: BenchTruth, thing: StageObject) -> str:
     projectors = [part for p in truth.projectors for part in (p.pose, p.lens, p.focus, p.light)]
     for part in (truth.camera.pose, truth.camera.lens, *projectors):
         digest.update(dump(part).encode())
-    digest.update(f"{truth.subsamples} {thing.paint}".encode())
+    digest.update(f"{truth.subsamples} {thing.paint} {truth.object.gloss} {truth.object.gloss_exponent}".encode())
     for name in ("vertices", "faces", "normals", "corner_values", "texture", "parts"):
         digest.update(np.ascontiguousarray(getattr(thing, name)).tobytes())
     return digest.hexdigest()

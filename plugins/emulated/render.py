@@ -78,7 +78,8 @@ class Renderer:
         self._profiles = [pixel_profiles(p.light.fill_factor) for p in truth.projectors]
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
         self._vignette = _vignette(truth)
-        self._ambient = _pixel_sums(samples.albedo, samples.starts) * np.asarray(truth.ambient, dtype=np.float32)
+        self._albedo = _pixel_sums(samples.albedo, samples.starts)
+        self._ambient = self._albedo * np.asarray(truth.ambient, dtype=np.float32)
         self._last: tuple[tuple[object, ...], FloatImage] | None = None
 
     def light(self, frames: Sequence[ByteImage], levels: Sequence[float]) -> FloatImage:
@@ -94,6 +95,10 @@ class Renderer:
         for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
             if level > 0.0:
                 total += np.float32(level) * self._layer(index, frame, digests[index])
+        if self._truth.indirect > 0.0:
+            # The mean light on what the camera sees stands for what object and room throw back.
+            lit = (total - self._ambient).sum(axis=0, dtype=np.float64) / np.maximum(self._albedo.sum(axis=0), 1e-9)
+            total += self._albedo * (self._truth.indirect * lit).astype(np.float32)
         image = self._through_lens(total)
         self._last = (key, image)
         return image
@@ -108,9 +113,11 @@ class Renderer:
             emitted(self._truth.projectors[index].light, frame), *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0
         )
         samples, (profiles, radii) = self._samples, self._profiles[index]
+        gloss = samples.gloss[index]
+        albedo = samples.albedo + gloss[:, None] if gloss.size else samples.albedo
         layer = _lit_pixels(
             np.ascontiguousarray(padded), samples.at_px[index], samples.gain[index], samples.blur[index],
-            samples.albedo, samples.starts, profiles, radii,
+            albedo, samples.starts, profiles, radii,
         )  # fmt: skip
         kept[digest] = layer
         if len(kept) > LAYERS_KEPT:

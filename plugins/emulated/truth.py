@@ -132,11 +132,17 @@ class ProjectorTruth:
 
 @dataclass(frozen=True, slots=True)
 class ObjectTruth:
-    """``kind`` is ``vase-and-bust`` (``seed`` varies it), or ``mesh`` with ``file`` relative to the stage folder."""
+    """``kind`` is ``vase-and-bust`` (``seed`` varies it), or ``mesh`` with ``file`` relative to the stage folder.
+
+    ``gloss``: strength of its highlights (Blinn and Phong, normalised): light added where the surface mirrors a lens
+    into the camera, relative to a perfect white; ``gloss_exponent``: how small they are.
+    """
 
     kind: str
     file: str
     seed: Annotated[int, Between(0, 2**63 - 1)]
+    gloss: Annotated[float, Between(0.0, 1.0)] = 0.0
+    gloss_exponent: Annotated[float, Between(1.0, 1e4)] = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +166,8 @@ class BenchTruth:
     default is two).
 
     ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder;
-    ``mains``: which emulated relays feed which projectors, whose mains are on otherwise.
+    ``mains``: which emulated relays feed which projectors, whose mains are on otherwise;
+    ``indirect``: the share of all projected light that object and room throw back evenly on the object.
     """
 
     size: str
@@ -175,6 +182,7 @@ class BenchTruth:
     projectors: tuple[ProjectorTruth, ...]
     scenario: str = ""
     mains: tuple[MainsTruth, ...] = ()
+    indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
 
 
 def write_truth(stage: Path, truth: BenchTruth) -> None:
