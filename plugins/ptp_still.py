@@ -16,9 +16,8 @@ from hal.ptp_datasets import DeviceInfo
 from hal.transcript import Transcript
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.ptp_body import Body, Channel
-from plugins.ptp_canon import EosBody
+from plugins.ptp_choice import choose_body, device_info
 from plugins.ptp_files import PendingFile, commit_all, kind_of
-from plugins.ptp_generic import GenericBody
 from plugins.ptp_link import Diary, PtpLink, refused
 from plugins.ptp_shot import Picture, Shot, Timing
 
@@ -82,7 +81,11 @@ class PtpCamera:
         return self._capabilities
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        info = self._with_body(lambda _: self._device_info(deadline), deadline)
+        def ask(body: Body) -> DeviceInfo:
+            assert self._channel is not None
+            return device_info(self._channel, deadline)
+
+        info = self._with_body(ask, deadline)
         return DeviceIdentity(info.manufacturer, info.model, info.serial, info.version)
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
@@ -260,13 +263,13 @@ class PtpCamera:
             reply = self._channel.once(Operation.OPEN_SESSION, _SESSION, deadline=deadline)
             if not reply.ok and reply.code != Answer.SESSION_ALREADY_OPEN:
                 raise refused(reply, "open a session")
-            info = self._device_info(deadline)
+            info = device_info(self._channel, deadline)
             self._check_serial(info)
             self._channel = Channel(
                 link, self._timing, self._diary, operations=info.operations, properties=info.properties
             )
             self._channel.exposing_until_s = self._exposing_until_s
-            body = self._choose_body(info)
+            body = choose_body(self._channel, info, to_card=self._to_card, keep_on_card=self._keep, both=self._both)
             body.prepare(after_break=after_break, deadline=deadline)
             if self._settings is not None:
                 body.configure(self._settings, deadline=deadline)
@@ -276,25 +279,6 @@ class PtpCamera:
         self._body = body
         self._capabilities = body.capabilities
         return body
-
-    def _choose_body(self, info: DeviceInfo) -> Body:
-        assert self._channel is not None
-        eos = {Operation.EOS_SET_PROPERTY, Operation.EOS_GET_EVENT} <= info.operations
-        if eos and info.operations & {Operation.EOS_RELEASE, Operation.EOS_RELEASE_ON}:
-            return EosBody(self._channel, to_card=self._to_card, keep_on_card=self._keep, both=self._both)
-        if Operation.INITIATE_CAPTURE in info.operations:
-            return GenericBody(self._channel, info, keep_on_card=self._keep)
-        raise DeviceRefused(
-            "camera-no-remote-release",
-            what=f"The {info.model or 'camera'} cannot be released over its cable.",
-            remedy="Set its USB or network mode to PTP or remote control, or use another camera.",
-        )
-
-    def _device_info(self, deadline: Deadline) -> DeviceInfo:
-        assert self._channel is not None
-        return DeviceInfo.parse(
-            self._channel.ask(Operation.GET_DEVICE_INFO, doing="say what it is", deadline=deadline).data
-        )
 
     def _check_serial(self, info: DeviceInfo) -> None:
         """Calibration belongs to one camera: another one at the same address must not go unnoticed."""

@@ -1,6 +1,6 @@
-"""PTP over USB: transactions on the bulk pipes, events on the interrupt pipe (PIMA 15740, annex D).
+"""PTP over USB: transactions on the bulk pipes (PIMA 15740, annex D); ``ptp_usb_events`` reads the interrupt pipe.
 
-One thread at a time may use a link; a thread of its own reads the events. Everything waits in slices, so that the
+One thread at a time may use a link. Everything waits in slices, so that the
 caller's deadline and cancellation are kept; a transaction that was left in the middle is cancelled (0x64) and breaks
 the link, because its late answer could be taken for the next one.
 """
@@ -8,20 +8,19 @@ the link, because its late answer could be taken for the next one.
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from array import array
-from collections import deque
 from collections.abc import Callable
 from typing import Final, Self, TypeVar
 
 from hal import ptp_usb
 from hal.deadline import Deadline
-from hal.errors import DeviceError, DeviceGone, ProtocolError
+from hal.errors import DeviceError, ProtocolError
 from hal.ptp import Answer, broken
 from hal.ptp_usb import HEADER, ClassRequest
 from hal.transcript import Transcript
 from plugins.ptp_link import MOST_IN_MEMORY, LinkEvent, Reply, Sink, camera_lost
+from plugins.ptp_usb_events import InterruptReader
 from plugins.ptp_usb_pipes import Pipes, PipeStalled
 from plugins.ptpip_wire import still_time
 
@@ -29,7 +28,6 @@ Result = TypeVar("Result")
 
 _SLICE_S: Final = 0.1
 _BLOCK: Final = 1 << 20
-_MOST_EVENTS: Final = 10_000
 _LONGEST_NOTE: Final = 4096
 _REQUEST_S: Final = 0.3
 _RESET_S: Final = 2.0
@@ -51,12 +49,7 @@ class PtpUsbLink:
         self._spare = b""
         self._in_transaction = False
         self._closed = False
-        self._released = False
-        self._events: deque[LinkEvent] = deque(maxlen=_MOST_EVENTS)
-        self._news = threading.Condition()
-        self._ended: DeviceGone | None = None
-        self._stop = threading.Event()
-        self._reader = threading.Thread(target=self._read_events, name="ptp-usb-events", daemon=True)
+        self._interrupts = InterruptReader(pipes)
 
     @classmethod
     def over(cls, pipes: Pipes, *, transcript: Transcript | None = None, deadline: Deadline) -> Self:
@@ -67,12 +60,12 @@ class PtpUsbLink:
         except BaseException:
             pipes.close()
             raise
-        link._reader.start()
+        link._interrupts.start()
         return link
 
     @property
     def broken(self) -> bool:
-        return self._closed or self._ended is not None
+        return self._closed or self._interrupts.ended is not None
 
     def transact(
         self,
@@ -104,9 +97,7 @@ class PtpUsbLink:
         return reply
 
     def events(self) -> list[LinkEvent]:
-        with self._news:
-            found = list(self._events)
-            self._events.clear()
+        found = self._interrupts.taken()
         if not found:
             self._check_open()
         return found
@@ -115,33 +106,21 @@ class PtpUsbLink:
         until = deadline.within(seconds)
         while not until.passed and not self.broken:
             until.sleep(0)
-            with self._news:
-                if self._events or self._news.wait(min(_SLICE_S, until.left_s())):
-                    return
+            if self._interrupts.wait(min(_SLICE_S, until.left_s())):
+                return
 
     def close(self) -> None:
         if self._closed:
             return
         self._closed = True
-        if self._in_transaction and self._ended is None:
+        if self._in_transaction and self._interrupts.ended is None:
             with contextlib.suppress(DeviceError, PipeStalled):
                 self._pipes.send_request(ClassRequest.CANCEL, ptp_usb.pack_cancel(self._transaction), _REQUEST_S)
-        self._stop.set()
-        if self._reader.is_alive():
-            self._reader.join(3 * _SLICE_S)
-        if not self._reader.is_alive():
-            self._release()
-
-    def _release(self) -> None:
-        """Close the pipes once: never under the feet of a reader that a dead bus holds; then the reader does it."""
-        with self._news:
-            released, self._released = self._released, True
-        if not released:
-            self._pipes.close()
+        self._interrupts.close()
 
     def _check_open(self) -> None:
-        if self._ended is not None:
-            raise self._ended
+        if self._interrupts.ended is not None:
+            raise self._interrupts.ended
         if self._closed:
             raise camera_lost("it was closed")
 
@@ -286,35 +265,6 @@ class PtpUsbLink:
     def _note(self, data: bytes) -> None:
         if self._transcript is not None:
             self._transcript.received(data[:_LONGEST_NOTE])
-
-    def _read_events(self) -> None:
-        try:
-            self._read_until_stopped()
-        finally:
-            if self._stop.is_set():
-                self._release()
-
-    def _read_until_stopped(self) -> None:
-        stalls = 0
-        while not self._stop.is_set():
-            try:
-                data = self._pipes.read_event(_SLICE_S)
-                stalls = 0
-                if data:
-                    code, parameters = ptp_usb.parse_event(data)
-                    with self._news:
-                        self._events.append(LinkEvent(code, parameters))
-                        self._news.notify_all()
-            except ProtocolError:
-                continue  # a lost event is made up for by asking; see the bodies
-            except PipeStalled:
-                stalls += 1
-                self._stop.wait(min(1.0, 0.05 * stalls))
-            except DeviceGone as gone:
-                with self._news:
-                    self._ended = gone
-                    self._news.notify_all()
-                return
 
 
 def _nowhere(piece: memoryview) -> None:

@@ -12,7 +12,21 @@ from dataclasses import replace
 from typing import Final
 
 from plugins.emulated.ptp_body import JPEG, EmulatedBody, Exposed
-from plugins.emulated.ptp_card import STORAGE, Stored
+from plugins.emulated.ptp_card import STORAGE
+from plugins.emulated.ptp_eos_records import (
+    APERTURES,
+    BULB,
+    FORMATS,
+    ISO_NAMES,
+    OLD_ISOS,
+    SHUTTER,
+    f_number,
+    format_bytes,
+    new_object,
+    read_format,
+    record,
+    seconds,
+)
 from plugins.emulated.ptp_wire import (
     BUSY,
     GENERAL_ERROR,
@@ -31,37 +45,6 @@ _CARD: Final = 2
 _MANUAL: Final = 3
 _MIRROR_REASON: Final = 3
 _FULL_REASON: Final = 7
-_JPEG_FINE: Final = (1, 0, 3)
-_JPEG_COARSE: Final = (1, 0, 2)
-_RAW: Final = (6, 0, 4)
-_FORMATS: Final = ((_JPEG_FINE,), (_JPEG_COARSE,), (_RAW,), (_RAW, _JPEG_FINE))
-
-
-def _thirds(first: int, last: int) -> tuple[int, ...]:
-    """Exposure codes in thirds of a stop."""
-    return tuple(code for code in range(first, last + 1) if code % 8 in (0, 3, 5))
-
-
-_BULB: Final = 0x0C
-_SHUTTER: Final = _thirds(0x10, 0x98)
-_APERTURES: Final = _thirds(0x20, 0x50)
-_ISO_NAMES: Final = dict(
-    zip(
-        _thirds(0x48, 0x78),
-        (100, 125, 160, 200, 250, 320, 400, 500, 640, 800, 1000, 1250, 1600, 2000, 2500, 3200, 4000, 5000, 6400),
-        strict=True,
-    )
-)
-_OLD_ISOS: Final = (0x48, 0x50, 0x58, 0x60, 0x68)
-_EIGHTHS: Final = {0: 0.0, 3: 1 / 3, 5: 2 / 3}
-
-
-def _seconds(code: int) -> float:
-    return float(2.0 ** (7 - code // 8 - _EIGHTHS[code % 8]))
-
-
-def _f_number(code: int) -> float:
-    return float(2.0 ** ((code // 8 - 1 + _EIGHTHS[code % 8]) / 2))
 
 
 class EosBody(EmulatedBody):
@@ -71,7 +54,7 @@ class EosBody(EmulatedBody):
     raw_format = 0xB103
     capture_formats = (JPEG, 0xB103)
     events = (0x4002, 0x4003, 0x4004, 0x4005, 0xC101)
-    isos: tuple[int, ...] = tuple(_ISO_NAMES)
+    isos: tuple[int, ...] = tuple(ISO_NAMES)
     operations: tuple[int, ...] = (
         *(0x101B, 0x9101, 0x9102, 0x9107, 0x910F, 0x9110, 0x9114, 0x9115, 0x9116, 0x9117),
         *(0x911A, 0x911B, 0x911C, 0x911D, 0x911E, 0x9125, 0x9126, 0x9128, 0x9129, 0x9153),
@@ -83,9 +66,9 @@ class EosBody(EmulatedBody):
             **{0xD101: 0x30, 0xD102: 0x60, 0xD103: 0x48, 0xD105: _MANUAL, 0xD106: 0, 0xD108: 3, 0xD111: 0, 0xD11B: 0},
             **{0xD11C: _CARD, 0xD11E: STORAGE, 0xD1B0: 0, 0xD1B1: 0},
         }
-        shutter = (*((_BULB,) if 0x9125 in self.operations else ()), *_SHUTTER)
-        self._lists = {0xD101: _APERTURES, 0xD102: shutter, 0xD103: self.isos, 0xD11C: (_CARD, _HOST)}
-        self._format: tuple[tuple[int, int, int], ...] = _FORMATS[0]
+        shutter = (*((BULB,) if 0x9125 in self.operations else ()), *SHUTTER)
+        self._lists = {0xD101: APERTURES, 0xD102: shutter, 0xD103: self.isos, 0xD11C: (_CARD, _HOST)}
+        self._format: tuple[tuple[int, int, int], ...] = FORMATS[0]
         self._reports: list[bytes] = []
         self._reporting = False
         self._pressed = 0
@@ -94,7 +77,7 @@ class EosBody(EmulatedBody):
     def shutter_codes(self, codes: tuple[int, ...] = ()) -> tuple[int, ...]:
         """The shutter codes that can be set, bulb left out; ``codes`` replaces them."""
         with self.lock:
-            kept = tuple(code for code in self._lists[0xD102] if code == _BULB)
+            kept = tuple(code for code in self._lists[0xD102] if code == BULB)
             if codes:
                 self._lists[0xD102] = (*kept, *codes)
                 self._report_list(0xD102)
@@ -135,7 +118,7 @@ class EosBody(EmulatedBody):
             case 0x9128 | 0x9129:
                 return self._button(asked[0], down=code == 0x9128)
             case 0x9125:
-                return self._fire(bulb=True) if self._values[0xD102] == _BULB else Outcome(GENERAL_ERROR)
+                return self._fire(bulb=True) if self._values[0xD102] == BULB else Outcome(GENERAL_ERROR)
             case 0x9126:
                 return self.close_shutter()
             case 0x9153:
@@ -146,7 +129,7 @@ class EosBody(EmulatedBody):
     def exposed(self, exposed: Exposed) -> None:
         for stored in exposed.stored:
             if not self.faults.take("lost_events"):
-                self._reports.append(_new_object(stored, waiting=exposed.to_host))
+                self._reports.append(new_object(stored, waiting=exposed.to_host))
         self._report(0xC18B, struct.pack("<I", 0))
 
     def _button(self, button: int, *, down: bool) -> Outcome:
@@ -194,9 +177,9 @@ class EosBody(EmulatedBody):
     def _settings(self, *, raw: bool) -> ShotSettings:
         code = self._values[0xD102]
         return ShotSettings(
-            exposure_s=0.0 if code == _BULB else _seconds(code),
-            iso=_ISO_NAMES[self._values[0xD103]],
-            aperture_f=_f_number(self._values[0xD101]),
+            exposure_s=0.0 if code == BULB else seconds(code),
+            iso=ISO_NAMES[self._values[0xD103]],
+            aperture_f=f_number(self._values[0xD101]),
             raw=raw,
             jpeg=not raw,
         )
@@ -204,7 +187,7 @@ class EosBody(EmulatedBody):
     def _fire(self, *, bulb: bool = False) -> Outcome:
         if self._values.get(0xD1B0, 0):
             return Outcome(parameters=(_MIRROR_REASON,))
-        if self._values[0xD102] == _BULB and not bulb:
+        if self._values[0xD102] == BULB and not bulb:
             return Outcome(BUSY)
         if self._values[0xD11C] == _HOST and self.faults.take("target_flips"):
             self._values[0xD11C] = _CARD
@@ -227,11 +210,11 @@ class EosBody(EmulatedBody):
             return Outcome(WRONG_VALUE)
         code, value = struct.unpack_from("<II", data, 4)
         if code == 0xD120:
-            wanted = _read_format(data[8:])
-            if wanted not in _FORMATS:
+            wanted = read_format(data[8:])
+            if wanted not in FORMATS:
                 return Outcome(WRONG_VALUE)
             self._format = wanted
-            self._report(0xC189, struct.pack("<I", code) + _format_bytes(wanted))
+            self._report(0xC189, struct.pack("<I", code) + format_bytes(wanted))
             return Outcome()
         if code not in self._values or value not in self._lists.get(code, (value,)):
             return Outcome(WRONG_VALUE)
@@ -255,15 +238,15 @@ class EosBody(EmulatedBody):
         self._reports.clear()
         for code, value in {**self._values, 0xD111: self._battery_code()}.items():
             self._report(0xC189, struct.pack("<II", code, value))
-        self._report(0xC189, struct.pack("<I", 0xD120) + _format_bytes(self._format))
+        self._report(0xC189, struct.pack("<I", 0xD120) + format_bytes(self._format))
         self._report(0xC189, struct.pack("<I", 0xD1AF) + self.names.serial.encode("ascii", "replace") + b"\0")
         for code in self._lists:
             self._report_list(code)
-        formats = b"".join(_format_bytes(one) for one in _FORMATS)
-        self._report(0xC18A, struct.pack("<III", 0xD120, 3, len(_FORMATS)) + formats)
+        formats = b"".join(format_bytes(one) for one in FORMATS)
+        self._report(0xC18A, struct.pack("<III", 0xD120, 3, len(FORMATS)) + formats)
         self._report(0xC18B, struct.pack("<I", int(self.exposing)))
         if on:
-            self._reports += [_new_object(stored, waiting=True) for stored in self.card.waiting.values()]
+            self._reports += [new_object(stored, waiting=True) for stored in self.card.waiting.values()]
         return Outcome()
 
     def _report_list(self, code: int) -> None:
@@ -272,13 +255,13 @@ class EosBody(EmulatedBody):
 
     def _report(self, code: int, body: bytes) -> None:
         if self._reporting:
-            self._reports.append(_record(code, body))
+            self._reports.append(record(code, body))
 
 
 class OldEosBody(EosBody):
     """The operations of the EOS 400D: one release, no buttons, whole stops of ISO."""
 
-    isos = _OLD_ISOS
+    isos = OLD_ISOS
     operations = (
         *(0x101B, 0x9101, 0x9102, 0x9107, 0x910F, 0x9110, 0x9114, 0x9115, 0x9116, 0x9117),
         *(0x911A, 0x911B, 0x911C, 0x911D, 0x911E),
@@ -287,28 +270,3 @@ class OldEosBody(EosBody):
     def power_on(self) -> None:
         super().power_on()
         del self._values[0xD1B0], self._values[0xD1B1]  # no live view
-
-
-def _record(code: int, body: bytes) -> bytes:
-    padded = body + bytes(-len(body) % 4)
-    return struct.pack("<II", 8 + len(padded), code) + padded
-
-
-def _new_object(stored: Stored, *, waiting: bool) -> bytes:
-    name = stored.name.encode("ascii") + b"\0"
-    size = len(stored.data)
-    if waiting:
-        return _record(0xC186, struct.pack("<IIIII", stored.handle, stored.format, 0, size, 0) + name)
-    head = struct.pack("<IIIII", stored.handle, STORAGE, stored.format, 0, 0)
-    return _record(0xC181, head + struct.pack("<III", size, stored.parent, 0) + name)
-
-
-def _format_bytes(parts: tuple[tuple[int, int, int], ...]) -> bytes:
-    return struct.pack("<I", len(parts)) + b"".join(struct.pack("<IIII", 16, *part) for part in parts)
-
-
-def _read_format(data: bytes) -> tuple[tuple[int, int, int], ...]:
-    parts = struct.unpack_from("<I", data)[0]
-    if parts not in (1, 2) or len(data) != 4 + 16 * parts:
-        return ()
-    return tuple(struct.unpack_from("<III", data, 8 + 16 * index) for index in range(parts))

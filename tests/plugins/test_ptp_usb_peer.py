@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import threading
 import time
@@ -95,6 +96,7 @@ class PortPipes:
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ctypes.CDLL]:
+    gc.collect()  # a virtual camera that is still open keeps its folder for the next one
     folder = tmp_path_factory.mktemp("vcamera")
     (folder / "GPH_0001.JPG").write_bytes(JPEG)
     spec = find_spec("gphoto2")
