@@ -24,7 +24,7 @@ from controller.play.frames import FrameFile, FrameSet, OutputSize
 from controller.play.live import TARGET
 from controller.services import stage_trust, usable_calibration
 from controller.session.live import FrameMaker, Frames, LiveFigures, Maker, TargetMaker, run_live
-from controller.session.live_parts import live_maps
+from controller.session.live_parts import live_maps, target_px
 from controller.session.machine import Event
 from controller.session.progress import Level, Reporter
 from controller.session.publishing import bundle_display
@@ -71,10 +71,10 @@ def live(
     ``usable_calibration`` raises, and what devices raise.
     """
     checked = check_stage(stage)
-    run = usable_calibration(checked, reporter)
-    ready = _ready(checked, run)
-    open_it = partial(_opened, source, ready.maps.target_px, loop=loop, rate_hz=rate_hz)
+    calibrated = _calibrated(checked, reporter)
+    open_it = partial(_opened, source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
     open_it().close()
+    ready = _ready(checked, calibrated, reporter)
     told: dict[str, Any] = {}
 
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
@@ -94,15 +94,19 @@ def _opened(source: Path, target_px: tuple[int, int], *, loop: bool, rate_hz: fl
     return open_source(source, loop=loop, rate_hz=rate_hz)
 
 
-def _ready(checked: Checked, run: Path) -> _Ready:
+def _calibrated(checked: Checked, reporter: Reporter) -> Calibrated:
+    return Calibrated(usable_calibration(checked, reporter), checked.names)
+
+
+def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> _Ready:
     """The maps, and the brightest white that the stated share of the object can show."""
-    calibrated = Calibrated(run, checked.names)
     maps = live_maps(calibrated, {table.name: table.output for table in checked.stage.tables.projectors})
     black = calibrated.calibration.black
     white: FloatImage = np.ones_like(black)
     share = checked.stage.tables.solve.exposure_share
     brightness = choose_exposure(calibrated.transport, white, black, share=share, drive=calibrated.drive)
-    return _Ready(maps, brightness, _in_bundle(checked, run.name))
+    reporter.say(f"A target's white is a radiance of {brightness:.7g}.")
+    return _Ready(maps, brightness, _in_bundle(checked, calibrated.folder.name))
 
 
 def _in_bundle(checked: Checked, calibration: str) -> bool:
@@ -130,9 +134,10 @@ def _show(
     def tell(figures: LiveFigures) -> None:
         nonlocal status
         status = display.playing(deadline=context.deadline.within(20)).live or status
+        made_hz = figures.made / max(figures.seconds, 1e-3)
         context.advance(
             0.0 if seconds is None else min(figures.seconds / seconds, 1.0),
-            f"{figures.made / max(figures.seconds, 1e-3):.1f} pictures a second, {figures.late} late",
+            f"{made_hz:.1f} pictures a second, {figures.late} late, {figures.bad} bad",
         )
 
     try:
@@ -238,12 +243,12 @@ def feed(
     after ``seconds``, or when it is stopped; the file stays, with its last picture.
     """
     checked = check_stage(stage)
-    ready = _ready(checked, usable_calibration(checked, reporter))
-    pictures = _opened(source, ready.maps.target_px, loop=loop, rate_hz=rate_hz)
+    calibrated = _calibrated(checked, reporter)
+    pictures = _opened(source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
+    ready = _ready(checked, calibrated, reporter)
     outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in checked.stage.tables.display.outputs]
     if targets:
         outputs = [OutputSize(TARGET, *ready.maps.target_px)]
-    reporter.say(f"A target's white is a radiance of {ready.brightness:.6g}.")
     with contextlib.closing(FrameFile(into, outputs)) as file:
         maker = TargetMaker(ready.maps.target_px) if targets else FrameMaker(Interactive(ready.maps), ready.brightness)
         write = _target_writer(file) if targets else _writer(file, outputs, ready.maps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -48,6 +49,8 @@ class VideoSource:
     def __init__(self, path: Path, *, loop: bool) -> None:
         """Raises UsageError("live-source-unreadable")."""
         self._path, self._loop = path, loop
+        # What is wrong with a file is told in our words; its decoder would write its own to the terminal.
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         self._capture = cv2.VideoCapture(str(path))
         rate = float(self._capture.get(cv2.CAP_PROP_FPS)) if self._capture.isOpened() else 0.0
         if not rate > 0:

@@ -9,7 +9,7 @@ from controller.bundle.live_maps import LiveMaps
 from controller.bundle.writer import NewLive
 from controller.errors import WorkError
 from controller.session.solving import Calibrated
-from controller.solve.scaling import scaling_maps
+from controller.solve.scaling import reduction, scaling_maps
 
 
 def live_arrays(run: Path, outputs: Mapping[str, tuple[str, tuple[int, int]]]) -> NewLive:
@@ -20,6 +20,13 @@ def live_arrays(run: Path, outputs: Mapping[str, tuple[str, tuple[int, int]]]) -
     names = {projector: output for projector, (output, _) in outputs.items()}
     maps = live_maps(Calibrated(run, tuple(outputs)), names)
     return NewLive(maps.target_px, maps.arrays())
+
+
+def target_px(calibrated: Calibrated) -> tuple[int, int]:
+    """(width, height) of the targets, from the camera's picture; nothing is built for it."""
+    width, height = calibrated.camera_px or calibrated.calibration.black.shape[1::-1]
+    factor = reduction((height, width))
+    return -(-width // factor), -(-height // factor)
 
 
 def live_maps(calibrated: Calibrated, outputs: Mapping[str, str]) -> LiveMaps:
