@@ -6,7 +6,7 @@ import json
 import shutil
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,11 +14,10 @@ from typing import Any
 
 from controller.app import Checked, check_stage, run_on_stage
 from controller.config import write_stage
-from controller.demo.bench_process import BenchProcess
+from controller.demo.bench_process import BenchProcess, emulated_bench
 from controller.errors import UsageError, WorkError
 from controller.services import calibrating
 from controller.session import costs
-from controller.session.calibrating import read_geometry
 from controller.session.progress import Reporter
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
@@ -29,12 +28,9 @@ from controller.study.keeping import save_result
 from controller.study.pages import publish
 from controller.study.photographing import RigLight, dot_steps
 from controller.study.scenes import SCENES, Scene
-from controller.study.subject import Subject
+from controller.study.stagehand import RigHand, Stagehand, subject_of
 from controller.study.values import Experiment
-from hal.deadline import in_seconds
 from hal.errors import DeviceError
-from hal.interfaces import Bench
-from hal.registry import OpenContext, load_drivers
 
 SIZES = ("small", "medium", "paper")
 MARK = "study.json"
@@ -51,6 +47,7 @@ class Parts:
     context: Context
     checked: Checked
     calibrated: Calibrated
+    hand: Stagehand
 
 
 def study(
@@ -105,15 +102,19 @@ def _on_scene(
 ) -> list[Path]:
     stage = prepare_scene(out / "scenes" / scene.name, scene, size=size, seed=seed)
     checked = check_stage(stage)
+    emulated_bench(stage).disturb(stage, ())  # what a stopped experiment may have left
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
-    steps = partial(_steps, experiments=experiments, checked=checked, scene=scene, size=size, seed=seed)
+    steps = partial(
+        _steps, experiments=experiments, checked=checked, scene=scene, size=size, seed=seed, disturb=bench.disturb
+    )
     run = run_on_stage(checked, steps, name="study", reporter=reporter, cancel=cancel, around=bench, again=True)
     return [run / RESULTS / f"{one.name}.json" for one in experiments]
 
 
 def _steps(
-    rig: Rig, run: Path, *, experiments: Sequence[Experiment], checked: Checked, scene: Scene, size: str, seed: int
-) -> Sequence[Step]:
+    rig: Rig, run: Path, *, experiments: Sequence[Experiment], checked: Checked, scene: Scene, size: str, seed: int,
+    disturb: Callable[[Sequence[Mapping[str, Any]]], None],
+) -> Sequence[Step]:  # fmt: skip
     """Calibrate, photograph dots where they are wanted, and do each experiment; what is done already is passed over."""
     longest_s = checked.stage.tables.capture.longest_exposure_s
     calibrated = Calibrated(run, checked.names)
@@ -128,7 +129,7 @@ def _steps(
         steps.append(
             Step(
                 f"study-{one.name}",
-                partial(_experiment, rig, checked, calibrated, one, told, longest_s),
+                partial(_experiment, rig, checked, calibrated, one, told, longest_s, disturb),
                 inputs={"size": size, "seed": str(seed), "code": one.code_sha256()},
                 after=(*after, *dots),
                 title=one.title,
@@ -145,20 +146,18 @@ def _experiment(
     one: Experiment,
     told: Mapping[str, Any],
     longest_s: float,
+    disturb: Callable[[Sequence[Mapping[str, Any]]], None],
     context: Context,
 ) -> Sequence[Path]:
     before, began_s = context.journal.shot_count(), time.perf_counter()
-    subject = Subject(
-        calibration=calibrated.calibration,
-        geometry=read_geometry(context.folder),
-        transport=calibrated.transport,
-        light=RigLight(rig, context, calibrated, one.name, longest_s),
-        size=str(told["size"]),
-        seed=int(told["seed"]),
-        advance=context.advance,
-        parts=Parts(rig, context, checked, calibrated),
-    )
-    result = one.run(subject)
+    make = subject_of(str(told["size"]), int(told["seed"]), context)
+    hand = RigHand(rig, context, calibrated, one.name, checked.prior, longest_s, disturb, make)
+    subject = make(calibrated, RigLight(rig, context, calibrated, one.name, longest_s), context.folder)
+    subject.parts = Parts(rig, context, checked, calibrated, hand)
+    try:
+        result = one.run(subject)
+    finally:
+        disturb(())
     facts = {
         **told,
         "photographs": context.journal.shot_count() - before,
@@ -195,7 +194,7 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
         thing = out / "object.ply"
         scene.write_object(thing)
     try:
-        tables = _bench(building, scene).prepare(building, size=size, object_file=thing, seed=seed)
+        tables = emulated_bench(building, scene.settings).prepare(building, size=size, object_file=thing, seed=seed)
     except DeviceError as error:
         raise WorkError(error.code, what=error.what, remedy=error.remedy) from error
     named = {"stage": {"name": f"study {scene.name}"}, **tables, "safety": {"power_down_s": POWER_DOWN_S}}
@@ -204,9 +203,3 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
     building.rename(stage)
     sync_folder(out)
     return stage
-
-
-def _bench(stage: Path, scene: Scene) -> Bench:
-    driver = load_drivers().get("bench", "emulated")
-    bench: Bench = driver.open(dict(scene.settings), OpenContext(stage=stage), in_seconds(10))
-    return bench

@@ -9,13 +9,15 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from controller.errors import WorkError
-from hal.deadline import Cancelled
+from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError
+from hal.interfaces import Bench
+from hal.registry import OpenContext, load_drivers
 
 END_S = 10.0
 STARTS = 2
@@ -36,6 +38,7 @@ class BenchProcess:
         self._stage = stage
         self._cancel = cancel
         self._tell = tell
+        self._disturbed = False
 
     def __enter__(self) -> Self:
         """Return once its devices are there. Raises what it tells, WorkError("bench-not-started") and Cancelled."""
@@ -102,6 +105,21 @@ class BenchProcess:
             remedy="Start `velatura emulate` on the stage by hand to see more.",
         )
 
+    def disturb(self, changes: Sequence[Mapping[str, Any]]) -> None:
+        """Change the stage as the bench explains it, () mends all; on return it counts.
+
+        Raises DeviceError for a change that the bench does not know, WorkError("bench-gone").
+        """
+        if not changes and not self._disturbed:
+            return
+        emulated_bench(self._stage).disturb(self._stage, changes)
+        self._disturbed = bool(changes)
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.strip() and "bumps" in json.loads(line):
+                return
+        raise WorkError("bench-gone", what="The bench ended while the stage was changed.", remedy="Start again.")
+
     def end(self) -> None:
         """Ask the bench to end, and make it end."""
         if self._process.poll() is None:
@@ -115,6 +133,13 @@ class BenchProcess:
 
     def __exit__(self, *_: object) -> None:
         self.end()
+
+
+def emulated_bench(stage: Path, settings: Mapping[str, Any] | None = None) -> Bench:
+    """The bench that sets up, disturbs and serves ``stage``; settings as its driver explains them."""
+    driver = load_drivers().get("bench", "emulated")
+    bench: Bench = driver.open(dict(settings or {}), OpenContext(stage=stage), in_seconds(10))
+    return bench
 
 
 def terminated_when_input_ends() -> None:
