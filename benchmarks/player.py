@@ -46,6 +46,8 @@ MANY_SWAPS = 100_000
 def measure(size: str) -> list[Row]:
     """Start, imports, swaps as fast as they go, pacing at 30 and 60 Hz, memory, and whole sets seen from outside."""
     paper = size == "paper"
+    # A kiosk's modules are compiled once; where Python may not keep that, every start would do it again.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     with tempfile.TemporaryDirectory(prefix="velatura-bench-") as folder:
         place = Path(folder)
         swaps = _frames(size)
