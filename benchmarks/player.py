@@ -104,11 +104,14 @@ def _imports() -> Row:
     # As launch.py and the service's unit start it.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     seconds("controller.play.__main__")
-    plain, ours = (
+    plain, numpy, ours = (
         [1000 * float(value) for value in np.median([seconds(module) for _ in range(STARTS)], axis=0)]
-        for module in ("sys", "controller.play.__main__")
+        for module in ("sys", "numpy", "controller.play.__main__")
     )
-    how = f"median of {STARTS}, less {plain[0]:.0f} ms of Python's own; processor time {ours[1] - plain[1]:.0f} ms"
+    how = (
+        f"median of {STARTS}, less {plain[0]:.0f} ms of Python's own; processor time {ours[1] - plain[1]:.0f} ms, "
+        f"{numpy[1] - plain[1]:.0f} of it numpy"
+    )
     return at_most("imports", ours[0] - plain[0], 150.0, unit="ms", how=how)
 
 
