@@ -12,11 +12,13 @@ from controller.commands.running import Json
 
 
 def report(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a demo's run: STAGE/runs/...-demo.")],
+    where: Annotated[
+        Path, typer.Argument(metavar="RUN", help="A run's folder, STAGE/runs/...; or a stage: its newest.")
+    ],
     out: Annotated[Path | None, typer.Option(help="Where the report goes; else into the run's folder.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Write report.html and report.json of a finished demo again."""
-    from controller.demo.report import report_again
+    """Write report.html and report.json of a calibration, or of a finished demo again."""
+    from controller.report_services import report_of
 
-    console.show_result(report_again(run, run if out is None else out), as_json=as_json)
+    console.show_result(report_of(where, out), as_json=as_json)

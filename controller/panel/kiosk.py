@@ -129,6 +129,9 @@ class Kiosk(Protocol):
     def results(self, run: str) -> Results:
         """Raises UsageError("run-unknown")."""
 
+    def report(self, run: str) -> Path:
+        """A run's report, one HTML file; made if it is not there yet, which takes seconds. Raises as ``results``."""
+
     def aiming(self) -> Aiming:
         """The newest measurement: of the last test shots, or of the calibration if that is newer. Seconds."""
 

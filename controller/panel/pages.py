@@ -69,7 +69,7 @@ class Pages:
         entries += [
             Entry("GET", "/see" + op.path, "session", op.role, self._picture(op.name))
             for op in QUESTIONS
-            if op.media.startswith("image/")
+            if op.media.startswith("image/") or op.name == "report"
         ]
         return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]
 

@@ -19,9 +19,12 @@ from controller.storage import write_atomically
 
 @dataclass(frozen=True, slots=True)
 class Picture:
+    """``large``: it holds small text, and wants more than a column of a strip."""
+
     caption: str
     image: ByteImage
     note: str = ""
+    large: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,15 @@ class Goal:
 
 
 @dataclass(frozen=True, slots=True)
+class Table:
+    """Figures side by side: ``header`` and every row have one more column than what is compared."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Page:
     title: str
     summary: str
@@ -53,6 +65,7 @@ class Page:
     galleries: tuple[tuple[str, str, tuple[Picture, ...]], ...] = ()
     steps: tuple[tuple[str, float], ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
+    tables: tuple[Table, ...] = ()
 
 
 def render(page: Page) -> str:

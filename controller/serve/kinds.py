@@ -21,6 +21,7 @@ from hal.deadline import in_seconds
 AIM_S: Final = 300.0
 QUICK: Final = Request("quick", light=True)
 PUBLISH: Final = Request("publish")
+REPORT: Final = Request("report")
 VARIANTS: Final = Request("variants")
 
 LendRig = Callable[[], AbstractContextManager[Rig]]
@@ -52,6 +53,7 @@ class Kinds:
             "full": Kind(self._full, lambda request: self._missing_device()),
             "publish": Kind(self._publish, known),
             "compute": Kind(self._publish, known),
+            "report": Kind(self._report),
             "takeover": Kind(self._takeover, known),
             "variants": Kind(self._variants, known),
         }
@@ -125,7 +127,8 @@ class Kinds:
         assert isinstance(found, dict)
         reporter.job = replace(reporter.job, run=run_name(found))
         told = Decision("calibrated", "The stage is calibrated anew.")
-        then = (replace(PUBLISH, key=request.key),) if self._wishes() else ()
+        report = replace(REPORT, arguments=(reporter.job.run,))
+        then = (replace(PUBLISH, key=request.key), report) if self._wishes() else (report,)
         return Finished(request, told, then=then)
 
     def _wishes(self) -> bool:
@@ -140,6 +143,13 @@ class Kinds:
             made = make_appearances(stage=self._stage, names=(), reporter=reporter, cancel=cancel)
         told = Decision("published", f"A new bundle is installed: {made['appearances']}.")
         return Finished(request, told, then=(VARIANTS,) if self._several() else ())
+
+    def _report(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.report_services import calibration_report
+
+        (run,) = request.arguments
+        calibration_report(self._stage / "runs" / run, check_stage(self._stage))
+        return Finished(request, Decision("reported", f"The report of {run} is written; see the results."))
 
     def _several(self) -> bool:
         return len(check_stage(self._stage).names) > 1

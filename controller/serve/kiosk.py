@@ -302,6 +302,9 @@ class StageKiosk:
     def results(self, run: str) -> Results:
         return runs.results(self.stage, run, self.service.checked.stage.tables.calibration.worst_grade)
 
+    def report(self, run: str) -> Path:
+        return runs.report(self.stage, run, self.service.checked)
+
     def aiming(self) -> Aiming:
         return aim.aiming(self.service.checked)
 

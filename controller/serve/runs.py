@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from controller.app import Checked
 from controller.calibrations import finished_calibrations
 from controller.errors import UsageError
 from controller.panel.kiosk import Grade, Results
@@ -49,13 +50,28 @@ def names(stage: Path) -> tuple[str, ...]:
     return tuple(sorted(found, reverse=True)[:MOST])
 
 
-def results(stage: Path, run: str, worst_grade: float) -> Results:
-    """Raises UsageError("run-unknown")."""
+def report(stage: Path, run: str, checked: Checked) -> Path:
+    """The run's report.html, made if it is not there yet. Seconds. Raises UsageError("run-unknown")."""
+    folder = _folder(stage, run)
+    page = folder / "report.html"
+    if not page.exists():
+        from controller.report_services import calibration_report
+
+        calibration_report(folder, checked)
+    return page
+
+
+def _folder(stage: Path, run: str) -> Path:
     if run not in names(stage):
         raise UsageError(
             "run-unknown", what=f"There is no run {run[:80]!r} with results.", remedy="Choose another one."
         )
-    folder = stage / "runs" / run
+    return stage / "runs" / run
+
+
+def results(stage: Path, run: str, worst_grade: float) -> Results:
+    """Raises UsageError("run-unknown")."""
+    folder = _folder(stage, run)
     pictures = {"error": folder / PICTURE} if (folder / PICTURE).exists() else {}
     for name in _PICTURES:
         if (folder / f"{name}.png").exists():

@@ -24,6 +24,7 @@ TITLES: Final[Mapping[str, str]] = {
     "full": "Full recalibration",
     "publish": "Appearances",
     "compute": "New appearance",
+    "report": "Report of",
     "takeover": "Frames without a projector",
     "variants": "Frames for the loss of a projector",
 }

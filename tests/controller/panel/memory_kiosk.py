@@ -264,6 +264,12 @@ class MemoryKiosk:
             raise UsageError("run-unknown", what="There is no such run.", remedy="Choose another.")
         return self._results[run]
 
+    def report(self, run: str) -> Path:
+        self.results(run)
+        file = self._folder.parent / "report.html"
+        file.write_text("<!doctype html><title>A report</title>")
+        return file
+
     def aiming(self) -> Aiming:
         aims = (ProjectorAim("left", 0.82, 0.9), ProjectorAim("middle", 0.9, 0.7), ProjectorAim("right", 0.4, 0.2))
         hints = ("Turn right's focus ring; its pixels are soft.",)
