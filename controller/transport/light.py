@@ -30,7 +30,7 @@ from controller.transport.planes import frame_planes, image_planes, plane_frames
 if TYPE_CHECKING:
     from controller.transport.patches import Patches
 
-VERSION: Final = 3
+VERSION: Final = 4
 FAINTEST: Final = 1e-6
 """A camera pixel counts as lit by a projector above this fraction of the projector's brightest white."""
 

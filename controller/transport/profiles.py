@@ -6,6 +6,7 @@ the pixels around one position, and sums to 1: so does every product of two rows
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,6 +25,14 @@ CUT: Final = 2.5
 """Windows reach at least this many standard deviations."""
 LANES: Final = 4
 """Windows are multiples of this wide and high."""
+SMALL_PHASES: Final = 2 * PHASES
+"""Positions of small windows reach half a pixel beyond the gap between two pixels, because a skew moves them."""
+SKEWS: Final = 32
+"""Steps of a small window's skew in an inverse square pixel."""
+SKEW_STEPS: Final = 127
+GROUP: Final = 16
+"""Small windows are walked so many at a time: as many as one has shares."""
+LINE: Final = 64
 
 
 class Profiles(NamedTuple):
@@ -62,3 +71,39 @@ def build_profiles() -> Profiles:
         size,
         np.array([np.count_nonzero(size == LANES)]),
     )
+
+
+class SmallProfiles(NamedTuple):
+    """What windows of LANES by LANES are made of.
+
+    ``table`` float32, flat: row f of kind k, LANES shares that sum to 1, begins at LANES (k SMALL_PHASES + f); row f is
+    that of position (f + 1/2) / PHASES - 1/2. ``skews`` float32, flat: for each skew from -SKEW_STEPS to SKEW_STEPS
+    the LANES by LANES factors by which the product of two rows differs from a Gaussian with that skew.
+    """
+
+    table: FloatImage
+    skews: FloatImage
+
+
+@lru_cache(maxsize=1)
+def build_small_profiles() -> SmallProfiles:
+    """The tables of small windows. Not to be written to."""
+    sigma = sigma_of(np.arange(KINDS))
+    sigma = sigma[2 * CUT * sigma <= LANES]
+    position = (np.arange(SMALL_PHASES) + 0.5) / PHASES - 0.5
+    apart = position[:, None] - np.arange(-1, LANES - 1)
+    exponent = -0.5 * (apart / sigma[:, None, None]) ** 2
+    shares = np.exp(exponent - exponent.max(axis=2, keepdims=True))
+    shares /= shares.sum(axis=2, keepdims=True)
+    from_middle = np.arange(LANES) - (LANES - 1) / 2
+    skew = np.arange(-SKEW_STEPS, SKEW_STEPS + 1) / SKEWS
+    factors = np.exp(-skew[:, None] * np.outer(from_middle, from_middle).ravel())
+    return SmallProfiles(_aligned(shares.ravel()), _aligned(factors.ravel()))
+
+
+def _aligned(values: npt.NDArray[np.float64]) -> FloatImage:
+    """The values in single precision, from the beginning of a line of the processor's cache on."""
+    room = np.empty(values.size + LINE // 4, np.float32)
+    skipped = -room.ctypes.data % LINE // 4
+    room[skipped : skipped + values.size] = values
+    return room[skipped : skipped + values.size]

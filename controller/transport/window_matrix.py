@@ -10,9 +10,9 @@ import scipy.sparse as sp
 
 from controller.arrays import Float64
 from controller.compiled import compiled
-from controller.transport.profiles import PHASE_BITS, PHASES, Profiles
+from controller.transport.profiles import LANES, PHASE_BITS, PHASES, SKEW_STEPS, Profiles, SmallProfiles
 from controller.transport.window_transport import WindowTransport
-from controller.transport.windows import SHEAR_BITS, TILE, Windows
+from controller.transport.windows import NEAR, OTHER, SHEAR_BITS, SKEWED, SORTS, STRIP, TILE, Windows
 
 Sites = npt.NDArray[np.int64]
 
@@ -24,59 +24,96 @@ def windows_of_sites(transport: WindowTransport) -> npt.NDArray[np.int32]:
     sites = transport.lit[0].size * (1 if transport.colours.size else 3)
     found = np.full((len(transport.sizes), sites), -1, np.int32)
     for n in range(len(transport.sizes)):
-        first, last = windows.first[windows.cell_first[n]], windows.first[windows.cell_first[n + 1]]
-        found[n, windows.site[first:last]] = np.arange(first, last, dtype=np.int32)
+        first, last = windows.first[SORTS * windows.cell_first[n]], windows.first[SORTS * windows.cell_first[n + 1]]
+        # not those that only fill a group up
+        own = first + np.flatnonzero(windows.gain[first:last])
+        found[n, windows.site[own]] = own
     return found
 
 
-def site_rows(transport: WindowTransport, n: int, sites: Sites) -> sp.csr_matrix[np.float64]:
-    """(sites, pixels of projector n): gain times shares at some camera sites, colour mixing left out."""
+def site_rows(transport: WindowTransport, n: int, sites: Sites, pixels: Sites) -> sp.csr_matrix[np.float64]:
+    """(sites, pixels): gain times shares at some camera sites, colour mixing left out.
+
+    ``pixels``: of projector n, rising. No array is as large as the projector: there are many such parts.
+    """
     chosen = windows_of_sites(transport)[n, sites].astype(np.int64)
     row = np.flatnonzero(chosen >= 0)
     chosen = chosen[row]
     windows, table = transport.windows, transport.table
-    kinds = windows.across[chosen] >> PHASE_BITS, windows.down[chosen] >> PHASE_BITS
-    size = int((table.size[kinds[0]] * table.size[kinds[1]]).sum())
-    rows, columns, values = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
     cell = np.searchsorted(windows.first, chosen, side="right") - 1
-    count = _entries(windows, table, chosen, cell, row, rows, columns, values)
-    shape = (sites.size, transport.sizes[n][0] * transport.sizes[n][1])
-    return sp.csr_matrix((values[:count], (rows[:count], columns[:count])), shape=shape)
+    other = cell % SORTS == OTHER
+    kinds = windows.across[chosen[other]] >> PHASE_BITS, windows.down[chosen[other]] >> PHASE_BITS
+    size = int((table.size[kinds[0]] * table.size[kinds[1]]).sum()) + LANES * LANES * int((~other).sum())
+    rows, columns, values = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
+    count = _entries(windows, table, transport.small, chosen, cell, row, pixels, rows, columns, values)
+    return sp.csr_matrix((values[:count], (rows[:count], columns[:count])), shape=(sites.size, pixels.size))
 
 
 @compiled()
 def _entries(
     windows: Windows,
     table: Profiles,
+    small: SmallProfiles,
     chosen: Sites,
     cell: Sites,
     row: Sites,
+    pixels: Sites,
     rows: Sites,
     columns: Sites,
     values: Float64,
 ) -> int:
-    halo = windows.halo[0]
-    side = TILE + 2 * halo
     n = 0
     for i in range(chosen.size):
-        e = chosen[i]
-        height_px, width_px = windows.size[windows.place[cell[i], 0]]
-        xs, ys, shear = np.int64(windows.across[e]), np.int64(windows.down[e]), np.int64(windows.shear[e])
-        wide, high, fx, fy = xs >> PHASE_BITS, ys >> PHASE_BITS, xs & (PHASES - 1), ys & (PHASES - 1)
-        width, height = table.size[wide], table.size[high]
-        top = windows.place[cell[i], 2] - halo + np.int64(windows.at[e]) // side
-        left = windows.place[cell[i], 3] - halo + np.int64(windows.at[e]) % side
-        for j in range(height):
-            x = fx + ((shear * ((j - (height // 2 - 1)) * PHASES - fy)) >> SHEAR_BITS)
-            shift, f = x >> PHASE_BITS, x & (PHASES - 1)
-            down = np.float64(windows.gain[e]) * table.table[table.first[high] + fy * height + j]
-            for k in range(width):
-                y, c = top + j, left + shift + k
-                if 0 <= y < height_px and 0 <= c < width_px:
-                    rows[n], columns[n] = row[i], y * width_px + c
-                    values[n] = down * table.table[table.first[wide] + f * width + k]
-                    n += 1
+        _, _, top, left = windows.place[cell[i] // SORTS]
+        height, width = windows.size[windows.place[cell[i] // SORTS, 0]]
+        if cell[i] % SORTS == OTHER:
+            shares = _other_shares(windows, table, chosen[i])
+        else:
+            shares = _shares(windows, small, chosen[i], cell[i] % SORTS == SKEWED)
+        for down, along, share in shares:
+            y, x = top + down, left + along
+            if not (0 <= y < height and 0 <= x < width):
+                continue
+            place = np.searchsorted(pixels, y * width + x)
+            if place < pixels.size and pixels[place] == y * width + x:
+                rows[n], columns[n], values[n] = row[i], place, share
+                n += 1
     return n
+
+
+@compiled()
+def _shares(windows: Windows, small: SmallProfiles, e: int, skewed: bool) -> list[tuple[int, int, float]]:
+    """Row and column from the tile's corner on, and gain times share, of each pixel of a small window."""
+    at, xs, ys = np.int64(windows.at[e]), LANES * np.int64(windows.across[e]), LANES * np.int64(windows.down[e])
+    top, left = at % STRIP - NEAR, at // STRIP - NEAR
+    skews = LANES * LANES * (SKEW_STEPS + np.int64(windows.skew[e]))
+    found = []
+    for j in range(LANES):
+        for k in range(LANES):
+            share = np.float64(windows.gain[e]) * small.table[xs + k] * small.table[ys + j]
+            factor = small.skews[skews + LANES * j + k] if skewed else np.float32(1)
+            found.append((int(top + j), int(left + k), float(share * factor)))
+    return found
+
+
+@compiled()
+def _other_shares(windows: Windows, table: Profiles, e: int) -> list[tuple[int, int, float]]:
+    """The same of any other window."""
+    halo = windows.halo[0]
+    side = TILE + 2 * halo
+    at, xs, ys = np.int64(windows.at[e]), np.int64(windows.across[e]), np.int64(windows.down[e])
+    wide, high, fx, fy = xs >> PHASE_BITS, ys >> PHASE_BITS, xs & (PHASES - 1), ys & (PHASES - 1)
+    width, height = table.size[wide], table.size[high]
+    top, left = at // side - halo, at % side - halo
+    found = []
+    for j in range(height):
+        x = fx + ((np.int64(windows.skew[e]) * ((j - (height // 2 - 1)) * PHASES - fy)) >> SHEAR_BITS)
+        shift, f = x >> PHASE_BITS, x & (PHASES - 1)
+        down = np.float64(windows.gain[e]) * table.table[table.first[high] + fy * height + j]
+        for k in range(width):
+            share = down * np.float64(table.table[table.first[wide] + f * width + k])
+            found.append((int(top + j), int(left + shift + k), float(share)))
+    return found
 
 
 def interpolation(transport: WindowTransport, channel: int, pixels: Sites, sites: Sites) -> sp.csr_matrix[np.float64]:
@@ -123,8 +160,7 @@ def box_rows(
         for n in range(len(transport.sizes)):
             span = transport.span(n)
             mine = unknown[(unknown >= span.start) & (unknown < span.stop)]
-            rows = sp.csc_matrix(site_rows(transport, n, sites))[:, mine - span.start]
-            part = D @ rows
+            part = sp.csc_matrix(D @ site_rows(transport, n, sites, mine - span.start))
             parts.append(sp.hstack([part * float(transport.mixing[n, c, d]) for d in channels], format="csc"))
         count = [part.shape[1] // len(channels) for part in parts]
         whole = sp.hstack(parts, format="csc")

@@ -19,10 +19,12 @@ from controller.calibrate.values import Calibration, PhaseMap
 from controller.transport.light import FAINTEST, LightTransport
 from controller.transport.mosaic import collect, interpolate, weigh
 from controller.transport.planes import image_planes
-from controller.transport.profiles import Profiles, build_profiles
+from controller.transport.profiles import Profiles, SmallProfiles, build_profiles, build_small_profiles
 from controller.transport.spare import lent
+from controller.transport.window_build import build_windows
+from controller.transport.window_cells import even_gains
 from controller.transport.window_products import adjoint_sites, forward_sites
-from controller.transport.windows import Windows, build_windows
+from controller.transport.windows import Windows
 
 WHOLE: Final = 0.998
 """A camera pixel is lit by a projector where the samples it is made of have windows for this part of its white."""
@@ -34,13 +36,14 @@ _OWN: Final = ("mixing", "lit", "per_weight", "colours", "per_sum")
 class WindowTransport(LightTransport):
     """T by camera samples.
 
-    ``windows``: each sample's shares; ``table``: the profiles they are made of
+    ``windows``: each sample's shares; ``table``, ``small``: the profiles they are made of
     ``colours`` (2, 2) int64 of the camera's samples, or (0, 0) where each pixel has three of its own
     ``per_sum`` (3, pixels) float32: 1 / sum of a projector pixel's part in the picture, gains left out, or 0
     """
 
     windows: Windows
     table: Profiles
+    small: SmallProfiles
     colours: npt.NDArray[np.int64]
     per_sum: FloatImage
 
@@ -72,7 +75,7 @@ class WindowTransport(LightTransport):
         lit = np.zeros((len(maps), *mask.shape), np.bool_)
         pixels = int(windows.start[-1])
         none = np.zeros((3, pixels), np.float32)
-        made = cls(mixing, lit, none[0], sizes, windows, build_profiles(), colours, none)
+        made = cls(mixing, lit, none[0], sizes, windows, build_profiles(), build_small_profiles(), colours, none)
         light = np.empty((3, *mask.shape), np.float32)
         plain = np.broadcast_to(np.eye(3, dtype=np.float32), mixing.shape).copy()
         ones = np.ones((3, pixels), np.float32)
@@ -82,16 +85,16 @@ class WindowTransport(LightTransport):
         light[:] = 1
         total = made._sums(light, (0, len(maps)))
         per_sum = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
-        return cls(mixing, lit, per_sum.max(axis=0), sizes, windows, made.table, colours, per_sum)
+        return cls(mixing, lit, per_sum.max(axis=0), sizes, windows, made.table, made.small, colours, per_sum)
 
     def _products(self, p: FloatImage, mixing: FloatImage, projectors: tuple[int, int], out: FloatImage) -> None:
         if not self.colours.size:
             out[:] = 0
-            forward_sites(self.windows, self.table, mixing, p, projectors, out.reshape(-1))
+            forward_sites(self.windows, self.table, self.small, mixing, p, projectors, out.reshape(-1))
             return
         with lent(self.shape) as sites:
             sites[:] = 0
-            forward_sites(self.windows, self.table, mixing, p, projectors, sites.reshape(-1))
+            forward_sites(self.windows, self.table, self.small, mixing, p, projectors, sites.reshape(-1))
             interpolate(sites, self.colours, out)
 
     def _sampled(self, white: FloatImage) -> FloatImage:
@@ -109,19 +112,20 @@ class WindowTransport(LightTransport):
     def _sums(self, image: FloatImage, projectors: tuple[int, int]) -> FloatImage:
         out = np.zeros((3, self.pixels), np.float32)
         plain = np.broadcast_to(np.eye(3, dtype=np.float32), self.mixing.shape).copy()
-        self._transposed(image, plain, False, projectors, out)
+        even = self.windows._replace(gain=even_gains(self.windows, self.small))
+        self._transposed(image, plain, even, projectors, out)
         return out
 
     def _transposed(
-        self, picture: FloatImage, mixing: FloatImage, weighted: bool, projectors: tuple[int, int], out: FloatImage
+        self, picture: FloatImage, mixing: FloatImage, windows: Windows, projectors: tuple[int, int], out: FloatImage
     ) -> None:
         if not self.colours.size:
             samples = np.ascontiguousarray(picture).reshape(-1)
-            adjoint_sites(self.windows, self.table, mixing, samples, weighted, projectors, out)
+            adjoint_sites(windows, self.table, self.small, mixing, samples, projectors, out)
             return
         with lent(self.shape) as sites:
             collect(picture, self.colours, sites)
-            adjoint_sites(self.windows, self.table, mixing, sites.reshape(-1), weighted, projectors, out)
+            adjoint_sites(windows, self.table, self.small, mixing, sites.reshape(-1), projectors, out)
 
     def forward_planes(
         self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
@@ -132,7 +136,7 @@ class WindowTransport(LightTransport):
 
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         out = np.empty((3, self.pixels), np.float32) if out is None else out
-        self._transposed(r, self.mixing, True, (0, len(self.sizes)), out)
+        self._transposed(r, self.mixing, self.windows, (0, len(self.sizes)), out)
         return out
 
     def sheet(self) -> FloatImage:
@@ -140,10 +144,10 @@ class WindowTransport(LightTransport):
         return np.zeros(self.shape if self.colours.size else (3, *self.shape), np.float32)
 
     def add_light(self, n: int, p: FloatImage, sheet: FloatImage) -> None:
-        forward_sites(self.windows, self.table, self.mixing, p, (n, n + 1), sheet.reshape(-1))
+        forward_sites(self.windows, self.table, self.small, self.mixing, p, (n, n + 1), sheet.reshape(-1))
 
     def pull(self, n: int, sheet: FloatImage, out: FloatImage) -> None:
-        adjoint_sites(self.windows, self.table, self.mixing, sheet.reshape(-1), True, (n, n + 1), out)
+        adjoint_sites(self.windows, self.table, self.small, self.mixing, sheet.reshape(-1), (n, n + 1), out)
 
     def weigh(self, sheet: FloatImage, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
         if self.colours.size:
@@ -171,4 +175,4 @@ class WindowTransport(LightTransport):
     def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> WindowTransport:
         windows = Windows(*(arrays[name] for name in Windows._fields))
         mixing, lit, per_weight, colours, per_sum = (arrays[name] for name in _OWN)
-        return cls(mixing, lit, per_weight, sizes, windows, build_profiles(), colours, per_sum)
+        return cls(mixing, lit, per_weight, sizes, windows, build_profiles(), build_small_profiles(), colours, per_sum)
