@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -101,8 +100,8 @@ def plotted(
     marks: Mapping[str, tuple[str, float]] | None = None,
     log_y: bool = False,
     y_range: tuple[float, float] | None = None,
-) -> bytes:
-    """A PNG of curves. ``marks``: label -> ("x" or "y", value), drawn as thin lines across."""
+) -> ByteImage:
+    """Curves as a picture. ``marks``: label -> ("x" or "y", value), drawn as thin lines across."""
     figure, axes = _figure((7.2, 4.0))
     for line in lines:
         axes.plot(line.x, line.y, line.style, label=line.name, markersize=3, linewidth=1.3)
@@ -117,13 +116,13 @@ def plotted(
     axes.set_ylabel(y)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.legend(fontsize=8, frameon=False)
-    return _png(figure)
+    return _drawn(figure)
 
 
 def maps(
     panels: Mapping[str, FloatImage], *, low: float, high: float, label: str, colours: str = "viridis", columns: int = 2
-) -> bytes:
-    """A PNG of maps (rows, columns), NaN grey, side by side with one scale of colours."""
+) -> ByteImage:
+    """Maps (rows, columns), NaN grey, side by side with one scale of colours."""
     rows = -(-len(panels) // columns)
     shape = next(iter(panels.values())).shape
     height = 3.6 * shape[0] / shape[1] * rows + 0.35 * rows
@@ -140,7 +139,7 @@ def maps(
             drawn = axes.imshow(shown, vmin=low, vmax=high, cmap=colours, interpolation="nearest")
     bar = figure.colorbar(drawn, ax=list(grid.ravel()), shrink=0.8, pad=0.02)
     bar.set_label(label, fontsize=9)
-    return _png(figure, tight=False)
+    return _drawn(figure, tight=False)
 
 
 def _figure(size: tuple[float, float], *, axes: bool = True) -> tuple[Any, Any]:
@@ -153,10 +152,8 @@ def _figure(size: tuple[float, float], *, axes: bool = True) -> tuple[Any, Any]:
     return figure, figure.add_subplot() if axes else None
 
 
-def _png(figure: Any, *, tight: bool = True) -> bytes:
-    out = io.BytesIO()
+def _drawn(figure: Any, *, tight: bool = True) -> ByteImage:
     if tight:
         figure.tight_layout()
-    # Without the program's name and version: the same figures give the same file.
-    figure.savefig(out, format="png", metadata={"Software": None})
-    return out.getvalue()
+    figure.canvas.draw()
+    return np.array(np.asarray(figure.canvas.buffer_rgba())[..., :3], np.uint8)

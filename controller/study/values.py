@@ -43,7 +43,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A picture: ``name`` (of its file), what it shows, and (rows, columns, 3) uint8, or a finished PNG's bytes."""
+    """A picture: ``name`` (of its file), what it shows, and (rows, columns, 3) uint8, or a PNG's bytes."""
 
     name: str
     caption: str

@@ -15,6 +15,7 @@ from controller.study.keeping import read_result, save_result
 from controller.study.pages import publish
 from controller.study.scenes import SCENES, curved_object
 from controller.study.values import Criterion, Experiment, Figure, Result, Table
+from controller.study.words import SAID, WHY, said, why
 
 
 def result(value: float = 0.5) -> Result:
@@ -83,11 +84,14 @@ def test_pictures_stay_small() -> None:
     assert len(encoded_webp(noise)) <= LARGEST_BYTES
 
 
-def test_drawings_are_pngs_and_the_same_each_time() -> None:
-    drawn = [plotted([Line("a", [1.0, 2.0], [3.0, 4.0])], x="x", y="y", marks={"m": ("y", 3.5)}) for _ in range(2)]
-    assert drawn[0][:8] == b"\x89PNG\r\n\x1a\n"
-    assert drawn[0] == drawn[1]
-    assert maps({"a": np.full((4, 6), np.nan, np.float32)}, low=0, high=1, label="l")[:4] == b"\x89PNG"
+def test_drawings_hold_what_is_drawn_and_are_the_same_each_time() -> None:
+    one, again, other = (
+        plotted([Line("a", [1.0, 2.0], [3.0, y])], x="x", y="y", marks={"m": ("y", 3.5)}) for y in (4.0, 4.0, 5.0)
+    )
+    assert (one == again).all()
+    assert (one != other).any()
+    empty, full = (maps({"a": np.full((4, 6), v, np.float32)}, low=0, high=1, label="l") for v in (np.nan, 1.0))
+    assert (empty != full).any(axis=2).mean() > 0.2
 
 
 def test_a_strip_holds_every_panel() -> None:
@@ -116,3 +120,13 @@ def test_the_curved_object_is_a_mesh_that_faces_the_audience(tmp_path: Path) -> 
     assert len(mesh.vertices) == 31 * 21
     assert (mesh.face_normals[:, 2] > 0).mean() == 1
     assert np.ptp(mesh.vertices[:, 1]) == pytest.approx(0.3, abs=1e-3)
+
+
+def test_words_stand_apart_from_results_and_are_about_known_experiments() -> None:
+    names = {one.name for one in EXPERIMENTS}
+    assert set(SAID) <= names
+    assert {name for name, _ in WHY} <= names
+    assert said("residual-six") == said("residual") != ""
+    (name, begins), text = next(iter(WHY.items()))
+    assert why(name, f"{begins} and more") == text
+    assert why(name, "something else") == ""
