@@ -22,6 +22,8 @@ PATIENCE_S: Final = 15.0
 """A projector may be silent for so long before it counts as lost."""
 MOST_STRIKES: Final = 3
 """Strikes in a row without light, after which the lamp is left alone until the next opening."""
+ASK_ANEW_S: Final = 120.0
+"""After so long a projector that reported a fault is opened anew: many tell of one unasked, and never of its end."""
 LIGHT_MARGIN_S: Final = 30.0
 _LOOKS: Final = {
     Power.ON: Condition.LIT, Power.WARMING: Condition.LIGHTING, Power.COOLING: Condition.COOLING,
@@ -61,6 +63,7 @@ class ProjectorKeeper:
         self._struck_at_s: float | None = None
         self._in_vain = 0
         self._burning = False
+        self._faulty_since_s: float | None = None
 
     @property
     def view(self) -> ProjectorView:
@@ -80,12 +83,12 @@ class ProjectorKeeper:
     def want_lit(self, wanted: bool | None) -> None:
         if wanted and not self._want_lit:
             # A lamp that was given up gets one more strike at every opening.
-            self._in_vain = min(self._in_vain, MOST_STRIKES - 1)
+            self._in_vain, self._faulty_since_s = min(self._in_vain, MOST_STRIKES - 1), float("-inf")
         self._want_lit = wanted
 
     def forgive(self) -> None:
-        """A technician has looked after the lamp: it gets all its strikes again."""
-        self._in_vain = 0
+        """A technician has looked after the lamp: it gets all its strikes again, the first at once."""
+        self._in_vain, self._faulty_since_s = 0, float("-inf")
 
     def step(self) -> None:
         """Look once, and do what follows. Blocks for some answers at most; raises nothing that a device can cause."""
@@ -163,8 +166,9 @@ class ProjectorKeeper:
                 guard.switch_off(deadline=in_seconds(guard.switch_s))
             self._struck_at_s = None
             self._see(Condition.BROKEN, status, _decision(faulty(self.name, status)))
+            self._ask_anew(guard)
         elif status.power is Power.ON or not guard.capabilities.power:
-            self._struck_at_s, self._burning = None, True
+            self._struck_at_s, self._burning, self._faulty_since_s = None, True, None
             if guard.stable_left_s() <= 0:
                 self._in_vain = 0
             self._see(Condition.LIT, status, None)
@@ -175,6 +179,16 @@ class ProjectorKeeper:
             self._see(Condition.COOLING, status, self._view.problem)
         else:
             self._strike(guard, status)
+
+    def _ask_anew(self, guard: LampGuard) -> None:
+        now_s = self._clock.now_s()
+        if self._faulty_since_s is None:
+            self._faulty_since_s = now_s
+        if self._in_vain >= MOST_STRIKES or now_s - self._faulty_since_s < ASK_ANEW_S:
+            return
+        self._in_vain, self._faulty_since_s, self._burning = self._in_vain + 1, now_s, False
+        guard.close()
+        self._guard = None
 
     def _await_light(self, guard: LampGuard, status: ProjectorStatus) -> None:
         if self._struck_at_s is None:

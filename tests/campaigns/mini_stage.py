@@ -14,6 +14,7 @@ import hashlib
 import json
 import sqlite3
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 from unittest.mock import patch
@@ -23,7 +24,7 @@ import numpy.typing as npt
 
 from controller.demo import stage as demo_stage
 from plugins.emulated import bench, staging
-from plugins.emulated.lamp import EmulatedLamp, LampPhase
+from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
 from plugins.emulated.shot import ShotFiles, ShotSettings
 from plugins.emulated.staging import Size
 from plugins.emulated.stands import Stands
@@ -76,11 +77,15 @@ class SteadyWorld(World):
 
 
 class HonestLamp(EmulatedLamp):
-    """Writes down what it should not have been asked to do."""
+    """Tells what it should not have been asked to do."""
+
+    def __init__(self, timing: LampTiming) -> None:
+        super().__init__(timing)
+        self.told: Callable[[str], None] = lambda sin: note({"sin": sin})
 
     def strike(self) -> bool:
         if self.phase is LampPhase.COOLING:
-            note({"sin": "struck while it cooled"})
+            self.told("struck while it cooled")
         return super().strike()
 
 
