@@ -85,9 +85,6 @@ def _criteria(made: Sequence[Made]) -> tuple[Criterion, ...]:
             f"{share:.1%}",
             share >= MOST_WINDOWS,
             reason,
-            ""
-            if share >= MOST_WINDOWS
-            else "In the other windows the four differ by single edge pixels; see the maps.",
         ),
         Criterion(
             "its lambda over the whole object is the highest",
