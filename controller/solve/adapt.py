@@ -1,14 +1,17 @@
 """Targets bent gently into what a stage can make, where light is lacking, instead of cut off (after Law et al. 2011).
 
 What the eye compares is a place with its surroundings. So where a target needs more light than there is, its
-surroundings are dimmed with it, by one gain that varies slowly: differences within a neighbourhood stay, the difference
-between neighbourhoods shrinks. Below the black image, where light can't be taken away, a toe keeps the order of the
-darkest tones. Nothing changes farther than ``REACH`` from where something is lacking, and where cutting off loses less
-(``contrast_kept``), it is left at that.
+surroundings are dimmed with it, by one gain that varies slowly: differences within a neighbourhood stay, the
+difference between neighbourhoods shrinks. A few pixels that hardly any light reaches, at grazing edges for instance,
+would need hundreds of times what there is, and bring all of their surroundings into the dark with them: they are
+given up. Below the black image, where light can't be taken away, a toe keeps the order of the darkest tones. Nothing
+changes farther than ``REACH`` from where something is lacking, and where cutting off loses less (``contrast_kept``),
+it is left at that.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Final
 
@@ -26,7 +29,9 @@ KNEE: Final = 0.7
 REACH: Final = 1 / 8
 """How far a dimming reaches, relative to the picture's longer side."""
 WINDOW_MIN_PX: Final = 3
-STRENGTHS: Final = 3
+STRENGTHS: Final = (0.5, 1.0)
+GIVEN_UP: Final = (0.02, 0.05)
+"""Shares of the object's pixels, those that need most, for which nothing else is dimmed."""
 TOE: Final = 0.5
 """Of the black image: targets bend away from it within about this part of it."""
 SCALES: Final = (1 / 400, 1 / 200, 1 / 100, 1 / 50)
@@ -58,6 +63,7 @@ def adapt(
     black: FloatImage,
     *,
     strength: float = 1.0,
+    given_up: float = 0.0,
     drive: Drive | None = None,
 ) -> Adapted:
     """Bend ``wanted`` into reach.
@@ -66,20 +72,24 @@ def adapt(
     ----------
     wanted, black : (rows, columns, 3) float32 radiance; ``wanted`` may be darker than ``black`` or brighter than T 1
     strength : from 0 (leave it, to be cut off) to 1 (wholly within reach); between them the gain is weakened
+    given_up : share of the object's pixels, those that need most, that may be cut off all the same
 
     Raises UsageError "image-wrong-size", "target-not-finite" or "adapt-strength".
     """
-    if not 0 <= strength <= 1:
+    if not (0 <= strength <= 1 and 0 <= given_up < 1):
         raise UsageError(
             "adapt-strength",
-            what=f"A contrast adaptation of strength {strength} was asked for.",
-            remedy="Ask for a strength from 0 to 1.",
+            what=f"A contrast adaptation of strength {strength} was asked for, with {given_up} of the pixels given up.",
+            remedy="Ask for a strength from 0 to 1, and give up a share from 0 to below 1.",
         )
     drive = Drive(transport) if drive is None else drive
     before = feasibility(transport, wanted, black, drive=drive)
     lifted = _above_black(np.maximum(wanted, 0), black, strength)
     needed = drive.of(lifted - black).max(axis=2)
-    gain = _gain(np.where(np.isfinite(needed), np.maximum(needed, 0), 0).astype(np.float32), drive.mask, strength)
+    needed = np.where(np.isfinite(needed), np.maximum(needed, 0), 0).astype(np.float32)
+    if given_up > 0 and drive.mask.any():
+        needed = np.minimum(needed, np.quantile(needed[drive.mask], 1 - given_up).astype(np.float32))
+    gain = _gain(needed, drive.mask, strength)
     target = np.where(drive.mask[..., None], black + gain[..., None] * (lifted - black), wanted).astype(np.float32)
     return Adapted(target, gain, before, feasibility(transport, target, black, drive=drive))
 
@@ -93,16 +103,16 @@ def adapt_gently(
     most: float = 1.0,
     drive: Drive | None = None,
 ) -> tuple[Adapted, float, float]:
-    """The weakest of a few strengths up to ``most`` that keeps the most contrast; and the contrast cut off and adapted.
+    """The adaptation that keeps most contrast, of a few up to strength ``most``; and the contrast cut off and adapted.
 
-    A few highlights lose little when they are cut off, and to dim their surroundings for them would lose more: then the
-    strength is 0. ``white`` as in ``contrast_kept``; errors as ``adapt``.
+    A few highlights lose little when they are cut off, and to dim their surroundings for them would lose more: they are
+    given up, or nothing is adapted at all. ``white`` as in ``contrast_kept``; errors as ``adapt``.
     """
     drive = Drive(transport) if drive is None else drive
     reach = black + transport.reach()
     kept: list[tuple[float, Adapted]] = []
-    for step in range(STRENGTHS + 1):
-        adapted = adapt(transport, wanted, black, strength=most * step / STRENGTHS, drive=drive)
+    for strength, given_up in ((0.0, 0.0), *itertools.product(STRENGTHS, GIVEN_UP)):
+        adapted = adapt(transport, wanted, black, strength=most * strength, given_up=given_up, drive=drive)
         shown = np.clip(adapted.target, black, reach)
         kept.append((contrast_kept(shown, wanted, drive.mask, white=white), adapted))
     best = max(kept, key=lambda one: one[0])
