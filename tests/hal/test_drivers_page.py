@@ -55,7 +55,7 @@ class TestTheDriverOfThePage(ProjectorConformance):
         with socketserver.ThreadingTCPServer(("127.0.0.1", 0), handler) as server:
             threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
             table = {"address": f"127.0.0.1:{server.server_address[1]}", "cool_down_s": 0.2}
-            opened: Projector = open_device(names["DRIVER"], table, OpenContext(Path()), in_seconds(5))
+            opened: Projector = open_device(names["DRIVER"], table, OpenContext(Path()), in_seconds(20))
             yield opened
             opened.close()
             server.shutdown()

@@ -206,15 +206,15 @@ def test_a_request_looks_as_the_standard_says() -> None:
 def test_headers_and_long_lists_are_read_fast_enough_to_be_no_cost() -> None:
     """Twenty times the goals of the benchmark, so that a loaded machine does not fail the test."""
     header = struct.pack("<II", 14, 7)
-    started = time.perf_counter()
+    started = time.thread_time()
     for _ in range(1000):
         ptp_ip.parse_header(header)
-    assert (time.perf_counter() - started) / 1000 < 20e-6
+    assert (time.thread_time() - started) / 1000 < 20e-6
     handles = ptp.pack_array("I", range(5000))
     assert min(_seconds(lambda: ptp.parse_handles(handles)) for _ in range(20)) < 2e-3
 
 
 def _seconds(work: Callable[[], object]) -> float:
-    started = time.perf_counter()
+    started = time.thread_time()
     work()
-    return time.perf_counter() - started
+    return time.thread_time() - started

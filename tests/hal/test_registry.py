@@ -43,7 +43,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 def test_a_plugin_of_another_distribution_is_found_and_opens(install: Install, tmp_path: Path) -> None:
     install("acme-projectors", {"acme": "vel_acme:DRIVER"}, GOOD.format(name="acme"))
     driver = load_drivers().get("projector", "acme")
-    opened = open_device(driver, {"port": "/dev/ttyUSB0"}, OpenContext(tmp_path), in_seconds(1))
+    opened = open_device(driver, {"port": "/dev/ttyUSB0"}, OpenContext(tmp_path), in_seconds(20))
     assert opened == {"port": "/dev/ttyUSB0"}
 
 

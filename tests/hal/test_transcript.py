@@ -84,7 +84,7 @@ RECORD = [
 
 def test_a_replay_answers_as_recorded() -> None:
     link = ReplayLink(RECORD)
-    soon = in_seconds(1)
+    soon = in_seconds(20)
     link.write(b"abc\r", deadline=soon)
     assert link.read_until(b"\r", limit=10, deadline=soon) == b"one\r"
     assert link.read_until(b"\r", limit=10, deadline=soon) == b"two\r"
@@ -97,18 +97,18 @@ def test_a_replay_answers_as_recorded() -> None:
 def test_a_replay_holds_the_caller_to_the_record() -> None:
     link = ReplayLink(RECORD)
     with pytest.raises(ProtocolError) as caught:
-        link.write(b"abX", deadline=in_seconds(1))
+        link.write(b"abX", deadline=in_seconds(20))
     assert caught.value.code == "replay-departed"
     assert caught.value.theirs is False
     with pytest.raises(ProtocolError, match="'more'"):
-        ReplayLink([]).write(b"more", deadline=in_seconds(1))
+        ReplayLink([]).write(b"more", deadline=in_seconds(20))
 
 
 def test_a_replay_has_no_more_answers_than_the_record() -> None:
     link = ReplayLink(RECORD)
     with pytest.raises(DeviceTimeout):
-        link.read_exactly(1, deadline=in_seconds(1))
-    link.write(b"abc\r", deadline=in_seconds(1))
+        link.read_exactly(1, deadline=in_seconds(20))
+    link.write(b"abc\r", deadline=in_seconds(20))
     with pytest.raises(DeviceTimeout):
-        link.read_exactly(9, deadline=in_seconds(1))
-    assert link.read_exactly(8, deadline=in_seconds(1)) == b"one\rtwo\r"
+        link.read_exactly(9, deadline=in_seconds(20))
+    assert link.read_exactly(8, deadline=in_seconds(20)) == b"one\rtwo\r"

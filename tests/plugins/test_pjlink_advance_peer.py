@@ -64,7 +64,7 @@ def served() -> Iterator[Served]:
 def opened(served: Served, folder: Path, password: str) -> Projector:
     (folder / "quick.toml").write_text(quick_profile(LAMP, base="pjlink"))
     table = {"address": f"127.0.0.1:{served.port}", "profile": "quick.toml", "password": password}
-    return open_pjlink_projector(table, OpenContext(folder), in_seconds(5))
+    return open_pjlink_projector(table, OpenContext(folder), in_seconds(20))
 
 
 class TestPeer(ProjectorConformance):
@@ -79,9 +79,9 @@ class TestPeer(ProjectorConformance):
 
 def test_what_it_tells_of_itself_is_read(served: Served, tmp_path: Path) -> None:
     driver = opened(served, tmp_path, "secret")
-    identity = driver.identity(deadline=in_seconds(5))
+    identity = driver.identity(deadline=in_seconds(20))
     assert (identity.maker, identity.model, identity.serial) == ("EPSON", "EB-L735U", "X8JK0000001")
-    status = driver.status(deadline=in_seconds(5))
+    status = driver.status(deadline=in_seconds(20))
     assert (status.power, status.lamp_hours, status.faults) == (Power.OFF, 1200, ())
     driver.close()
 
@@ -94,5 +94,5 @@ def test_a_wrong_password_is_named(served: Served, tmp_path: Path) -> None:
 
 def test_it_answers_our_search(served: Served) -> None:
     with PjLinkListener("127.0.0.1", 0) as listener:
-        found = listener.search(deadline=in_seconds(5), to=("127.0.0.1", served.udp_port), patience_s=0.5)
+        found = listener.search(deadline=in_seconds(20), to=("127.0.0.1", served.udp_port), patience_s=0.5)
     assert [(one.host, one.mac) for one in found] == [("127.0.0.1", "00:26:ab:00:00:01")]

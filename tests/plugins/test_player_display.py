@@ -46,7 +46,7 @@ def player(tmp_path: Path) -> Iterator[PlayerProcess]:
 
 
 def opened(folder: Path, **settings: Any) -> PlayerDisplay:
-    display = DRIVER.open({"outputs": TABLES, **settings}, OpenContext(folder, runtime=folder), in_seconds(5))
+    display = DRIVER.open({"outputs": TABLES, **settings}, OpenContext(folder, runtime=folder), in_seconds(20))
     assert isinstance(display, PlayerDisplay)
     return display
 
@@ -82,25 +82,25 @@ def shown(folder: Path) -> dict[str, npt.NDArray[np.uint8]]:
 
 def test_frames_arrive_byte_for_byte_and_what_is_not_named_is_black(display: PlayerDisplay, tmp_path: Path) -> None:
     frames = noise(OUTPUTS, 9)
-    presented = display.show(frames, deadline=in_seconds(5))
+    presented = display.show(frames, deadline=in_seconds(20))
     assert all(np.array_equal(shown(tmp_path)[name], frames[name]) for name in frames)
     assert Frames(tmp_path / "out.frame").presented_at == presented.at_s
-    display.show({"P2": frames["P2"][::-1, ::-1]}, deadline=in_seconds(5))
+    display.show({"P2": frames["P2"][::-1, ::-1]}, deadline=in_seconds(20))
     assert not shown(tmp_path)["P1"].any()
     assert np.array_equal(shown(tmp_path)["P2"], frames["P2"][::-1, ::-1])
 
 
 def test_appearances_sequences_status_and_bundles_through_the_driver(display: PlayerDisplay, tmp_path: Path) -> None:
-    display.play("1", deadline=in_seconds(5))
+    display.play("1", deadline=in_seconds(20))
     assert np.array_equal(shown(tmp_path)["P1"], noise(OUTPUTS, 1)["P1"])
-    identity = display.load_bundle(tmp_path / "b.vel", deadline=in_seconds(5))
-    assert display.status(deadline=in_seconds(5))["bundle"] == identity
-    first = display.play_sequence([("0", 0.01), ("1", 0.01)], repeat=3, rate_hz=100, deadline=in_seconds(5))
-    ends = time.monotonic() + 5
-    while (status := display.status(deadline=in_seconds(5)))["sequence_running"] and time.monotonic() < ends:
+    identity = display.load_bundle(tmp_path / "b.vel", deadline=in_seconds(20))
+    assert display.status(deadline=in_seconds(20))["bundle"] == identity
+    first = display.play_sequence([("0", 0.01), ("1", 0.01)], repeat=3, rate_hz=100, deadline=in_seconds(20))
+    ends = time.monotonic() + 30
+    while (status := display.status(deadline=in_seconds(20)))["sequence_running"] and time.monotonic() < ends:
         time.sleep(0.01)
     assert status["sequence"] == first.sequence + 5
-    display.stop(deadline=in_seconds(5))
+    display.stop(deadline=in_seconds(20))
     assert not shown(tmp_path)["P1"].any()
 
 
@@ -125,14 +125,14 @@ def test_wrong_settings_are_told_before_anything_is_opened(tmp_path: Path, outpu
 
 
 def test_it_finds_a_restarted_player_again(display: PlayerDisplay, player: PlayerProcess, tmp_path: Path) -> None:
-    display.show(noise(OUTPUTS, 1), deadline=in_seconds(5))
+    display.show(noise(OUTPUTS, 1), deadline=in_seconds(20))
     os.kill(player.pid, signal.SIGKILL)
     player.restart()
     with pytest.raises(DeviceGone) as caught:
-        display.show(noise(OUTPUTS, 2), deadline=in_seconds(5))
+        display.show(noise(OUTPUTS, 2), deadline=in_seconds(20))
     assert caught.value.code == "player-gone"
     frames = noise(OUTPUTS, 3)
-    display.show(frames, deadline=in_seconds(5))
+    display.show(frames, deadline=in_seconds(20))
     assert np.array_equal(shown(tmp_path)["P1"], frames["P1"])
 
 
@@ -143,14 +143,14 @@ def test_a_hung_player_costs_the_deadline_and_its_late_answer_is_not_mistaken(
     began = time.monotonic()
     with pytest.raises(DeviceTimeout):
         display.play("0", deadline=in_seconds(0.3))
-    assert 0.25 < time.monotonic() - began < 2
+    assert 0.25 < time.monotonic() - began < 10
     cancel = threading.Event()
     threading.Timer(0.1, cancel.set).start()
     with pytest.raises(Cancelled):
         display.status(deadline=in_seconds(30, cancel))
     os.kill(player.pid, signal.SIGCONT)
-    assert display.status(deadline=in_seconds(5))["ok"]
-    assert display.play("1", deadline=in_seconds(5)).sequence > 1
+    assert display.status(deadline=in_seconds(20))["ok"]
+    assert display.play("1", deadline=in_seconds(20)).sequence > 1
     assert np.array_equal(shown(tmp_path)["P1"], noise(OUTPUTS, 1)["P1"])
 
 

@@ -112,13 +112,13 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ctypes.CDLL]:
 
 @pytest.fixture
 def link(library: ctypes.CDLL) -> Iterator[PtpUsbLink]:
-    link = PtpUsbLink.over(PortPipes(library), deadline=in_seconds(5))
+    link = PtpUsbLink.over(PortPipes(library), deadline=in_seconds(20))
     yield link
     link.close()
 
 
 def ask(link: PtpUsbLink, *request: int, **options: Any) -> bytes:
-    reply = link.transact(*request, deadline=in_seconds(5), **options)
+    reply = link.transact(*request, deadline=in_seconds(20), **options)
     assert reply.ok, hex(reply.code)
     return reply.data
 
@@ -139,14 +139,14 @@ def test_our_whole_driver_takes_pictures_with_it(library: ctypes.CDLL, tmp_path:
         return PtpUsbLink.over(PortPipes(library), deadline=deadline)
 
     timing = Timing(grace_s=0.2, margin_s=2.0)
-    camera = PtpCamera(connect, timing=timing, deadline=in_seconds(10))
+    camera = PtpCamera(connect, timing=timing, deadline=in_seconds(20))
     try:
-        assert camera.identity(deadline=in_seconds(5)).maker == "GP"
-        confirmed = camera.configure(ExposureSettings(0.02, 100, 5.6, raw=False), deadline=in_seconds(5))
+        assert camera.identity(deadline=in_seconds(20)).maker == "GP"
+        confirmed = camera.configure(ExposureSettings(0.02, 100, 5.6, raw=False), deadline=in_seconds(20))
         assert (confirmed.exposure_s, confirmed.aperture_f) == (0.02, 5.6)
         for number in range(3):
-            files = camera.capture(tmp_path / f"shot{number}", deadline=in_seconds(10))
+            files = camera.capture(tmp_path / f"shot{number}", deadline=in_seconds(20))
             assert [file.path.read_bytes() == JPEG for file in files] == [True]
-        assert camera.status(deadline=in_seconds(5)).battery_percent == 50
+        assert camera.status(deadline=in_seconds(20)).battery_percent == 50
     finally:
         camera.close()
