@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row, at_most
+from benchmarks._panels import OpenPanels, log_in, make_account
 from benchmarks._stage import FIRST_SEED, prepared_stage
 from controller.app import check_stage
 from controller.bundle.install import install
@@ -35,6 +36,9 @@ STARTS = 5
 HANGS = 3
 LONGEST_S = 60.0
 REST_S = 5.0
+PAGES = 15
+OPEN = 50
+PORT = 18377
 NAME = "grey"
 
 
@@ -53,11 +57,61 @@ def measure(size: str) -> list[Row]:
                 wait_for(stage, "playing")
                 hangs = [_hang(stage) for _ in range(HANGS)]
                 share = _at_rest(served.pid)
+                served.terminate()
+                served.wait()
+            panels = _panels(stage)
     return [
         at_most("boot to pictures, lamps warm", statistics.median(boots), 3.0, unit="s", how=_spread(boots)),
         at_most("player stopped by SIGSTOP, until a picture", max(hangs), 5.0, unit="s", how=_spread(hangs)),
         at_most("service while playing", 100 * share, 10.0, unit="% of a core", how=f"over {REST_S:g} s"),
+        *panels,
     ]
+
+
+def _panels(stage: Path) -> list[Row]:
+    """The first page, and what open panels cost: nothing to tell, and four changes a second (the names, on and off)."""
+    make_account(stage)
+    with service(stage, "--panel", f"127.0.0.1:{PORT}") as served:
+        wait_for(stage, "playing")
+        browser = log_in(PORT)
+        pages = [browser.first_page() for _ in range(PAGES)]
+        alone, nobody = _at_rest(served.pid), _busy(stage, served.pid)
+        with OpenPanels(browser, OPEN) as panels:
+            time.sleep(2.0)
+            resting = _at_rest(served.pid)
+            before = panels.received
+            busy = _busy(stage, served.pid)
+            told = (panels.received - before) / OPEN / REST_S
+    seconds = [seconds for seconds, _ in pages]
+    return [
+        at_most("first page with all it loads", max(size for _, size in pages) / 1e3, 100.0, unit="kB",
+                how="page, style sheet, script, icon"),
+        at_most("first page with all it loads, time", 1e3 * statistics.median(seconds), 150.0, unit="ms",
+                how=_spread(seconds)),
+        at_most(f"{OPEN} open panels, nothing changes", 100 * (resting - alone), 10.0, unit="% of a core",
+                how=f"processor time over {REST_S:g} s, less that without them"),
+        at_most(f"{OPEN} open panels, something changes all the time", 100 * (busy - nobody), 10.0,
+                unit="% of a core", how=f"as above; {told:.0f} bytes a second to each"),
+    ]  # fmt: skip
+
+
+def _busy(stage: Path, pid: int) -> float:
+    """As ``_at_rest``, while the state changes as often as panels are told."""
+    ended = threading.Event()
+
+    def change() -> None:
+        on = False
+        while not ended.wait(0.25):
+            on = not on
+            ask(stage, "identify", on=on)
+
+    thread = threading.Thread(target=change)
+    thread.start()
+    try:
+        return _at_rest(pid)
+    finally:
+        ended.set()
+        thread.join()
 
 
 def install_grey(stage: Path) -> None:
@@ -76,9 +130,10 @@ def install_grey(stage: Path) -> None:
 
 
 @contextlib.contextmanager
-def service(stage: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """``velatura serve --no-panel`` in a process of its own, its lamps left lit at the end."""
-    command = [sys.executable, "-m", "controller", "serve", str(stage), "--no-panel", "--leave-lit"]
+def service(stage: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
+    """``velatura serve`` in a process of its own (without options without panel), its lamps left lit at the end."""
+    options = options or ("--no-panel",)
+    command = [sys.executable, "-m", "controller", "serve", str(stage), "--leave-lit", *options]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         try:
             yield process
