@@ -5,6 +5,7 @@ Everything is on the processor: memory outputs have no shaders.
 
 from __future__ import annotations
 
+import os
 import statistics
 import tempfile
 import time
@@ -190,19 +191,31 @@ def _streams(folder: Path, scaler: Interactive, target: ByteImage, *, paper: boo
         ("live targets shown, from a video file", lambda: VideoSource(video, loop=True), False),
     ]
     rows = []
-    with start_player(folder, settings):
+    with start_player(folder, settings) as player:
         display = DRIVER.open({"socket": "player.sock"}, OpenContext(stage=folder), in_seconds(20))
         assert isinstance(display, PlayerDisplay)
         for figure, source, has_goal in kinds:
+            cpu_s = time.process_time(), _cpu_s(player.pid)
             shown, seconds, live = _streamed(display, folder / "live.frame", outputs, scaler, source())
+            ours_ms, players_ms = (
+                1e3 * (now - before) / max(shown, 1)
+                for now, before in zip((time.process_time(), _cpu_s(player.pid)), cpu_s, strict=True)
+            )
             delay_ms = 1e3 * (live.delay_p50_s or 0.0)
             rows.append(
                 at_least(figure, shown / seconds, 25.0 if has_goal else None, unit="/s",
                          how=f"{shown} in {seconds:.1f} s by a player of its own, into memory outputs; from written "
-                         f"to presented p50 {delay_ms:.0f} ms")
+                         f"to presented p50 {delay_ms:.0f} ms; processor time a target {ours_ms:.0f} ms here and "
+                         f"{players_ms:.0f} ms in the player")
             )  # fmt: skip
         display.close()
     return rows
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _streamed(
