@@ -11,6 +11,7 @@ case was explained and mended before its deadline, nothing hung, and no lamp was
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import random
@@ -224,18 +225,21 @@ def campaign(numbers: list[int], lanes: int, folder: Path) -> list[dict[str, Any
     begun = prepare_wired(folder / "begun")
     words = [sys.executable, "-m", "tests.campaigns.serve_wires", "lane"]
     stages = [copy(begun, folder / f"lane-{number}") for number in range(min(lanes, len(numbers)))]
-    processes = [
-        subprocess.Popen(
-            [*words, str(stage), *map(str, numbers[number::lanes])], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY
-        )
-        for number, stage in enumerate(stages)
-    ]
-    rows = []
-    for process in processes:
-        said = [json.loads(line) for line in process.communicate()[0].splitlines()]
-        rows += said
+    rows: list[dict[str, Any]] = []
+    with contextlib.ExitStack() as stack:
+        running = []
+        for number, stage in enumerate(stages):
+            said = stack.enter_context((folder / f"lane-{number}.said").open("w"))
+            command = [*words, str(stage), *map(str, numbers[number::lanes])]
+            running.append(subprocess.Popen(command, stdout=said, cwd=REPOSITORY))
+            stack.callback(running[-1].kill)
+        for process in running:
+            process.wait()
+    for number, process in enumerate(running):
+        told = [json.loads(line) for line in (folder / f"lane-{number}.said").read_text().splitlines()]
+        rows += told
         if process.returncode not in (0, 1):
-            rows.append({"case": f"a lane after {said[-1:]}", "wrong": f"it ended with {process.returncode}"})
+            rows.append({"case": f"a lane after {told[-1:]}", "wrong": f"it ended with {process.returncode}"})
     return rows
 
 
