@@ -9,10 +9,12 @@ import json
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
+from statistics import median
 
 from benchmarks import timed
 from hal.deadline import in_seconds
@@ -50,22 +52,25 @@ def peak_here() -> int:
 
 def main(bus: str, flavour: str, size: str, folder: str) -> None:
     """Take pictures, and tell how long one took and how much memory this process had."""
-    number = count()
+    number, spent_s = count(), list[float]()
     with serving(bus, flavour, int(size), Path(folder)) as address, tempfile.TemporaryDirectory() as pictures:
         camera = open_camera({"address": address}, OpenContext(Path(pictures)), in_seconds(10))
         try:
             camera.configure(ExposureSettings(EXPOSURE_S, 100), deadline=in_seconds(10))
 
             def capture() -> None:
+                began_s = time.process_time()
                 for file in camera.capture(Path(pictures) / f"{next(number)}", deadline=in_seconds(60)):
                     if abs(file.size - int(size)) > 8:
                         raise AssertionError(f"the camera sent {file.size} bytes instead of {size}")
                     file.path.unlink()
+                spent_s.append(time.process_time() - began_s)
 
             timing = timed(capture, repeats=REPEATS)
         finally:
             camera.close()
-    print(json.dumps({"words": str(timing), "median": timing.median, "peak": peak_here()}))
+    told = {"words": str(timing), "median": timing.median, "cpu": median(spent_s), "peak": peak_here()}
+    print(json.dumps(told))
 
 
 if __name__ == "__main__":
