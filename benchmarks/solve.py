@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -11,11 +10,11 @@ from numba import prange
 
 from benchmarks import Row, Timing, at_most, peak_bytes, timed
 from benchmarks._synthetic import synthetic_calibration, synthetic_target
+from benchmarks._traced import Sweep, Trace, traced
 from controller.arrays import ByteImage, FloatImage
 from controller.calibrate.values import Calibration
 from controller.compiled import compiled
 from controller.solve.appearance import Base, base_image, scale_frames, solve_base
-from controller.solve.bounded import TOLERANCE, Solution, solve_bounded
 from controller.solve.dither import to_device
 from controller.solve.feasibility import choose_exposure, target_radiance
 from controller.solve.interactive import interactive
@@ -25,8 +24,10 @@ from controller.transport.window_transport import WindowTransport
 STREAMED_FLOATS = 1 << 27
 NEAR_BEST = 1e-3
 NEAR_ENOUGH = 1e-2
-LOOSE = 4e-4
-SMALLEST = 1e-6
+BASE_SWEEPS = 150
+LONG_SWEEPS = 400
+MOST_S = 110.0
+"""Of a long run; a gap to its best is a lower bound of that to the optimum, the less so the longer it was."""
 
 
 @compiled(parallel=True, fastmath=True)
@@ -86,51 +87,29 @@ def _values(timing: Timing) -> tuple[float, float, float]:
 
 
 def _solve(transport: LightTransport, calibration: Calibration, target: FloatImage, *, paper: bool) -> list[Row]:
-    """A cold solve of ``target``, far beyond need for the best objective, then as far as 1e-3 and 1e-2 of it."""
+    """A base, an appearance far beyond need for its best objective, and the same again from base x scale."""
     black = calibration.black
-    solve_bounded(transport, target, black, most_iterations=1)
-    at: list[float] = []
-    best = solve_bounded(
-        transport,
-        target,
-        black,
-        tolerance=2e-6,
-        most_iterations=400,
-        progress=lambda iteration, kkt: at.append(time.perf_counter()),
-    )
-    sweep = Timing(*(float(f(np.diff(at))) for f in (np.min, np.median, np.max)))
-    near = _until(transport, target, black, best.objective * (1 + NEAR_BEST), TOLERANCE)
-    memory = peak_bytes()
-    rows = [
-        at_most("one sweep over the projectors", sweep.minimum, None, unit="s", how=str(sweep)),
-        at_most(
-            "solve to 1e-3 of the best objective",
-            near.seconds,
-            15.0 if paper else None,
-            unit="s",
-            how=f"{near.iterations} sweeps, KKT residual {near.kkt:.2g}; best of {best.iterations}, {best.kkt:.2g}",
-        ),
-        at_most(
-            "peak memory of the process",
-            memory / 1e9,
-            3.0 if paper else None,
-            unit="GB",
-            how="the calibration, its pictures and the solves, resident",
-        ),
-    ]
-    base = solve_base(transport, base_image(calibration, "white"), black)
-    rows.append(at_most("base solve", base.solution.seconds, None, unit="s", how=f"{base.solution.iterations} sweeps"))
+    traced(transport, target, black, 1)
+    image = base_image(calibration, "white")
+    of_base = traced(transport, image, black, BASE_SWEEPS, most_s=MOST_S)
+    rows = _near("base solve", of_base, NEAR_BEST, 15.0 if paper else None)
+    rows.append(at_most("one sweep over the projectors", of_base.sweep.minimum, None, unit="s", how=str(of_base.sweep)))
+    rows.append(at_most("before the first sweep", of_base.setup.seconds, None, unit="s", how=_processor(of_base.setup)))
+    whole = traced(transport, target, black, LONG_SWEEPS, most_s=MOST_S)
+    rows += _near("appearance", whole, NEAR_BEST, None)
+    rows += _near("appearance", whole, NEAR_ENOUGH, 5.0 if paper else None)
+    rows.append(at_most("peak memory of the process", peak_bytes() / 1e9, 3.0 if paper else None, unit="GB",
+                        how="the calibration, its pictures and the solves, resident"))  # fmt: skip
+    base = solve_base(transport, image, black)
+    solution = base.solution
+    above = solution.objective / of_base.best - 1
+    rows.append(at_most("base solve as it stops by itself", solution.seconds, None, unit="s",
+                        how=f"{solution.iterations} sweeps, KKT {solution.kkt:.2g}, {above:.1e} above the best"))  # fmt: skip
     start = scale_frames(transport, base, target, black)
-    warm = _until(transport, target, black, best.objective * (1 + NEAR_ENOUGH), LOOSE, start)
-    rows.append(
-        at_most(
-            "full solve from base x scale to 1e-2",
-            warm.seconds,
-            5.0 if paper else None,
-            unit="s",
-            how=f"{warm.iterations} sweeps",
-        )
-    )
+    warm = traced(transport, target, black, 60, start=start, enough=whole.best * (1 + NEAR_ENOUGH))
+    number, at = warm.reached(whole.best * (1 + NEAR_ENOUGH))
+    rows.append(at_most("appearance from base x scale to 1e-2", at.seconds, 5.0 if paper else None, unit="s",
+                        how=f"{number} sweeps; {_processor(at)}"))  # fmt: skip
     ready = interactive(transport, base, black, [part.radiometry for part in calibration.projectors])
     shown = timed(lambda: ready.frames(target), repeats=15)
     slow = timed(lambda: _reference(transport, base, target, calibration), repeats=2)
@@ -141,22 +120,17 @@ def _solve(transport: LightTransport, calibration: Calibration, target: FloatIma
     return rows
 
 
+def _near(what: str, trace: Trace, gap: float, goal: float | None) -> list[Row]:
+    number, at = trace.reached(trace.best * (1 + gap))
+    last = trace.sweeps[-1]
+    how = f"{number} sweeps, set-up included, KKT residual {at.kkt:.2g}; {_processor(at)}; best of {len(trace.sweeps)}"
+    return [at_most(f"{what} to {gap:g} of the best", at.seconds, goal, unit="s", how=f"{how}, {last.kkt:.2g}")]
+
+
+def _processor(at: Sweep) -> str:
+    return f"{at.processor_s:.3g} s of processor time"
+
+
 def _reference(transport: LightTransport, base: Base, target: FloatImage, calibration: Calibration) -> list[ByteImage]:
     frames = scale_frames(transport, base, target, calibration.black)
     return [to_device(frame, part.radiometry) for frame, part in zip(frames, calibration.projectors, strict=True)]
-
-
-def _until(
-    transport: LightTransport,
-    target: FloatImage,
-    black: FloatImage,
-    objective: float,
-    tolerance: float,
-    start: Sequence[FloatImage] | None = None,
-) -> Solution:
-    """A solve that stops by a KKT residual small enough for ``objective``, found by lowering it by a fifth."""
-    while True:
-        found = solve_bounded(transport, target, black, tolerance=tolerance, start=start)
-        if found.objective <= objective or tolerance < SMALLEST:
-            return found
-        tolerance *= 0.8

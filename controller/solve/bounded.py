@@ -18,7 +18,8 @@ import numpy as np
 from controller.arrays import FloatImage
 from controller.errors import UsageError
 from controller.solve.descent import Watch, descend
-from controller.solve.gradient import inner, share_of, tie, weighted_residual
+from controller.solve.gradient import inner, tie, weighted_residual
+from controller.solve.guess import guess
 from controller.solve.smoothness import squared_edges
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
@@ -186,11 +187,10 @@ def _frame_view(transport: LightTransport, n: int, planes: FloatImage) -> FloatI
 
 
 def first_guess(problem: Problem) -> FloatImage:
-    """All projectors at the same share of their light: right wherever the target is smooth."""
-    share = problem.transport.reach_planes()
-    share_of(problem.wanted, share)
-    guess = problem.transport.gaussian_mean_planes(share)
-    return np.clip(guess, 0, 1, out=guess)
+    """(3, pixels): the best frames for light that is smooth (``guess``); dark where a pixel lights nothing."""
+    x = guess(problem.transport, problem.wanted)
+    x[problem.majoriser == 0] = 0
+    return x
 
 
 def roughness(problem: Problem, x: FloatImage) -> float:

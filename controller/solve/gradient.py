@@ -163,17 +163,6 @@ def tie(
 
 
 @compiled(parallel=True, fastmath=True)
-def share_of(wanted: FloatImage, reach: FloatImage) -> None:
-    """Write min(wanted / reach, 1) over ``reach``, 0 where there is none; both (3, rows, columns)."""
-    one, none = np.float32(1), np.float32(0)
-    for y in prange(reach.shape[1]):
-        for c in range(3):
-            for x in range(reach.shape[2]):
-                light = reach[c, y, x]
-                reach[c, y, x] = min(wanted[c, y, x] / light, one) if light > 0 else none
-
-
-@compiled(parallel=True, fastmath=True)
 def inner(a: FloatImage, b: FloatImage) -> float:
     """The inner product of two flat arrays, added up in blocks so that it is the same for any number of threads."""
     block = 1 << 14

@@ -1,0 +1,229 @@
+"""The bounded solver beside an older one, a prototype outside this repository, in one run.
+
+``VELATURA_REFERENCE`` names its folder; without it, a notice stands in place of the rows. The prototype makes a stage
+of its own, and takes joint accelerated steps on it. Our solver gets the same arrays, the prototype's own products and
+the same objective (squared residual and smoothness), and sweeps until it is as near. So that ratio is of the methods;
+the time of one T p and T' r of either, each for a stage of the same size, is a row of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import runpy
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks import Row, at_least, at_most, timed
+from benchmarks._synthetic import synthetic_calibration
+from controller.arrays import FloatImage
+from controller.errors import WorkError
+from controller.solve.bounded import Problem, roughness
+from controller.solve.descent import Watch, descend
+from controller.transport import LightTransport
+
+VARIABLE: Final = "VELATURA_REFERENCE"
+FACTORS: Final = {"small": 0.2, "medium": 0.5, "paper": 1.0}
+ITERATIONS: Final = 50
+MOST_SWEEPS: Final = 60
+
+
+def measure(size: str) -> list[Row]:
+    """Seconds to the objective that the prototype has after ``ITERATIONS``, and of the products."""
+    folder = os.environ.get(VARIABLE)
+    if not folder:
+        return [Row(f"left out: {VARIABLE} is not set", "", None, 0.0, None, "name the prototype's folder")]
+    theirs, seconds = _prototype(Path(folder), FACTORS[size])
+    objective = _objective(theirs, theirs["p"])
+    transport = _Theirs.of(theirs)
+    sweeps, ours_s, reached = _to_objective(transport, theirs, objective)
+    goal = 2.0 if size == "paper" else None
+    return [
+        at_most(f"prototype, {ITERATIONS} joint iterations", seconds, None, unit="s", how=f"objective {objective:.6g}"),
+        at_most("sweeps to the same objective", ours_s, None, unit="s",
+                how=f"{sweeps} sweeps from equal shares, these included, with the prototype's products; {reached:.6g}"),
+        at_least("as fast as the prototype, same products", seconds / ours_s, goal, unit="x", how="the method alone"),
+        *_products(theirs, size, seconds / ours_s, goal),
+    ]  # fmt: skip
+
+
+@contextlib.contextmanager
+def _arguments(folder: Path, *given: str) -> Iterator[None]:
+    before, path = sys.argv, list(sys.path)
+    sys.argv, sys.path = [str(folder), *given], [str(folder), *path]
+    try:
+        yield
+    finally:
+        sys.argv, sys.path = before, path
+
+
+def _prototype(folder: Path, factor: float) -> tuple[dict[str, Any], float]:
+    """What it leaves behind, and the seconds that its iterations took, without those of its own reports."""
+    told = io.StringIO()
+    with _arguments(folder, str(factor), str(ITERATIONS)), contextlib.redirect_stdout(told):
+        theirs = runpy.run_path(str(folder / "solve.py"))
+    whole = float(re.findall(rf"^{ITERATIONS} t ([\d.]+)", told.getvalue(), re.MULTILINE)[-1])
+    report_s = timed(lambda: theirs["obj"](theirs["p"]), repeats=2).minimum
+    return theirs, whole - report_s * (ITERATIONS // 10 - 1)
+
+
+def _smooth(theirs: dict[str, Any]) -> tuple[FloatImage, FloatImage]:
+    """Its smoothness weights as planes (3, pixels)."""
+    across, down = (np.ascontiguousarray(theirs[name].T) for name in ("wh", "wv"))
+    return across, down
+
+
+def _objective(theirs: dict[str, Any], p: npt.NDArray[np.float32]) -> float:
+    """Squared residual and smoothness at ``p`` (pixels, 3)."""
+    squared = 2 * theirs["obj"](p)[0]
+    shape = theirs["N"], theirs["ph"], theirs["pw"], 3
+    frames, across, down = (theirs[name].reshape(shape) if name else p.reshape(shape) for name in ("", "wh", "wv"))
+    for n in range(shape[0]):
+        squared += float((across[n, :, :-1] * np.diff(frames[n], axis=1) ** 2).sum(dtype=np.float64))
+        squared += float((down[n, :-1] * np.diff(frames[n], axis=0) ** 2).sum(dtype=np.float64))
+    return float(squared)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Theirs(LightTransport):
+    """The prototype's T, by its own products; a sheet is its picture (rows, columns, 3)."""
+
+    theirs: dict[str, Any]
+
+    @classmethod
+    def of(cls, theirs: dict[str, Any]) -> _Theirs:
+        size = int(theirs["ph"]), int(theirs["pw"])
+        count = int(theirs["N"])
+        lit = np.ones((count, theirs["H"], theirs["W"]), np.bool_)
+        mixing = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3)).copy()
+        return cls(mixing, lit, np.ones(count * size[0] * size[1], np.float32), (size,) * count, theirs)
+
+    def _part(self, n: int) -> tuple[Any, ...]:
+        span = self.span(n)
+        return tuple(self.theirs[name][span] for name in ("P", "X0", "Y0", "A"))
+
+    def sheet(self) -> FloatImage:
+        return np.zeros((*self.shape, 3), np.float32)
+
+    def add_light(self, n: int, p: FloatImage, sheet: FloatImage) -> None:
+        weights, left, top, amplitude = self._part(n)
+        pixels = np.ascontiguousarray(p[:, self.span(n)].T)
+        of = self.theirs
+        of["fwd"](weights, left, top, pixels, amplitude, sheet, of["K"], *self.sizes[n], 1, of["B"])
+
+    def pull(self, n: int, sheet: FloatImage, out: FloatImage) -> None:
+        weights, left, top, amplitude = self._part(n)
+        pixels = np.empty((left.size, 3), np.float32)
+        self.theirs["adj"](weights, left, top, sheet, amplitude, pixels, self.theirs["K"])
+        out[:, self.span(n)] = pixels.T
+
+    def weigh(self, sheet: FloatImage, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
+        np.subtract(sheet, aim, out=out)
+
+    def aim(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
+        return picture
+
+    def forward_planes(
+        self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
+    ) -> FloatImage:
+        raise TypeError("the prototype's pictures are sheets")
+
+    def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
+        raise TypeError("the prototype's pictures are sheets")
+
+    def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
+        raise TypeError("the prototype has no means")
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return {}
+
+    @classmethod
+    def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> _Theirs:
+        raise KeyError("P")
+
+
+def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) -> tuple[int, float, float]:
+    """Sweeps until the objective is no higher, their seconds without those of looking, and the objective then."""
+    across, down = _smooth(theirs)
+    majoriser = 2 * _ties(transport, across, down)
+    ones, sheet, reach = np.ones_like(majoriser), transport.sheet(), transport.sheet()
+    data = np.zeros_like(majoriser)
+    for n in range(len(transport.sizes)):
+        sheet[:] = 0
+        transport.add_light(n, ones, sheet)
+        reach += sheet
+        transport.pull(n, sheet, data)
+    majoriser += data
+    wanted: FloatImage = theirs["tgt"]
+    problem = Problem(transport, wanted, np.ones(transport.shape, np.float32), across, down, majoriser)
+    start = _start(transport, wanted, reach)
+    descend(problem, start.copy(), Watch(0, 1))
+    seen: list[tuple[int, float, float]] = []
+    state = {"looked_s": 0.0, "began_s": time.perf_counter()}
+    start = _start(transport, wanted, reach)
+
+    def look(sweep: int, x: FloatImage) -> None:
+        arrived_s = time.perf_counter()
+        light = transport.sheet()
+        for n in range(len(transport.sizes)):
+            transport.add_light(n, x, light)
+        found = float(((light - wanted).astype(np.float64) ** 2).sum()) + roughness(problem, x)
+        seen.append((sweep, arrived_s - state["began_s"] - state["looked_s"], found))
+        state["looked_s"] += time.perf_counter() - arrived_s
+
+    def enough() -> bool:
+        return bool(seen) and seen[-1][2] <= objective
+
+    with contextlib.suppress(WorkError):
+        descend(problem, start, Watch(0, MOST_SWEEPS, cancelled=enough, look=look))
+    return seen[-1]
+
+
+def _start(transport: _Theirs, wanted: FloatImage, reach: FloatImage) -> FloatImage:
+    """All projectors at the same share of their light, as means over their pixels' light."""
+    share, whole = np.empty((3, transport.pixels), np.float32), np.empty((3, transport.pixels), np.float32)
+    for n in range(len(transport.sizes)):
+        transport.pull(n, wanted, share)
+        transport.pull(n, reach, whole)
+    return np.clip(share / np.maximum(whole, np.finfo(np.float32).tiny), 0, 1)
+
+
+def _ties(transport: _Theirs, across: FloatImage, down: FloatImage) -> FloatImage:
+    """The sum of each pixel's ties (3, pixels)."""
+    total = across + down
+    for n, size in enumerate(transport.sizes):
+        frame, right, below = (v[:, transport.span(n)].reshape(3, *size) for v in (total, across, down))
+        frame[:, :, 1:] += right[:, :, :-1]
+        frame[:, 1:] += below[:, :-1]
+    return total
+
+
+def _products(theirs: dict[str, Any], size: str, method: float, goal: float | None) -> list[Row]:
+    of = {name: theirs[name] for name in ("P", "X0", "Y0", "p", "A", "R", "K", "ph", "pw", "N", "B", "g")}
+    forward = timed(
+        lambda: theirs["fwd"](*(of[k] for k in ("P", "X0", "Y0", "p", "A", "R", "K", "ph", "pw", "N", "B")))
+    )
+    adjoint = timed(lambda: theirs["adj"](*(of[k] for k in ("P", "X0", "Y0", "R", "A", "g", "K"))))
+    transport = LightTransport.build(synthetic_calibration(size))
+    p = np.full((3, transport.pixels), 0.5, np.float32)
+    light, back = np.empty((3, *transport.shape), np.float32), np.empty((3, transport.pixels), np.float32)
+    here = (
+        timed(lambda: transport.forward_planes(p, out=light)),
+        timed(lambda: transport.adjoint_planes(light, out=back)),
+    )
+    theirs_s, ours_s = forward.minimum + adjoint.minimum, here[0].minimum + here[1].minimum
+    return [
+        at_most("prototype's T p and T' r", theirs_s, None, unit="s", how=f"{forward}; {adjoint}"),
+        at_most("our T p and T' r", ours_s, None, unit="s", how=f"{here[0]}; {here[1]}; synthetic stage of this size"),
+        at_least("as fast as the prototype, with our products", method * theirs_s / ours_s, goal, unit="x",
+                 how="estimated: the two ratios multiplied; the stages differ in their footprints"),
+    ]  # fmt: skip
