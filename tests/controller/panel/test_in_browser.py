@@ -13,6 +13,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from controller.panel.accounts import Accounts
+from controller.panel.pages import NAVIGATION
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, picture, tab
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import QUICK_HASH, Served, served
@@ -25,6 +26,7 @@ PAGES = (
     "/appearances/new",
     "/schedule",
     "/results",
+    "/lamps",
     "/events",
     "/doctor",
     "/aiming",
@@ -235,6 +237,10 @@ def test_first_start_leads_from_the_one_time_password_to_a_stage(tmp_path: Path,
         page.wait_for_url("**/aiming")
         assert '[camera]\ndriver = "ptp"' in kiosk.settings()
         assert accounts.first_start() is None
+
+
+def test_every_page_of_the_navigation_is_looked_at() -> None:
+    assert {path for path, _, _ in NAVIGATION} <= set(PAGES)
 
 
 @pytest.mark.parametrize("phone", [True, False])
