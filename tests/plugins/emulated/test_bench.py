@@ -206,11 +206,23 @@ def test_white_is_well_exposed_at_a_fifteenth_of_a_second(world: World, prepared
 
 
 def test_a_frame_that_appears_in_the_middle_of_an_exposure_counts_for_its_share(
-    world: World, prepared: Path, tmp_path: Path
+    world: World, prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    exposed_s: list[tuple[float, float]] = []
+    during = world._visible.during
+
+    def noted(start_s: float, end_s: float) -> Any:
+        exposed_s.append((start_s, end_s))
+        return during(start_s, end_s)
+
+    # When the shutter really was open: a loaded machine opens it late, and closes it late.
+    monkeypatch.setattr(world._visible, "during", noted)
     show(prepared, 255, time.monotonic() - 1.0, 2)
     quarter = dataclasses.replace(WHITE, exposure_s=0.8, aperture_f=32.0)
     whole = signal_of(world, tmp_path, quarter)
-    show(prepared, 0, time.monotonic() + 0.1, 4)
+    dark_at_s = time.monotonic() + 0.2
+    show(prepared, 0, dark_at_s, 4)
     part = signal_of(world, tmp_path, quarter)
-    assert part / whole == pytest.approx((0.1 + 2 / 60) / 0.4, abs=0.06)
+    start_s, end_s = exposed_s[-1]
+    share = (dark_at_s + 2 / 60 - start_s) / (end_s - start_s)
+    assert part / whole == pytest.approx(min(1.0, max(0.0, share)), abs=0.06)
