@@ -142,6 +142,9 @@ def appearance(
     base: Annotated[
         str | None, typer.Option(help="The base image: minimum, white or high-pass; else as stage.toml says.")
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A preview: base times scale alone, whatever detail the target has.")
+    ] = False,
     scheduler: Annotated[
         str | None, typer.Option(help="Solve on the workers of a Dask scheduler: tcp://host:8786 or tls://host:8786.")
     ] = None,
@@ -152,7 +155,7 @@ def appearance(
     work(
         "controller.services:make_appearances", as_json=as_json,
         stage=stage, names=tuple(names or ()), scenes=tuple(blender or ()), accept_grade=accept_grade, base=base,
-        scheduler=scheduler,
+        scheduler=scheduler, quick=quick,
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,12 +108,14 @@ def make_appearances(
     accept_grade: bool = False,
     base: str | None = None,
     scheduler: str | None = None,
+    quick: bool = False,
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml on the last calibration, and install them as the stage's bundle.
 
     ``scenes``: Blender scenes to render besides ``names``, or alone if no names are given.
     ``accept_grade``: publish whatever the calibration's grade. ``base``: the base image, instead of stage.toml's.
-    ``scheduler``: of a Dask cluster, on whose workers the appearances are solved.
+    ``scheduler``: of a Dask cluster, on whose workers the appearances are solved. ``quick``: by base times scale
+    alone, whatever stage.toml says; without it the next run solves them as stage.toml says.
 
     No device is touched: the projectors may be off, or playing.
     Raises what ``usable_calibration``, ``wishes_of``, ``answering_on`` and the steps raise.
@@ -126,7 +129,11 @@ def make_appearances(
         wishes = wishes_of(checked.stage, calibrated, names) if names or not scenes else []
         wishes += [scene_wish(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve
-        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or table.base, table.adapt)
+        kept = base_choice(table.base)
+        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or kept, table.adapt)
+        if quick:
+            # a high-pass base would be solved anew for each
+            options = replace(options, mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
         outputs = output_sizes(checked)
         scale = costs.scale(size for _, size in outputs.values())
         with answering_on(scheduler, calibrated, wishes) as answering, Journal(run) as journal:

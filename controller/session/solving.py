@@ -128,7 +128,7 @@ def solve_steps(
         Step(
             "base",
             partial(_solve_base, calibrated, options),
-            inputs=options.inputs(),
+            inputs=options.base_inputs(),
             after=tuple(after),
             title="Solving the base image",
             weight=costs.BASE_S * scale,

@@ -47,9 +47,14 @@ class SolveOptions:
     adapt: float = 0.0
 
     def inputs(self) -> dict[str, str]:
-        """What a result depends on, as the journal compares it."""
+        """What an appearance depends on, as the journal compares it."""
         asked = {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode, "base": self.base}
         return asked if self.adapt == 0 else {**asked, "adapt": repr(self.adapt)}
+
+    def base_inputs(self) -> dict[str, str]:
+        """What the base image depends on: neither on how appearances are made of it, nor how bright."""
+        shared = "white" if self.base == "high-pass" else self.base
+        return {"smoothness": repr(self.smoothness), "base": shared}
 
 
 @dataclass(frozen=True, slots=True)
