@@ -93,8 +93,8 @@ def test_a_writer_that_never_pauses_never_gives_a_torn_frame(tmp_path: Path) -> 
     writer.start()
     try:
         reader, seen = FrameReader(path), set[int]()
-        until = time.monotonic() + 0.5
-        while time.monotonic() < until:
+        begun_s = time.monotonic()
+        while (passed_s := time.monotonic() - begun_s) < 0.5 or (len(seen) <= 5 and passed_s < 30):
             found = reader.latest()
             assert found is not None
             assert np.ptp(found.frames["P1"]) == 0
