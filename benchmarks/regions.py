@@ -18,17 +18,19 @@ import numpy as np
 
 from benchmarks import Row, Timing, at_least, at_most
 from benchmarks._synthetic import crop_calibration, synthetic_calibration, synthetic_target
+from benchmarks._traced import traced
 from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration
-from controller.solve.bounded import Solution, first_guess, pose, solve_bounded
+from controller.solve.bounded import first_guess, pose, solve_bounded
 from controller.solve.box_solvers import BoxProblem, solve_box
 from controller.solve.feasibility import choose_exposure, target_radiance
 from controller.solve.regions import PHASES, SIZE_PX, Regions, solve_regions
 from controller.transport import LightTransport
 
 SAMPLE: Final = 30
-GLOBAL_REPEATS: Final = 2
-MOST_ITERATIONS: Final = 150
+LONG_SWEEPS: Final = 400
+MOST_S: Final = 60.0
+"""Of the run whose least objective counts as the best."""
 CROPS: Final = 3
 CROP_PX: Final = 64
 SIZES_PX: Final = (8, 16, 32)
@@ -63,11 +65,13 @@ def _target(transport: LightTransport, black: FloatImage) -> FloatImage:
 def _times(calibration: Calibration, kind: str, gap: float, *, paper: bool) -> list[Row]:
     transport = LightTransport.build(calibration)
     target = _target(transport, calibration.black)
-    near, same = _global_seconds(transport, target, calibration.black, (NEAR_BEST, gap))
+    traced(transport, target, calibration.black, 1)
+    trace = traced(transport, target, calibration.black, LONG_SWEEPS, most_s=MOST_S)
+    (near_sweeps, near), (same_sweeps, same) = (trace.reached(trace.best * (1 + above)) for above in (NEAR_BEST, gap))
     rows = [
-        at_most(f"global solve to {above:.1e} above the best, {kind}", timing.median, None, unit="s",
-                how=f"{iterations} iterations; {timing}")
-        for above, (timing, iterations) in ((NEAR_BEST, near), (gap, same))
+        at_most(f"global solve to {above:.1e} above the best, {kind}", at.seconds, None, unit="s",
+                how=f"{sweeps} sweeps, set-up included; best of {len(trace.sweeps)}")
+        for above, sweeps, at in ((NEAR_BEST, near_sweeps, near), (gap, same_sweeps, same))
     ]  # fmt: skip
     regions = Regions(pose(transport, target, calibration.black, 0.001, None))
     count = sum(1 for phase in PHASES for _ in regions.of_phase(phase))
@@ -86,35 +90,12 @@ def _times(calibration: Calibration, kind: str, gap: float, *, paper: bool) -> l
         rows += [
             at_most(f"regions by {solver}, {kind}", whole, None, unit="s",
                     how=f"{count} regions on {cores} cores, from {SAMPLE}; each {_timing(spent)}"),
-            at_least(f"regions by {solver} by global solve to {NEAR_BEST:g}, {kind}", whole / near[0].median,
+            at_least(f"regions by {solver} by global solve to {NEAR_BEST:g}, {kind}", whole / near.seconds,
                      goal if paper else None, unit="x", how="solving alone, without cutting out the equations"),
-            at_least(f"regions by {solver} by global solve as near as they come, {kind}", whole / same[0].median,
+            at_least(f"regions by {solver} by global solve as near as they come, {kind}", whole / same.seconds,
                      None, unit="x", how=f"to {gap:.1e} above the best, what regions of 16 leave on a crop"),
         ]  # fmt: skip
     return rows
-
-
-def _global_seconds(
-    transport: LightTransport, target: FloatImage, black: FloatImage, gaps: tuple[float, ...]
-) -> list[tuple[Timing, int]]:
-    """For each gap, the time of the iterations after which the objective is that near to the best, and their number.
-
-    What counts as the best is the objective after ``MOST_ITERATIONS``.
-    """
-
-    def solved(iterations: int) -> Solution:
-        return solve_bounded(transport, target, black, tolerance=0, most_iterations=iterations)
-
-    best = solved(MOST_ITERATIONS).objective
-    found = []
-    for gap in gaps:
-        iterations = 9
-        objective = np.inf
-        while objective > best * (1 + gap) and iterations < MOST_ITERATIONS:
-            iterations = iterations * 4 // 3
-            objective = solved(iterations).objective
-        found.append((_timing([solved(iterations).seconds for _ in range(GLOBAL_REPEATS)]), iterations))
-    return found
 
 
 def _sampled(regions: Regions) -> tuple[list[list[BoxProblem]], float]:

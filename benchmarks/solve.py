@@ -102,9 +102,9 @@ def _solve(transport: LightTransport, calibration: Calibration, target: FloatIma
                         how="the calibration, its pictures and the solves, resident"))  # fmt: skip
     base = solve_base(transport, image, black)
     solution = base.solution
-    above = solution.objective / of_base.best - 1
+    near = f"KKT residual {solution.kkt:.2g}, {solution.objective / of_base.best - 1:.1e} above the best"
     rows.append(at_most("base solve as it stops by itself", solution.seconds, None, unit="s",
-                        how=f"{solution.iterations} sweeps, KKT {solution.kkt:.2g}, {above:.1e} above the best"))  # fmt: skip
+                        how=f"{solution.iterations} sweeps, {near}"))  # fmt: skip
     start = scale_frames(transport, base, target, black)
     warm = traced(transport, target, black, 60, start=start, enough=whole.best * (1 + NEAR_ENOUGH))
     number, at = warm.reached(whole.best * (1 + NEAR_ENOUGH))
