@@ -19,7 +19,7 @@ from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
 def client(emulator: EmulatedPjLinkProjector) -> Iterator[Any]:
     """A connection of pypjlink2, not yet authenticated."""
     host, port = emulator.address.split(":")
-    link = PyPjLink.from_address(host, int(port), timeout=5)
+    link = PyPjLink.from_address(host, int(port), timeout=20)
     try:
         yield link
     finally:
