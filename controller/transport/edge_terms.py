@@ -64,11 +64,19 @@ class EdgedTransport(LightTransport):
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         """T' r on planes, as ``LightTransport.adjoint_planes``."""
         back = self.model.adjoint_planes(r, out=out)
-        flat = r.reshape(3, -1)
-        for n, term in enumerate(self.terms):
-            seen = np.stack([term.differences.T @ (term.white[c] * flat[c, term.camera]) for c in range(3)])
-            back[:, self.span(n)] += self.mixing[n].T @ seen.astype(np.float32)
+        for n in range(len(self.terms)):
+            self._add_term(n, r, back)
         return back
+
+    def adjoint_part(self, n: int, r: FloatImage, out: FloatImage) -> None:
+        """T_n' r of one projector, as ``LightTransport.adjoint_part``."""
+        self.model.adjoint_part(n, r, out)
+        self._add_term(n, r, out)
+
+    def _add_term(self, n: int, r: FloatImage, back: FloatImage) -> None:
+        term, flat = self.terms[n], r.reshape(3, -1)
+        seen = np.stack([term.differences.T @ (term.white[c] * flat[c, term.camera]) for c in range(3)])
+        back[:, self.span(n)] += self.mixing[n].T @ seen.astype(np.float32)
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         """The model's."""

@@ -133,6 +133,10 @@ class LightTransport(ABC):
     def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
         """T' r on planes: (3, rows, columns) to (3, pixels)."""
 
+    def adjoint_part(self, n: int, r: FloatImage, out: FloatImage) -> None:
+        """Write T_n' r, of a picture (3, rows, columns), to the pixels of ``n`` in ``out`` (3, pixels of all)."""
+        out[:, self.span(n)] = self.adjoint_planes(r)[:, self.span(n)]
+
     def sheet(self) -> FloatImage:
         """The light of no projector, in the form that a solver keeps it in: as the camera samples it.
 
@@ -147,7 +151,7 @@ class LightTransport(ABC):
 
     def pull(self, n: int, sheet: FloatImage, out: FloatImage) -> None:
         """Write the transpose of ``add_light`` to the pixels of ``n`` in ``out`` (3, pixels of all projectors)."""
-        out[:, self.span(n)] = self.adjoint_planes(sheet)[:, self.span(n)]
+        self.adjoint_part(n, sheet, out)
 
     def weigh(self, sheet: FloatImage, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
         """Write D' w D sheet - aim, with D making the picture of a sheet; ``weights`` (rows, columns)."""

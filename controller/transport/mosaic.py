@@ -37,15 +37,33 @@ def _count(colours: Colours, y: int, x: int, colour: int, rows: int, columns: in
 @compiled()
 def _picture_one(sites: FloatImage, colours: Colours, y: int, x: int) -> tuple[float, float, float]:
     rows, columns = sites.shape
-    total, n = np.zeros(3, np.float32), np.zeros(3, np.int64)
+    red = green = blue = np.float32(0)
+    reds = greens = blues = 0
     for r in range(max(y - 1, 0), min(y + 2, rows)):
         for c in range(max(x - 1, 0), min(x + 2, columns)):
-            colour = colours[r & 1, c & 1]
-            total[colour] += sites[r, c]
-            n[colour] += 1
-    own = colours[y & 1, x & 1]
-    total[own], n[own] = sites[y, x], 1
-    return total[0] / max(n[0], 1), total[1] / max(n[1], 1), total[2] / max(n[2], 1)
+            colour, value = colours[r & 1, c & 1], sites[r, c]
+            # no arrays: making them would take longer than all else here
+            if colour == 0:
+                red, reds = red + value, reds + 1
+            elif colour == GREEN:
+                green, greens = green + value, greens + 1
+            else:
+                blue, blues = blue + value, blues + 1
+    own, here = colours[y & 1, x & 1], sites[y, x]
+    found = (
+        here if own == 0 else red / np.float32(max(reds, 1)),
+        here if own == GREEN else green / np.float32(max(greens, 1)),
+        here if own not in (0, GREEN) else blue / np.float32(max(blues, 1)),
+    )
+    return float(found[0]), float(found[1]), float(found[2])
+
+
+@compiled()
+def _neighbours(colours: Colours, y: int, x: int, colour: int, rows: int, columns: int) -> int:
+    """Of how many sites the mean is that a pixel has in a colour not its own."""
+    if not (0 < y < rows - 1 and 0 < x < columns - 1):
+        return _count(colours, y, x, colour, rows, columns)
+    return 2 if colours[y & 1, x & 1] == GREEN else 4
 
 
 @compiled()
@@ -57,7 +75,7 @@ def _collect_one(planes: FloatImage, above: int, rows: int, colours: Colours, y:
     for r in range(max(y - 1, 0), min(y + 2, rows)):
         for c in range(max(x - 1, 0), min(x + 2, columns)):
             if colours[r & 1, c & 1] != own:
-                total += planes[own, r - above, c] / np.float32(_count(colours, r, c, own, rows, columns))
+                total += planes[own, r - above, c] / np.float32(_neighbours(colours, r, c, own, rows, columns))
     return total
 
 

@@ -98,12 +98,15 @@ class PatchTransport(LightTransport):
         if not self._blurred:
             adjoint_planes(self.patches, self.gain, self.mixing, r, (0, len(self.sizes)), out)
             return out
-        part, scratch = np.empty_like(r), np.empty_like(r)
         for n in range(len(self.sizes)):
-            np.multiply(self.after[n], r, out=part)
-            blur_planes(part, self.taps, scratch, part)
-            adjoint_planes(self.patches, self.gain, self.mixing, part, (n, n + 1), out)
+            self.adjoint_part(n, r, out)
         return out
+
+    def adjoint_part(self, n: int, r: FloatImage, out: FloatImage) -> None:
+        if self._blurred:
+            r, scratch = self.after[n] * r, np.empty_like(r)
+            blur_planes(r, self.taps, scratch, r)
+        adjoint_planes(self.patches, self.gain, self.mixing, r, (n, n + 1), out)
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         """``gaussian_mean`` on planes: (3, rows, columns) to (3, pixels); pixels of other projectors are 0."""

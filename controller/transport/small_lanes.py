@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 
 from controller.arrays import FloatImage
 from controller.transport.profiles import GROUP, LANES, SKEW_STEPS, SmallProfiles
-from controller.transport.windows import Windows
+from controller.transport.windows import STRIP, Windows
 
 _FLOAT, _INDEX, _LANE = ir.FloatType(), ir.IntType(64), ir.IntType(32)
 _SIXTEEN, _FOUR = ir.VectorType(_FLOAT, GROUP), ir.VectorType(_FLOAT, LANES)
@@ -196,14 +196,23 @@ def _pour_strips(_: Any, strips: Any, at: Any, sums: Any, to: Any, side: Any) ->
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         kinds = signature.args
         strips, sums = _data(context, builder, kinds[0], args[0]), _data(context, builder, kinds[2], args[2])
-        four, index = _loaded(builder, strips, args[1], _SIXTEEN), args[3]
-        for k in range(LANES):
-            address = builder.bitcast(builder.gep(sums, [index]), _FOUR.as_pointer())
-            before = builder.load(address)
-            before.align = 4
-            row = _mixed(builder, four, _NOTHING, range(LANES * k, LANES * (k + 1)))
-            builder.store(builder.fadd(before, row, flags=_FLAGS), address).align = 4
-            index = builder.add(index, args[4])
+        nothing = ir.Constant(_SIXTEEN, [0.0] * GROUP)
+        over = nothing
+        for x in range(0, STRIP, LANES):
+            own, beyond = over, nothing
+            for k in range(LANES if x < STRIP - LANES else 0):
+                four = _loaded(builder, strips, builder.add(args[1], _number(LANES * STRIP * (x + k))), _SIXTEEN)
+                # strip k's pixels stand k columns farther right: some among these four columns, the rest in the next
+                here = [j - k if j % LANES >= k else GROUP for j in range(GROUP)]
+                own = builder.fadd(own, _mixed(builder, four, nothing, here), flags=_FLAGS)
+                if k:
+                    there = [j + LANES - k if j % LANES < k else GROUP for j in range(GROUP)]
+                    beyond = builder.fadd(beyond, _mixed(builder, four, nothing, there), flags=_FLAGS)
+            index, over = builder.add(args[3], _number(x)), beyond
+            for k in range(LANES):
+                row = _mixed(builder, own, _NOTHING, range(LANES * k, LANES * (k + 1)))
+                builder.store(row, builder.bitcast(builder.gep(sums, [index]), _FOUR.as_pointer())).align = 4
+                index = builder.add(index, args[4])
         return context.get_dummy_value()
 
     return types.void(strips, types.int64, sums, types.int64, types.int64), generate
@@ -225,6 +234,6 @@ fill_strips = cast("Callable[[FloatImage, Index, Index, FloatImage, Index], None
 """``fill_strips(light, at, side, strips, to)``: write four rows of four of ``light``, ``side`` a row, side by side."""
 
 pour_strips = cast("Callable[[FloatImage, Index, FloatImage, Index, Index], None]", intrinsic(_pour_strips))
-"""``pour_strips(strips, at, sums, to, side)``: its transpose; adds sixteen to four rows of four of ``sums``."""
+"""``pour_strips(strips, at, sums, to, side)``: write four rows, STRIP wide, of what all strips add up to."""
 
 # In all of these the arrays are flat and indices unchecked.

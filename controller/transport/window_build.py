@@ -34,7 +34,7 @@ def build_windows(
     sizes = np.array([m.spread_px2.shape[:2] for m in maps], np.int64).reshape(-1, 2)
     halo = max((_halo(m.spread_px2, tables[0]) for m in maps), default=NEAR)
     place, cell_first = place_cells(sizes)
-    counts, parts = [], []
+    counts, parts, other = [], [], False
     for n, phase_map in enumerate(maps):
         count = np.zeros(SORTS * int(cell_first[n + 1] - cell_first[n]), np.int64)
         arguments = (phase_map.projector_px, phase_map.spread_px2, white[n], colours, use[n], *tables, halo)
@@ -46,6 +46,7 @@ def build_windows(
         walk(*arguments, first[:-1].copy(), False, *filled)
         settle(first, count, *filled)
         counts.append(room)
+        other = other or bool(room[OTHER::SORTS].any())
         parts.append(filled)
     room = np.concatenate(counts)
     first = np.concatenate([[0], np.cumsum(room)])
@@ -66,7 +67,8 @@ def build_windows(
         start,
         sizes,
         cell_first,
-        np.array([halo], np.int64),
+        # small windows reach no farther
+        np.array([halo if other else NEAR], np.int64),
     )
 
 

@@ -59,7 +59,7 @@ def spread(
     values: FloatImage,
     sums: FloatImage,
 ) -> None:
-    """Add the ``values`` of the sites, times gain, to ``sums`` (side, side) in the shares of a cell's windows."""
+    """Add the ``values`` of the sites, times gain, in the shares of a cell's windows to ``sums`` (side, side), all 0."""
     first = windows.first[SORTS * cell : SORTS * (cell + 1) + 1]
     flat, side = sums.reshape(-1), sums.shape[0]
     if first[UPRIGHT] < first[OTHER]:
@@ -72,9 +72,8 @@ def spread(
             else:
                 spread_skewed(windows, small, e, values, strips)
         corner = (windows.halo[0] - NEAR) * (side + 1)
-        for x in range(STRIPS):
-            for y in range(0, STRIP, LANES):
-                pour_strips(strips, LANES * (STRIP * x + y), flat, corner + side * y + x, side)
+        for y in range(0, STRIP, LANES):
+            pour_strips(strips, LANES * y, flat, corner + side * y, side)
     if first[OTHER] < first[OTHER + 1]:
         _spread_other(windows, table, first[OTHER], first[OTHER + 1], side, values, flat)
 

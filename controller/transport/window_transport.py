@@ -139,6 +139,9 @@ class WindowTransport(LightTransport):
         self._transposed(r, self.mixing, self.windows, (0, len(self.sizes)), out)
         return out
 
+    def adjoint_part(self, n: int, r: FloatImage, out: FloatImage) -> None:
+        self._transposed(r, self.mixing, self.windows, (n, n + 1), out)
+
     def sheet(self) -> FloatImage:
         """One number a sample; see ``LightTransport.sheet``."""
         return np.zeros(self.shape if self.colours.size else (3, *self.shape), np.float32)

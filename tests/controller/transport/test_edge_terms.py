@@ -13,7 +13,7 @@ from controller.calibrate.edges import EdgeShares, edge_patterns
 from controller.calibrate.shares import gaussian_weights, normalised
 from controller.calibrate.values import Calibration
 from controller.transport import LightTransport
-from controller.transport.edge_terms import EdgedTransport, edge_term, term_arrays, terms_from, with_terms
+from controller.transport.edge_terms import EdgedTransport, EdgeTerm, edge_term, term_arrays, terms_from, with_terms
 from tests.controller.transport.conftest import random_calibration
 
 CAMERA = (60, 80)
@@ -79,6 +79,25 @@ def test_the_adjoint_is_the_transpose() -> None:
     one = float(np.sum(edged.forward([p]).astype(np.float64) * r))
     other = float(np.sum(p.astype(np.float64) * edged.adjoint(r)[0]))
     assert one == pytest.approx(other, rel=1e-4)
+
+
+def test_one_projectors_part_of_the_transpose_is_its_own_pixels() -> None:
+    calibration = random_calibration(8, camera=CAMERA, sizes=((12, 16), (7, 5)))
+    model = LightTransport.build(calibration)
+    random = np.random.default_rng(8)
+    terms = []
+    for n, (rows, columns) in enumerate(model.sizes):
+        camera = np.flatnonzero(model.lit[n])[:20]
+        share = sp.random_array((20, rows * columns), density=0.1, rng=random, dtype=np.float32)
+        terms.append(EdgeTerm(sp.csr_matrix(share), camera, random.random((3, 20), np.float32)))
+    r = random.standard_normal((3, *CAMERA)).astype(np.float32)
+    for transport in (model, with_terms(model, tuple(terms))):
+        whole = transport.adjoint_planes(r)
+        for n in range(2):
+            part = np.full_like(whole, -7)
+            transport.pull(n, r, part)
+            np.testing.assert_allclose(part[:, transport.span(n)], whole[:, transport.span(n)], rtol=1e-5, atol=1e-5)
+            assert (np.delete(part, np.r_[transport.span(n)], axis=1) == -7).all()
 
 
 def test_magnitudes_bound_every_product() -> None:

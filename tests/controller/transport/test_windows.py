@@ -22,6 +22,7 @@ from controller.transport import LightTransport
 from controller.transport.patch_transport import PatchTransport
 from controller.transport.window_matrix import box_rows
 from controller.transport.window_transport import WindowTransport
+from controller.transport.windows import SORTS
 
 Stage = Callable[..., Calibration]
 Floats = npt.NDArray[np.float32]
@@ -101,6 +102,12 @@ def expected(calibration: Calibration, frames: list[Floats]) -> Floats:
     return developed((sites / largest).astype(np.float32), calibration.mosaic) * np.float32(largest)
 
 
+def whites(calibration: Calibration) -> Floats:
+    """All projectors' white images together, at the pixels of the object."""
+    total: Floats = np.sum([part.white for part in calibration.projectors], axis=0)
+    return total[calibration.object_mask]
+
+
 @pytest.mark.parametrize("mosaic", [None, RGGB, np.array([[1, 2], [0, 1]])], ids=["none", "RGGB", "GBRG"])
 def test_a_product_follows_the_definition_of_the_model(stage: Stage, mosaic: npt.NDArray[np.int64] | None) -> None:
     calibration = on_frame(mapped(stage(1, masked=False, sizes=((40, 50), (17, 15))), 1, mosaic=mosaic, ordered=True))
@@ -111,6 +118,27 @@ def test_a_product_follows_the_definition_of_the_model(stage: Stage, mosaic: npt
     # blur is rounded by up to 1 %, places to 1/512 pixel, the cut is square instead of elliptical
     error = np.sqrt(np.mean((got - wanted) ** 2) / np.mean(wanted**2))
     assert error < 0.01
+
+
+def test_small_windows_follow_the_definition_whatever_their_skew(stage: Stage) -> None:
+    calibration = on_frame(mapped(stage(14, masked=False, sizes=((40, 50), (70, 75))), 14, ordered=True))
+    parts, rng = [], np.random.default_rng(14)
+    for part in calibration.projectors:
+        assert part.phase_map is not None
+        xx, yy = rng.uniform(0.15, 0.45, (2, *part.metapixels.valid.shape))
+        xy = rng.uniform(-0.6, 0.6, xx.shape) * np.sqrt(xx * yy)
+        spread = np.stack([xx, xy, yy], -1).astype(np.float32)
+        parts.append(dataclasses.replace(part, phase_map=PhaseMap(part.phase_map.projector_px, spread)))
+    calibration = dataclasses.replace(calibration, projectors=tuple(parts))
+    transport = LightTransport.build(calibration)
+    assert isinstance(transport, WindowTransport)
+    upright, skewed, other = np.diff(transport.windows.first).reshape(-1, SORTS).sum(axis=0)
+    assert min(upright, skewed) > 100
+    assert other < 0.2 * skewed
+    frames = frames_of(transport)
+    got, wanted = transport.forward(frames), expected(calibration, frames)
+    assert np.sqrt(np.mean((got - wanted) ** 2) / np.mean(wanted**2)) < 0.01
+    np.testing.assert_allclose(transport.reach()[transport.object_mask], whites(calibration), rtol=2e-5)
 
 
 @slow_start
