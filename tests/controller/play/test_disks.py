@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+import pytest
+
 from controller.bundle.install import current, install
 from controller.play.launch import PlayerProcess
 from tests.controller.play.conftest import write_noise
@@ -36,7 +38,8 @@ def without_root_s_rights(start: Callable[[], Found]) -> Found:
     def drop_and_start() -> Found:
         # Rights belong to the thread, which ends with this; a process that it starts has none that it has lost.
         for right in _RIGHTS if os.geteuid() == 0 else ():
-            assert ctypes.CDLL(None, use_errno=True).prctl(_PR_CAPBSET_DROP, right, 0, 0, 0) == 0
+            if ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, right, 0, 0, 0) != 0:
+                pytest.skip("root may not give up its rights here, so no folder is read-only to it")
         return start()
 
     with ThreadPoolExecutor(1) as pool:
