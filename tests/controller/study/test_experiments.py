@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
+import pytest
 
 from controller.calibrate.values import PhaseMap
 from controller.capture.dots import dot_patterns
+from controller.study import ablation, earlier
 from controller.study.catalogue import EXPERIMENTS
 from controller.study.earlier import feathered
-from controller.study.measuring import Quality
+from controller.study.measuring import Quality, unbounded_inverse
 from controller.study.photographing import dots_as_shares
 from controller.study.residual import PAPER, Made, _criteria, residual
+from controller.study.sharpness import local_sharpness
 from controller.study.values import column
 from tests.controller.study.array_stage import ArrayLight, array_subject
 
@@ -75,3 +80,42 @@ def test_dots_become_the_shares_that_made_them() -> None:
 
 def test_every_experiment_says_what_it_does_not_show() -> None:
     assert all(one.shows.endswith(".") and one.paper and one.title for one in EXPERIMENTS)
+
+
+def test_sharpness_is_measured_for_one_and_for_all_naive_and_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = partial(unbounded_inverse, iterations=12)
+    monkeypatch.setattr("controller.study.sharpness.unbounded_inverse", few)
+    subject = array_subject(2)
+    result = local_sharpness(subject)
+    (table,) = result.tables
+    overall = [float(value or 0) for value in column(table, "lambda, whole")]
+    assert len(overall) == 4
+    assert overall[3] > overall[2]
+    assert overall[3] > overall[0]
+    assert result.criteria[3].holds
+    assert {figure.name for figure in result.figures} == {"photographs", "behind", "maps"}
+
+
+def quality_of(error: float) -> Quality:
+    return Quality(error, 2 * error, error / 10, 1 - error / 10, 1 - error / 10)
+
+
+def test_an_ablation_whose_steps_each_help_holds_and_one_step_back_is_told() -> None:
+    nothing = np.zeros((2, 2, 3), np.float32)
+    names = (*ablation.FALLS, ablation.QUADRILATERALS, ablation.OURS)
+
+    def judged(*errors: float) -> list[bool | None]:
+        steps = [ablation.Step(n, (), 1.0, nothing, quality_of(e)) for n, e in zip(names, errors, strict=True)]
+        return [criterion.holds for criterion in ablation._criteria(steps)]
+
+    assert judged(7, 6, 5, 4, 3, 4, 2) == [True] * 6
+    assert judged(7, 6, 6.5, 4, 3, 2, 2.5) == [True, False, True, True, False, True]
+
+
+def test_ours_is_compared_with_every_earlier_system() -> None:
+    nothing = np.zeros((2, 2, 3), np.float32)
+    made = [earlier.Made(f"system {e}", 1.0, nothing, quality_of(e)) for e in (3, 1, 2)]
+    first, second = earlier._criteria(made)
+    assert first.holds
+    assert second.holds is False
+    assert "CIEDE2000 and RMSE and SSIM" in second.reason
