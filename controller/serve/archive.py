@@ -23,6 +23,8 @@ FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"
 KEPT: Final = 5
 MOST_FILES: Final = 100_000
+ROOM_SHARE: Final = 0.9
+"""Of the free space that a backup may fill when it is unpacked; the kiosk's own log needs some."""
 _SECRET: Final = ("keys", "kiosk", "run")
 _BACKED_UP: Final = ("stage.toml", "schedule.toml", "profiles", "appearances", "bundles", "bundles-without")
 
@@ -46,8 +48,8 @@ def backup(stage: Path) -> Path:
 def restore(stage: Path, file: Path) -> None:
     """Replace settings, calibration and appearances by those of a backup; what was there stays in kiosk/replaced.
 
-    Everything is unpacked and checked beside before anything is replaced. Raises UsageError("not-a-backup") and what
-    ``load_stage`` raises for the settings in it.
+    Everything is unpacked and checked beside before anything is replaced. Raises UsageError("not-a-backup"),
+    WorkError("no-space") and what ``load_stage`` raises for the settings in it.
     """
     with tempfile.TemporaryDirectory(prefix=".restore-", dir=stage) as name:
         fresh = Path(name)
@@ -146,10 +148,19 @@ def _unpack(file: Path, folder: Path) -> None:
                 members.append(member)
             if not members or members[0].name != MARK:
                 raise _not_ours()
+            _require_room(folder, sum(member.size for member in members))
             # The data filter refuses absolute paths, "..", devices and links that lead out.
             archive.extractall(folder, members, filter="data")
     except (tarfile.TarError, OSError, EOFError, ValueError) as error:
         raise _not_ours() from error
+
+
+def _require_room(folder: Path, size: int) -> None:
+    """Raises WorkError("no-space"): what is small when packed may be large."""
+    free = shutil.disk_usage(folder).free
+    if size > ROOM_SHARE * free:
+        raise WorkError("no-space", what=f"The backup needs {size / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free.",
+                        remedy="Free some space on the disk of the stage.")  # fmt: skip
 
 
 def _not_ours() -> UsageError:

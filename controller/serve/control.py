@@ -87,6 +87,9 @@ class ControlServer:
             return _error("request-wrong", f"The request does not fit: {error}.", "See docs/serve.md.")
         except OSError as error:
             return _error("cannot-write", f"A file could not be used: {error}.", "See what the disk says.")
+        except Exception as error:  # noqa: BLE001 - the last boundary of this thread: the asker is told, and it goes on
+            what = f"The kiosk met an error that it does not know ({type(error).__name__}: {error})."
+            return _error("crash", what, "Export the diagnostics.")
 
 
 def _error(code: str, what: str, remedy: str) -> dict[str, Any]:

@@ -288,9 +288,12 @@ def _ports_in(stage: Path) -> list[int]:
 
 
 def ports() -> tuple[int, int]:
-    """Two that nobody listens on now."""
-    with socket.create_server(("127.0.0.1", 0)) as one, socket.create_server(("127.0.0.1", 0)) as other:
-        return int(one.getsockname()[1]), int(other.getsockname()[1])
+    """Two that nobody listens on now, below those that the system hands out: they must be free again after a cut."""
+    dice, found = random.SystemRandom(), list[int]()
+    while len(found) < 2:
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", dice.randrange(20_000, 32_000))) as one:
+            found.append(int(one.getsockname()[1]))
+    return found[0], found[1]
 
 
 def killed(stage: Path, nursery: Nursery, dice: random.Random, most: int, longest_s: float) -> Lived:
