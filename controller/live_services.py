@@ -47,7 +47,7 @@ LAST_S: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class _Ready:
+class Ready:
     """What is worked out before the lamps are lit. ``shaded``: the installed bundle has the maps for shaders."""
 
     maps: LiveMaps
@@ -98,7 +98,7 @@ def _calibrated(checked: Checked, reporter: Reporter) -> Calibrated:
     return Calibrated(usable_calibration(checked, reporter), checked.names)
 
 
-def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> _Ready:
+def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> Ready:
     """The maps, and the brightest white that the stated share of the object can show."""
     maps = live_maps(calibrated, {table.name: table.output for table in checked.stage.tables.projectors})
     black = calibrated.calibration.black
@@ -106,7 +106,7 @@ def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> _Rea
     share = checked.stage.tables.solve.exposure_share
     brightness = choose_exposure(calibrated.transport, white, black, share=share, drive=calibrated.drive)
     reporter.say(f"A target's white is a radiance of {brightness:.7g}.")
-    return _Ready(maps, brightness, _in_bundle(checked, calibrated.folder.name))
+    return Ready(maps, brightness, _in_bundle(checked, calibrated.folder.name))
 
 
 def _in_bundle(checked: Checked, calibration: str) -> bool:
@@ -122,7 +122,7 @@ def _in_bundle(checked: Checked, calibration: str) -> bool:
 def _show(
     rig: Rig,
     context: Context,
-    ready: _Ready,
+    ready: Ready,
     open_it: Callable[[], LiveSource],
     *,
     rate_hz: float,
@@ -141,7 +141,7 @@ def _show(
         )
 
     try:
-        with _way(rig, context, ready) as way:
+        with way_to_light(rig, context, ready) as way:
             figures = run_live(open_it(), way.maker, way.write, rate_hz=rate_hz, seconds=seconds, tell=tell)
             # the last one is shown at the next tick of the player's clock
             context.deadline.sleep(LAST_S)
@@ -166,7 +166,7 @@ def _told(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Way:
+class Way:
     """How pictures become light: targets to the player's shaders, or finished frames."""
 
     maker: Maker
@@ -174,19 +174,23 @@ class _Way:
 
 
 @contextlib.contextmanager
-def _way(rig: Rig, context: Context, ready: _Ready) -> Iterator[_Way]:
+def way_to_light(rig: Rig, context: Context, ready: Ready) -> Iterator[Way]:
+    """Ask the player for live pictures, in the way that it can, and let it go at the end; the picture stays.
+
+    Raises what devices raise.
+    """
     display, folder = bundle_display(rig), runtime_folder(rig.stage)
     deadline = context.deadline.within(60)
     if ready.shaded:
         size = OutputSize(TARGET, *ready.maps.target_px)
         with _fresh(folder / TARGETS_FILE, [size]) as file:
             if _takes_targets(rig, file.path, ready.brightness, deadline):
-                yield _Way(TargetMaker(ready.maps.target_px), _target_writer(file))
+                yield Way(TargetMaker(ready.maps.target_px), _target_writer(file))
                 return
     outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in display.outputs(deadline=deadline)]
     with _fresh(folder / FRAMES_FILE, outputs) as file:
         display.live(file.path, deadline=deadline)
-        yield _Way(FrameMaker(Interactive(ready.maps), ready.brightness), _writer(file, outputs, ready.maps))
+        yield Way(FrameMaker(Interactive(ready.maps), ready.brightness), _writer(file, outputs, ready.maps))
 
 
 def _takes_targets(rig: Rig, path: Path, white: float, deadline: Deadline) -> bool:

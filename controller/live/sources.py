@@ -57,6 +57,9 @@ class VideoSource:
             self._capture.release()
             raise unreadable(path, "it is no video that OpenCV can decode")
         self.rate_hz = rate
+        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        # the last frame is shown however late it is; some files don't tell how many they have
+        self._last = count - 1 if count > 0 and not loop else None
         self._at = -1
         self._before = 0
         self._ended = False
@@ -64,6 +67,9 @@ class VideoSource:
     def next(self, at_s: float) -> LivePicture | None:
         """See ``LiveSource``."""
         due = int(at_s * self.rate_hz)
+        if self._last is not None:
+            self._ended = self._ended or (due > self._last and self._at >= self._last)
+            due = min(due, self._last)
         skipped = 0
         found: ByteImage | None = None
         while self._at < due and not self._ended:

@@ -99,6 +99,21 @@ def test_pictures_are_shown_as_they_come_until_ctrl_c_leaves_lamps_safe_and_blac
     assert processes_on(stage) == []
 
 
+def test_a_video_is_decoded_for_a_player_elsewhere(stage: Path, tmp_path: Path) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (388, 260))
+    for grey in range(40, 140, 4):
+        writer.write(np.full((260, 388, 3), grey, np.uint8))
+    writer.release()
+    outcome = velatura("live", stage, tmp_path / "v.avi", "--into", tmp_path / "live.frame", "--targets")
+    assert outcome.code == 0
+    assert outcome.result["made"] + outcome.result["late"] == 25
+    assert (outcome.result["bad"], outcome.result["white"] > 0) == (0, True)
+    (target,) = Frames(tmp_path / "live.frame").read().values()
+    assert target.shape == (*CAMERA_PX[::-1], 3)
+    assert abs(int(target.min()) - 136) <= 3
+    assert abs(int(target.max()) - 136) <= 3
+
+
 def test_a_source_that_does_not_fit_is_refused_before_a_lamp_is_struck(stage: Path, tmp_path: Path) -> None:
     before = strikes(stage)
     with contextlib.closing(FrameFile(tmp_path / "render", [OutputSize("target", 388, 260)])):

@@ -41,7 +41,11 @@ def test_a_video_gives_the_frame_that_is_due_and_counts_those_it_passed_over(tmp
     assert later is not None
     assert (later.number, later.skipped) == (3, 2)
     assert abs(int(later.pixels.mean()) - 160) < 4
-    assert source.next(0.9) is None
+    last = source.next(0.9)
+    assert last is not None, "the last one is shown, however late"
+    assert (last.number, last.skipped) == (4, 0)
+    assert not source.ended
+    assert source.next(0.95) is None
     assert source.ended
     source.close()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -72,9 +71,9 @@ def test_adaptation_brings_more_pixels_into_reach_and_tells_the_contrast(transpo
 
 
 def test_the_base_is_not_solved_again_for_another_way_of_using_it() -> None:
-    quick = dataclasses.replace(OPTIONS, mode="scale", share=0.5, adapt=1.0)
+    quick = replace(OPTIONS, mode="scale", share=0.5, adapt=1.0)
     assert quick.inputs() != OPTIONS.inputs()
     assert quick.base_inputs() == OPTIONS.base_inputs()
-    assert dataclasses.replace(OPTIONS, base="high-pass").base_inputs() == OPTIONS.base_inputs()
-    assert dataclasses.replace(OPTIONS, base="minimum").base_inputs() != OPTIONS.base_inputs()
-    assert dataclasses.replace(OPTIONS, smoothness=0.5).base_inputs() != OPTIONS.base_inputs()
+    assert replace(OPTIONS, base="high-pass").base_inputs() == OPTIONS.base_inputs()
+    assert replace(OPTIONS, base="minimum").base_inputs() != OPTIONS.base_inputs()
+    assert replace(OPTIONS, smoothness=0.5).base_inputs() != OPTIONS.base_inputs()
