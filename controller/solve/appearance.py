@@ -1,4 +1,4 @@
-"""New appearances at interactive speed: base times scale (paper 3, eqs 4-6), and the full solve started from it.
+"""New appearances at interactive speed: base times scale (paper 3, eqs 4-6), and the full solve.
 
 C_t = C_b x C_s for every camera pixel; the base's frames P_b are solved once; each projector pixel's P_s is the mean of
 C_s over its metapixel; then P_t = P_b x P_s. Light is counted above the black image K, and the product is taken in the
@@ -7,7 +7,7 @@ camera's colours, M p, so that projectors of different primaries are scaled alik
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -195,18 +195,20 @@ def make_appearance(
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Appearance:
-    """Frames for a target radiance: by base and scale, by a full solve started from it, or by what the target needs."""
-    frames: Sequence[FloatImage] = scale_frames(transport, base, target, black)
+    """Frames for a target radiance: by base and scale, by a full solve, or by what the target needs.
+
+    A full solve starts from the target alone (``guess``), which takes fewer sweeps than base x scale (decision 25).
+    """
+    check_target(transport, target)
     detail = fine_detail(transport, base, target, black)
     if mode == "scale" or (mode == "auto" and detail < FINE_DETAIL):
-        return Appearance(tuple(frames), "scale", detail, None)
+        return Appearance(tuple(scale_frames(transport, base, target, black)), "scale", detail, None)
     solution = solve_bounded(
         transport,
         target,
         black,
         smoothness=smoothness,
         weights=weights,
-        start=frames,
         tolerance=tolerance,
         progress=progress,
         cancelled=cancelled,

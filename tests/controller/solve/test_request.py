@@ -64,7 +64,7 @@ def test_adaptation_brings_more_pixels_into_reach_and_tells_the_contrast(transpo
     options = replace(OPTIONS, share=0.4, adapt=1.0)
     figures = answer(transport, base, STAGE.black, picture(30), options).figures
     values = {key: value for key, value in figures.items() if isinstance(value, float)}
-    assert values["reachable_share"] < 0.6 < 0.99 < values["adapted_share"]
+    assert values["reachable_share"] < 0.6 < 0.95 < values["adapted_share"], "all but the few given up"
     assert values["contrast_kept"] > values["contrast_kept_cut_off"]
     assert OPTIONS.inputs() != options.inputs()
     assert "adapt" not in OPTIONS.inputs(), "results of stages that do not adapt stay valid"
