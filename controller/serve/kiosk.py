@@ -14,13 +14,10 @@ from controller.panel.accounts import Accounts
 from controller.panel.kiosk import (
     Aiming,
     Appearance,
-    BundleIdentity,
     ComputeSettings,
-    DeviceRow,
     EventRow,
     Finding,
     FoundDevice,
-    Grade,
     Job,
     KioskState,
     LampDay,
@@ -34,10 +31,10 @@ from controller.serve import aim, archive, finding, runs, settings
 from controller.serve.control import plain
 from controller.serve.ports import Request
 from controller.serve.service import Service
+from controller.serve.snapshot import Snapshots
 from controller.serve.works import title_of
 from controller.storage import write_atomically
 
-GRADES_EVERY_S: Final = 10.0
 NOTICE_S: Final = 900.0
 """How long a notice may stay; a lamp should not burn for it all night."""
 _REVISIONS: Final = 1_000_000_000
@@ -58,10 +55,9 @@ class StageKiosk:
         self._service: Service | None = None
         self._lock = threading.RLock()
         self._callbacks: list[Callable[[], None]] = []
-        self._grades: tuple[float, tuple[Grade, ...]] = (0.0, ())
         self._last = KioskState(0, stage.name, "off", "The stage is not set up yet.", time.time(), needs_setup=True)
         self._events = 0
-        self._since = ("", 0.0)
+        self._snapshots = Snapshots(stage)
         self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
         self._notice_ends_s = float("inf")
 
@@ -128,7 +124,7 @@ class StageKiosk:
         if service is None:
             return
         self._end_notice(service)
-        now = self._made(service)
+        now = self._snapshots.of(service, self._last.revision + 1)
         with self._lock:
             same = replace(now, revision=self._last.revision) == self._last and self._events == service.log.number
             self._events = service.log.number
@@ -140,51 +136,6 @@ class StageKiosk:
     def _notify(self) -> None:
         for callback in tuple(self._callbacks):
             callback()
-
-    def _made(self, service: Service) -> KioskState:
-        machine, shown = service.conductor.machine, service.player.view.shown
-        state = machine.state.value
-        if self._since[0] != state:
-            self._since = (state, time.time())
-        at_s, grades = self._grades
-        if time.monotonic() - at_s > GRADES_EVERY_S or not at_s:
-            grades = runs.grades(self.stage, service.checked.stage.tables.calibration.worst_grade)
-            self._grades = time.monotonic(), grades
-        index = service.stock.index(bundle := service.stock.bundle())
-        identity = None
-        if index is not None and bundle is not None:
-            identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
-        return KioskState(
-            revision=self._last.revision + 1,
-            stage=service.checked.stage.tables.stage.name,
-            state=state,
-            reason=machine.reason,
-            since_unix_s=self._since[1],
-            devices=(*service.devices.rows(), self._player_row(service), *self._disk_row(service)),
-            job=service.works.job,
-            playing=shown.appearance if shown is not None else "",
-            next_event=service.conductor.plan.next,
-            bundle=identity,
-            lamps=service.lamps,
-            grades=grades,
-            identifying=service.player.identifying,
-            warnings=self._warnings(service),
-        )
-
-    def _warnings(self, service: Service) -> tuple[str, ...]:
-        said = service.player.view.warning
-        return service.devices.warnings if said is None else (*service.devices.warnings, said.text)
-
-    def _player_row(self, service: Service) -> DeviceRow:
-        problem = service.player.view.problem
-        what, remedy = (None, "") if problem is None else (problem.reason, problem.remedy)
-        return DeviceRow("player", "display", "player", (), what, remedy)
-
-    def _disk_row(self, service: Service) -> tuple[DeviceRow, ...]:
-        if service.log.problem is None:
-            return ()
-        remedy = "Free some space on the disk; playback goes on meanwhile."
-        return (DeviceRow("disk", "disk", "", (), f"The event log can't be written: {service.log.problem}.", remedy),)
 
     # -- commands
 
@@ -243,8 +194,11 @@ class StageKiosk:
         playing = self._last.playing
         if index is None:
             return ()
-        made = float(index.created_unix_s)
-        return tuple(Appearance(one.name, made, playing=one.name == playing) for one in index.appearances)
+        made, previews = float(index.created_unix_s), service.stock.previews()
+        return tuple(
+            Appearance(one.name, made, playing=one.name == playing, preview=previews.get(one.name))
+            for one in index.appearances
+        )
 
     def remove_appearance(self, name: str) -> None:
         service = self.service

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Final
@@ -11,7 +13,9 @@ from controller.bundle.install import current
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
 from controller.errors import BundleError, VelaturaError
+from controller.storage import write_atomically
 
+PREVIEWS: Final = "kiosk/previews"
 WITHOUT: Final = "bundles-without"
 """Folder of the stage: for each set of missing projectors a folder like ``bundles``."""
 
@@ -44,6 +48,30 @@ class BundleStock:
             return None
         wanted = {one.name for one in whole.appearances}
         return path if wanted <= {one.name for one in index.appearances} else None
+
+    def previews(self) -> dict[str, Path]:
+        """A PNG of how each appearance of the installed bundle will look, for those that it has one of.
+
+        Written beside once a bundle; those of bundles before are removed.
+        """
+        path = self.bundle()
+        index = self.index(path)
+        if path is None or index is None:
+            return {}
+        folder = self._stage / PREVIEWS / path.stem
+        if not folder.is_dir():
+            shutil.rmtree(folder.parent, ignore_errors=True)
+            # A full disk costs pictures on a page, and nothing else.
+            with (
+                contextlib.suppress(BundleError, VelaturaError, OSError),
+                Bundle.open_trusted(path, self._trust) as bundle,
+            ):
+                folder.mkdir(parents=True)
+                for number, one in enumerate(index.appearances):
+                    if (data := bundle.thumbnail(one.name)) is not None:
+                        write_atomically(folder / f"{number}.png", data)
+        files = {one.name: folder / f"{number}.png" for number, one in enumerate(index.appearances)}
+        return {name: file for name, file in files.items() if file.exists()}
 
     def index(self, path: Path | None) -> Index | None:
         """What an installed bundle holds; None for none, and for one that this stage would not play."""

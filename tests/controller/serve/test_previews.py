@@ -1,0 +1,46 @@
+"""The pictures that the panel shows of the installed appearances come out of the bundle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from controller.bundle.export import png
+from controller.bundle.install import install
+from controller.bundle.signing import Trust
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.serve.stock import PREVIEWS, BundleStock
+
+UNSIGNED = Trust((), allow_unsigned=True)
+
+
+def installed(stage: Path, revision: int, names: tuple[str, ...]) -> bytes:
+    """A bundle in which all but the last appearance have a picture; that picture."""
+    picture = png(np.full((4, 6, 3), 10 * revision, np.uint8))
+    frames = {"P1": np.zeros((8, 8, 3), np.uint8)}
+    made = [NewAppearance(name, frames, thumbnail=None if name == names[-1] else picture) for name in names]
+    write_bundle(
+        stage / "made.vel", stage="demo", calibration="one", created_unix_s=1, outputs=[("P1", 8, 8)],
+        appearances=made, key=None, revision=revision,
+    )  # fmt: skip
+    install(stage / "made.vel", stage / "bundles", trusted=(), allow_unsigned=True)
+    return picture
+
+
+def test_each_appearance_has_the_picture_of_its_own_bundle_or_none(tmp_path: Path) -> None:
+    stock = BundleStock(tmp_path, UNSIGNED)
+    assert stock.previews() == {}
+    first = installed(tmp_path, 1, ("marble", "a name with spaces", "bare"))
+    found = stock.previews()
+    assert sorted(found) == ["a name with spaces", "marble"]
+    assert {file.read_bytes() for file in found.values()} == {first}
+    second = installed(tmp_path, 2, ("marble", "bare"))
+    assert {name: file.read_bytes() for name, file in stock.previews().items()} == {"marble": second}
+    assert len(list((tmp_path / PREVIEWS).iterdir())) == 1, "those of the bundle before are gone"
+
+
+def test_a_disk_that_takes_nothing_costs_the_pictures_alone(tmp_path: Path) -> None:
+    installed(tmp_path, 1, ("marble", "bare"))
+    (tmp_path / "kiosk").write_text("a file where a folder should be")
+    assert BundleStock(tmp_path, UNSIGNED).previews() == {}
