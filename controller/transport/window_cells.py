@@ -59,7 +59,7 @@ def spread(
     values: FloatImage,
     sums: FloatImage,
 ) -> None:
-    """Add the ``values`` of the sites, times gain, in the shares of a cell's windows to ``sums`` (side, side), all 0."""
+    """Add the ``values`` of the sites, times gain, in a cell's windows' shares to ``sums`` (side, side), all 0."""
     first = windows.first[SORTS * cell : SORTS * (cell + 1) + 1]
     flat, side = sums.reshape(-1), sums.shape[0]
     if first[UPRIGHT] < first[OTHER]:
