@@ -152,7 +152,8 @@ def _experiment(
     before, began_s = context.journal.shot_count(), time.perf_counter()
     make = subject_of(str(told["size"]), int(told["seed"]), context)
     hand = RigHand(rig, context, calibrated, one.name, checked.prior, longest_s, disturb, make)
-    subject = make(calibrated, RigLight(rig, context, calibrated, one.name, longest_s), context.folder)
+    light = RigLight(rig, context, calibrated, one.name, longest_s)
+    subject = make(calibrated, light, context.folder)
     subject.parts = Parts(rig, context, checked, calibrated, hand)
     try:
         result = one.run(subject)
@@ -160,7 +161,8 @@ def _experiment(
         disturb(())
     facts = {
         **told,
-        "photographs": context.journal.shot_count() - before,
+        # What an earlier run photographed counts, too; what an experiment photographs by itself is not in ``used``.
+        "photographs": max(len(light.used), context.journal.shot_count() - before),
         "seconds": round(time.perf_counter() - began_s),
     }
     folder = context.folder / RESULTS

@@ -94,8 +94,8 @@ def index_page(rows: Sequence[tuple[Experiment, Kept | None]]) -> str:
     head = (
         "`velatura study` repeats the paper's evaluation on emulated stages whose optics share no code with the "
         "controller. Everything goes through a calibration and is judged by photographs; nothing is tuned to the "
-        "truth of a stage. A page an experiment, with its tables under `data/`. Pages are written by the command; "
-        "they are not edited by hand."
+        "truth of a stage. A page an experiment, with its tables under `data/`. Pages are written by the command and "
+        "not by hand; how an experiment is added is told in `docs/study/adding.md`."
     )
     parts = [
         "# The paper's experiments, done again",
@@ -113,7 +113,7 @@ def _facts(facts: Mapping[str, object]) -> str:
         "size": "size {}",
         "seed": "seed {}",
         "photographs": "{} photographs",
-        "seconds": "{} s of work, other programs running beside it",
+        "seconds": "{} s of work",
     }
     told = [text.format(facts[key]) for key, text in words.items() if key in facts]
     return "; ".join(told) + "." if told else ""

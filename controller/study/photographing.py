@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -53,6 +53,8 @@ class RigLight:
     calibrated: Calibrated
     name: str
     longest_exposure_s: float
+    used: list[Path] = field(default_factory=list)
+    """The photographs that were taken, now or by an earlier run."""
 
     def photograph(self, name: str, frames: Sequence[FloatImage], *, white: float) -> FloatImage:
         shown = device_frames(self.calibrated.calibration, frames)
@@ -66,6 +68,7 @@ class RigLight:
             for number, exposure_s in enumerate(exposures_s)
         ]  # fmt: skip
         keep_if_lit(self.rig, self.context, taken)
+        self.used.extend(one.path for one in taken)
         merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
         # Too bright for the shortest exposure is at least its full scale; black would be the one wrong answer.
         return np.asarray(np.nan_to_num(merged, nan=1 / min(one.exposure_s for one in taken)), np.float32)
