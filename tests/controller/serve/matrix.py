@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from controller.session.machine import State
 from hal.values import Power, ProjectorStatus
 from tests.controller.serve.model import Kiosk
 
+PROFILES = Path(__file__).parents[3] / "firmware_configs" / "projectors"
 DEADLINE_S = 700.0
 """Two strikes' rests, the retry out of FAULT, and the lamps' own times."""
 SETTLED = (State.PLAYING, State.DEGRADED, State.FAULT, State.OFF)
@@ -35,14 +37,23 @@ def _trouble(name: str, kind: str) -> Fault:
 
 def _reports(name: str, word: str) -> Fault:
     def strike(kiosk: Kiosk) -> None:
-        if word == "temperature":
+        if "temperature" in word:
             kiosk.lamps[name].go_dark()
-        kiosk.lamps[name].reports = ProjectorStatus(Power.FAULT, (word,))
+        power = Power.ON if word.endswith("-warning") else Power.FAULT
+        kiosk.lamps[name].reports = ProjectorStatus(power, (word,))
 
     def mend(kiosk: Kiosk) -> None:
         kiosk.lamps[name].reports = None
 
     return Fault(f"{name} reports {word}", strike, mend)
+
+
+def words() -> list[str]:
+    """What projectors may say of themselves: every word of every profile that is shipped, and PJLink's own."""
+    told = {"lamp-failed", "temperature", "cover", "fan", "filter"}
+    for profile in PROFILES.glob("*.toml"):
+        told.update(tomllib.loads(profile.read_text()).get("notices", {}).get("trouble", {}).values())
+    return sorted(told)
 
 
 def _burst(name: str) -> Fault:
@@ -108,7 +119,7 @@ def _set(what: str, on: object, off: object) -> Fault:
 
 FAULTS = (
     *(_trouble("left", kind) for kind in ("silent", "lost", "late", "refuse", "gone")),
-    *(_reports("left", word) for word in ("lamp-failed", "temperature", "cover", "fan")),
+    *(_reports("left", word) for word in words()),
     _burst("left"), _unplugged("left"), _slow("left"), _everyone("silent"), _everyone("refuse"),
     Fault("left switched off by its remote control", _remote_control, _nothing),
     Fault("power cut", lambda kiosk: kiosk.power_cut(120.0), _nothing),
