@@ -80,7 +80,7 @@ class Conductor:
         self._plan = Plan(None)
         self._since_s = monotonic()
         self._attempts, self._missing = 0, frozenset[str]()
-        self._lit_until_s = float("-inf")
+        self._lit_until_s, self._lit_closed = float("-inf"), False
 
     # -- asked from outside
 
@@ -103,6 +103,7 @@ class Conductor:
         """Stop, and cool the lamps, until the schedule says otherwise the next time."""
         with self._lock:
             self._agenda.cancel()
+            self._lit_until_s = float("-inf")
             self.wishes.override(False, self._plan)
 
     def choose(self, appearance: str) -> None:
@@ -110,10 +111,10 @@ class Conductor:
         with self._lock:
             self.wishes.choose(appearance, self._plan)
 
-    def light_for(self, seconds: float) -> None:
-        """Light while the stage is open, also with nothing to play; 0 ends it."""
+    def light_for(self, seconds: float, *, closed_too: bool = False) -> None:
+        """Light, also with nothing to play, while open or ``closed_too``; 0 ends it, and so does ``shut``."""
         with self._lock:
-            self._lit_until_s = self._monotonic() + seconds
+            self._lit_until_s, self._lit_closed = self._monotonic() + seconds, closed_too
 
     def ask(self, *requests: Request) -> None:
         """Queue work. Raises WorkError("busy") while other work runs or waits, and with the reason it can't be done."""
@@ -143,7 +144,7 @@ class Conductor:
             self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
             views = [keeper.view for keeper in self._keepers]
             open_now = self._pictures.something(wanted_open)
-            lit_anyway = wanted_open and self._monotonic() < self._lit_until_s
+            lit_anyway = (wanted_open or self._lit_closed) and self._monotonic() < self._lit_until_s
             light = open_now or lit_anyway or self._agenda.needs_light
             self._move(views, light, open_now)
             cooling = self.machine.state in (State.COOLING, State.OFF)

@@ -37,6 +37,7 @@ from controller.storage import write_atomically
 
 NOTICE_S: Final = 900.0
 """How long a notice may stay; a lamp should not burn for it all night."""
+AIMING_S: Final = 900.0
 _REVISIONS: Final = 1_000_000_000
 
 
@@ -265,6 +266,8 @@ class StageKiosk:
     def test_shots(self) -> Job:
         service, asked = self.service, Request("aim", light=True)
         service.ask(asked)
+        # Whoever aims takes them again and again; a lamp must not be struck for each.
+        service.conductor.light_for(AIMING_S, closed_too=True)
         return self._job(service, title_of(asked))
 
     def find_devices(self) -> Sequence[FoundDevice]:

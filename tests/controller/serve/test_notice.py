@@ -13,6 +13,7 @@ from controller.play.launch import PlayerSettings
 from controller.serve.eventlog import Decision
 from controller.serve.notice import notice
 from controller.serve.player_keeper import NOTICE_TURN_S, PlayerKeeper
+from controller.serve.ports import BLACK
 from controller.session.machine import State
 from controller.storage import runtime_folder
 from tests.controller.panel.served import QUICK_HASH
@@ -75,6 +76,23 @@ def test_a_one_time_password_is_taken_as_the_projectors_show_it(tmp_path: Path) 
     accounts.set_password("technician", "Some Words of Mine")
     assert accounts.entered
     assert accounts.verify("technician", "SOME WORDS OF MINE") is None
+
+
+def test_lamps_stay_lit_for_whoever_aims_also_when_closed_and_until_somebody_closes(tmp_path: Path) -> None:
+    kiosk = Kiosk(tmp_path)
+    kiosk.run_until(State.PLAYING)
+    kiosk.conductor.shut()
+    kiosk.run_until(State.OFF)
+    kiosk.conductor.light_for(600.0)
+    kiosk.run(60)
+    assert kiosk.state is State.OFF, "a notice is nothing for a closed stage"
+    kiosk.conductor.light_for(600.0, closed_too=True)
+    kiosk.run_until(State.READY)
+    assert kiosk.player.view.shown == BLACK
+    kiosk.conductor.shut()
+    kiosk.run_until(State.OFF)
+    assert not kiosk.lit
+    assert not kiosk.sins
 
 
 def test_lamps_are_lit_for_a_notice_and_cool_when_it_is_over(tmp_path: Path) -> None:
