@@ -20,7 +20,7 @@ from controller.capture.acquire import Acquirer
 from controller.config import Stage, check_driver_settings, load_stage
 from controller.config.models import CameraTable, OpenTable
 from controller.errors import UsageError
-from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover, start_player
+from controller.play.launch import PlayerProcess, PlayerSettings, replace_player
 from controller.session.darkness import Darkness, dark_before
 from controller.session.journal import Journal
 from controller.session.lamps import LampFile
@@ -211,8 +211,7 @@ def _player(stage: Stage, context: OpenContext, *, plays: bool) -> PlayerProcess
     assert context.runtime is not None
     settings = player_settings(stage, context.runtime, plays=plays)
     # A run that was killed leaves its player, which plays on by design; it still has our socket.
-    end_leftover(context.runtime)
-    return start_player(context.runtime, settings)
+    return replace_player(context.runtime, settings)
 
 
 def player_settings(stage: Stage, runtime: Path, *, plays: bool) -> PlayerSettings:

@@ -25,6 +25,8 @@ _READY_S: Final = 20.0
 _END_S: Final = 5.0
 _POLL_S: Final = 0.02
 _TOLD_BYTES: Final = 600
+_TAKEN: Final = "is already running"
+"""In what a player says that finds another one in its place (``storage.exclusive``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,3 +183,20 @@ def start_player(runtime: Path, settings: PlayerSettings, *, timeout_s: float = 
     player = PlayerProcess(runtime, settings)
     player.wait_until_ready(timeout_s)
     return player
+
+
+def replace_player(runtime: Path, settings: PlayerSettings, *, timeout_s: float = _READY_S) -> PlayerProcess:
+    """``start_player`` in the place of one that a killed starter left behind, as ``end_leftover`` and for whom it may.
+
+    One that was still loading when its starter was killed serves nobody yet, and takes the place a moment later.
+    """
+    end_leftover(runtime)
+    try:
+        return start_player(runtime, settings, timeout_s=timeout_s)
+    except WorkError as error:
+        if _TAKEN not in error.what:
+            raise
+    until_s = time.monotonic() + timeout_s
+    while not end_leftover(runtime) and time.monotonic() < until_s:
+        time.sleep(_POLL_S)
+    return start_player(runtime, settings, timeout_s=timeout_s)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.play.launch import PlayerProcess, end_leftover
+from controller.play import launch
+from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover, replace_player
 
 
 @pytest.mark.parametrize("hangs", [False, True])
@@ -30,3 +31,14 @@ def test_where_none_serves_nothing_happens(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(str(tmp_path / "player.sock"))  # nobody listens: its player is dead
     assert not end_leftover(tmp_path)
+
+
+def test_one_that_was_still_loading_when_it_was_looked_for_is_replaced_all_the_same(
+    start: Callable[..., PlayerProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = start()
+    looks = iter([False])  # the first look finds nobody, as while it loads
+    monkeypatch.setattr(launch, "end_leftover", lambda runtime: next(looks, None) is None and end_leftover(runtime))
+    with replace_player(tmp_path, PlayerSettings([("P1", 64, 48)], tmp_path / "other.frame")) as player:
+        assert player.alive
+        assert not left.alive
