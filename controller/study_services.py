@@ -71,12 +71,14 @@ def study(
             "size-unknown", what=f"There is no size {size!r}.", remedy=f"Choose one of {', '.join(SIZES)}."
         )
     out = out.resolve()
-    made: list[Path] = [_without_stage(one, out, size, seed, reporter) for one in wanted if one.scene is None]
+    pages = (out / "pages" if pages is None else pages).resolve()
+    index = publish([_without_stage(one, out, size, seed, reporter) for one in wanted if one.scene is None], pages,
+                    EXPERIMENTS)  # fmt: skip
     for scene in dict.fromkeys(one.scene for one in wanted if one.scene is not None):
         here = [one for one in wanted if one.scene == scene]
         reporter.say(f"On {SCENES[scene].title}: {', '.join(one.name for one in here)}.")
-        made += _on_scene(SCENES[scene], here, out, size, seed, reporter, cancel)
-    index = publish(made, (out / "pages" if pages is None else pages).resolve(), EXPERIMENTS)
+        # After each stage, so that one that fails does not cost the pages of those before.
+        index = publish(_on_scene(SCENES[scene], here, out, size, seed, reporter, cancel), pages, EXPERIMENTS)
     return {"index": str(index)}
 
 
