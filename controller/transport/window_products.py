@@ -58,8 +58,9 @@ def _poured(windows: Windows, tile: int, mixing: FloatImage, sums: FloatImage, o
     top, left = windows.place[tile, 2] - halo, windows.place[tile, 3] - halo
     a, b = max(left, 0), min(left + side, columns)
     for y in range(max(top, 0), min(top + side, rows)):
-        seen = sums[:, y - top, a - left : b - left]
-        r, g, s = seen[0], seen[1], seen[2]
+        row, c0, c1 = y - top, a - left, b - left
+        # not slices of a slice, whose elements numba can't know to lie side by side
+        r, g, s = sums[0, row, c0:c1], sums[1, row, c0:c1], sums[2, row, c0:c1]
         k = windows.start[n] + y * columns
         for c in range(3):
             red, green, blue = mixing[0, c], mixing[1, c], mixing[2, c]
