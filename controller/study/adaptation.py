@@ -120,8 +120,9 @@ def _criteria(made: Sequence[Made]) -> tuple[Criterion, ...]:
         holds = worst > 0 if lacking else worst > -NOT_WORSE
         asked = "more contrast is kept than by cutting off" if lacking else "nothing is lost where little is lacking"
         reason = "" if holds else (
-            "Adaptation is chosen by what a perfect stage would show of it; in the photograph that gain is smaller than"
-            " what the solve and the camera's noise make of it."
+            "So little lacks light that a dimming would lose elsewhere what it wins there: nothing was adapted."
+            if abs(after.kept - before.kept) < NOT_WORSE else
+            "Adaptation is chosen by what a perfect stage would show of it; the photograph shows less."
         )  # fmt: skip
         found.append(
             Criterion(
@@ -167,11 +168,12 @@ def _figures(subject: Subject, made: Sequence[Made]) -> tuple[Figure, ...]:
 
 TEXT = """\
 A photograph as target, at exposures that ask more and more of the object's pixels for more light than there is.
-*Cut off*: the solve does what it can. *Gently adapted*: what `[solve] adapt = 1` does, the weakest of a few
-strengths that keeps most contrast. *Adapted in full*: all in reach. Contrast is measured in photographs of the
-result, in two ways: the measure by which the strength is chosen, and one that has no part in it, band-limited
-contrast after Peli 1990. The colour difference is to the target as it was asked for, and adaptation makes it
-larger: it trades absolute brightness for detail. No person was asked: how much of this an eye prefers is not shown."""
+*Cut off*: the solve does what it can. *Gently adapted*: what `[solve] adapt = 1` does: of a few dimmings, which
+give up the pixels that hardly any light reaches, the one that keeps most contrast. *Adapted in full*: all in reach.
+Contrast is measured in photographs of the result, in two ways: the measure by which the dimming is chosen, and one
+that has no part in it, band-limited contrast after Peli 1990. The colour difference is to the target as it was
+asked for, and adaptation makes it larger: it trades absolute brightness for detail. No person was asked: how much
+of this an eye prefers is not shown."""
 
 ADAPTATION = Experiment(
     name="adaptation",

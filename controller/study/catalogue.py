@@ -8,11 +8,14 @@ from typing import Final
 from controller.errors import UsageError
 from controller.study.ablation import ABLATION
 from controller.study.adaptation import ADAPTATION
+from controller.study.drifting import DRIFTING
 from controller.study.earlier import EARLIER
+from controller.study.effort import EFFORT
 from controller.study.frequency import FREQUENCY
 from controller.study.placement import PLACEMENT
 from controller.study.regions import REGIONS
 from controller.study.residual import RESIDUAL, RESIDUAL_SIX
+from controller.study.robustness import ROBUSTNESS
 from controller.study.sharpness import SHARPNESS
 from controller.study.values import Experiment
 
@@ -25,6 +28,9 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     FREQUENCY,
     EARLIER,
     PLACEMENT,
+    EFFORT,
+    DRIFTING,
+    ROBUSTNESS,
     ADAPTATION,
 )
 

@@ -1,0 +1,39 @@
+"""One appearance, solved and photographed, by which experiments judge a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from controller.arrays import FloatImage
+from controller.solve.bounded import SMOOTHNESS, solve_bounded
+from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
+from controller.solve.weights import appearance_weights
+from controller.study.measuring import Quality, quality
+from controller.study.subject import Subject, Wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """An appearance as it was asked for, its linear ``frames``, and how its photograph compares."""
+
+    wanted: Wanted
+    frames: Sequence[FloatImage]
+    photograph: FloatImage
+    quality: Quality
+
+
+def trial(subject: Subject, name: str) -> Trial:
+    """A photograph wrapped on the reconstructed object, at an exposure that 95 % of it can reach."""
+    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+    wanted = subject.wanted(target)
+    weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
+    black = subject.calibration.black
+    solution = solve_bounded(subject.transport, wanted.radiance, black, weights=weights, smoothness=SMOOTHNESS)
+    return shown(subject, name, wanted, solution.frames)
+
+
+def shown(subject: Subject, name: str, wanted: Wanted, frames: Sequence[FloatImage]) -> Trial:
+    """The same frames photographed, now."""
+    picture = subject.light.photograph(name, frames, white=wanted.white)
+    return Trial(wanted, frames, picture, quality(subject, picture, wanted))

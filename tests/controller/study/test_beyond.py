@@ -1,0 +1,176 @@
+"""The experiments beyond the paper, on a stage in arrays with somebody who disturbs it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from controller.arrays import FloatImage
+from controller.calibrate.drift import Culprit, Drift, ProjectorDrift
+from controller.calibrate.registration import Motion
+from controller.errors import CalibrationError
+from controller.session.modes import DotOptions
+from controller.study.adaptation import CUT, GENTLE, adaptation, bands_kept
+from controller.study.drifting import LEVELS_PX, Bumped, _criteria, drifting
+from controller.study.effort import effort
+from controller.study.robustness import TROUBLES, quantised, robustness
+from controller.study.stagehand import Again, Change
+from controller.study.subject import Dots, Subject
+from controller.study.values import column
+from tests.controller.study.array_stage import ArrayLight, array_subject
+
+
+def motion(rms_px: float) -> Motion:
+    return Motion(np.eye(3), (0.0, 0.0), (rms_px, 0.0), 0.01, rms_px, 0.0, 0.01, 1.0, 0.001, (1.0, 1.0, 1.0), 1.0, True)
+
+
+@dataclass
+class Clumsy:
+    """Moves a stage in arrays as ``changes`` say: every bump shifts what the projectors show, till it is calibrated."""
+
+    subject: Subject
+    changes: tuple[Change, ...] = ()
+    done: list[str] = field(default_factory=list)
+
+    def disturb(self, *changes: Change) -> None:
+        self.changes = changes
+
+    def _moved_px(self, what: str) -> float:
+        return sum(
+            float(change.get("shift_px", (0.0,))[0]) + float(change.get("move_mm", (0.0,))[0])
+            for change in self.changes if change["what"] == what
+        )  # fmt: skip
+
+    def drift(self, name: str) -> Drift:
+        moved = {what: self._moved_px(what) for what in ("projector", "camera", "object")}
+        culprit = next((kind for what, kind in (("camera", Culprit.CAMERA), ("object", Culprit.OBJECT))
+                        if moved[what] > 0.2), Culprit.NOBODY)  # fmt: skip
+        projectors = tuple(
+            ProjectorDrift(part.name, motion(moved["projector"] if n == 0 else 0.0), (1.0, 1.0, 1.0),
+                           (0.01, 0.01, 0.01), 0.0, 1.0)
+            for n, part in enumerate(self.subject.calibration.projectors)
+        )  # fmt: skip
+        return Drift(projectors, motion(moved["camera"] + moved["object"]), culprit, 0.0, 1.0)
+
+    def quickly(self, name: str) -> Again:
+        return self.again(name)
+
+    def again(self, name: str, options: DotOptions | None = None) -> Again:
+        self.done.append(name)
+        if any(change.get("gloss", 0) > 0.02 for change in self.changes):
+            raise CalibrationError("too-glossy", what="The object mirrors.", remedy="Dull it.")
+        subject = dataclasses.replace(self.subject, light=array_subject().light)
+        spacing = 0 if options is None or options.spacing_px is None else options.spacing_px
+        photographs = 3 * (30 + (spacing**2 if options is not None and options.mode == "paper" else 0))
+        return Again(subject, photographs, {"p0": 1.2, "p1": 1.4})
+
+
+@dataclass
+class Disturbed:
+    """``Light`` that shows what a clumsy hand made of the frames."""
+
+    light: ArrayLight
+    hand: Clumsy
+
+    def photograph(self, name: str, frames: Sequence[FloatImage], *, white: float) -> FloatImage:
+        shown = list(frames)
+        for change in self.hand.changes:
+            pixels = round(float(change.get("shift_px", (0.0,))[0]) + float(change.get("move_mm", (0.0,))[0]))
+            shown[0] = np.roll(shown[0], pixels, axis=1)
+            shown = [np.asarray(frame ** np.float32(float(change.get("gamma", 1.0)))) for frame in shown]
+        return self.light.photograph(name, shown, white=white)
+
+    def dots(self, n: int) -> Dots:
+        return self.light.dots(n)
+
+
+def stage() -> tuple[Subject, Clumsy]:
+    subject = array_subject()
+    hand = Clumsy(subject)
+    assert isinstance(subject.light, ArrayLight)
+    subject.light = Disturbed(subject.light, hand)
+    subject.parts = SimpleNamespace(hand=hand)
+    return subject, hand
+
+
+def test_bumps_cost_more_the_larger_they_are_are_noticed_and_mended() -> None:
+    subject, hand = stage()
+    result = drifting(subject)
+    (table,) = result.tables
+    unnoticed = [float(row[2] or 0) for row in table.rows if row[0] == "a projector"]
+    assert unnoticed[-1] > unnoticed[0] + 0.5
+    assert [criterion.holds for criterion in result.criteria] == [True, True, True, True]
+    assert len(hand.done) == len(LEVELS_PX) + 1 + 2
+    assert hand.changes == ()
+
+
+def test_costly_bumps_that_nobody_notices_wrong_names_and_bad_mending_are_told_as_misses() -> None:
+    _, hand = stage()
+    hand.disturb({"what": "camera", "shift_px": (5.0, 0.0)})
+    blind = hand.drift("quiet")
+    found = [Bumped("a projector", 5.0, 9.0, False, False, 0.0, 4.0, 9, 1.2, 95),
+             Bumped("the camera", 5.0, None, False, False, 0.0)]  # fmt: skip
+    undisturbed, noticed, named, mended = _criteria(1.0, blind, found)
+    assert not undisturbed.holds
+    assert not noticed.holds
+    assert not named.holds
+    assert "the camera by 5 px" in named.reason
+    assert not mended.holds
+
+
+def test_photographs_are_counted_for_every_way_to_calibrate() -> None:
+    subject, hand = stage()
+    result = effort(subject)
+    (table,) = result.tables
+    assert column(table, "photographs a projector") == [30, 46, 66, 94, 174]
+    assert len(hand.done) == 5
+    assert result.criteria[1].holds
+
+
+def test_every_trouble_is_met_at_every_level_and_one_that_can_not_be_calibrated_is_told() -> None:
+    subject, hand = stage()
+    result = robustness(subject)
+    (table,) = result.tables
+    assert len(table.rows) == 1 + sum(len(trouble.levels) for trouble in TROUBLES)
+    by = {(row[0], row[1]): row for row in table.rows}
+    assert by["highlights", 0.05][6] == "The object mirrors."
+    assert by["highlights", 0.05][3] is None
+    gamma = [float(by["gamma error", level][3] or 0) for level in (1.02, 1.05, 1.1)]
+    assert gamma == sorted(gamma)
+    assert float(by["quantisation", 4.0][3] or 0) > float(by["quantisation", 7.0][3] or 0)
+    assert hand.changes == ()
+
+
+@pytest.mark.parametrize("bits", [1.0, 4.0, 8.0])
+def test_quantised_frames_have_as_many_values_as_their_bits_allow(bits: float) -> None:
+    frame = np.linspace(0, 1, 60_000, dtype=np.float32).reshape(100, 200, 3)
+    (coarse,) = quantised([frame], bits)
+    assert 2**bits - 1 <= len(np.unique(coarse)) <= 2**bits  # the lowest step of eight bits is narrower than a sample
+    assert np.abs(coarse - frame).max() < 2.2 * 0.5 / (2**bits - 1) + 1e-6
+
+
+def test_adaptation_keeps_more_contrast_where_light_lacks() -> None:
+    subject, _ = stage()
+    result = adaptation(subject)
+    (table,) = result.tables
+    rows = {(row[0], row[2]): row for row in table.rows}
+    for measure in (3, 4):
+        assert float(rows[0.5, GENTLE][measure] or 0) > float(rows[0.5, CUT][measure] or 0)
+
+
+def test_band_contrast_counts_what_goes_along_with_the_target_only() -> None:
+    rng = np.random.default_rng(2)
+    target = np.repeat(rng.random((60, 80, 1)), 3, axis=2).astype(np.float32) + 0.5
+    mask = np.ones((60, 80), bool)
+    assert bands_kept(target, target, mask) == pytest.approx(1.0)
+    assert bands_kept(3 * target, target, mask) == pytest.approx(1.0, abs=1e-4)
+    flat = np.full_like(target, 1.0)
+    assert bands_kept(flat, target, mask) == pytest.approx(0.0, abs=1e-6)
+    half = np.asarray(0.5 * target + 0.5 * target.mean(), np.float32)
+    assert 0.4 < bands_kept(half, target, mask) < 0.65
+    assert bands_kept(np.asarray(2.0 - target, np.float32), target, mask) < 0.1
