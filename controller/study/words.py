@@ -69,7 +69,7 @@ contrast. Smoothness takes a part, too: without it the model gives F_3 = 0.60 in
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
 well below F_1, so what the base leaves to it there is partly lost. With the base's limit at a quarter of F_1
-nothing is.""",
+little is.""",
 }
 """Why a criterion of an experiment is missed, by the experiment's name and the beginning of what is asked."""
 
