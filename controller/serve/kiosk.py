@@ -206,7 +206,9 @@ class StageKiosk:
         if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
             raise UsageError("appearance-in-use", what=f"{name} is playing, or the schedule names it.",
                              remedy="Play another one, and take it out of the schedule.")  # fmt: skip
+        service.conductor.check_idle()
         settings.remove_picture(self.stage, name)
+        settings.forget_solved(self.stage, name)
         service.ask(Request("publish"))
 
     def lamp_history(self) -> Sequence[LampDay]:

@@ -33,7 +33,7 @@ class Pictures:
         name, bundle = self._wishes.appearance(plan, self._stock.names()), self._stock.bundle()
         if not missing:
             return Showing(bundle, name)
-        instead = self._stock.without(missing)
+        instead = self._stock.without(missing, name)
         if instead is not None:
             return Showing(instead, name)
         # The whole stage's frames go on meanwhile: dimmer, but there.

@@ -101,8 +101,11 @@ class Stock(Protocol):
     def names(self) -> Sequence[str]:
         """The appearances of the installed bundle."""
 
-    def without(self, missing: Collection[str]) -> Path | None:
-        """The bundle that was solved for the stage without these projectors from the same calibration, or None."""
+    def without(self, missing: Collection[str], appearance: str) -> Path | None:
+        """The bundle that was solved for the stage without these projectors from the same calibration, or None.
+
+        It holds ``appearance``; it need not hold all others of the installed bundle.
+        """
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.app import check_stage
+from controller.calibrations import finished_calibrations
 from controller.config.editing import rewrite_stage
 from controller.config.lines import KeyLines
 from controller.config.loader import FILE, LARGEST_BYTES, parse_stage
@@ -87,3 +88,10 @@ def remove_picture(stage: Path, name: str) -> None:
     left = "\n".join([*lines[:first], *lines[last:]])
     validate(left)
     write_atomically(stage / FILE, left.encode())
+
+
+def forget_solved(stage: Path, name: str) -> None:
+    """Remove an appearance's frames of the newest calibration: what is solved there stays in every new bundle."""
+    for run in finished_calibrations(stage)[:1]:
+        for suffix in ("json", "npz"):
+            (run / f"appearance-{name}.{suffix}").unlink(missing_ok=True)

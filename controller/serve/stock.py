@@ -41,13 +41,12 @@ class BundleStock:
         index = self.index(self.bundle())
         return () if index is None else tuple(one.name for one in index.appearances)
 
-    def without(self, missing: Collection[str]) -> Path | None:
+    def without(self, missing: Collection[str], appearance: str) -> Path | None:
         path, whole = current(slots_without(self._stage, missing)), self.index(self.bundle())
         index = self.index(path)
         if index is None or whole is None or index.calibration != whole.calibration:
             return None
-        wanted = {one.name for one in whole.appearances}
-        return path if wanted <= {one.name for one in index.appearances} else None
+        return path if appearance in [one.name for one in index.appearances] else None
 
     def previews(self) -> dict[str, Path]:
         """A PNG of how each appearance of the installed bundle will look, for those that it has one of.

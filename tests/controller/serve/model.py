@@ -127,7 +127,7 @@ class ModelStock:
     def names(self) -> Sequence[str]:
         return ("shine", "marble")
 
-    def without(self, missing: Collection[str]) -> Path | None:
+    def without(self, missing: Collection[str], appearance: str) -> Path | None:
         return self.beside.get(frozenset(missing))
 
 

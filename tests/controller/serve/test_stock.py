@@ -1,4 +1,4 @@
-"""The pictures that the panel shows of the installed appearances come out of the bundle."""
+"""What the stock finds in bundles: pictures for the panel, and frames for a stage that lost a projector."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from controller.bundle.export import png
 from controller.bundle.install import install
 from controller.bundle.signing import Trust
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.serve.stock import PREVIEWS, BundleStock
+from controller.serve.stock import PREVIEWS, BundleStock, slots_without
 
 UNSIGNED = Trust((), allow_unsigned=True)
 
 
-def installed(stage: Path, revision: int, names: tuple[str, ...]) -> bytes:
+def installed(stage: Path, revision: int, names: tuple[str, ...], slots: Path | None = None) -> bytes:
     """A bundle in which all but the last appearance have a picture; that picture."""
     picture = png(np.full((4, 6, 3), 10 * revision, np.uint8))
     frames = {"P1": np.zeros((8, 8, 3), np.uint8)}
@@ -24,7 +24,7 @@ def installed(stage: Path, revision: int, names: tuple[str, ...]) -> bytes:
         stage / "made.vel", stage="demo", calibration="one", created_unix_s=1, outputs=[("P1", 8, 8)],
         appearances=made, key=None, revision=revision,
     )  # fmt: skip
-    install(stage / "made.vel", stage / "bundles", trusted=(), allow_unsigned=True)
+    install(stage / "made.vel", slots or stage / "bundles", trusted=(), allow_unsigned=True)
     return picture
 
 
@@ -44,3 +44,12 @@ def test_a_disk_that_takes_nothing_costs_the_pictures_alone(tmp_path: Path) -> N
     installed(tmp_path, 1, ("marble", "bare"))
     (tmp_path / "kiosk").write_text("a file where a folder should be")
     assert BundleStock(tmp_path, UNSIGNED).previews() == {}
+
+
+def test_frames_without_a_projector_serve_what_they_hold(tmp_path: Path) -> None:
+    installed(tmp_path, 1, ("marble", "bare"))
+    stock = BundleStock(tmp_path, UNSIGNED)
+    assert stock.without({"left"}, "marble") is None
+    installed(tmp_path, 1, ("marble",), slots_without(tmp_path, {"left"}))
+    assert stock.without({"left"}, "marble") is not None
+    assert stock.without({"left"}, "bare") is None
