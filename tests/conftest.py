@@ -11,6 +11,11 @@ from hypothesis import settings
 
 from tests.scheduling import LongestFirst
 
+# Workers that share the cores: numeric libraries whose threads wait for each other would take several times as long.
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if WORKERS > 1:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported, which none of the above does
+
 # The same examples in every run; HYPOTHESIS_PROFILE=search looks for new ones.
 settings.register_profile("suite", derandomize=True)
 settings.register_profile("search", print_blob=True)
@@ -21,6 +26,15 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 signal.signal(signal.SIGINT, signal.default_int_handler)
 for number in (signal.SIGHUP, signal.SIGTERM):
     signal.signal(number, signal.SIG_DFL)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cores_shared_between_workers() -> None:
+    """Each worker's kernels run on its share of the cores. The programs that tests start take theirs from us."""
+    if WORKERS > 1:
+        import numba
+
+        numba.set_num_threads(max(1, numba.get_num_threads() // WORKERS))
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -57,6 +57,12 @@ def listening_to_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def share_of_the_cores() -> dict[str, str]:
+    """For a program beside other workers' tests: as many kernel threads as there are cores for it."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    return {"NUMBA_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // workers))} if workers > 1 else {}
+
+
 class Command:
     """``velatura WORDS --json`` in a process of its own, its lines read as they come."""
 
@@ -73,7 +79,7 @@ class Command:
                 stderr=subprocess.PIPE,
                 text=True,
                 cwd=REPOSITORY,
-                env=os.environ | {"PYTHONFAULTHANDLER": "1"},
+                env=os.environ | {"PYTHONFAULTHANDLER": "1"} | share_of_the_cores(),
             )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -170,6 +176,7 @@ class Bench:
             stdout=subprocess.PIPE,
             text=True,
             cwd=REPOSITORY,
+            env=os.environ | share_of_the_cores(),
             start_new_session=True,
         )
         self._until("ready")
