@@ -152,7 +152,7 @@ class Process:
         return not Path(f"/proc/{self._pid}").exists()
 
     def kill(self) -> None:
-        """SIGKILL to it and to every process that it has started; stopped first, so that it starts no other meanwhile."""
+        """SIGKILL to it and to all that it has started; stopped first, so that it starts no other meanwhile."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self._pid, signal.SIGSTOP)
         for pid in (*children(self._pid), self._pid):

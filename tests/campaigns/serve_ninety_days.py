@@ -214,12 +214,12 @@ class NinetyDays:
             self.account.minutes["open" if truly else "closed"] += 1
         elif at_s - self.changed_s <= SETTLING_S:
             self.account.minutes["opening or closing"] += 1
+        elif not truly and self.kiosk.conductor.plan.open is False and self._checking():
+            self.account.minutes["nightly check"] += 1
         elif at_s <= self.excused_until_s:
             self.account.minutes[f"excused: {self.why}"] += 1
             if not self._explained(self.why):
                 self.account.unaccounted.append(f"{local:%Y-%m-%d %H:%M} nothing in the log tells of {self.why}")
-        elif not truly and self.kiosk.conductor.plan.open is False and self._checking():
-            self.account.minutes["nightly check"] += 1
         elif all(lamp.dud for lamp in self.kiosk.lamps.values()):
             self.account.minutes["every lamp dead"] += 1
         else:
@@ -228,7 +228,9 @@ class NinetyDays:
             )
 
     def _checking(self) -> bool:
-        return self.kiosk.conductor.working or self.kiosk.state is State.COOLING
+        """A check that finds a lamp dark is given up, and the lamps are cooled."""
+        begun_s = self.heard.get("task-due", -1e9)
+        return self.kiosk.conductor.working or self.kiosk.state is State.COOLING or self.now_s - begun_s < SETTLING_S
 
 
 def live(folder: Path, *, days: float, start: datetime, seed: int) -> Account:
