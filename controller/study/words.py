@@ -32,7 +32,9 @@ the regions hold an edge, and the larger every figure.""",
 lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels
 (eq. 9), in windows; edges are Canny's, at the target's own threshold. *Naive* is the light of photographed
 dots, inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated
-shares. All four make the same target at an exposure that one projector can reach.""",
+shares. All four make the same target at an exposure that one projector can reach. How many windows count as
+best is not sharp itself: at size small and seed 1, solves that went another way to the same residual gave 86 %
+and 92 %, and 0.825 and 0.843 over the whole object.""",
     "frequency": """\
 Bands of upright waves around a grey, faint and bold, their frequency rising downwards, over the middle of a
 pale shell, at an exposure that one projector can reach. *Contrast kept* is the amplitude in phase with the
