@@ -97,8 +97,12 @@ def _draw(found: list[dict[str, float]]) -> None:
     for axis, key, title in zip(
         axes, ("ns", "bytes"), ("a sweep, ns a projector pixel", "memory, bytes a projector pixel"), strict=True
     ):
-        axis.semilogx(of_paper, [one[key] for one in found], "o-", base=2)
-        axis.set(title=title, xlabel="pixels, of the paper's", ylim=(0, None))
+        values = [one[key] for one in found]
+        axis.axhspan(min(values), EVEN * min(values), color="0.9", label="20 % above the least")
+        axis.semilogx(of_paper, values, "o-", base=2)
+        axis.set(title=title, xlabel="pixels, of the paper's", ylim=(0, 1.15 * max(*values, EVEN * min(values))))
+        axis.set_xticks(of_paper, [f"1/{1 / part:g}" if part < 1 else f"{part:g}" for part in of_paper])
+        axis.legend(loc="lower right")
     figure.savefig(PICTURE, dpi=120)
     plt.close(figure)
 

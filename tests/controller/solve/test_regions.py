@@ -99,7 +99,7 @@ def test_one_region_over_a_crop_by_camera_samples_gives_the_global_optimum() -> 
     transport = LightTransport.build(calibration)
     target = picture(transport)
     exact = solve_regions(transport, target, calibration.black, solver=FAST, size_px=128)
-    best = solve_bounded(transport, target, calibration.black, tolerance=1e-7, most_iterations=6000)
+    best = solve_bounded(transport, target, calibration.black, tolerance=1e-6, most_iterations=6000)
     assert exact.regions == 1
     assert best.objective == pytest.approx(exact.objective, rel=1e-4)
     phases = solve_regions(transport, target, calibration.black, solver=FAST)
@@ -114,7 +114,7 @@ def test_one_region_over_the_whole_image_gives_the_global_optimum(stage: Stage, 
     weights = np.random.default_rng(1).uniform(0, 2, transport.shape).astype(np.float32)
     weights[20:24] = 0
     exact = solve_regions(transport, target, calibration.black, solver=FAST, size_px=100, weights=weights)
-    best = solve_bounded(transport, target, calibration.black, weights=weights, tolerance=1e-7, most_iterations=6000)
+    best = solve_bounded(transport, target, calibration.black, weights=weights, tolerance=1e-6, most_iterations=6000)
     assert exact.regions == 1
     assert best.objective == pytest.approx(exact.objective, rel=1e-4)
 
@@ -123,7 +123,7 @@ def test_four_phases_come_near_the_global_optimum_and_never_below_it(stage: Stag
     calibration = crop(stage, blurred=True)
     transport = LightTransport.build(calibration)
     target = picture(transport)
-    best = solve_bounded(transport, target, calibration.black, tolerance=1e-7, most_iterations=6000)
+    best = solve_bounded(transport, target, calibration.black, tolerance=1e-6, most_iterations=6000)
     found = solve_regions(transport, target, calibration.black, solver=FAST)
     assert found.regions == 16
     assert -1e-4 < found.objective / best.objective - 1 < 0.06
