@@ -8,6 +8,7 @@ from xdist.scheduler import LoadFileScheduling
 
 TOGETHER: Final = {
     "tests/end_to_end/test_demo.py": "the finished demo",
+    "tests/end_to_end/test_takeover.py": "the finished demo",
     "tests/end_to_end/test_targets.py": "the finished demo",
 }
 """A fixture of the session is made once a worker, and the finished demo takes minutes."""

@@ -1,0 +1,108 @@
+"""A lamp dies while the kiosk plays: the projectors that are left take over, on a real calibration."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.app import check_stage
+from controller.arrays import FloatImage, load_arrays
+from controller.calibrations import finished_calibration
+from controller.demo.bench_process import BenchProcess
+from controller.errors import VelaturaError
+from controller.serve.control import ask
+from controller.services import make_appearances
+from controller.session.progress import Silent
+from controller.session.solving import Calibrated
+from tests.end_to_end.conftest import FinishedDemo
+from tests.end_to_end.program import LONGEST_S, Command
+
+pytestmark = pytest.mark.timeout(600)
+NAME, DEAD = "checkerboard", "above"
+FAULTS = f"""
+[[event]]
+do = "lamp-failure"
+device = "{DEAD}"
+on_message = 12
+"""
+
+
+def copied(stage: Path, to: Path) -> Path:
+    """What is only ever replaced is linked; databases and mapped files are written to."""
+
+    def keep(source: str, target: str) -> None:
+        (os.link if source.endswith((".npz", ".dng")) else shutil.copy2)(source, target)
+
+    return Path(shutil.copytree(stage, to, copy_function=keep, ignore=shutil.ignore_patterns("run")))
+
+
+def shown(stage: Path) -> list[bool]:
+    """Whether each output shows anything."""
+    outputs = check_stage(stage).stage.tables.display.outputs
+    data, at, lit = np.memmap(stage / "run" / "outputs.frame", np.uint8, "r"), 4096, []
+    for output in outputs:
+        size = output.width_px * output.height_px * 3
+        lit.append(bool(np.any(data[at : at + size])))
+        at += size + -size % 4096
+    return lit
+
+
+def wait_for(what: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + LONGEST_S
+    while not what():
+        assert time.monotonic() < until_s
+        time.sleep(0.2)
+
+
+def codes(stage: Path) -> list[str]:
+    try:
+        return [row["code"] for row in ask(stage, "events")]
+    except VelaturaError:  # it is not there yet
+        return []
+
+
+def error_of(seen: FloatImage, target: FloatImage, where: np.ndarray[tuple[int, int], np.dtype[np.bool_]]) -> float:
+    """rms of the difference at the best brightness over the target's rms: a dimmer stage is no error."""
+    light, wanted = seen[where], target[where]
+    gain = float((light * wanted).sum() / np.square(light).sum())
+    return float(np.sqrt(np.square(gain * light - wanted).mean() / np.square(wanted).mean()))
+
+
+def test_the_others_take_over_for_a_dead_lamp(finished_demo: FinishedDemo, tmp_path: Path) -> None:
+    stage = copied(finished_demo.stage, tmp_path / "stage")
+    head, *tables = (stage / "stage.toml").read_text().split("\n[[appearances]]\n")
+    (table,) = (one for one in tables if f'"{NAME}"' in one)
+    # One appearance is solved for the others, instead of all.
+    (stage / "stage.toml").write_text(f"{head}\n[[appearances]]\n{table}")
+    shutil.rmtree(stage / "bundles")
+    make_appearances(stage=stage, names=[NAME], reporter=Silent(), cancel=threading.Event())
+    (stage / "bench" / "dead.toml").write_text(FAULTS)
+    bench = stage / "bench.toml"
+    text = bench.read_text()
+    assert 'scenario = ""' in text
+    bench.write_text(text.replace('scenario = ""', 'scenario = "bench/dead.toml"'))
+    with BenchProcess(stage, cancel=threading.Event()), Command("serve", stage, "--no-panel") as kiosk:
+        wait_for(lambda: "takeover-solved" in codes(stage))
+        wait_for(lambda: shown(stage) == [True, True, False])
+        state = ask(stage, "status")
+        assert (state["state"], state["playing"]) == ("degraded", NAME)
+        assert kiosk.interrupt().code == 0
+    run, names = finished_calibration(stage), check_stage(stage).names
+    calibrated = Calibrated(run, names)
+    black = calibrated.calibration.black
+    whole, left = (load_arrays(folder / f"appearance-{NAME}.npz") for folder in (run, run / "without" / DEAD))
+    dark = np.zeros_like(whole[f"linear-{DEAD}"])
+    lit = np.logical_or.reduce([calibrated.transport.lit[number] for number, name in enumerate(names) if name != DEAD])
+    where = lit & left["reachable"] & whole["reachable"] & calibrated.calibration.object_mask
+    errors = []
+    for frames in (left, whole):
+        light = [dark if name == DEAD else frames[f"linear-{name}"] for name in names]
+        errors.append(error_of(calibrated.transport.forward(light) + black, left["target"], where))
+    assert errors[0] < 0.5 * errors[1], "frames solved for the others are no better than the old ones in its absence"
