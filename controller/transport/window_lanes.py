@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 
 from controller.arrays import FloatImage
@@ -77,70 +77,6 @@ def _window_add(_: Any, sums: Any, at: Any, table: Any, shares: Any, down: Any, 
     four = types.UniTuple(types.int64, LANES)  # type: ignore[no-untyped-call]
     return types.void(sums, four, table, four, types.int64, types.float32), generate
 
-
-def _small_sum(_: Any, light: Any, at: Any, side: Any, table: Any, across: Any, down: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kinds = signature.args
-        weights = _loaded(context, builder, kinds[3], args[3], args[5])
-        total, index = None, args[1]
-        for k in range(LANES):
-            part = builder.fmul(
-                _loaded(context, builder, kinds[0], args[0], index), _lane(builder, weights, k), flags=["fast"]
-            )
-            total = part if total is None else builder.fadd(total, part, flags=["fast"])
-            index = builder.add(index, args[2])
-        total = builder.fmul(total, _loaded(context, builder, kinds[3], args[3], args[4]), flags=["fast"])
-        result = builder.extract_element(total, ir.Constant(_LANE, 0))
-        for k in range(1, LANES):
-            result = builder.fadd(result, builder.extract_element(total, ir.Constant(_LANE, k)), flags=["fast"])
-        return result
-
-    return types.float32(light, types.int64, types.int64, table, types.int64, types.int64), generate
-
-
-def _small_add(_: Any, sums: Any, at: Any, side: Any, table: Any, across: Any, down: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kinds = signature.args
-        nothing = ir.Constant(_FLOATS, ir.Undefined)
-        value = _lane(builder, builder.insert_element(nothing, args[6], ir.Constant(_LANE, 0)), 0)
-        weights = _loaded(context, builder, kinds[3], args[3], args[5])
-        along = builder.fmul(_loaded(context, builder, kinds[3], args[3], args[4]), value, flags=["fast"])
-        index = args[1]
-        for k in range(LANES):
-            address = _address(context, builder, kinds[0], args[0], index)
-            before = builder.load(address)
-            before.align = 4
-            part = builder.fmul(along, _lane(builder, weights, k), flags=["fast"])
-            builder.store(builder.fadd(before, part, flags=["fast"]), address).align = 4
-            index = builder.add(index, args[2])
-        return context.get_dummy_value()
-
-    return types.void(sums, types.int64, types.int64, table, types.int64, types.int64, types.float32), generate
-
-
-def _fetch(_: Any, values: Any, index: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, value=args[0]).data
-        byte = ir.IntType(8).as_pointer()
-        address = builder.bitcast(builder.gep(data, [args[1]]), byte)
-        kind = ir.FunctionType(ir.VoidType(), [byte, _LANE, _LANE, _LANE])
-        name = "llvm.prefetch.p0i8"
-        prefetch = cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
-        builder.call(prefetch, [address, *(ir.Constant(_LANE, value) for value in (0, 3, 1))])
-        return context.get_dummy_value()
-
-    return types.void(values, types.int64), generate
-
-
-fetch = cast("Callable[[FloatImage, Index], None]", intrinsic(_fetch))
-"""``fetch(values, index)``: bring values[index] to the cache, if there is such a place; costs next to nothing."""
-
-small_sum = cast("Callable[[FloatImage, Index, Index, FloatImage, Index, Index], float]", intrinsic(_small_sum))
-"""``small_sum(light, at, side, table, across, down)``: sum of the four by four of ``light`` from ``at`` on, ``side`` a
-row, times table[across:] along and table[down:] down."""
-
-small_add = cast("Callable[[FloatImage, Index, Index, FloatImage, Index, Index, float], None]", intrinsic(_small_add))
-"""``small_add(sums, at, side, table, across, down, value)``: its transpose."""
 
 window_sum = cast("Callable[[FloatImage, Rows, FloatImage, Rows, Index], float]", intrinsic(_window_sum))
 """``window_sum(light, at, table, shares, down)``: sum of four rows of four, light[at[k]:] times table[shares[k]:] times
