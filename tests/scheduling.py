@@ -8,6 +8,7 @@ from xdist.scheduler import LoadFileScheduling
 
 TOGETHER: Final = {
     "tests/end_to_end/test_demo.py": "the finished demo",
+    "tests/end_to_end/test_live.py": "the finished demo",
     "tests/end_to_end/test_takeover.py": "the finished demo",
     "tests/end_to_end/test_targets.py": "the finished demo",
 }
@@ -23,7 +24,8 @@ LONGEST_FIRST: Final = (
     "tests/controller/cluster/test_cluster.py",
     "tests/controller/panel/test_in_browser.py",
     "tests/end_to_end/test_killed_demo.py",
-    "tests/plugins/finding/test_serial_ports.py",
+    "tests/end_to_end/test_technician.py",
+    "tests/controller/study/test_beyond.py",
     "tests/plugins/test_gphoto2_peer.py",
 )
 """What would keep one worker busy for a minute after the other has ended, were it to come last."""
