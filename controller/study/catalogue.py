@@ -8,6 +8,7 @@ from typing import Final
 from controller.errors import UsageError
 from controller.study.ablation import ABLATION
 from controller.study.adaptation import ADAPTATION
+from controller.study.appearances import APPEARANCES
 from controller.study.drifting import DRIFTING
 from controller.study.earlier import EARLIER
 from controller.study.effort import EFFORT
@@ -27,6 +28,7 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     SHARPNESS,
     FREQUENCY,
     EARLIER,
+    APPEARANCES,
     PLACEMENT,
     EFFORT,
     DRIFTING,
