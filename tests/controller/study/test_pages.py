@@ -126,7 +126,8 @@ def test_words_stand_apart_from_results_and_are_about_known_experiments() -> Non
     names = {one.name for one in EXPERIMENTS}
     assert set(SAID) <= names
     assert {name for name, _ in WHY} <= names
-    assert said("residual-six") == said("residual") != ""
+    assert said("residual-six").startswith(said("residual"))
+    assert said("residual") != ""
     (name, begins), text = next(iter(WHY.items()))
     assert why(name, f"{begins} and more") == text
     assert why(name, "something else") == ""
