@@ -51,8 +51,8 @@ keeps the bounds inside the solve on the same dots. These are our own implementa
 is better than theirs was; none of their code was run.""",
 }
 SAID_OF_SIX: Final = f"""\
-{SAID["residual"]} The projectors are taken by how much of the picture they light, so the first three are not those of the other page. At
-size small and seed 1, six bring nothing that four do not: 0.01688 and 0.01686."""
+{SAID["residual"]} The projectors are taken by how much of the picture they light, so the first three are not those
+of the other page. At size small and seed 1, six bring nothing that four do not: 0.01688 and 0.01686."""
 
 WHY: Final[Mapping[tuple[str, str], str]] = {
     ("ablation", "+ Gaussian metapixels"): """\
