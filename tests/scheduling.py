@@ -9,6 +9,7 @@ from xdist.scheduler import LoadFileScheduling
 TOGETHER: Final = {
     "tests/end_to_end/test_demo.py": "the finished demo",
     "tests/end_to_end/test_live.py": "the finished demo",
+    "tests/end_to_end/test_on_a_cluster.py": "the finished demo",
     "tests/end_to_end/test_takeover.py": "the finished demo",
     "tests/end_to_end/test_targets.py": "the finished demo",
 }
@@ -17,6 +18,9 @@ LONGEST_FIRST: Final = (
     "the finished demo",
     "tests/end_to_end/test_going_on.py",
     "tests/end_to_end/test_drift.py",
+    "tests/end_to_end/test_technician.py",
+    "tests/campaigns/test_kills.py",
+    "tests/campaigns/test_serve_wires.py",
     "tests/controller/calibrate/test_chain.py",
     "tests/controller/solve/test_regions.py",
     "tests/plugins/test_on_usb_bus.py",
@@ -24,7 +28,6 @@ LONGEST_FIRST: Final = (
     "tests/controller/cluster/test_cluster.py",
     "tests/controller/panel/test_in_browser.py",
     "tests/end_to_end/test_killed_demo.py",
-    "tests/end_to_end/test_technician.py",
     "tests/controller/study/test_beyond.py",
     "tests/plugins/test_gphoto2_peer.py",
 )
