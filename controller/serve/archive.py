@@ -18,9 +18,13 @@ from typing import Any, Final
 from controller.calibrations import finished_calibrations
 from controller.config import load_stage
 from controller.errors import UsageError, WorkError
+from controller.storage import sync_folder
 
 FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"
+RESTORING: Final = ".restoring"
+"""An unpacked and checked backup: while it is there, its parts are on their way to their places."""
+REPLACED: Final = "kiosk/replaced"
 KEPT: Final = 5
 MOST_FILES: Final = 100_000
 ROOM_SHARE: Final = 0.9
@@ -48,25 +52,41 @@ def backup(stage: Path) -> Path:
 def restore(stage: Path, file: Path) -> None:
     """Replace settings, calibration and appearances by those of a backup; what was there stays in kiosk/replaced.
 
-    Everything is unpacked and checked beside before anything is replaced. Raises UsageError("not-a-backup"),
-    WorkError("no-space") and what ``load_stage`` raises for the settings in it.
+    Everything is unpacked and checked beside before anything is replaced; from then on it happens, be it by
+    ``finish_restore`` after a power cut. Raises UsageError("not-a-backup"), WorkError("no-space") and what
+    ``load_stage`` raises for the settings in it.
     """
+    finish_restore(stage)
     with tempfile.TemporaryDirectory(prefix=".restore-", dir=stage) as name:
-        fresh = Path(name)
+        fresh = Path(name) / "fresh"
+        fresh.mkdir()
         _unpack(file, fresh)
         load_stage(fresh)
-        old = stage / "kiosk" / "replaced"
+        old = stage / REPLACED
         shutil.rmtree(old, ignore_errors=True)
         old.mkdir(parents=True)
-        for part in sorted(fresh.iterdir()):
-            if part.name in (*_SECRET, MARK):
-                continue
-            if part.name == "runs":
-                _merge_runs(part, stage / "runs")
-                continue
-            if (stage / part.name).exists():
-                (stage / part.name).rename(old / part.name)
-            part.rename(stage / part.name)
+        fresh.rename(stage / RESTORING)
+        sync_folder(stage)
+    finish_restore(stage)
+
+
+def finish_restore(stage: Path) -> bool:
+    """Go on with a restore that was cut off between its parts, so that no mixture stays; whether there was one."""
+    fresh, old = stage / RESTORING, stage / REPLACED
+    if not fresh.exists():
+        return False
+    for part in sorted(fresh.iterdir()):
+        if part.name in (*_SECRET, MARK):
+            continue
+        if part.name == "runs":
+            _merge_runs(part, stage / "runs")
+            continue
+        if (stage / part.name).exists():
+            (stage / part.name).rename(old / part.name)
+        part.rename(stage / part.name)
+    sync_folder(stage)
+    shutil.rmtree(fresh)
+    return True
 
 
 def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:

@@ -16,6 +16,7 @@ from controller.errors import UsageError, VelaturaError, WorkError
 from controller.panel.kiosk import Lamp
 from controller.play.launch import PlayerSettings
 from controller.play.notify import Notifier
+from controller.serve import archive
 from controller.serve.clock import Clockwork, beginning
 from controller.serve.conductor import Conductor, Limits
 from controller.serve.devices import Devices
@@ -216,6 +217,9 @@ def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) ->
 
     Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
     """
+    if (stage / archive.RESTORING).exists():
+        with stage_lock(stage):
+            archive.finish_restore(stage)
     checked = check_stage(stage)
     if checked.stage.tables.display.driver != "player":
         raise UsageError(

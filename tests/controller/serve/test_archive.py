@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -161,3 +162,48 @@ def test_a_disk_that_takes_nothing_is_told_and_leaves_nothing(stage: Path, monke
     with pytest.raises(WorkError, match="No space left"):
         archive.backup(stage)
     assert list((stage / archive.FOLDER).iterdir()) == []
+
+
+class Cut(Exception):
+    """The power went."""
+
+
+def test_a_restore_that_is_cut_off_anywhere_leaves_the_old_stage_or_becomes_the_new_one(
+    stage: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    before = tmp_path / "before"
+    file = tmp_path / "backup.tar.gz"
+    archive.backup(stage).rename(file)
+    (stage / "stage.toml").write_text(TEXT.replace("The vase", "Another vase"))
+    (stage / "appearances" / "glass.png").write_bytes(b"later")
+    shutil.copytree(stage, before, symlinks=True)
+    rename, outcomes = Path.rename, set()
+    for cut_at in range(1, 30):
+        shutil.rmtree(stage)
+        shutil.copytree(before, stage, symlinks=True)
+        done = 0
+
+        def cut(self: Path, target: Path, cut_at: int = cut_at) -> Path:
+            nonlocal done
+            done += 1
+            if done == cut_at:
+                raise Cut
+            return rename(self, target)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Path, "rename", cut)
+            try:
+                archive.restore(stage, file)
+                whole = True
+            except Cut:
+                whole = False
+        finished = archive.finish_restore(stage)
+        settings = (stage / "stage.toml").read_text()
+        picture = (stage / "appearances" / "glass.png").read_bytes()
+        outcomes.add(("Another" in settings, picture == b"later"))
+        assert finished == (not whole and "Another" not in settings)
+        assert not (stage / archive.RESTORING).exists()
+        if whole:
+            break
+    assert outcomes == {(True, True), (False, False)}
+    assert cut_at > 3
