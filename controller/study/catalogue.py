@@ -18,6 +18,7 @@ from controller.study.regions import REGIONS
 from controller.study.residual import RESIDUAL, RESIDUAL_SIX
 from controller.study.robustness import ROBUSTNESS
 from controller.study.sharpness import SHARPNESS
+from controller.study.times import TIMES
 from controller.study.values import Experiment
 
 EXPERIMENTS: Final[tuple[Experiment, ...]] = (
@@ -29,6 +30,7 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     FREQUENCY,
     EARLIER,
     APPEARANCES,
+    TIMES,
     PLACEMENT,
     EFFORT,
     DRIFTING,
