@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy import ndimage
 
 from controller.arrays import FloatImage, Mask
 from controller.blender import job
@@ -72,8 +73,17 @@ def _lit_anew(subject: Subject, _: Told) -> Target:
         subject.geometry, subject.mask, base_colour=(1.0, 1.0, 1.0), light_direction=LIGHT_FROM, strength=0.0,
         ambient=0.15,
     )  # fmt: skip
-    paint = own_paint(subject.geometry, subject.transport.reach())
+    paint = _paint_everywhere(subject)
     return Target(np.asarray(light.image * paint, np.float32), light.mask)
+
+
+def _paint_everywhere(subject: Subject) -> FloatImage:
+    """The object's own paint; where its shape is not known, that of the nearest place where it is."""
+    geometry = subject.geometry
+    known = subject.mask & np.isfinite(geometry.normals).all(axis=2) & np.isfinite(geometry.points_m).all(axis=2)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    paint: FloatImage = own_paint(geometry, subject.transport.reach())[tuple(nearest)]
+    return paint
 
 
 def _recoloured(subject: Subject, _: Told) -> Target:
@@ -171,8 +181,8 @@ LOOKS: Final[tuple[Look, ...]] = (
     Look("recoloured", "recoloured", OURS, _recoloured),
     Look("pattern", "pattern replaced", OURS, _dotted),
     Look("leaves", "leaves added", OURS, _leaved),
-    Look("marble", "marble, light inside it", BLENDER, partial(rendered, scene="marble")),
-    Look("gold", "inter-reflections in gold", BLENDER, partial(rendered, scene="gold")),
+    Look("marble", "translucent marble", BLENDER, partial(rendered, scene="marble")),
+    Look("gold", "inter-reflections", BLENDER, partial(rendered, scene="gold")),
     Look("glazed", "glaze", BLENDER, partial(rendered, scene="glazed")),
     Look("lowered-head", "head lowered", BLENDER, partial(rendered, scene="lowered-head")),
 )

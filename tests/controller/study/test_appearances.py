@@ -56,12 +56,13 @@ def test_without_blender_its_looks_are_left_out_and_told_and_the_others_are_made
     monkeypatch.setattr(experiment, "LOOKS", some)
     subject = with_folder(tmp_path)
     result = appearances(subject)
-    made, *others = result.criteria
+    made, *others, dimmed = result.criteria
     assert made.holds is False
     assert made.reached == f"2 of {len(some)}"
     assert made.reason.count("Blender was not found.") == 4
     assert {criterion.asked.split(":")[0] for criterion in others} == {"gloss", "leaves added"}
-    assert column(result.tables[0], "").count("left out") == 4
+    assert dimmed.holds
+    assert column(result.tables[0], "state").count("left out") == 4
     assert isinstance(subject.light, ArrayLight)
     assert subject.light.names == [f"{name}-{way}" for name in ("gloss", "leaves")
                                    for way in ("ours", "one", "one-dimmed")]  # fmt: skip
@@ -161,16 +162,17 @@ def shown(look: Look, ours: float, model: float, alone: float) -> Shown:
     nothing = np.zeros((2, 2, 3), np.float32)
     of = partial(Quality, delta_e_p95=0.0, rmse=0.0, ssim=1.0, sharpness=1.0)
     return Shown(
-        look, Wanted(nothing, np.ones((2, 2), np.bool_), 1.0), 1.0, nothing, nothing, of(ours), of(model), of(alone),
-        0.5, of(alone), of(ours), 1.0,
+        look, Wanted(nothing, np.ones((2, 2), np.bool_), 1.0), 1.0, nothing, nothing, of(ours), of(ours), of(model),
+        of(alone),        0.5, of(alone), of(ours), 1.0,
     )  # fmt: skip
 
 
 def test_what_misses_its_goal_says_whether_the_solve_or_the_calibration_does() -> None:
     made = [shown(LOOKS[0], 5.0, 4.5, 20.0), shown(LOOKS[1], 5.0, 1.0, 20.0), shown(LOOKS[2], 1.0, 0.5, 2.0)]
     criteria = experiment._criteria(made, [LeftOut(LOOKS[5], "No Blender.")])
-    assert [one.holds for one in criteria] == [False, False, True, False, True, True, False]
-    assert "marble, light inside it: No Blender." in criteria[0].reason
+    assert [one.holds for one in criteria] == [False, False, True, False, True, True, False, False]
+    assert "translucent marble: No Blender." in criteria[0].reason
     assert "The solve itself comes no nearer than 4.50" in criteria[1].reason
     assert "the calibration's error" in criteria[3].reason
     assert "2.0 times" in criteria[6].reached
+    assert criteria[7].reason == "Not nearer: gloss, novel light, recoloured."  # in RMSE and SSIM they are alike
