@@ -150,8 +150,8 @@ def _criteria(shown: Sequence[Shown], left_out: Sequence[LeftOut]) -> tuple[Crit
                 f"{other:.2f} to {ours:.2f}: {other / ours:.1f} times",
                 better,
                 "" if better else
-                f"So much of it is in one projector's reach that it comes to {other:.2f} by itself; ours by the model"
-                f" alone is {one.model.delta_e:.2f}.",
+                f"Half of it is within {other:.2f} with one projector alone, and ours photographed can't be much nearer;"
+                f" 95 % is within {one.alone.delta_e_p95:.1f} with one, and within {one.ours.delta_e_p95:.1f} of ours.",
             )
         )  # fmt: skip
     return (*found, *_against_dimmed(shown))
@@ -268,5 +268,5 @@ APPEARANCES = Experiment(
     shows="gloss, marble, inter-reflections, new light, new colours, a new pattern, leaves, and a lowered head.",
     scene="painted",
     run=appearances,
-    cost_s=180.0,
+    cost_s=120.0,
 )
