@@ -29,6 +29,7 @@ from controller.commands.drift import drift
 from controller.commands.export import export
 from controller.commands.keys import keys
 from controller.commands.live import live
+from controller.commands.photograph import photograph
 from controller.commands.plan import plan
 from controller.commands.report import report
 from controller.commands.running import Json, StageFolder, group, projector_names, work
@@ -184,6 +185,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     drift,
     appearance,
     play,
+    photograph,
     live,
     keys,
     emulate,

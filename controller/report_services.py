@@ -1,4 +1,4 @@
-"""Reports of finished runs: of a demo, or of a calibration."""
+"""Reports of finished runs: of a demo, of a calibration, or of photographs of appearances."""
 
 from __future__ import annotations
 
@@ -9,18 +9,25 @@ from controller.app import Checked, check_stage
 from controller.calibrations import worst_grade
 from controller.errors import UsageError
 from controller.report.calibration import Asked, graded_runs, write_calibration_report
+from controller.session.compared import SUFFIX
 
 
 def report_of(where: Path, out: Path | None) -> Mapping[str, str]:
     """Write the report of a run's folder, or of a stage's newest graded calibration, into ``out`` or the run's folder.
 
-    Raises UsageError("run-not-graded", "nothing-graded") and as ``check_stage`` and ``demo.report.report_again``.
+    Raises UsageError("run-not-graded", "nothing-graded", "run-not-compared") and as ``check_stage`` and
+    ``demo.report.report_again``.
     """
     run = newest_graded(where) if (where / "stage.toml").exists() else where
     if run.name.endswith("-demo"):
         from controller.demo.report import report_again
 
         return report_again(run, run if out is None else out)
+    if run.name.endswith(SUFFIX):
+        from controller.comparison_services import comparison_report
+
+        compared = comparison_report(run, check_stage(run.resolve().parent.parent), out)
+        return {"report": str(compared), "figures": str(compared.with_suffix(".json"))}
     html = calibration_report(run, check_stage(run.resolve().parent.parent), out)
     return {"report": str(html), "figures": str(html.with_suffix(".json"))}
 

@@ -45,6 +45,16 @@ def compute(
     _job(stage, "compute", {"name": name, "target": str(picture.resolve())}, no_wait=no_wait, as_json=as_json)
 
 
+def compare(
+    stage: StageFolder,
+    name: Annotated[str | None, typer.Argument(help="Only this appearance.", autocompletion=appearance_names)] = None,
+    no_wait: Annotated[bool, typer.Option("--no-wait", help="Do not follow it to its end.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Let the running kiosk photograph its appearances and compare them with their targets; followed to its end."""
+    _job(stage, "compare", {"name": name}, no_wait=no_wait, as_json=as_json)
+
+
 def show(stage: StageFolder, name: Name, as_json: Json = False) -> None:
     """Let the running kiosk open, and play this appearance from now on."""
     _done(stage, "play", f"{name} is played.", as_json=as_json, name=name)
@@ -68,10 +78,12 @@ def results(
     run: Annotated[str | None, typer.Argument(help="A run's name; all runs with results if left out.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Grade and figures of a calibration, or which calibrations there are."""
+    """Grade and figures of a calibration; or which there are, and what the appearances achieve."""
     if run is None:
-        names = _call(stage, "runs")
-        console.show_result({"runs": names} if as_json else "\n".join(names) or "There are none yet.", as_json=as_json)
+        names, compared = _call(stage, "runs"), _call(stage, "comparisons")
+        lines = [*names, *(_achieved(one) for one in compared)]
+        found = {"runs": names, "comparisons": compared}
+        console.show_result(found if as_json else "\n".join(lines) or "There are none yet.", as_json=as_json)
         return
     found = _call(stage, "results", run=run)
     grade = found["grade"]
@@ -79,6 +91,12 @@ def results(
     lines += [f"{label}: {value}" for label, value in found["figures"]]
     lines += [f"{name}: {path}" for name, path in found["pictures"].items()]
     console.show_result(found if as_json else "\n".join(lines), as_json=as_json)
+
+
+def _achieved(one: Mapping[str, Any]) -> str:
+    newest = one["history"][0]
+    return (f"{one['name']}: colour difference {newest['delta_e']:.2f} (95 %: {newest['delta_e_p95']:.2f}), "
+            f"sharpness {newest['sharpness']:.2f}, photographed in {newest['run']}")  # fmt: skip
 
 
 def lamps(stage: StageFolder, as_json: Json = False) -> None:
@@ -158,4 +176,4 @@ def _job(stage: Path, op: str, arguments: Mapping[str, Any], *, no_wait: bool, a
     work("controller.serve.following:ask_and_follow", as_json=as_json, stage=stage, op=op, arguments=arguments)
 
 
-COMMANDS = (recalibrate, compute, show, remove, appearances, results, lamps, aim, feasibility, settings)
+COMMANDS = (recalibrate, compute, compare, show, remove, appearances, results, lamps, aim, feasibility, settings)

@@ -18,7 +18,7 @@ def report(
     out: Annotated[Path | None, typer.Option(help="Where the report goes; else into the run's folder.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Write report.html and report.json of a calibration, or of a finished demo again."""
+    """Write report.html and report.json of a calibration, of photographs of appearances, or of a demo again."""
     from controller.report_services import report_of
 
     console.show_result(report_of(where, out), as_json=as_json)

@@ -148,6 +148,11 @@ class CalibrationTable(Table):
         description="the largest error of a prediction, in per cent, with which a calibration may be published, "
         "above 0, at most 1000",
     )
+    photograph_at_night: bool = Field(
+        default=False,
+        description="true or false: whether the kiosk photographs what the appearances achieve after a nightly "
+        "recalibration",
+    )
 
 
 class SolveTable(Table):

@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import Protocol
 
 from controller.panel.values import (
+    Achieved,
     Aiming,
     Appearance,
     BundleIdentity,
+    Comparison,
     ComputeSettings,
     DeviceRow,
     EventLevel,
@@ -83,6 +85,15 @@ class Kiosk(Protocol):
 
     def appearances(self) -> Sequence[Appearance]: ...
 
+    def compare(self, name: str | None = None) -> Job:
+        """Begin to photograph the installed appearances, or that one, and to compare them with their targets.
+
+        Raises WorkError with the reason why it can't be done now, and UsageError("appearance-unknown").
+        """
+
+    def comparisons(self) -> Sequence[Comparison]:
+        """What the installed appearances achieved, in the bundle's order; without those that nobody photographed."""
+
     def remove_appearance(self, name: str) -> None:
         """Raises UsageError for the one that is playing, or that the schedule names."""
 
@@ -146,9 +157,11 @@ class Kiosk(Protocol):
 
 
 __all__ = [
+    "Achieved",
     "Aiming",
     "Appearance",
     "BundleIdentity",
+    "Comparison",
     "ComputeSettings",
     "DeviceRow",
     "EventLevel",

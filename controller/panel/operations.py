@@ -85,6 +85,11 @@ def _preview(panel: Panel, values: Values) -> FileAnswer:
     return picture_answer(found[0] if found else None)
 
 
+def _compared_picture(panel: Panel, values: Values) -> FileAnswer:
+    found = [one for one in panel.kiosk.comparisons() if one.name == values["name"]]
+    return picture_answer(found[0].pictures.get(values["picture"]) if found else None)
+
+
 def _saved(path: Path) -> FileAnswer:
     return FileAnswer(path, "application/octet-stream", path.name)
 
@@ -92,6 +97,10 @@ def _saved(path: Path) -> FileAnswer:
 VIEWER, OPERATOR, TECHNICIAN = Role.VIEWER, Role.OPERATOR, Role.TECHNICIAN
 _NAME_IN_PATH: Final = Field("name", APPEARANCE.about, pattern=NAME, where="path")
 _RUN_IN_PATH: Final = Field("run", "a run's name", pattern=RUN, longest=96, where="path")
+_PICTURE_IN_PATH: Final = Field(
+    "picture", "before, target, achieved, error or resolution", where="path",
+    choices=("before", "target", "achieved", "error", "resolution"),
+)  # fmt: skip
 _FILE: Final = "application/octet-stream"
 
 QUESTIONS: Final = (
@@ -108,6 +117,11 @@ QUESTIONS: Final = (
               lambda p, v: plain(p.kiosk.appearances())),
     Operation("preview", "GET", "/appearances/{name}/preview", VIEWER, "How it will look", _preview,
               (_NAME_IN_PATH,), "image/png"),
+    Operation("comparisons", "GET", "/comparisons", VIEWER, "What the appearances achieve, as photographed",
+              lambda p, v: plain(p.kiosk.comparisons())),
+    Operation("comparison-picture", "GET", "/appearances/{name}/pictures/{picture}", VIEWER,
+              "A picture of what an appearance achieves", _compared_picture,
+              (_NAME_IN_PATH, _PICTURE_IN_PATH), "image/png"),
     Operation("lamp-history", "GET", "/lamps", VIEWER, "Each lamp's hours and strikes at the end of its last days",
               lambda p, v: plain(p.kiosk.lamp_history())),
     Operation("schedule", "GET", "/schedule", VIEWER, "Opening hours", lambda p, v: plain(p.kiosk.schedule())),
@@ -118,8 +132,7 @@ QUESTIONS: Final = (
               lambda p, v: FileAnswer(p.kiosk.report(v["run"]), "text/html", f"report-{v['run']}.html"),
               (_RUN_IN_PATH,), "text/html"),
     Operation("run-picture", "GET", "/runs/{run}/pictures/{picture}", VIEWER, "A picture of a run", _run_picture,
-              (_RUN_IN_PATH, Field("picture", "before, target, achieved, error or resolution", where="path",
-                                   choices=("before", "target", "achieved", "error", "resolution"))), "image/png"),
+              (_RUN_IN_PATH, _PICTURE_IN_PATH), "image/png"),
     Operation("camera", "GET", "/camera", VIEWER, "What the camera sees", _camera, media="image/jpeg"),
     Operation("target-picture", "GET", "/targets/{target}", OPERATOR, "An uploaded target, as we encoded it",
               lambda p, v: picture_answer(p.targets.path(v["target"])),
@@ -161,6 +174,10 @@ COMMANDS: Final = (
     Operation("compute", "POST", "/appearances", OPERATOR, "Solve for an uploaded target", _compute,
               (APPEARANCE, TARGET, Field("brightness", "0.05 to 1; left out: the brightest that fits", "number", False,
                                          least=0.05, most=1)), then="/", said="The computation has begun."),
+    Operation("compare", "POST", "/comparisons", OPERATOR, "Photograph what is installed, and compare with the targets",
+              lambda p, v: plain(p.kiosk.compare(v.get("name"))),
+              (Field("name", "only this appearance", required=False, pattern=NAME),), then="/",
+              said="The appearances are shown and photographed, one after the other."),
     Operation("remove-appearance", "DELETE", "/appearances/{name}", TECHNICIAN, "Remove an appearance",
               done(lambda p, v: p.kiosk.remove_appearance(v["name"])), (_NAME_IN_PATH,),
               then="/appearances", said="Removed."),

@@ -146,7 +146,8 @@ class Pages:
     def _results(self, request: Request) -> dict[str, Any]:
         runs = list(self._panel.kiosk.runs())
         name = request.path_params.get("run") or (runs[0] if runs else None)
-        return {"runs": runs, "results": self._panel.kiosk.results(name) if name else None}
+        compared = self._panel.kiosk.comparisons()
+        return {"runs": runs, "compared": compared, "results": self._panel.kiosk.results(name) if name else None}
 
     def _events(self, request: Request) -> dict[str, Any]:
         level = request.query_params.get("level", "")

@@ -110,7 +110,8 @@ class LampDay:
 class Grade:
     """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False where the older one stayed.
 
-    ``delta_e`` is the median colour difference against the target (CIEDE2000), None where nothing was played.
+    ``delta_e`` is the largest median colour difference (CIEDE2000) of the appearances that were photographed last on
+    this calibration, None where nothing was.
     """
 
     run: str
@@ -161,13 +162,41 @@ class EventRow:
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """A solved appearance; ``preview`` is a PNG of how the object will look, or None."""
+    """A solved appearance; ``preview`` is a PNG of how the object will look, or None. ``delta_e``: the newest of its
+    ``Comparison``, None where it was never photographed.
+    """
 
     name: str
     made_unix_s: float
     delta_e: float | None = None
     playing: bool = False
     preview: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Achieved:
+    """How near a photograph of one appearance came to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
+    percentile of the colour difference (CIEDE2000), ``rmse`` of the target's white, ``sharpness`` 0..1.
+    """
+
+    run: str
+    unix_s: float
+    delta_e: float
+    delta_e_p95: float
+    rmse: float
+    sharpness: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What one installed appearance achieves: ``history`` newest first, at least one, and the newest one's pictures.
+
+    Names in use: "before", "target", "achieved", "error", "resolution"; files that the kiosk made itself (PNG).
+    """
+
+    name: str
+    history: tuple[Achieved, ...]
+    pictures: dict[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,9 @@ XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [
 ERROR_SCALE_DELTA_E = 12.0
 """The colour difference at which an error map is at its brightest; the same in every report, so that two compare."""
 
+OUTSIDE = (38, 40, 44)
+"""The grey of maps where nothing is known."""
+
 
 @dataclass(frozen=True, slots=True)
 class Crop:
@@ -57,7 +60,19 @@ def error_picture(delta_e: FloatImage, mask: Mask) -> ByteImage:
     level = np.clip(np.nan_to_num(delta_e) / ERROR_SCALE_DELTA_E, 0, 1)
     coloured = cv2.applyColorMap(np.asarray(np.rint(level * 255), dtype=np.uint8), cv2.COLORMAP_INFERNO)
     rgb = np.asarray(coloured[..., ::-1], dtype=np.uint8).copy()
-    rgb[~mask] = (38, 40, 44)
+    rgb[~mask] = OUTSIDE
+    return rgb
+
+
+def sharpness_picture(local: FloatImage, window_px: int, shape: tuple[int, int], mask: Mask) -> ByteImage:
+    """Local sharpness by windows, 0 to 1 with NaN where nothing can be judged, as a picture of ``shape``.
+
+    Dark violet none of the target's edges, yellow all of them; grey outside the mask and where there are too few.
+    """
+    whole = np.kron(local, np.ones((window_px, window_px), np.float32))[: shape[0], : shape[1]]
+    level = np.asarray(np.rint(np.clip(np.nan_to_num(whole), 0, 1) * 255), dtype=np.uint8)
+    rgb = np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[..., ::-1], dtype=np.uint8).copy()
+    rgb[~mask | np.isnan(whole)] = OUTSIDE
     return rgb
 
 

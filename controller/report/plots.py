@@ -28,16 +28,23 @@ STYLE: Final[Any] = {
 }  # fmt: skip
 
 
-def history(errors: Mapping[str, Sequence[float]], runs: Sequence[str], limit: float) -> ByteImage:
-    """Each projector's error (per cent) in each run, oldest first, with the limit that the stage asks for."""
+def history(
+    errors: Mapping[str, Sequence[float]],
+    runs: Sequence[str],
+    limit: float,
+    *,
+    label: str = "error of the prediction, %",
+    unit: str = " %",
+) -> ByteImage:
+    """Each line's error in each run, oldest first, NaN where it has none, with the limit that is asked for."""
 
     def draw(axes: Any) -> None:
         for name, values in errors.items():
             axes.plot(range(len(runs)), values, marker="o", label=name)
-        axes.axhline(limit, color="#f0876b", linestyle="--", label=f"limit {limit:g} %")
+        axes.axhline(limit, color="#f0876b", linestyle="--", label=f"limit {limit:g}{unit}")
         axes.set_xticks(range(len(runs)), [f"{run[4:6]}-{run[6:8]}\n{run[9:11]}:{run[11:13]}" for run in runs])
         axes.set_ylim(bottom=0)
-        axes.set_ylabel("error of the prediction, %")
+        axes.set_ylabel(label)
         axes.legend(ncols=2, fontsize=9)
 
     return _plot(draw)

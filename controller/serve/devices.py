@@ -73,13 +73,13 @@ class Devices:
         """The device that photographs need and that is away, or None."""
         if self.camera.device is None or self.camera.problem is not None:
             problem = self.camera.problem or Decision("camera-missing", "The camera was not found yet.", "Wait for it.")
-            reason = f"There can be no calibration without the camera. {problem.reason}"
+            reason = f"There can be no photographs without the camera. {problem.reason}"
             return replace(problem, reason=reason, level="error")
         away = [
             keeper.name for keeper in self.projectors if keeper.view.condition in (Condition.LOST, Condition.BROKEN)
         ]
         if away:
-            return Decision("projector-missing", f"There can be no calibration without projector {', '.join(away)}.",
+            return Decision("projector-missing", f"There can be no photographs without projector {', '.join(away)}.",
                             "Mend it first; playback goes on without it.", "error")  # fmt: skip
         return None
 

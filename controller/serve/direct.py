@@ -128,7 +128,16 @@ def _appearances(folder: Path) -> Any:
     index = (stock := BundleStock(folder, stage_trust(load_stage(folder)))).index(stock.bundle())
     if index is None:
         return []
-    return [{"name": one.name, "made_unix_s": index.created_unix_s, "playing": False} for one in index.appearances]
+    names = [one.name for one in index.appearances]
+    errors = {one.name: one.history[0].delta_e for one in runs.comparisons(folder, names)}
+    return [
+        {"name": name, "made_unix_s": index.created_unix_s, "delta_e": errors.get(name), "playing": False}
+        for name in names
+    ]
+
+
+def _comparisons(folder: Path) -> Any:
+    return plain(runs.comparisons(folder, BundleStock(folder, stage_trust(load_stage(folder))).names()))
 
 
 def _settings(folder: Path, text: str) -> None:
@@ -172,6 +181,7 @@ _DIRECT.update(
         **{name: _account(name) for name in account_operations(lambda: stage_accounts(Path()), lambda _: None)},
         "appearances": _appearances,
         "lamp-history": lambda folder: plain(LampHistory(folder).days()),
+        "comparisons": _comparisons,
         "runs": lambda folder: list(runs.names(folder)),
         "results": _results,
         "settings": settings.text,

@@ -22,6 +22,7 @@ AIM_S: Final = 300.0
 QUICK: Final = Request("quick", light=True)
 PUBLISH: Final = Request("publish")
 REPORT: Final = Request("report")
+COMPARE: Final = Request("compare", light=True)
 VARIANTS: Final = Request("variants")
 
 LendRig = Callable[[], AbstractContextManager[Rig]]
@@ -29,7 +30,9 @@ LendRig = Callable[[], AbstractContextManager[Rig]]
 
 
 class Kinds:
-    """``missing_device`` says which device is away that photographs need; ``calibrated``, ``idle``: from memory."""
+    """``missing_device`` says which device is away that photographs need; ``calibrated``: whether anything is, and
+    ``open_now``: whether the stage is open by its hours. All from memory.
+    """
 
     def __init__(
         self,
@@ -38,9 +41,10 @@ class Kinds:
         *,
         missing_device: Callable[[], Decision | None],
         calibrated: Callable[[], bool],
+        open_now: Callable[[], bool] = lambda: False,
     ) -> None:
         self._stage, self._lend = stage, lend
-        self._missing_device, self._calibrated = missing_device, calibrated
+        self._missing_device, self._calibrated, self._open_now = missing_device, calibrated, open_now
 
     def table(self) -> dict[str, Kind]:
         """Every kind by its name."""
@@ -51,6 +55,7 @@ class Kinds:
             "quick": Kind(self._quick, lit),
             "projector": Kind(self._projector, lit),
             "full": Kind(self._full, lambda request: self._missing_device()),
+            "compare": Kind(self._compare, lit),
             "publish": Kind(self._publish, known),
             "compute": Kind(self._publish, known),
             "report": Kind(self._report),
@@ -128,11 +133,26 @@ class Kinds:
         reporter.job = replace(reporter.job, run=run_name(found))
         told = Decision("calibrated", "The stage is calibrated anew.")
         report = replace(REPORT, arguments=(reporter.job.run,))
-        then = (replace(PUBLISH, key=request.key), report) if self._wishes() else (report,)
-        return Finished(request, told, then=then)
+        if not (tables := check_stage(self._stage).stage.tables).appearances:
+            return Finished(request, told, then=(report,))
+        # The last, so that a lamp which does not light again costs nothing else.
+        last = (replace(COMPARE, key=f"photographs after {request.key}"),)
+        wanted = request.key and tables.calibration.photograph_at_night
+        return Finished(request, told, then=(replace(PUBLISH, key=request.key), report, *(last if wanted else ())))
 
-    def _wishes(self) -> bool:
-        return bool(check_stage(self._stage).stage.tables.appearances)
+    def _compare(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        from controller.comparison_services import photograph
+
+        if request.key and self._open_now():
+            return Finished(request, Decision("photographs-left-out", "The appearances were not photographed: the stage"
+                                              " has opened meanwhile.", "", "warning"))  # fmt: skip
+        with self._lend() as rig, holding(Held(self._stage, rig)):
+            found = photograph(stage=self._stage, names=request.arguments, reporter=reporter, cancel=cancel)
+        reporter.job = replace(reporter.job, run=run_name(found))
+        worst = max(found["appearances"], key=lambda row: float(row["delta_e00_median"]))
+        told = (f"{len(found['appearances'])} appearances were photographed; the largest median colour difference is"
+                f" {worst['delta_e00_median']:.2f}, of {worst['name']}.")  # fmt: skip
+        return Finished(request, Decision("photographed", told, "See the results."))
 
     # -- without
 

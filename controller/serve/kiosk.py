@@ -14,6 +14,7 @@ from controller.panel.accounts import Accounts
 from controller.panel.kiosk import (
     Aiming,
     Appearance,
+    Comparison,
     ComputeSettings,
     EventRow,
     Finding,
@@ -159,9 +160,7 @@ class StageKiosk:
 
     def play(self, name: str) -> None:
         service = self.service
-        if name not in service.stock.names():
-            raise UsageError("appearance-unknown", what=f"The installed bundle has no appearance {name[:64]!r}.",
-                             remedy=f"It has {', '.join(service.stock.names()) or 'none'}.")  # fmt: skip
+        service.stock.check_name(name)
         service.conductor.choose(name)
         service.conductor.open()
 
@@ -196,10 +195,21 @@ class StageKiosk:
         if index is None:
             return ()
         made, previews = float(index.created_unix_s), service.stock.previews()
+        errors = {one.name: one.history[0].delta_e for one in self.comparisons()}
         return tuple(
-            Appearance(one.name, made, playing=one.name == playing, preview=previews.get(one.name))
+            Appearance(one.name, made, errors.get(one.name), one.name == playing, previews.get(one.name))
             for one in index.appearances
         )
+
+    def compare(self, name: str | None = None) -> Job:
+        service = self.service
+        service.stock.check_name(name)
+        asked = Request("compare", light=True, arguments=() if name is None else (name,))
+        service.ask(asked)
+        return self._job(service, title_of(asked))
+
+    def comparisons(self) -> Sequence[Comparison]:
+        return runs.comparisons(self.stage, self.service.stock.names())
 
     def remove_appearance(self, name: str) -> None:
         service = self.service

@@ -110,7 +110,8 @@ class Stock(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Work to be done: ``kind`` is "drift", "quick", "projector", "full", "publish", "takeover" or what a caller adds.
+    """Work to be done: ``kind`` is "drift", "quick", "projector", "full", "compare", "publish", "takeover" or what
+    a caller adds.
 
     ``light``: with all lamps lit and the display to itself; ``key``: the planner's task that this does;
     ``arguments`` are the kind's own

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -11,7 +12,8 @@ from typing import Any, Final
 from controller.app import Checked
 from controller.calibrations import finished_calibrations
 from controller.errors import UsageError
-from controller.panel.kiosk import Grade, Results
+from controller.panel.kiosk import Achieved, Comparison, Grade, Results
+from controller.session.compared import compared_in, compared_runs, history_of, pictures_of
 from controller.session.grades import FILE, PICTURE, passes, worst_of
 
 MOST: Final = 50
@@ -22,12 +24,14 @@ _PICTURES: Final = ("before", "target", "achieved", "error", "resolution")
 def grades(stage: Path, worst_grade: float) -> tuple[Grade, ...]:
     """Of every graded run, newest first."""
     finished = {run.name for run in finished_calibrations(stage)}
+    errors = _errors(stage)
     found = []
     for run in sorted((stage / "runs").glob("*"), reverse=True)[:MOST]:
         if (worst := worst_of(run)) is not None:
             kept = run.name in finished and passes(run, worst_grade)
             note = f"{worst[0]} is predicted with {worst[1]:.1f} % error"
-            found.append(Grade(run.name, began_s(run.name), run.name.rpartition("-")[2], _letter(run), kept, note=note))
+            kind = run.name.rpartition("-")[2]
+            found.append(Grade(run.name, began_s(run.name), kind, _letter(run), kept, errors.get(run.name), note))
     return tuple(found)
 
 
@@ -52,6 +56,8 @@ def names(stage: Path) -> tuple[str, ...]:
 
 def report(stage: Path, run: str, checked: Checked) -> Path:
     """The run's report.html, made if it is not there yet. Seconds. Raises UsageError("run-unknown")."""
+    if run in [folder.name for folder in compared_runs(stage)]:
+        return _comparison_report(stage / "runs" / run, checked)
     folder = _folder(stage, run)
     page = folder / "report.html"
     if not page.exists():
@@ -59,6 +65,40 @@ def report(stage: Path, run: str, checked: Checked) -> Path:
 
         calibration_report(folder, checked)
     return page
+
+
+def _comparison_report(folder: Path, checked: Checked) -> Path:
+    page = folder / "report.html"
+    if page.exists():
+        return page
+    from controller.comparison_services import comparison_report
+
+    return comparison_report(folder, checked)
+
+
+def comparisons(stage: Path, appearances: Sequence[str]) -> tuple[Comparison, ...]:
+    """What these appearances achieved, in their order; without those that nobody photographed."""
+    found = []
+    for name, known in history_of(stage, appearances).items():
+        rows = [
+            Achieved(
+                one.run, one.photographed_unix_s, one.delta_e00_median, one.delta_e00_p95, one.rmse,
+                one.sharpness_lambda,
+            )
+            for one in reversed(known)
+        ]  # fmt: skip
+        found.append(Comparison(name, tuple(rows), pictures_of(stage, known[-1])))
+    return tuple(found)
+
+
+def _errors(stage: Path) -> dict[str, float]:
+    """By calibration, the largest median colour difference of the last photographs on it."""
+    found = {}
+    for run in compared_runs(stage):
+        known = compared_in(run)
+        if known:
+            found[known[0].calibration] = max(one.delta_e00_median for one in known)
+    return found
 
 
 def _folder(stage: Path, run: str) -> Path:

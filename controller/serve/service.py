@@ -52,8 +52,9 @@ class Service:
         self.devices.scene = self._scene
         self.lamp_history = LampHistory(stage.folder)
         kinds = Kinds(
-            stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated
-        )
+            stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated,
+            open_now=lambda: bool(self.schedule.now.rows) and self.conductor.plan.open is True,
+        )  # fmt: skip
         self.works = ThreadWorks(kinds.table(), log, number=int(log.value("job") or 0))
         safety = stage.tables.safety
         self.conductor = Conductor(

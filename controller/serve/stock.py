@@ -12,7 +12,7 @@ from controller.bundle.format import Index
 from controller.bundle.install import current
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
-from controller.errors import BundleError, VelaturaError
+from controller.errors import BundleError, UsageError, VelaturaError
 from controller.storage import write_atomically
 
 PREVIEWS: Final = "kiosk/previews"
@@ -40,6 +40,12 @@ class BundleStock:
     def names(self) -> Sequence[str]:
         index = self.index(self.bundle())
         return () if index is None else tuple(one.name for one in index.appearances)
+
+    def check_name(self, name: str | None) -> None:
+        """Raises UsageError("appearance-unknown") for a name that the installed bundle does not have."""
+        if name is not None and name not in self.names():
+            raise UsageError("appearance-unknown", what=f"The installed bundle has no appearance {name[:64]!r}.",
+                             remedy=f"It has {', '.join(self.names()) or 'none'}.")  # fmt: skip
 
     def without(self, missing: Collection[str], appearance: str) -> Path | None:
         path, whole = current(slots_without(self._stage, missing)), self.index(self.bundle())

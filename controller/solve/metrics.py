@@ -87,14 +87,44 @@ def sharpness(achieved: FloatImage, target: FloatImage, white: float, mask: Mask
 
     Both edge images are cut at the target's own threshold, so a flat result does not find edges in its noise.
     """
+    return _lambda(*_both_edges(achieved, target, white, mask))
+
+
+def sharpness_windows(
+    achieved: FloatImage, target: FloatImage, white: float, mask: Mask, size_px: int, *, least_edges: int = 12
+) -> tuple[FloatImage, float]:
+    """lambda (paper 6, eq. 9) in each square window of ``size_px`` camera pixels, and over all of them.
+
+    (window rows, window columns) float32, NaN where the target has fewer than ``least_edges`` edge pixels.
+    """
+    ours, theirs = _both_edges(achieved, target, white, mask)
+
+    def counted(picture: Mask) -> Float64:
+        rows, columns = (-(-side // size_px) * size_px for side in mask.shape)
+        whole = np.zeros((rows, columns))
+        whole[: mask.shape[0], : mask.shape[1]] = picture
+        return np.asarray(whole.reshape(rows // size_px, size_px, columns // size_px, size_px).sum(axis=(1, 3)))
+
+    common, most = counted(ours & theirs), np.maximum(counted(ours), counted(theirs))
+    enough = (counted(theirs) >= least_edges) & (most > 0)
+    local = np.divide(common, most, out=np.full(most.shape, np.nan), where=enough)
+    return local.astype(np.float32), _lambda(ours, theirs)
+
+
+def _lambda(ours: Mask, theirs: Mask) -> float:
+    most = max(int(ours.sum()), int(theirs.sum()))
+    return float((ours & theirs).sum() / most) if most else 1.0
+
+
+def _both_edges(achieved: FloatImage, target: FloatImage, white: float, mask: Mask) -> tuple[Mask, Mask]:
+    """Edges (rows, columns) of both pictures inside the mask, by Canny."""
     gradients = [_gradient(image, white) for image in (achieved, target)]
     strength = np.hypot(*(part.astype(np.float32) for part in gradients[1]))[mask]
     threshold = max(float(np.quantile(strength, STRONG)) if strength.size else 0.0, FAINTEST_EDGE)
     ours, theirs = (
         (cv2.Canny(dx, dy, WEAK * threshold, threshold, L2gradient=True) > 0) & mask for dx, dy in gradients
     )
-    most = max(int(ours.sum()), int(theirs.sum()))
-    return float((ours & theirs).sum() / most) if most else 1.0
+    return ours, theirs
 
 
 def _gradient(image: FloatImage, white: float) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]]:

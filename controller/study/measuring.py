@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, lsmr
 from skimage.metrics import structural_similarity
 
 from controller.arrays import Float64, FloatImage, Mask
-from controller.solve.metrics import EDGE_SIGMA_PX, FAINTEST_EDGE, GRADIENT_SCALE, STRONG, WEAK, compare
+from controller.solve.metrics import compare, sharpness_windows
 from controller.solve.targets_values import linear_to_srgb
 from controller.study.subject import Subject, Wanted
 from controller.transport import LightTransport
@@ -80,43 +79,11 @@ def normalised_residual(achieved: FloatImage, wanted: Wanted, mask: Mask) -> Flo
     return np.asarray(np.sqrt(region_means(squared, mask)), np.float32)
 
 
-def edges(image: FloatImage, white: float, threshold: float) -> Mask:
-    """Edges (rows, columns) as ``solve.metrics.sharpness`` finds them, above a threshold of the gradient."""
-    dx, dy = (np.round(part).astype(np.int16) for part in _gradient(image, white))
-    return np.asarray(cv2.Canny(dx, dy, WEAK * threshold, threshold, L2gradient=True) > 0)
-
-
-def edge_threshold(image: FloatImage, white: float, mask: Mask) -> float:
-    """The target's own threshold for its edges and those of what is compared with it."""
-    strength = np.hypot(*_gradient(image, white))[mask]
-    return max(float(np.quantile(strength, STRONG)) if strength.size else 0.0, FAINTEST_EDGE)
-
-
-def _gradient(image: FloatImage, white: float) -> tuple[FloatImage, FloatImage]:
-    grey = np.clip(image.mean(axis=2) / white, 0, 1) ** np.float32(1 / 2.2)
-    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
-    dx, dy = (np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1 - i, i) * GRADIENT_SCALE, np.float32) for i in range(2))
-    return dx, dy
-
-
 def sharpness_map(
     achieved: FloatImage, wanted: Wanted, mask: Mask, size_px: int, least_edges: int = 12
 ) -> tuple[FloatImage, float]:
     """lambda (paper 6, eq. 9) in each square window, NaN where the target has too few edges; and over all of them."""
-    threshold = edge_threshold(wanted.radiance, wanted.white, mask)
-    ours, theirs = (edges(image, wanted.white, threshold) & mask for image in (achieved, wanted.radiance))
-
-    def counted(picture: Mask) -> Float64:
-        rows, columns = (-(-side // size_px) * size_px for side in mask.shape)
-        whole = np.zeros((rows, columns))
-        whole[: mask.shape[0], : mask.shape[1]] = picture
-        return np.asarray(whole.reshape(rows // size_px, size_px, columns // size_px, size_px).sum(axis=(1, 3)))
-
-    common, most = counted(ours & theirs), np.maximum(counted(ours), counted(theirs))
-    enough = counted(theirs) >= least_edges
-    local = np.divide(common, most, out=np.full(most.shape, np.nan), where=enough & (most > 0))
-    total = max(int(ours.sum()), int(theirs.sum()))
-    return local.astype(np.float32), float((ours & theirs).sum() / total) if total else 1.0
+    return sharpness_windows(achieved, wanted.radiance, wanted.white, mask, size_px, least_edges=least_edges)
 
 
 def unbounded_inverse(

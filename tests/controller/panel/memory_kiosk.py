@@ -13,9 +13,11 @@ from PIL import Image
 
 from controller.errors import UsageError, WorkError
 from controller.panel.kiosk import (
+    Achieved,
     Aiming,
     Appearance,
     BundleIdentity,
+    Comparison,
     ComputeSettings,
     DeviceRow,
     EventRow,
@@ -73,6 +75,7 @@ class MemoryKiosk:
             name: Appearance(name, BORN, 1.2, preview=self._drawn(name)) for name in ("marble", "warm wood")
         }
         self._results: dict[str, Results] = {}
+        self._comparisons: dict[str, Comparison] = {}
         self._state = KioskState(
             revision=1,
             stage="Head of a boy",
@@ -199,6 +202,23 @@ class MemoryKiosk:
 
     def appearances(self) -> Sequence[Appearance]:
         return list(self._appearances.values())
+
+    def compare(self, name: str | None = None) -> Job:
+        names = [self._known(name).name] if name is not None else list(self._appearances)
+
+        def finish(run: str) -> None:
+            for one in names:
+                before = self._comparisons[one].history if one in self._comparisons else ()
+                now = Achieved(run, BORN + 86400 * len(before), 1.25 + len(before), 3.5, 0.012, 0.81)
+                kinds = ("before", "target", "achieved", "error", "resolution")
+                pictures = {kind: self._drawn(kind, 60 + 30 * at) for at, kind in enumerate(kinds)}
+                self._comparisons[one] = Comparison(one, (now, *before), pictures)
+                self._appearances[one] = replace(self._appearances[one], delta_e=now.delta_e)
+
+        return self._begin("Photographs", "calibrating", finish)
+
+    def comparisons(self) -> Sequence[Comparison]:
+        return [self._comparisons[name] for name in self._appearances if name in self._comparisons]
 
     def remove_appearance(self, name: str) -> None:
         self._known(name)

@@ -1,0 +1,194 @@
+"""What appearances achieve: pictures of one run of photographs, and its report beside those before."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from controller.arrays import ByteImage, load_arrays
+from controller.bundle.export import png
+from controller.errors import UsageError
+from controller.report import plots
+from controller.report.page import Goal, Page, Picture, Row, Table, write_report
+from controller.report.pictures import crop_around, error_picture, fitted, sharpness_picture, to_screen
+from controller.session.compared import Compared, compared_in, compared_runs, picture_path
+from controller.session.comparing import compared_mask
+from controller.session.journal import Journal
+from controller.session.runner import Context, Step
+from controller.session.solving import Calibrated, read_solved
+from controller.storage import write_atomically
+
+COMPARED: Final = 3
+SHOWN_RUNS: Final = 12
+LONGEST_PX: Final = 960
+GOAL_DELTA_E: Final = 4.0
+_SHOWN: Final = (
+    ("before", "Before", "all projectors at white"),
+    ("target", "Target", ""),
+    ("achieved", "Achieved", "photograph"),
+    ("error", "Error", "CIEDE2000"),
+    ("resolution", "Resolution", "violet: none of the target's edges are there; yellow: all; grey: it has too few"),
+)
+_FIGURES: Final[tuple[tuple[str, Callable[[Compared], float], str], ...]] = (
+    ("median CIEDE2000", lambda one: one.delta_e00_median, "{:.2f}"),
+    ("95th percentile", lambda one: one.delta_e00_p95, "{:.2f}"),
+    ("rms error", lambda one: 100 * one.rmse, "{:.2f} % of white"),
+    ("sharpness", lambda one: one.sharpness_lambda, "{:.2f}"),
+)
+
+
+def picture_steps(calibrated: Calibrated, names: Sequence[str]) -> list[Step]:
+    """After ``session.comparing.compare_steps``: the pictures of each appearance, for report and panel."""
+    return [
+        Step(
+            f"pictures-{name}",
+            partial(_draw, calibrated, name),
+            after=(f"compare-{name}",),
+            title=f"Drawing the maps of {name}",
+            weight=0.3,
+        )
+        for name in names
+    ]
+
+
+def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]:
+    calibration = calibrated.calibration
+    solved = read_solved(calibrated.folder, name, calibrated.projectors)
+    arrays = load_arrays(context.folder / f"compared-{name}.npz")
+    (one,) = (one for one in compared_in(context.folder) if one.name == name)
+    on_object, mask = calibration.object_mask, compared_mask(calibrated, solved)
+    crop = crop_around(on_object)
+    lit = sum((part.white for part in calibration.projectors), start=calibration.black)
+    white = float(np.nanpercentile(lit[on_object], 99)) if on_object.any() else 1.0
+    target = np.where(on_object[..., None], solved.target, calibration.black).astype(np.float32)
+    to_xyz = calibration.camera_to_xyz
+    drawn = {
+        "before": to_screen(lit, to_xyz, white=white),
+        "target": to_screen(target, to_xyz, white=solved.exposure),
+        "achieved": to_screen(arrays["photograph"], to_xyz, white=solved.exposure),
+        "error": error_picture(arrays["error"].astype(np.float32), mask),
+        "resolution": sharpness_picture(arrays["resolution"], one.window_px, on_object.shape, mask),
+    }
+    paths = []
+    for kind, whole in drawn.items():
+        path = picture_path(context.folder, name, kind)
+        cut = np.ascontiguousarray(whole[crop.rows, crop.columns])
+        write_atomically(path, png(fitted(cut, longest_px=LONGEST_PX)))
+        paths.append(path)
+    return paths
+
+
+def write_comparison_report(run: Path, stage_name: str, out: Path | None = None) -> Path:
+    """Write report.html and report.json of a finished run into ``out`` (else its folder); the page's path.
+
+    Raises UsageError("run-not-compared").
+    """
+    found = compared_in(run)
+    if not found:
+        raise UsageError("run-not-compared", what=f"{run.name} has photographed no appearance.",
+                         remedy="Give the folder of a run of `velatura photograph`.")  # fmt: skip
+    earlier = [one for one in compared_runs(run.parent.parent) if one.name < run.name][-SHOWN_RUNS + 1 :]
+    before = [{one.name: one for one in compared_in(folder)} for folder in earlier]
+    figures = _figures(run, found)
+    page = Page(
+        title=f"{stage_name}: what {len(found)} appearance{'s' * (len(found) > 1)} achieve{'s' * (len(found) == 1)}",
+        summary=f"{figures['photographs']} photographs of {_day(run.name)}, compared with the targets that were solved"
+        f" on the calibration {found[0].calibration}.",
+        goals=_goals(found, before),
+        rows=tuple(_row(run, one) for one in found),
+        tables=(_beside(run.name, found, earlier[-COMPARED:], before[-COMPARED:]),),
+        galleries=_course(run.name, found, earlier, before),
+        steps=tuple(figures["steps"].items()),
+    )
+    html, _ = write_report(out or run, page, figures)
+    return html
+
+
+def _figures(run: Path, found: Sequence[Compared]) -> dict[str, Any]:
+    with Journal(run) as journal:
+        steps, shots = journal.steps(), journal.shot_count()
+    return {"run": run.name, "photographs": shots, "seconds": sum(steps.values()),
+            "appearances": [asdict(one) for one in found], "steps": steps}  # fmt: skip
+
+
+def _day(name: str) -> str:
+    try:
+        return time.strftime("%d %B %Y, %H:%M", time.strptime(name[:15], "%Y%m%d-%H%M%S"))
+    except ValueError:
+        return name
+
+
+def _goals(found: Sequence[Compared], before: Sequence[dict[str, Compared]]) -> tuple[Goal, ...]:
+    worst = max(found, key=lambda one: one.delta_e00_median)
+    blurred = min(found, key=lambda one: one.sharpness_lambda)
+    return (
+        Goal("Worst median colour difference", f"{worst.delta_e00_median:.2f}", f"at most {GOAL_DELTA_E:g}",
+             worst.delta_e00_median <= GOAL_DELTA_E, worst.title),
+        Goal("Since the last time", *_change(found, before)),
+        Goal("Least sharpness", f"{blurred.sharpness_lambda:.2f}", note=f"share of edges in common, {blurred.title}"),
+    )  # fmt: skip
+
+
+def _change(found: Sequence[Compared], before: Sequence[dict[str, Compared]]) -> tuple[str, str, None, str]:
+    """The appearance whose median changed most since it was photographed the last time."""
+    changes = []
+    for one in found:
+        last = next((each[one.name] for each in reversed(before) if one.name in each), None)
+        if last is not None:
+            changes.append((one.delta_e00_median - last.delta_e00_median, one.title))
+    if not changes:
+        return "nothing to compare", "", None, "it is the first time"
+    change, title = max(changes, key=lambda each: abs(each[0]))
+    return f"{change:+.2f}", "", None, f"median colour difference, {title}"
+
+
+def _row(run: Path, one: Compared) -> Row:
+    known = [(label, form.format(value(one))) for label, value, form in _FIGURES]
+    if one.reachable_share is not None:
+        known.append(("within reach", f"{100 * one.reachable_share:.1f} % of the object"))
+    pictures = []
+    for kind, caption, note in _SHOWN:
+        image = cv2.imread(str(picture_path(run, one.name, kind)))
+        if image is not None:
+            pictures.append(Picture(caption, _rgb(image), note))
+    return Row(one.title, tuple(known), tuple(pictures))
+
+
+def _rgb(image: Any) -> ByteImage:
+    return np.ascontiguousarray(image[..., ::-1], np.uint8)
+
+
+def _beside(
+    name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]]
+) -> Table:
+    """This run beside the last ones, newest first."""
+    runs = [*reversed(before)]
+    rows = [
+        (f"{one.title}, {label}", *(form.format(value(each[one.name])) if one.name in each else ""
+                                    for each in ({one.name: one}, *runs)))
+        for one in found
+        for label, value, form in _FIGURES
+    ]  # fmt: skip
+    header = ("", f"{name} (this one)", *(folder.name for folder in reversed(earlier)))
+    return Table("Beside the last ones" if earlier else "These are the first photographs", header, tuple(rows))
+
+
+def _course(
+    name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]]
+) -> tuple[tuple[str, str, tuple[Picture, ...]], ...]:
+    if not earlier:
+        return ()
+    held = [*before, {one.name: one for one in found}]
+    medians = {one.title: [each[one.name].delta_e00_median if one.name in each else float("nan") for each in held]
+               for one in found}  # fmt: skip
+    runs = [*(folder.name for folder in earlier), name]
+    label = "median colour difference, CIEDE2000"
+    drawn = plots.history(medians, runs, GOAL_DELTA_E, label=label, unit="")
+    return (("How it went", "", (Picture("Colour difference over the runs", drawn, large=True),)),)

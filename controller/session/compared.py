@@ -1,0 +1,84 @@
+"""What photographs of appearances were found to achieve, read from the runs' folders; ``session.comparing`` takes them.
+
+Light on purpose: the kiosk asks for this while it plays, with nothing loaded that calibrates.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+SUFFIX: Final = "-compare"
+"""How the names of such runs end."""
+PICTURES: Final = ("before", "target", "achieved", "error", "resolution")
+MOST: Final = 50
+"""So many runs are looked at, the newest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """One appearance in one run: ``photographed_unix_s`` when, on which ``calibration`` it was solved, and how near.
+
+    ``delta_e00_median``, ``delta_e00_p95``: CIEDE2000; ``rmse`` of the target's white; ``sharpness_lambda`` 0 to 1
+    (paper 6, eq. 9), all over the reachable pixels of the object; ``reachable_share`` of its pixels, if it is known;
+    ``window_px`` the side of the resolution map's windows, camera pixels
+    """
+
+    run: str
+    name: str
+    title: str
+    calibration: str
+    photographed_unix_s: float
+    delta_e00_median: float
+    delta_e00_p95: float
+    rmse: float
+    sharpness_lambda: float
+    reachable_share: float | None
+    window_px: int
+
+
+def figures_path(run: Path, name: str) -> Path:
+    return run / f"compared-{name}.json"
+
+
+def picture_path(run: Path, name: str, picture: str) -> Path:
+    """``picture``: one of ``PICTURES``."""
+    return run / f"compared-{name}-{picture}.png"
+
+
+def compared_in(run: Path) -> tuple[Compared, ...]:
+    """What a run holds, by name; a file that can't be read is left out, since the others say something without it."""
+    found = []
+    for path in sorted(run.glob("compared-*.json")):
+        try:
+            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            found.append(Compared(run=run.name, **content))
+        except (OSError, ValueError, TypeError):
+            continue
+    return tuple(found)
+
+
+def compared_runs(stage: Path) -> list[Path]:
+    """The runs that have photographed anything, oldest first, at most ``MOST``."""
+    folders = sorted((stage / "runs").glob(f"*{SUFFIX}"))[-MOST:]
+    return [folder for folder in folders if any(folder.glob("compared-*.json"))]
+
+
+def history_of(stage: Path, names: Collection[str]) -> dict[str, tuple[Compared, ...]]:
+    """Each of these appearances with what was found of it, oldest first; without those that nobody photographed."""
+    found: dict[str, list[Compared]] = {}
+    for run in compared_runs(stage):
+        for one in compared_in(run):
+            if one.name in names:
+                found.setdefault(one.name, []).append(one)
+    return {name: tuple(found[name]) for name in names if name in found}
+
+
+def pictures_of(stage: Path, one: Compared) -> dict[str, Path]:
+    """The pictures of it that the run holds, by ``PICTURES``."""
+    run = stage / "runs" / one.run
+    files = {picture: picture_path(run, one.name, picture) for picture in PICTURES}
+    return {picture: file for picture, file in files.items() if file.exists()}
