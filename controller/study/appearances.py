@@ -150,15 +150,16 @@ def _criteria(shown: Sequence[Shown], left_out: Sequence[LeftOut]) -> tuple[Crit
                 f"{other:.2f} to {ours:.2f}: {other / ours:.1f} times",
                 better,
                 "" if better else
-                f"Half of it is within {other:.2f} with one projector alone, and ours photographed can't be much nearer;"
-                f" 95 % is within {one.alone.delta_e_p95:.1f} with one, and within {one.ours.delta_e_p95:.1f} of ours.",
+                f"Half of it is within {other:.2f} with one projector, and calibration and noise keep ours, by the"
+                f" model {one.model.delta_e:.2f}, at {ours:.2f}; 95 % is within {one.alone.delta_e_p95:.1f} with one"
+                f" and {one.ours.delta_e_p95:.1f} with ours.",
             )
         )  # fmt: skip
     return (*found, *_against_dimmed(shown))
 
 
 def _against_dimmed(shown: Sequence[Shown]) -> list[Criterion]:
-    """Whether superposition brings more than light: one projector gets all the time it wants, ours does not."""
+    """Whether superposition brings more than light: one projector's target is as dim as it needs, ours is not."""
     if not shown:
         return []
     pairs = {one.look.title: (one.ours_there, one.alone_dimmed) for one in shown}
