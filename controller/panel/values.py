@@ -191,7 +191,7 @@ class Achieved:
 class Comparison:
     """What one installed appearance achieves: ``history`` newest first, at least one, and the newest one's pictures.
 
-    Names in use: "before", "target", "achieved", "error", "resolution"; files that the kiosk made itself (PNG).
+    Names in use: "before", "target", "achieved", "error", "resolution"; files that the kiosk made itself (JPEG).
     """
 
     name: str

@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 
 from controller.arrays import ByteImage, load_arrays
-from controller.bundle.export import png
 from controller.errors import UsageError
 from controller.report import plots
 from controller.report.page import Goal, Page, Picture, Row, Table, write_report
-from controller.report.pictures import crop_around, error_picture, fitted, sharpness_picture, to_screen
+from controller.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
 from controller.session.compared import Compared, compared_in, compared_runs, picture_path
 from controller.session.comparing import compared_mask
 from controller.session.journal import Journal
@@ -80,7 +79,7 @@ def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]
     for kind, whole in drawn.items():
         path = picture_path(context.folder, name, kind)
         cut = np.ascontiguousarray(whole[crop.rows, crop.columns])
-        write_atomically(path, png(fitted(cut, longest_px=LONGEST_PX)))
+        write_atomically(path, encoded(fitted(cut, longest_px=LONGEST_PX)))
         paths.append(path)
     return paths
 
@@ -171,13 +170,16 @@ def _beside(
     """This run beside the last ones, newest first."""
     runs = [*reversed(before)]
     rows = [
-        (f"{one.title}, {label}", *(form.format(value(each[one.name])) if one.name in each else ""
-                                    for each in ({one.name: one}, *runs)))
+        (one.title, *(_short(each[one.name]) if one.name in each else "" for each in ({one.name: one}, *runs)))
         for one in found
-        for label, value, form in _FIGURES
-    ]  # fmt: skip
+    ]
     header = ("", f"{name} (this one)", *(folder.name for folder in reversed(earlier)))
-    return Table("Beside the last ones" if earlier else "These are the first photographs", header, tuple(rows))
+    said = "beside the last ones" if earlier else "the first ones"
+    return Table(f"Colour difference, median and 95 %, and sharpness: {said}", header, tuple(rows))
+
+
+def _short(one: Compared) -> str:
+    return f"{one.delta_e00_median:.2f}, {one.delta_e00_p95:.2f}; {one.sharpness_lambda:.2f}"
 
 
 def _course(

@@ -46,7 +46,7 @@ def figures_path(run: Path, name: str) -> Path:
 
 def picture_path(run: Path, name: str, picture: str) -> Path:
     """``picture``: one of ``PICTURES``."""
-    return run / f"compared-{name}-{picture}.png"
+    return run / f"compared-{name}-{picture}.jpg"
 
 
 def compared_in(run: Path) -> tuple[Compared, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import time
 from pathlib import Path
 
 import pytest
@@ -103,3 +104,52 @@ def test_only_technicians_manage_accounts(panel: Served, role: str) -> None:
     with panel.client() as machine:
         for path in ("/accounts", "/tokens"):
             assert machine.get(f"/api/v1{path}", headers=token).status_code == 403
+
+
+def compared(running: Served, **fields: str) -> str:
+    """The results page after the button "Photograph and compare" of the appearances' page."""
+    with running.entered("otto") as client:
+        page = client.get("/appearances").text
+        assert page.count('action="/do/compare"') == 3, "one for all, and one for each"
+        sent = {"csrf": csrf(page)} | fields
+        answer = client.post("/do/compare", data=sent, headers={"origin": running.address}, follow_redirects=True)
+        assert "photographed, one after the other." in answer.text
+        until_s = time.monotonic() + 60
+        while not running.kiosk.snapshot().job.ended:  # type: ignore[union-attr]
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+        return html.unescape(client.get("/results").text)
+
+
+def test_appearances_are_photographed_and_the_results_show_the_newest_and_the_history(fresh: Served) -> None:
+    assert "No appearance was photographed yet." in text_of(fresh, "/results", "otto")
+    page = compared(fresh)
+    assert page.count("CIEDE2000") == 2
+    again = compared(fresh, name="warm wood")
+    wood = again[again.index("<h3>warm wood") :]
+    assert "colour difference 2.25" in wood
+    assert wood.index(">2.25<") < wood.index(">1.25<"), "the newest first"
+    with fresh.entered("vera") as vera:
+        for kind in ("before", "target", "achieved", "error", "resolution"):
+            picture = vera.get(f"/see/appearances/warm wood/pictures/{kind}?run-2")
+            assert (picture.status_code, picture.headers["content-type"]) == (200, "image/png")
+            assert f"/see/appearances/warm%20wood/pictures/{kind}?" in wood
+        assert vera.get("/see/appearances/glass/pictures/error").status_code == 404
+        assert 'action="/do/compare"' not in vera.get("/results").text
+
+
+def test_the_api_photographs_and_tells_what_was_achieved(fresh: Served) -> None:
+    operator, viewer = fresh.token(Role.OPERATOR), fresh.token(Role.VIEWER)
+    with fresh.client() as machine:
+        assert machine.get("/api/v1/comparisons", headers=viewer).json() == []
+        assert machine.post("/api/v1/comparisons", json={}, headers=viewer).status_code == 403
+        wrong = machine.post("/api/v1/comparisons", json={"name": "glass"}, headers=operator)
+        assert (wrong.status_code, wrong.json()["code"]) == (404, "appearance-unknown")
+        assert machine.post("/api/v1/comparisons", json={"name": "marble"}, headers=operator).json()["number"] == 1
+        until_s = time.monotonic() + 60
+        while not (found := machine.get("/api/v1/comparisons", headers=viewer).json()):
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+        assert [one["name"] for one in found] == ["marble"]
+        assert found[0]["history"][0]["delta_e_p95"] == 3.5
+        assert found[0]["pictures"] == {}, "no path leaves the machine"
