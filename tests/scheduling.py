@@ -10,6 +10,7 @@ TOGETHER: Final = {
     "tests/end_to_end/test_demo.py": "the finished demo",
     "tests/end_to_end/test_live.py": "the finished demo",
     "tests/end_to_end/test_on_a_cluster.py": "the finished demo",
+    "tests/end_to_end/test_photograph.py": "the finished demo",
     "tests/end_to_end/test_takeover.py": "the finished demo",
     "tests/end_to_end/test_targets.py": "the finished demo",
 }
