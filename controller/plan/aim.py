@@ -30,9 +30,9 @@ def aimed(model: ProjectorModel, spot: Spot, surface: Surface, fill: float) -> P
     position = np.asarray(spot.position_m, np.float64)
     seen = surface.points_m[surface.area_m2 > 0]
     target, focal = seen.mean(axis=0), model.throw_ratio[0] * size[0]
-    local = np.empty_like(seen)
+    local, across = np.empty_like(seen), _level(target - position)
     for _ in range(ROUNDS):
-        turned = _upright(target - position)
+        turned = _facing(target - position, across)
         local = (seen - position) @ turned.T
         if local[:, 2].min() <= 0.05:
             return None
@@ -48,10 +48,19 @@ def aimed(model: ProjectorModel, spot: Spot, surface: Surface, fill: float) -> P
     return Placement(model, spot, turned, focal, (float(centre[0]), float(centre[1])), best_focus(local[:, 2], weight))
 
 
-def _upright(forward: Float64) -> Float64:
-    """(3, 3) world to device: z forward, y down as far as that goes."""
+def _level(forward: Float64) -> Float64:
+    """The horizontal direction (3,) to the right of who looks ``forward``; looking straight down, the audience's."""
     ahead = forward / np.linalg.norm(forward)
-    down = np.asarray(DOWN if abs(ahead[1]) < STEEPEST else (0.0, 0.0, -1.0))
-    right = np.cross(down, ahead)
+    right = np.cross(DOWN if abs(ahead[1]) < STEEPEST else (0.0, 0.0, -1.0), ahead)
+    return np.asarray(right / np.linalg.norm(right))
+
+
+def _facing(forward: Float64, across: Float64) -> Float64:
+    """(3, 3) world to device: z forward, x as near to ``across`` as that goes.
+
+    From almost above, a lens shift turns the axis past the vertical; what is level must not turn over with it.
+    """
+    ahead = forward / np.linalg.norm(forward)
+    right = across - (across @ ahead) * ahead
     right /= np.linalg.norm(right)
     return np.stack((right, np.cross(ahead, right), ahead))

@@ -72,7 +72,7 @@ def test_from_a_cold_stage_to_a_playing_one_by_one_click_over_a_cancel_a_second_
             page.wait_for_url(re.compile(r"/(?!password)[^/]*$"))
             page.goto("/")
             page.get_by_role("button", name="Recalibrate", exact=True).click()
-            expect(page.get_by_text("Calibrating", exact=True)).to_be_visible(timeout=LONG_MS)
+            expect(page.locator("p.state strong")).to_have_text("Calibrating", timeout=LONG_MS)
             expect(page.locator(".steps .done").first).to_be_visible(timeout=LONG_MS)
             with tab(browser, f"http://{address}") as colleague:
                 log_in(colleague, PASSWORD)
@@ -80,15 +80,15 @@ def test_from_a_cold_stage_to_a_playing_one_by_one_click_over_a_cancel_a_second_
                 colleague.get_by_role("button", name="Cancel this job").click()
                 expect(page.get_by_text("stopped on request").first).to_be_visible(timeout=LONG_MS)
             page.get_by_role("button", name="Recalibrate", exact=True).click()
-            expect(page.get_by_text("Calibrating", exact=True)).to_be_visible(timeout=LONG_MS)
+            expect(page.locator("p.state strong")).to_have_text("Calibrating", timeout=LONG_MS)
             first.kill()
         with Command(*served) as second:
             # The page was open all the time, and its login holds.
             expect(page.get_by_role("button", name="Recalibrate", exact=True)).to_be_enabled(timeout=LONG_MS)
             second.wait_for_message("The panel is at")
             page.get_by_role("button", name="Recalibrate", exact=True).click()
-            expect(page.get_by_text("Calibrating", exact=True)).to_be_visible(timeout=LONG_MS)
-            expect(page.get_by_text("Playing", exact=True)).to_be_visible(timeout=LONG_MS)
+            expect(page.locator("p.state strong")).to_have_text("Calibrating", timeout=LONG_MS)
+            expect(page.locator("p.state strong")).to_have_text("Playing", timeout=LONG_MS)
             expect(page.get_by_text(APPEARANCE).first).to_be_visible(timeout=LONG_MS)
             assert second.interrupt().code == 0
     until_s = time.monotonic() + 20

@@ -138,12 +138,12 @@ def test_the_best_focus_is_where_scipy_finds_the_least_blur() -> None:
     assert best_focus(depth, weight) == pytest.approx(found.x, abs=1e-5)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     right=st.floats(-80, 80), above=st.floats(-60, 80), distance=st.floats(0.8, 3.0), up=st.floats(-0.6, 0.6),
     side=st.floats(-0.3, 0.3),
 )  # fmt: skip
-def test_an_aimed_projector_holds_the_object_in_the_middle_upright(
+def test_an_aimed_projector_holds_the_object_in_the_middle_and_stays_level(
     thing: Thing, model: ProjectorModel, right: float, above: float, distance: float, up: float, side: float
 ) -> None:
     a, b = np.deg2rad(right), np.deg2rad(above)
@@ -153,7 +153,8 @@ def test_an_aimed_projector_holds_the_object_in_the_middle_upright(
     placement = aimed(shifted, Spot("there", (float(at[0]), float(at[1]), float(at[2]))), surface, 0.8)
     assert placement is not None
     np.testing.assert_allclose(placement.rotation @ placement.rotation.T, np.eye(3), atol=1e-12)
-    assert placement.rotation[1, 1] > 0
+    level = np.cross((0.0, 1.0, 0.0), surface.points_m[surface.area_m2 > 0].mean(axis=0) - at)
+    assert placement.rotation[0] @ level / np.linalg.norm(level) > 0.9
     assert model.throw_ratio[0] - 1e-9 <= placement.throw_ratio <= model.throw_ratio[1] + 1e-9
     local = (surface.points_m[surface.area_m2 > 0] - at) @ placement.rotation.T
     picture = placement.focal_px * local[:, :2] / local[:, 2:] + placement.centre_px
