@@ -17,7 +17,7 @@ from controller.errors import UsageError
 from controller.report import plots
 from controller.report.page import Goal, Page, Picture, Row, Table, write_report
 from controller.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
-from controller.session.compared import Compared, compared_in, compared_runs, picture_path
+from controller.session.compared import Compared, all_compared, compared_in, picture_path
 from controller.session.comparing import compared_mask
 from controller.session.journal import Journal
 from controller.session.runner import Context, Step
@@ -28,6 +28,7 @@ COMPARED: Final = 3
 SHOWN_RUNS: Final = 12
 LONGEST_PX: Final = 960
 GOAL_DELTA_E: Final = 4.0
+MOMENT: Final = "%d %B %Y, %H:%M"
 _SHOWN: Final = (
     ("before", "Before", "all projectors at white"),
     ("target", "Target", ""),
@@ -93,7 +94,7 @@ def write_comparison_report(run: Path, stage_name: str, out: Path | None = None)
     if not found:
         raise UsageError("run-not-compared", what=f"{run.name} has photographed no appearance.",
                          remedy="Give the folder of a run of `velatura photograph`.")  # fmt: skip
-    earlier = [one for one in compared_runs(run.parent.parent) if one.name < run.name][-SHOWN_RUNS + 1 :]
+    earlier = [one for one in all_compared(run.parent.parent) if one.name < run.name][-SHOWN_RUNS + 1 :]
     before = [{one.name: one for one in compared_in(folder)} for folder in earlier]
     figures = _figures(run, found)
     page = Page(
@@ -119,7 +120,7 @@ def _figures(run: Path, found: Sequence[Compared]) -> dict[str, Any]:
 
 def _day(name: str) -> str:
     try:
-        return time.strftime("%d %B %Y, %H:%M", time.strptime(name[:15], "%Y%m%d-%H%M%S"))
+        return time.strftime(MOMENT, time.strptime(name[:15], "%Y%m%d-%H%M%S"))
     except ValueError:
         return name
 
@@ -152,6 +153,7 @@ def _row(run: Path, one: Compared) -> Row:
     known = [(label, form.format(value(one))) for label, value, form in _FIGURES]
     if one.reachable_share is not None:
         known.append(("within reach", f"{100 * one.reachable_share:.1f} % of the object"))
+    known.append(("photographed", time.strftime(MOMENT, time.localtime(one.photographed_unix_s))))
     pictures = []
     for kind, caption, note in _SHOWN:
         image = cv2.imread(str(picture_path(run, one.name, kind)))

@@ -13,7 +13,7 @@ from controller.app import Checked
 from controller.calibrations import finished_calibrations
 from controller.errors import UsageError
 from controller.panel.kiosk import Achieved, Comparison, Grade, Results
-from controller.session.compared import compared_in, compared_runs, history_of, pictures_of
+from controller.session.compared import all_compared, history_of, pictures_of
 from controller.session.grades import FILE, PICTURE, passes, worst_of
 
 MOST: Final = 50
@@ -56,7 +56,7 @@ def names(stage: Path) -> tuple[str, ...]:
 
 def report(stage: Path, run: str, checked: Checked) -> Path:
     """The run's report.html, made if it is not there yet. Seconds. Raises UsageError("run-unknown")."""
-    if run in [folder.name for folder in compared_runs(stage)]:
+    if run in [folder.name for folder in all_compared(stage)]:
         return _comparison_report(stage / "runs" / run, checked)
     folder = _folder(stage, run)
     page = folder / "report.html"
@@ -93,12 +93,7 @@ def comparisons(stage: Path, appearances: Sequence[str]) -> tuple[Comparison, ..
 
 def _errors(stage: Path) -> dict[str, float]:
     """By calibration, the largest median colour difference of the last photographs on it."""
-    found = {}
-    for run in compared_runs(stage):
-        known = compared_in(run)
-        if known:
-            found[known[0].calibration] = max(one.delta_e00_median for one in known)
-    return found
+    return {known[0].calibration: max(one.delta_e00_median for one in known) for known in all_compared(stage).values()}
 
 
 def _folder(stage: Path, run: str) -> Path:

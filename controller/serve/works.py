@@ -22,7 +22,7 @@ TITLES: Final[Mapping[str, str]] = {
     "quick": "Quick recalibration",
     "projector": "Recalibration of projector",
     "full": "Full recalibration",
-    "compare": "Photographs of",
+    "compare": "Photographing",
     "publish": "Appearances",
     "compute": "New appearance",
     "report": "Report of",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,17 +62,26 @@ def compared_in(run: Path) -> tuple[Compared, ...]:
     return tuple(found)
 
 
-def compared_runs(stage: Path) -> list[Path]:
-    """The runs that have photographed anything, oldest first, at most ``MOST``."""
+def all_compared(stage: Path) -> dict[Path, tuple[Compared, ...]]:
+    """The runs that have photographed anything, oldest first, at most ``MOST``, each with what it holds.
+
+    A run is read again only when something in its folder was replaced: the kiosk asks every few seconds.
+    """
     folders = sorted((stage / "runs").glob(f"*{SUFFIX}"))[-MOST:]
-    return [folder for folder in folders if any(folder.glob("compared-*.json"))]
+    held = {folder: _remembered(folder, folder.stat().st_mtime_ns) for folder in folders}
+    return {folder: found for folder, found in held.items() if found}
+
+
+@lru_cache(maxsize=4 * MOST)
+def _remembered(run: Path, changed_ns: int) -> tuple[Compared, ...]:
+    return compared_in(run)
 
 
 def history_of(stage: Path, names: Collection[str]) -> dict[str, tuple[Compared, ...]]:
     """Each of these appearances with what was found of it, oldest first; without those that nobody photographed."""
     found: dict[str, list[Compared]] = {}
-    for run in compared_runs(stage):
-        for one in compared_in(run):
+    for known in all_compared(stage).values():
+        for one in known:
             if one.name in names:
                 found.setdefault(one.name, []).append(one)
     return {name: tuple(found[name]) for name in names if name in found}
