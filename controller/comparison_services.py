@@ -43,11 +43,11 @@ def photograph(*, stage: Path, names: Sequence[str], reporter: Reporter, cancel:
 
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
         longest_s = checked.stage.tables.capture.longest_exposure_s
-        return [
-            *compare_steps(rig, calibrated, found.names, bundle=found.bundle, longest_exposure_s=longest_s),
-            *dark_after(rig.darkness, rig.display),
-            *picture_steps(calibrated, found.names),
-        ]
+        taken = compare_steps(rig, calibrated, found.names, bundle=found.bundle, longest_exposure_s=longest_s)
+        drawn = picture_steps(calibrated, found.names)
+        # Each with its pictures at once: whoever stops the run sees what was photographed until then.
+        both = [step for pair in zip(taken, drawn, strict=True) for step in pair]
+        return [*both, *dark_after(rig.darkness, rig.display)]
 
     run = run_on_stage(checked, steps, name=SUFFIX[1:], reporter=reporter, cancel=cancel, dark=True)
     html = comparison_report(run, checked)

@@ -156,7 +156,8 @@ def _row(run: Path, one: Compared) -> Row:
     known.append(("photographed", time.strftime(MOMENT, time.localtime(one.photographed_unix_s))))
     pictures = []
     for kind, caption, note in _SHOWN:
-        image = cv2.imread(str(picture_path(run, one.name, kind)))
+        path = picture_path(run, one.name, kind)
+        image = cv2.imread(str(path)) if path.exists() else None
         if image is not None:
             pictures.append(Picture(caption, _rgb(image), note))
     return Row(one.title, tuple(known), tuple(pictures))

@@ -150,8 +150,9 @@ class Kinds:
             found = photograph(stage=self._stage, names=request.arguments, reporter=reporter, cancel=cancel)
         reporter.job = replace(reporter.job, run=run_name(found))
         worst = max(found["appearances"], key=lambda row: float(row["delta_e00_median"]))
-        told = (f"{len(found['appearances'])} appearances were photographed; the largest median colour difference is"
-                f" {worst['delta_e00_median']:.2f}, of {worst['name']}.")  # fmt: skip
+        names = ", ".join(row["name"] for row in found["appearances"])
+        told = (f"Photographed: {names}. The largest median colour difference is {worst['delta_e00_median']:.2f},"
+                f" of {worst['name']}.")  # fmt: skip
         return Finished(request, Decision("photographed", told, "See the results."))
 
     # -- without

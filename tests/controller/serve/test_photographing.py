@@ -73,7 +73,7 @@ def kinds_after(stage: Stage, request: Request) -> list[str]:
 def test_what_was_asked_for_is_photographed_and_the_worst_is_told(tmp_path: Path, asked: list[tuple[str, ...]]) -> None:
     finished = Stage(tmp_path).do(Request("compare", light=True, arguments=("marble",)))
     assert asked == [("marble",)]
-    assert "the largest median colour difference is 2.25, of glass" in finished.outcome.reason
+    assert "The largest median colour difference is 2.25, of glass" in finished.outcome.reason
 
 
 @pytest.mark.usefixtures("asked")
