@@ -110,8 +110,8 @@ class LampDay:
 class Grade:
     """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False where the older one stayed.
 
-    ``delta_e`` is the largest median colour difference (CIEDE2000) of the appearances that were photographed last on
-    this calibration, None where nothing was.
+    ``delta_e`` is the largest of the newest median colour differences (CIEDE2000) of the appearances that were solved
+    on this calibration, None where none was photographed.
     """
 
     run: str

@@ -92,8 +92,12 @@ def comparisons(stage: Path, appearances: Sequence[str]) -> tuple[Comparison, ..
 
 
 def _errors(stage: Path) -> dict[str, float]:
-    """By calibration, the largest median colour difference of the last photographs on it."""
-    return {known[0].calibration: max(one.delta_e00_median for one in known) for known in all_compared(stage).values()}
+    """By calibration, the largest of the newest median colour differences of its appearances."""
+    newest: dict[str, dict[str, float]] = {}
+    for known in all_compared(stage).values():
+        for one in known:
+            newest.setdefault(one.calibration, {})[one.name] = one.delta_e00_median
+    return {calibration: max(medians.values()) for calibration, medians in newest.items()}
 
 
 def _folder(stage: Path, run: str) -> Path:

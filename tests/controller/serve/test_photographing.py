@@ -121,9 +121,10 @@ def test_the_results_hold_each_appearance_newest_first_and_the_calibrations_colo
     first = graded_run(tmp_path, "20260101-100000-calibrate", {"left": 0.01})
     second = graded_run(tmp_path, "20260103-033000-recalibrate", {"left": 0.015})
     compared_run(tmp_path, "20260102-100000-compare", first.name, {"marble": 1.0, "glass": 2.0})
+    compared_run(tmp_path, "20260102-110000-compare", first.name, {"marble": 0.5})
     compared_run(tmp_path, "20260104-100000-compare", second.name, {"marble": 1.5})
     marble, glass = runs.comparisons(tmp_path, ["marble", "glass", "wood"])
-    assert [one.delta_e for one in marble.history] == [1.5, 1.0]
+    assert [one.delta_e for one in marble.history] == [1.5, 0.5, 1.0]
     assert marble.pictures == {"error": tmp_path / "runs" / "20260104-100000-compare" / "compared-marble-error.jpg"}
     assert glass.history[0].run == "20260102-100000-compare"
     assert {one.run: one.delta_e for one in runs.grades(tmp_path, 8.0)} == {first.name: 2.0, second.name: 1.5}
