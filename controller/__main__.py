@@ -86,8 +86,7 @@ def emulate(
     as_json: Json = False,
 ) -> int:
     """Serve the emulated devices of a stage, and print the address of each, until Ctrl-C."""
-    from controller.demo.bench_process import terminated_when_input_ends
-    from controller.demo.stage import bench_of
+    from controller.demo.bench_process import bench_of, terminated_when_input_ends
 
     if not stage.is_dir():
         raise UsageError(

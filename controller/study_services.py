@@ -14,7 +14,7 @@ from typing import Any
 
 from controller.app import Checked, check_stage, run_on_stage
 from controller.config import write_stage
-from controller.demo.bench_process import BenchProcess, emulated_bench
+from controller.demo.bench_process import BenchProcess, bench_of
 from controller.errors import UsageError, WorkError
 from controller.services import calibrating
 from controller.session import costs
@@ -26,7 +26,7 @@ from controller.storage import sync_folder, write_atomically
 from controller.study.catalogue import EXPERIMENTS, chosen
 from controller.study.keeping import save_result
 from controller.study.pages import publish
-from controller.study.photographing import RigLight, dot_steps
+from controller.study.photographing import DOTS_NAME, RigLight, dot_steps
 from controller.study.scenes import SCENES, Scene
 from controller.study.stagehand import RigHand, Stagehand, subject_of
 from controller.study.values import Experiment
@@ -104,7 +104,7 @@ def _on_scene(
 ) -> list[Path]:
     stage = prepare_scene(out / "scenes" / scene.name, scene, size=size, seed=seed)
     checked = check_stage(stage)
-    emulated_bench(stage).disturb(stage, ())  # what a stopped experiment may have left
+    bench_of(stage).disturb(stage, ())  # what a stopped experiment may have left
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
     steps = partial(
         _steps, experiments=experiments, checked=checked, scene=scene, size=size, seed=seed, disturb=bench.disturb
@@ -127,7 +127,7 @@ def _steps(
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     told = {"scene": scene.title, "size": size, "seed": seed}
     for one in experiments:
-        dots = [f"study-dots-{name}" for name in checked.names] if one.dots else []
+        dots = [f"{DOTS_NAME}-{name}" for name in checked.names] if one.dots else []
         steps.append(
             Step(
                 f"study-{one.name}",
@@ -198,7 +198,7 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
         thing = out / "object.ply"
         scene.write_object(thing)
     try:
-        tables = emulated_bench(building, scene.settings).prepare(building, size=size, object_file=thing, seed=seed)
+        tables = bench_of(building, scene.settings).prepare(building, size=size, object_file=thing, seed=seed)
     except DeviceError as error:
         raise WorkError(error.code, what=error.what, remedy=error.remedy) from error
     named = {"stage": {"name": f"study {scene.name}"}, **tables, "safety": {"power_down_s": POWER_DOWN_S}}

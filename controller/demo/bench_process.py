@@ -112,7 +112,7 @@ class BenchProcess:
         """
         if not changes and not self._disturbed:
             return
-        emulated_bench(self._stage).disturb(self._stage, changes)
+        bench_of(self._stage).disturb(self._stage, changes)
         self._disturbed = bool(changes)
         assert self._process.stdout is not None
         for line in self._process.stdout:
@@ -135,8 +135,11 @@ class BenchProcess:
         self.end()
 
 
-def emulated_bench(stage: Path, settings: Mapping[str, Any] | None = None) -> Bench:
-    """The bench that sets up, disturbs and serves ``stage``; settings as its driver explains them."""
+def bench_of(stage: Path, settings: Mapping[str, Any] | None = None) -> Bench:
+    """The bench that this installation has, for ``stage``; settings as its driver explains them.
+
+    Raises PluginError("driver-unknown") where there is none.
+    """
     driver = load_drivers().get("bench", "emulated")
     bench: Bench = driver.open(dict(settings or {}), OpenContext(stage=stage), in_seconds(10))
     return bench

@@ -14,14 +14,12 @@ import numpy as np
 
 from controller.bundle.signing import generate_key
 from controller.config import write_stage
+from controller.demo.bench_process import bench_of
 from controller.errors import UsageError, WorkError
 from controller.services import KEY_FILE
 from controller.solve.targets import linear_to_srgb, shipped_photograph
 from controller.storage import sha256_of, sync_folder, write_atomically
-from hal.deadline import in_seconds
 from hal.errors import DeviceError
-from hal.interfaces import Bench
-from hal.registry import Drivers, OpenContext, load_drivers
 
 MARK = "demo.json"
 BUILDING = ".stage.part"
@@ -35,13 +33,6 @@ APPEARANCES: tuple[dict[str, Any], ...] = (
     {"name": "checkerboard", "kind": "checkerboard"},
     {"name": "gloss", "kind": "gloss"},
 )
-
-
-def bench_of(stage: Path, drivers: Drivers | None = None) -> Bench:
-    """The bench that this installation has. Raises PluginError("driver-unknown") where there is none."""
-    driver = (drivers or load_drivers()).get("bench", "emulated")
-    bench: Bench = driver.open({}, OpenContext(stage=stage), in_seconds(10))
-    return bench
 
 
 def prepare(out: Path, *, size: str, object_file: Path | None, seed: int) -> Path:

@@ -47,16 +47,19 @@ def dot_steps(rig: Rig, options: DotOptions, *, longest_exposure_s: float) -> li
         if options.mode == "auto":
             steps += edge_steps(rig, projector, options, longest_exposure_s)
         if options.mode == "paper":
-            steps.append(_capture_step(rig, projector, options, longest_exposure_s))
+            steps.append(capture_step(rig, projector, options, longest_exposure_s))
             steps.append(_fit_step(projector, number, options))
     steps.append(mode_step(options, [step.name for step in steps]))
     return [*steps, terms_step(rig)] if options.mode == "auto" else steps
 
 
-def _capture_step(rig: Rig, projector: RigProjector, options: DotOptions, longest_s: float) -> Step:
+def capture_step(
+    rig: Rig, projector: RigProjector, options: DotOptions, longest_s: float, *, name: str = "dots"
+) -> Step:
+    """Photograph a projector's dots; ``name``, with the projector's, is that of the step, of its index and its note."""
     return Step(
-        f"dots-{projector.name}",
-        partial(_photograph, rig, projector, options, longest_s),
+        f"{name}-{projector.name}",
+        partial(_photograph, rig, projector, options, longest_s, f"{name}-{projector.name}"),
         inputs={"longest_exposure_s": repr(longest_s), **options.inputs()},
         after=("exposure", f"pixels-{projector.name}"),
         title=f"Photographing the dots of {projector.name}",
@@ -81,7 +84,7 @@ def _expected_shots(projector: RigProjector, options: DotOptions) -> int:
 
 
 def _photograph(
-    rig: Rig, projector: RigProjector, options: DotOptions, longest_s: float, context: Context
+    rig: Rig, projector: RigProjector, options: DotOptions, longest_s: float, index: str, context: Context
 ) -> Sequence[Path]:
     known = of_sinusoids(context.folder, projector.name)
     spacing = spacing_of(options, known)
@@ -92,8 +95,8 @@ def _photograph(
         planned(projector, f"{spacing:02d}-{pattern.name}", partial(dot_frame, pattern, projector.size_px), exposure_s)
         for pattern in patterns
     ]
-    paths = take_in_batches(rig, context, plan, index=f"dots-{projector.name}")
-    notes = context.folder / f"dots-{projector.name}.json"
+    paths = take_in_batches(rig, context, plan, index=index)
+    notes = context.folder / f"{index}.json"
     write_atomically(notes, json.dumps({"spacing_px": spacing, "exposure_s": exposure_s}, indent=1).encode())
     return [notes, *paths]
 

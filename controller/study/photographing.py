@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,31 +16,25 @@ from controller.calibrate.dots import fit_dots
 from controller.calibrate.guess import guess_metapixels, modelled_correspondence, where_missing
 from controller.calibrate.values import PhaseMap
 from controller.capture.brackets import merge_brackets
-from controller.capture.dots import DotPattern, dot_frame, dot_patterns
-from controller.session import costs
+from controller.capture.dots import DotPattern, dot_patterns
 from controller.session.calibrating import read_correspondence, read_geometry, read_phase_map
 from controller.session.capturing import bracket
 from controller.session.dot_shots import (
-    check_disk,
-    dot_exposure_s,
-    of_sinusoids,
-    planned,
     read_batches,
-    spacing_of,
-    take_in_batches,
 )
+from controller.session.dotting import capture_step
 from controller.session.modes import DotOptions
 from controller.session.publishing import PHOTO_BRACKET
-from controller.session.rig import Rig, RigProjector
+from controller.session.rig import Rig
 from controller.session.runner import Context, Step
 from controller.session.shots import Developed, keep_if_lit, take_photograph
 from controller.session.solving import Calibrated, device_frames
-from controller.storage import write_atomically
 from controller.study.subject import Dots, Shares
 
 FAINTEST_SHARE = 0.01
 """A dot's light below this share of white is left out: it is the photograph's noise."""
 DOTS = DotOptions("paper", None)
+DOTS_NAME = "study-dots"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +68,10 @@ class RigLight:
 
     def dots(self, n: int) -> Dots:
         folder, name = self.context.folder, self.calibrated.projectors[n]
-        spacing = int(json.loads((folder / f"study-dots-{name}.json").read_text())["spacing_px"])
+        spacing = int(json.loads((folder / f"{DOTS_NAME}-{name}.json").read_text())["spacing_px"])
         rows, columns = self.calibrated.calibration.projectors[n].metapixels.valid.shape
         patterns = dot_patterns((columns, rows), spacing)
-        listed = read_batches(folder, f"study-dots-{name}", len(patterns))
+        listed = read_batches(folder, f"{DOTS_NAME}-{name}", len(patterns))
         taken = {item.name.removeprefix(f"{name}-{spacing:02d}-"): item for item in listed}
         light = load_arrays(folder / f"radiometry-{name}.npz")
         captures = Developed(taken, {"black": light["black"]})
@@ -135,34 +128,7 @@ def dots_as_shares(
 
 def dot_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
     """Photograph the dots of each projector, for ``Light.dots``; the calibration itself stays the fast one."""
-    return [
-        Step(
-            f"study-dots-{projector.name}",
-            partial(_photograph_dots, rig, projector, longest_exposure_s),
-            inputs={"longest_exposure_s": repr(longest_exposure_s), **DOTS.inputs()},
-            after=("exposure", f"pixels-{projector.name}"),
-            title=f"Photographing the dots of {projector.name}",
-            weight=49 * costs.shot_s(costs.scale([projector.size_px])),
-        )
-        for projector in rig.projectors
-    ]
-
-
-def _photograph_dots(rig: Rig, projector: RigProjector, longest_s: float, context: Context) -> Sequence[Path]:
-    name = projector.name
-    known = of_sinusoids(context.folder, name)
-    spacing = spacing_of(DOTS, known)
-    patterns = dot_patterns(projector.size_px, spacing)
-    check_disk(context.folder, projector, len(patterns))
-    exposure_s = dot_exposure_s(rig, context.folder, name, known, longest_s)
-    plan = [
-        planned(projector, f"{spacing:02d}-{pattern.name}", partial(dot_frame, pattern, projector.size_px), exposure_s)
-        for pattern in patterns
-    ]
-    paths = take_in_batches(rig, context, plan, index=f"study-dots-{name}")
-    notes = context.folder / f"study-dots-{name}.json"
-    write_atomically(notes, json.dumps({"spacing_px": spacing, "exposure_s": exposure_s}, indent=1).encode())
-    return [notes, *paths]
+    return [capture_step(rig, projector, DOTS, longest_exposure_s, name=DOTS_NAME) for projector in rig.projectors]
 
 
 def _digest(frames: Mapping[str, ByteImage]) -> str:
