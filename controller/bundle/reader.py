@@ -59,6 +59,8 @@ class Bundle:
         self.version = header.version
         self.identity = header.index_sha256.hex()
         self._data_end = header.index_offset
+        # One unpacker a thread: made anew for each stripe, their buffers leave gaps, and memory grows by and by.
+        self._thread = threading.local()
 
     @property
     def size(self) -> int:
@@ -205,6 +207,12 @@ class Bundle:
         for future in [pool.submit(task) for image in images for task in image.tasks()]:
             future.result()
 
+    def _unpacker(self) -> zstandard.ZstdDecompressor:
+        if not hasattr(self._thread, "unpacker"):
+            self._thread.unpacker = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
+        unpacker: zstandard.ZstdDecompressor = self._thread.unpacker
+        return unpacker
+
     def _inflate(self, blob: fmt.Blob, rows: npt.NDArray[Any]) -> None:
         """Decompress a blob into ``rows``; its frame must hold exactly that many bytes."""
         view = self._view(blob)
@@ -213,8 +221,7 @@ class Bundle:
         try:
             if zstandard.frame_content_size(view) != rows.nbytes:
                 raise damaged(f"the stripe at {blob.offset} does not hold the pixels of its rows")
-            unpacker = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
-            with unpacker.stream_reader(view, read_size=len(view)) as stream:
+            with self._unpacker().stream_reader(view, read_size=len(view)) as stream:
                 filled = stream.readinto(rows.data.cast("B"))
         except zstandard.ZstdError as error:
             raise damaged(f"the stripe at {blob.offset} can not be decompressed") from error

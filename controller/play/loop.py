@@ -23,6 +23,8 @@ from controller.play.playlist import Playlist
 from controller.play.presenting import Presenter
 
 _IDLE_S: Final = 0.1
+_STATM: Final = Path("/proc/self/statm")
+"""Made once: each Path interns its parts, and the table of interned strings grows after ten thousand of them."""
 _DECODE_WAIT_S: Final = 0.02
 _LIVE_WAIT_S: Final = 0.004
 
@@ -192,7 +194,7 @@ class Player:
         """What the status request answers (docs/player-protocol.md)."""
         presenter = self._presenter
         signed_by = None if self._decoded is None else self._decoded.bundle.signed_by
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        pages = int(_STATM.read_text(encoding="ascii").split()[1])
         return {
             "sequence": presenter.last.sequence,
             "presented_at": presenter.last.at_s,

@@ -48,6 +48,7 @@ class Intervals:
     def __init__(self) -> None:
         # Written to, so that all of it is there from the beginning and nothing seems to grow later.
         self._counts = np.full(_CLASSES, 0, np.uint32)
+        self._passed = np.full(_CLASSES, 0, np.uint64)
         self._last_s: float | None = None
         # A client may ask for the status ten thousand times a second, and adding up all classes takes 50 us.
         self._found: dict[float, float | None] = {}
@@ -69,7 +70,7 @@ class Intervals:
         return self._found[percent]
 
     def _percentile(self, percent: float) -> float | None:
-        passed = np.cumsum(self._counts, dtype=np.uint64)
+        passed = np.cumsum(self._counts, dtype=np.uint64, out=self._passed)
         if not passed[-1]:
             return None
         rank = max(1, math.ceil(percent / 100 * int(passed[-1])))

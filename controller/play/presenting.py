@@ -13,6 +13,9 @@ from controller.play.outputs import Output
 from controller.play.pacing import Grid, Intervals, sleep_until
 
 _EARLY_S: Final = 0.0005
+_FORGET: Final = 0.9
+_FORGET_PACED: Final = 0.9995
+"""What is left of a slow preparation after each picture: one in a hundred that is slow must not come late."""
 
 
 class Presenter:
@@ -29,7 +32,7 @@ class Presenter:
         self.grid = Grid(rate_hz)
         self.intervals = Intervals()
         self.late = 0
-        self._prepare_s = 0.0
+        self._prepare_s = self._slowest_s = 0.0
 
     def begin_sequence(self, rate_hz: float) -> None:
         """Pictures come on this grid from now on; count anew."""
@@ -41,7 +44,7 @@ class Presenter:
 
     def patience_s(self, coming: Coming) -> float:
         """Seconds until the set must be prepared; negative if that has passed."""
-        return self.grid.at_s(coming.tick) - self._prepare_s - _EARLY_S - time.monotonic()
+        return self.grid.at_s(coming.tick) - self._slowest_s - _EARLY_S - time.monotonic()
 
     def present(self, coming: Coming, frames: FrameSet, *, wait: bool = False) -> bool:
         """Present the set, or the next step on its way in, if its time has come (or ``wait`` for it).
@@ -49,12 +52,15 @@ class Presenter:
         Return whether the set itself is on the outputs now; it is ``shown`` then.
         """
         due_s, tick_s = self.grid.at_s(coming.tick), 1 / self.grid.rate_hz
-        if not wait and time.monotonic() < due_s - self._prepare_s - 2 * _EARLY_S:
+        if not wait and time.monotonic() < due_s - self._slowest_s - 2 * _EARLY_S:
             return False
         began_s = time.monotonic()
         self._prepare(coming, frames)
-        # Remember a slow preparation for a while, so that the next of its kind begins early enough.
-        self._prepare_s = min(max(time.monotonic() - began_s, 0.9 * self._prepare_s), tick_s)
+        # Remember a slow preparation for a while, so that the next of its kind begins early enough. For what has a time
+        # of its own that is a long while: to begin too early costs nothing, where somebody waits it costs a tick.
+        took_s = time.monotonic() - began_s
+        self._prepare_s = min(max(took_s, _FORGET * self._prepare_s), tick_s)
+        self._slowest_s = min(max(took_s, _FORGET_PACED * self._slowest_s), tick_s)
         sleep_until(due_s)
         if time.monotonic() > due_s + tick_s and coming.share == 0:
             # One that somebody waits for is due when it comes; one that follows another has a time of its own.

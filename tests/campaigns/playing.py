@@ -32,7 +32,7 @@ APPEARANCES: Final = 80
 FEW: Final = 6
 RATE_HZ: Final = 30.0
 MOST_IN_WINDOWS: Final = 10_800
-_GROWTH_ALLOWED_BYTES: Final = 1024 * 1024
+_GROWTH_ALLOWED_BYTES: Final = 512 * 1024
 
 
 @dataclass(frozen=True, slots=True)
