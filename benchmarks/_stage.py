@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.app import check_stage
+from controller.checking import check_stage
 from controller.demo.bench_process import BenchProcess
 from controller.demo.stage import prepare
 from controller.services import calibrate

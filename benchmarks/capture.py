@@ -15,11 +15,12 @@ import rawpy
 
 from benchmarks import Row, Timing, at_most, peak_bytes, timed
 from benchmarks._stage import FIRST_SEED, over, prepared_stage
-from controller.app import check_stage, run_on_stage
+from controller.app import run_on_stage
 from controller.arrays import ByteImage
 from controller.capture.acquire import Shot
 from controller.capture.latency import thumbprint
 from controller.capture.raw import read_photograph
+from controller.checking import check_stage
 from controller.demo.bench_process import BenchProcess
 from controller.session.progress import Silent
 from controller.session.rig import Rig

@@ -18,11 +18,11 @@ from benchmarks import Row, at_most, peak_bytes
 from benchmarks._judge import metapixel_errors, relative, rms
 from benchmarks._stage import FIRST_SEED, over, prepared_stage
 from benchmarks._truth import Truth, developed
-from controller.app import check_stage
 from controller.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.calibrate.dots import fit_picture
 from controller.calibrate.values import Calibration
 from controller.capture.patterns import device_frame
+from controller.checking import check_stage
 from controller.demo.bench_process import BenchProcess
 from controller.services import calibrate
 from controller.session.calibrating import read_calibration

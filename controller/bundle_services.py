@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.app import LOCK, check_stage
+from controller.app import LOCK
 from controller.bundle import install as slots
 from controller.bundle.export import export_pictures
 from controller.bundle.format import Index, valid_name
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANYONE, Trust, generate_key, load_public_key, unproven
+from controller.checking import check_stage
 from controller.config import Stage, load_stage
 from controller.config.loader import FILE
 from controller.errors import BundleError, UsageError

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from controller.app import Checked
 from controller.bundle.signing import Trust
+from controller.checking import Checked
 from controller.config import Stage
 from controller.errors import UsageError
 from controller.session.journal import Journal

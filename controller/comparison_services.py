@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from controller.app import Checked, check_stage, run_on_stage
+from controller.app import run_on_stage
 from controller.bundle.install import current
 from controller.bundle.reader import Bundle
 from controller.calibrations import finished_calibrations, stage_trust
+from controller.checking import Checked, check_stage
 from controller.errors import UsageError
 from controller.report.comparison import picture_steps, write_comparison_report
 from controller.session.compared import SUFFIX, compared_in

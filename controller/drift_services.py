@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.app import Checked, check_stage, marker, run_on_stage
+from controller.app import marker, run_on_stage
 from controller.calibrations import finished_calibration, worst_grade
+from controller.checking import Checked, check_stage
 from controller.errors import UsageError
 from controller.session.calibrating import calibration_steps
 from controller.session.darkness import dark_after

@@ -12,11 +12,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from controller.app import Checked, check_stage, run_on_stage
+from controller.app import run_on_stage
 from controller.arrays import FloatImage
 from controller.bundle.install import CURRENT, current
 from controller.bundle.live_maps import LiveMaps
 from controller.bundle.reader import Bundle
+from controller.checking import Checked, check_stage
 from controller.errors import BundleError
 from controller.live.sources import LiveSource, open_source
 from controller.live_files import FileSource, holds_frames

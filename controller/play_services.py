@@ -10,10 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from controller.app import LONGEST_RUN_S, check_stage, run_on_stage
+from controller.app import LONGEST_RUN_S, run_on_stage
 from controller.bundle.install import current
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
+from controller.checking import check_stage
 from controller.errors import UsageError
 from controller.services import stage_trust
 from controller.session.machine import Event

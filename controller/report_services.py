@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from controller.app import Checked, check_stage
 from controller.calibrations import worst_grade
+from controller.checking import Checked, check_stage
 from controller.errors import UsageError
 from controller.report.calibration import Asked, graded_runs, write_calibration_report
 from controller.session.compared import SUFFIX

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from controller.app import LONGEST_RUN_S, Checked, check_stage, marker, run_on_stage, stage_lock
+from controller.app import LONGEST_RUN_S, marker, run_on_stage, stage_lock
 from controller.bundle.install import current
 from controller.bundle.signing import Trust, load_signing_key
 from controller.calibrations import (
@@ -18,6 +18,7 @@ from controller.calibrations import (
     stage_trust,
     worst_grade,
 )
+from controller.checking import Checked, check_stage
 from controller.errors import UsageError
 from controller.session import costs
 from controller.session.calibrating import calibration_steps

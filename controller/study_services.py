@@ -12,7 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from controller.app import Checked, check_stage, run_on_stage
+from controller.app import run_on_stage
+from controller.checking import Checked, check_stage
 from controller.config import write_stage
 from controller.demo.bench_process import BenchProcess, bench_of
 from controller.errors import UsageError, WorkError

@@ -36,7 +36,8 @@ class Driver:
 
     ``open`` gets the device's table of stage.toml (without ``name`` and ``driver``), and returns an opened device of
     ``kind`` (see ``hal.interfaces``; for ``"bench"`` it is called with no settings and returns a ``Bench``).
-    ``settings`` explains each key that ``open`` understands; keys in ``required`` must be there.
+    ``settings`` explains each key that ``open`` understands; keys in ``required`` must be there. ``check`` raises
+    PluginError for values that ``open`` would refuse whatever is plugged in; it reads files at most, and no device.
     """
 
     kind: str
@@ -45,6 +46,7 @@ class Driver:
     open: Callable[[Mapping[str, Any], OpenContext, Deadline], Any]
     settings: Mapping[str, str] = field(default_factory=dict)
     required: tuple[str, ...] = ()
+    check: Callable[[Mapping[str, Any], OpenContext], None] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -192,10 +192,9 @@ class PjLinkProjector:
             self._lock.release()
 
 
-def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PjLinkProjector:
-    """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
-    address = str(setting(settings, "address", str))
-    host, port = host_and_port(address, pjlink.PORT)
+def _settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[str, int, str | None, ProjectorProfile]:
+    """Host, port, password and profile of a stage.toml table. Raises PluginError and ProtocolError."""
+    host, port = host_and_port(str(setting(settings, "address", str)), pjlink.PORT)
     password = setting(settings, "password", str)
     if password is not None and not 0 < len(password) <= pjlink.LONGEST_PASSWORD:
         raise PluginError(
@@ -203,7 +202,17 @@ def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, dea
             what=f"The password has {len(password)} characters; PJLink allows 1 to {pjlink.LONGEST_PASSWORD}.",
             remedy="Correct password in stage.toml, or leave it out.",
         )
-    profile = load_profile(setting(settings, "profile", str, "pjlink"), context.stage)
+    return host, port, password, load_profile(setting(settings, "profile", str, "pjlink"), context.stage)
+
+
+def check_pjlink_projector(settings: Mapping[str, Any], context: OpenContext) -> None:
+    """As ``hal.registry.Driver.check``."""
+    _settings(settings, context)
+
+
+def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PjLinkProjector:
+    """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
+    host, port, password, profile = _settings(settings, context)
     transcript = None
     if context.transcripts is not None:
         context.transcripts.mkdir(parents=True, exist_ok=True)
@@ -211,7 +220,7 @@ def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, dea
     projector = PjLinkProjector(
         lambda until: TcpLink(host, port, deadline=until, transcript=transcript),
         profile,
-        name=address,
+        name=str(settings["address"]),
         password=password,
         transcript=transcript,
     )
@@ -230,4 +239,5 @@ DRIVER = Driver(
         "profile": "times of its lamp: pjlink (the default), or a .toml file of the stage",
     },
     required=("address",),
+    check=check_pjlink_projector,
 )

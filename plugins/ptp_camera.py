@@ -15,12 +15,22 @@ from plugins.ptpip import PtpIpLink
 from plugins.ptpip_wire import PtpIpAddress
 
 
+def _settings(settings: Mapping[str, Any]) -> tuple[str, bool, bool, bool]:
+    """Address, whether pictures go to the card first, whether they stay there, RAW and JPEG. Raises PluginError."""
+    address = str(settings["address"])
+    _way(address, None)
+    to_card = _choice(settings, "target", "computer", "card") == "card"
+    return address, to_card, _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg")
+
+
+def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
+    """As ``hal.registry.Driver.check``."""
+    _settings(settings)
+
+
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
     """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
-    address = str(settings["address"])
-    to_card = _choice(settings, "target", "computer", "card") == "card"
-    keep_on_card, both = _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg")
-    _way(address, None)  # a wrong address leaves no file behind
+    address, to_card, keep_on_card, both = _settings(settings)  # a wrong one leaves no file behind
     transcript = None
     if context.transcripts is not None:
         context.transcripts.mkdir(parents=True, exist_ok=True)
@@ -90,4 +100,5 @@ DRIVER: Final = Driver(
         "keep_on_card": "true to leave pictures on the card after they were fetched (default false)",
     },
     required=("address",),
+    check=check_camera,
 )

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final
 
 from hal.deadline import Deadline
@@ -258,13 +259,24 @@ class SerialProjector:
             self._lock.release()
 
 
-def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
-    """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
+def _settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[ProjectorProfile, Path, int, str | None]:
+    """Profile, port, baud rate and address of a stage.toml table. Raises PluginError and ProtocolError."""
     profile = load_profile(setting(settings, "profile", str), context.stage)
     table = serial_table(profile)
+    address = setting(settings, "address", str)
+    checked_address(table, address)
     # Not resolved: the symlink is the stable name, and leads elsewhere after the adapter was unplugged.
-    port = context.stage / setting(settings, "port", str)
-    baud = setting(settings, "baud", int, table.baud)
+    return profile, context.stage / setting(settings, "port", str), setting(settings, "baud", int, table.baud), address
+
+
+def check_serial_projector(settings: Mapping[str, Any], context: OpenContext) -> None:
+    """As ``hal.registry.Driver.check``."""
+    _settings(settings, context)
+
+
+def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
+    """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
+    profile, port, baud, address = _settings(settings, context)
     transcript = None
     if context.transcripts is not None:
         context.transcripts.mkdir(parents=True, exist_ok=True)
@@ -272,8 +284,8 @@ def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, dea
     projector = SerialProjector(
         lambda until: SerialLink(port, baud=baud, deadline=until, transcript=transcript),
         profile,
-        name=str(setting(settings, "port", str)),
-        address=setting(settings, "address", str),
+        name=str(settings["port"]),
+        address=address,
         transcript=transcript,
     )
     projector.open(deadline)
@@ -292,4 +304,5 @@ DRIVER = Driver(
         "address": "the projector's number on the line, if not the profile's",
     },
     required=("profile", "port"),
+    check=check_serial_projector,
 )

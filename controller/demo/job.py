@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from controller.app import Checked, check_stage, marker, run_on_stage
+from controller.app import marker, run_on_stage
 from controller.arrays import save_arrays
+from controller.checking import Checked, check_stage
 from controller.demo.bench_process import BenchProcess
 from controller.demo.report import write_demo_report
 from controller.demo.stage import prepare

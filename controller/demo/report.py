@@ -12,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from controller.app import Checked, check_stage
 from controller.arrays import FloatImage, Mask, load_arrays
 from controller.calibrate.values import Calibration
+from controller.checking import Checked, check_stage
 from controller.errors import UsageError
 from controller.report.page import Goal, Page, Picture, Row, write_report
 from controller.report.pictures import Crop, crop_around, error_picture, fitted, to_screen

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from controller.app import LOCK, Checked, check_stage
+from controller.app import LOCK
+from controller.checking import Checked, check_stage
 from controller.config.loader import FILE
 from controller.doctor.trying import Trying, devices_of
 from controller.doctor.values import Examination, Finding

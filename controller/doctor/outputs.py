@@ -17,11 +17,13 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from controller.app import LOCK, Checked, check_stage, opened
+from controller.app import LOCK
 from controller.arrays import ByteImage
 from controller.capture.acquire import Shot
 from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic
+from controller.checking import Checked, check_stage
 from controller.doctor.values import Examination, Finding
+from controller.opening import opened
 from controller.session.lighting import lit
 from controller.session.machine import Machine
 from controller.session.power import light

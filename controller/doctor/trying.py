@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from controller.app import Checked
+from controller.checking import Checked
 from controller.doctor.values import Finding, Tried
 from controller.session.lamp_faults import fatal_faults, faulty
 from hal.deadline import Deadline

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.app import Checked, check_stage
 from controller.arrays import Mask
 from controller.calibrations import finished_calibration, finished_calibrations
+from controller.checking import Checked, check_stage
 from controller.errors import WorkError
 from controller.panel.kiosk import Aiming, ProjectorAim
 from controller.serve.devices import Devices

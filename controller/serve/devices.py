@@ -9,7 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final, cast
 
-from controller.app import Checked, light_sensor, mains_circuits, open_device, rig_of
+from controller.checking import Checked
+from controller.opening import light_sensor, mains_circuits, open_device, rig_of
 from controller.panel.kiosk import DeviceRow, LiveValue
 from controller.serve.device_keeper import DeviceKeeper
 from controller.serve.eventlog import Decision

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from controller.app import check_stage, stage_lock
+from controller.app import stage_lock
 from controller.calibrations import stage_trust, worst_grade
+from controller.checking import check_stage
 from controller.config import load_stage
 from controller.errors import UsageError
 from controller.panel.kiosk import Schedule, ScheduleRow

@@ -10,7 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from controller.app import Held, check_stage, holding
+from controller.app import Held, holding
+from controller.checking import check_stage
 from controller.serve.eventlog import Decision
 from controller.serve.ports import Finished, Request
 from controller.serve.works import JobReporter, Kind, run_name

@@ -9,8 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from controller.app import Checked
 from controller.calibrations import finished_calibrations
+from controller.checking import Checked
 from controller.errors import UsageError
 from controller.panel.kiosk import Achieved, Comparison, Grade, Results
 from controller.session.compared import all_compared, history_of, pictures_of

@@ -10,9 +10,11 @@ from datetime import date
 from pathlib import Path
 from typing import Final
 
-from controller.app import Checked, check_stage, player_settings, stage_lock, technicians_panel
+from controller.app import stage_lock
 from controller.calibrations import finished_calibrations, stage_trust
+from controller.checking import Checked, check_stage
 from controller.errors import UsageError, VelaturaError, WorkError
+from controller.opening import player_settings, technicians_panel
 from controller.panel.kiosk import Lamp
 from controller.play.launch import PlayerSettings
 from controller.play.notify import Notifier

@@ -7,8 +7,8 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
-from controller.app import check_stage
 from controller.calibrations import finished_calibrations
+from controller.checking import check_stage
 from controller.config.editing import rewrite_stage
 from controller.config.lines import KeyLines
 from controller.config.loader import FILE, LARGEST_BYTES, parse_stage

@@ -12,12 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from controller.app import LONGEST_RUN_S, Checked, check_stage, stage_lock
+from controller.app import LONGEST_RUN_S, stage_lock
 from controller.arrays import load_arrays
 from controller.bundle.install import current, install, revision_floor
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.checking import Checked, check_stage
 from controller.errors import UsageError
 from controller.serve.stock import slots_without
 from controller.services import output_sizes, signing_key, stage_trust, usable_calibration

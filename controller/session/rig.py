@@ -36,7 +36,7 @@ class RigProjector:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Everything that is switched, shown or photographed. Made by ``controller.app`` alone."""
+    """Everything that is switched, shown or photographed. Made by ``controller.opening`` alone."""
 
     stage: Path
     projectors: tuple[RigProjector, ...]

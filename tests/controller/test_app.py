@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from controller.app import LOCK, check_stage, run_on_stage, unfinished_run
+from controller.app import LOCK, run_on_stage, unfinished_run
+from controller.checking import check_stage
 from controller.errors import UsageError, WorkError
 from controller.session.journal import Journal
 from controller.session.machine import Event

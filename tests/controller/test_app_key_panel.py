@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.app import check_stage, technicians_panel
+from controller.checking import check_stage
 from controller.errors import UsageError
+from controller.opening import technicians_panel
 from controller.session.keys import KeyService, technicians_keys
 from controller.session.machine import State
 from hal.deadline import Deadline, in_seconds

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from controller.app import check_stage, run_on_stage
+from controller.app import run_on_stage
+from controller.checking import check_stage
 from controller.errors import UsageError
 from controller.session.darkness import Darkness, dark_after
 from controller.session.progress import Level

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.app import check_stage
+from controller.checking import check_stage
 from controller.comparison_services import installed, photograph
 from controller.errors import UsageError
 from controller.session.journal import Journal

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.app import LOCK, check_stage
+from controller.app import LOCK
 from controller.bundle.signing import generate_key
+from controller.checking import check_stage
 from controller.config import write_stage
 from controller.errors import UsageError
 from controller.play_services import play

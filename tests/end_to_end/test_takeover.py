@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.app import check_stage
 from controller.arrays import FloatImage, load_arrays
 from controller.calibrations import finished_calibration
+from controller.checking import check_stage
 from controller.demo.bench_process import BenchProcess
 from controller.errors import VelaturaError
 from controller.serve.control import ask

@@ -33,7 +33,7 @@ height_px = 210
 PROBE: Final = """
 import sys
 from pathlib import Path
-from controller.app import check_stage
+from controller.checking import check_stage
 from controller.serve.eventlog import EventLog
 from controller.serve.kiosk import StageKiosk
 from controller.serve.program import serve

@@ -36,6 +36,8 @@ WRONG = {
     "a table": (TEXT + "\n[camra]\n", "camra"),
     "a driver": (TEXT.replace('driver = "serial"', 'driver = "seriel"'), "seriel"),
     "a driver's own key": (TEXT.replace("port =", "prot ="), "prot"),
+    "a profile that there is not": (TEXT.replace("optoma-later", "optoma-latest"), "optoma-latest"),
+    "a camera's address": (TEXT.replace("ptpip:127.0.0.1", "ptpip:127.0.0.1:no"), "line"),
     "too long": ("# " + "x" * (1 << 20), "too long"),
     "nested": ("a = " + 5000 * "[" + 5000 * "]", "TOML"),
 }

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.app import check_stage
+from controller.checking import check_stage
 from controller.doctor.examine import Tools
 from controller.errors import UsageError
 from controller.serve.setup import set_up

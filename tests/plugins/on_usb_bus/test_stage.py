@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.app import check_stage, run_on_stage
+from controller.app import run_on_stage
+from controller.checking import check_stage
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
 from hal.errors import DeviceRefused
