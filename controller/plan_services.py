@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from controller.arrays import Float64
 from controller.errors import UsageError
 from controller.plan.drawing import layout, value_map
-from controller.plan.figures import figures_of
+from controller.plan.figures import figures_of, together
 from controller.plan.optics import lit_by
 from controller.plan.plan_file import EXAMPLE, PlanTables, read_plan
 from controller.plan.search import Chosen, candidates_of, chosen
@@ -131,19 +130,16 @@ def _stands(figures: Mapping[str, Any]) -> dict[str, str]:
 def _maps(thing: Thing, eye: Float64, placements: list[Placement], goal: Goal) -> tuple[Picture, ...]:
     view = seen_from(thing, eye, rows=VIEW_ROWS)
     lit = [lit_by(placement, view.surface, thing) for placement in placements]
-    steepest = math.cos(math.radians(goal.steepest_degrees))
-    useful = np.stack([one.reached & (one.cosine >= steepest) for one in lit])
-    lux = np.where(useful, [one.lux for one in lit], 0.0).sum(axis=0)
-    detail = np.where(useful, [one.detail_mm for one in lit], np.nan)
-    reached = useful.any(axis=0)
-    finest = np.full(len(lux), np.nan)
-    finest[reached] = np.nanmin(detail[:, reached], axis=0)
+    useful = np.stack([one.useful(goal.steepest_degrees) for one in lit])
+    found = together(lit, useful)
+    reached = found.count > 0
+    finest = np.where(reached, found.detail_mm, np.nan)
     sharp = np.where(reached, np.where(useful, [one.blur_px for one in lit], np.inf).min(axis=0), np.nan)
     steep = np.degrees(np.arccos(np.clip(np.where(useful, [one.cosine for one in lit], 0.0).max(axis=0), 0, 1)))
     maps = (
-        ("Light", "lux", lux, 0.0, max(1.5 * goal.lux, float(np.quantile(lux, 0.95)))),
+        ("Light", "lux", found.lux, 0.0, max(1.5 * goal.lux, float(np.quantile(found.lux, 0.95)))),
         ("Finest detail", "mm", finest, 0.0, 2 * goal.detail_mm),
-        ("Projectors that reach", "number", useful.sum(axis=0).astype(np.float64), 0.0, float(len(placements))),
+        ("Projectors that reach", "number", found.count.astype(np.float64), 0.0, float(len(placements))),
         ("Steepness of the best light", "degrees from the normal", np.where(reached, steep, np.nan), 0.0, 90.0),
         ("Blur of the sharpest", "projector pixels", sharp, 0.0, 2.0),
     )

@@ -3,22 +3,44 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.arrays import Float64, Mask
 from controller.plan.search import Chosen
 from controller.plan.values import Goal, Lit, Placement, Surface
 
 
+@dataclass(frozen=True, slots=True)
+class Together:
+    """What projectors do together at each of N points, each where it is of use.
+
+    ``lux`` (N,): the sum of them; ``detail_mm`` (N,): of the finest, infinite where there is none; ``count`` (N,)
+    """
+
+    lux: Float64
+    detail_mm: Float64
+    count: npt.NDArray[np.int64]
+
+
+def together(lit: Sequence[Lit], useful: Mask) -> Together:
+    """``useful`` (projectors, N) bool: where each of ``lit`` is of use."""
+    return Together(
+        np.where(useful, [one.lux for one in lit], 0.0).sum(axis=0),
+        np.where(useful, [one.detail_mm for one in lit], np.inf).min(axis=0),
+        useful.sum(axis=0),
+    )
+
+
 def figures_of(best: Chosen, surface: Surface, goal: Goal) -> dict[str, Any]:
     """Placements in words of a stand and a lens, and what the seen surface gets of each and of all."""
     weight = surface.area_m2 / surface.area_m2.sum()
-    useful = np.stack([one.useful for one in best.candidates])
-    lux = np.where(useful, [one.lit.lux for one in best.candidates], 0.0).sum(axis=0)
-    detail = np.where(useful, [one.lit.detail_mm for one in best.candidates], np.inf).min(axis=0)
-    count = useful.sum(axis=0)
+    found = together([one.lit for one in best.candidates], np.stack([one.useful for one in best.candidates]))
+    lux, detail, count = found.lux, found.detail_mm, found.count
     return {
         "quality": best.quality,
         "tried": best.tried,

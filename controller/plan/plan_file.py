@@ -171,12 +171,8 @@ def _on_shell(shell: ShellTable) -> list[Spot]:
     for distance in _steps(*shell.distance_m, shell.step_m):
         for above in _steps(*shell.above_degrees, shell.step_degrees):
             for right in _steps(*shell.right_degrees, shell.step_degrees):
-                azimuth, height = np.deg2rad(right), np.deg2rad(above)
-                position = distance * np.array(
-                    [np.sin(azimuth) * np.cos(height), -np.sin(height), -np.cos(azimuth) * np.cos(height)]
-                )
                 name = f"{right:+.0f}° right, {above:+.0f}° up, {distance:.2f} m"
-                spots.append(Spot(name, (float(position[0]), float(position[1]), float(position[2]))))
+                spots.append(Spot.round_the_object(name, right_degrees=right, above_degrees=above, distance_m=distance))
     return spots
 
 

@@ -102,7 +102,6 @@ def candidates_of(
     has none, WorkError("cancelled").
     """
     known: dict[ProjectorModel, list[Candidate]] = {}
-    steepest = np.cos(np.deg2rad(goal.steepest_degrees))
     different = list(dict.fromkeys(models))
     for number, (model, spot) in enumerate(itertools.product(different, spots)):
         check(cancel)
@@ -112,7 +111,7 @@ def candidates_of(
         if placement is None or in_the_way(placement.position_m, audience_m, surface, goal.body_m):
             continue
         lit = lit_by(placement, surface, shadows)
-        useful = lit.reached & (lit.cosine >= steepest)
+        useful = lit.useful(goal.steepest_degrees)
         if np.any(useful & (surface.area_m2 > 0)):
             found.append(Candidate(placement, lit, useful))
     for model, found in known.items():

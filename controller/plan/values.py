@@ -39,6 +39,15 @@ class Spot:
     name: str
     position_m: tuple[float, float, float]
 
+    @classmethod
+    def round_the_object(cls, name: str, *, right_degrees: float, above_degrees: float, distance_m: float) -> Spot:
+        """A place on a sphere of ``distance_m`` round the object, by degrees to the audience's right and above it."""
+        azimuth, height = np.deg2rad(right_degrees), np.deg2rad(above_degrees)
+        x, y, z = distance_m * np.array(
+            [np.sin(azimuth) * np.cos(height), -np.sin(height), -np.cos(azimuth) * np.cos(height)]
+        )
+        return cls(name, (float(x), float(y), float(z)))
+
 
 @dataclass(frozen=True, slots=True)
 class Placement:
@@ -95,6 +104,11 @@ class Lit:
     blur_px: Float64
     pixel_mm: Float64
     detail_mm: Float64
+
+    def useful(self, steepest_degrees: float) -> Mask:
+        """(N,) bool: reached, and no farther than ``steepest_degrees`` from the normal (``Goal``)."""
+        near: Mask = self.cosine >= np.cos(np.deg2rad(steepest_degrees))
+        return self.reached & near
 
 
 @dataclass(frozen=True, slots=True)

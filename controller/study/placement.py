@@ -58,9 +58,8 @@ def _spots() -> list[Spot]:
     for distance in (1.1, 1.3, 1.5):
         for above in (5.0, 15.0, 25.0, 35.0):
             for right in range(-60, 61, 10):
-                a, b = np.deg2rad(right), np.deg2rad(above)
-                x, y, z = distance * np.array([np.sin(a) * np.cos(b), -np.sin(b), -np.cos(a) * np.cos(b)])
-                spots.append(Spot(f"{right:+d}, {above:.0f}, {distance:.1f}", (float(x), float(y), float(z))))
+                name = f"{right:+d}, {above:.0f}, {distance:.1f}"
+                spots.append(Spot.round_the_object(name, right_degrees=right, above_degrees=above, distance_m=distance))
     return spots
 
 

@@ -75,7 +75,7 @@ def compared(
     both[known] = predicted.reached
     iou = float((both & lit & known).sum() / max(1, ((both | lit) & known).sum()))
     both &= lit & np.isfinite(_map_px(part)[..., 0])
-    both[known] &= predicted.cosine >= np.cos(np.deg2rad(steepest_degrees))
+    both[known] &= predicted.useful(steepest_degrees)
     of_points = both[known]
     spread = functools.partial(_spread, both)
     expected_px, _ = pixels_of(at, surface.points_m[of_points])
