@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +24,23 @@ import numpy as np
 from benchmarks import Row, at_most
 from benchmarks._panels import OpenPanels, log_in, make_account
 from benchmarks._stage import FIRST_SEED, prepared_stage
-from controller.app import check_stage
 from controller.bundle.install import install
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.checking import check_stage
 from controller.demo.bench_process import BenchProcess
 from controller.errors import VelaturaError
 from controller.serve.control import ask
 from controller.services import KEY_FILE, output_sizes
 from controller.storage import runtime_folder
+from tests.controller.play.wire import Wire
 
 STARTS = 5
 HANGS = 3
 LONGEST_S = 60.0
 REST_S = 5.0
+PACED_S = 20.0
+RATE_HZ = 30.0
 PAGES = 15
 OPEN = 50
 PORT = 18377
@@ -69,7 +74,7 @@ def measure(size: str) -> list[Row]:
 
 
 def _panels(stage: Path) -> list[Row]:
-    """The first page, and what open panels cost: nothing to tell, and four changes a second (the names, on and off)."""
+    """The first page, and what open panels cost: nothing to tell, and four changes a second (the schedule's)."""
     make_account(stage)
     with service(stage, "--panel", f"127.0.0.1:{PORT}") as served:
         wait_for(stage, "playing")
@@ -82,6 +87,8 @@ def _panels(stage: Path) -> list[Row]:
             before = panels.received
             busy = _busy(stage, served.pid)
             told = (panels.received - before) / OPEN / REST_S
+            busy_paced = _paced(stage)
+        quiet_paced = _paced(stage, changes=False)
     seconds = [seconds for seconds, _ in pages]
     return [
         at_most("first page with all it loads", max(size for _, size in pages) / 1e3, 100.0, unit="kB",
@@ -92,23 +99,52 @@ def _panels(stage: Path) -> list[Row]:
                 how=f"processor time over {REST_S:g} s, less that without them"),
         at_most(f"{OPEN} open panels, something changes all the time", 100 * (busy - nobody), 10.0,
                 unit="% of a core", how=f"as above; {told:.0f} bytes a second to each"),
+        at_most(f"swaps late at {RATE_HZ:g} Hz, {OPEN} open panels, something changes", float(busy_paced.late), 0.0,
+                unit="", how=f"more than a tick late, over {PACED_S:g} s; {quiet_paced.late} with no panel"),
+        at_most(f"p99 at {RATE_HZ:g} Hz, {OPEN} open panels, something changes", busy_paced.p99_ms, None, unit="ms",
+                how=f"{quiet_paced.p99_ms:.1f} ms with no panel"),
     ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """The player's own figures of a sequence."""
+
+    late: int
+    p99_ms: float
+
+
+def _paced(stage: Path, *, changes: bool = True) -> Pace:
+    """Have the kiosk's player swap at ``RATE_HZ``, while the service's state changes or does not."""
+    with _changing(stage) if changes else contextlib.nullcontext(), Wire(runtime_folder(stage) / "player.sock") as wire:
+        wire.ask("sequence", items=[[NAME, 1 / RATE_HZ]], rate_hz=RATE_HZ)
+        time.sleep(PACED_S)
+        status = wire.ask("status")
+        assert status["sequence_running"], "somebody else asked for another picture"
+        return Pace(status["late"], 1e3 * status["interval_p99_s"])
 
 
 def _busy(stage: Path, pid: int) -> float:
     """As ``_at_rest``, while the state changes as often as panels are told."""
+    with _changing(stage):
+        return _at_rest(pid)
+
+
+@contextlib.contextmanager
+def _changing(stage: Path) -> Iterator[None]:
+    """Inside, the schedule's time zone changes, which leaves what is played as it is."""
     ended = threading.Event()
 
     def change() -> None:
-        on = False
-        while not ended.wait(0.25):
-            on = not on
-            ask(stage, "identify", on=on)
+        for zone in itertools.cycle(("Europe/Berlin", "UTC")):
+            if ended.wait(0.25):
+                return
+            ask(stage, "set-schedule", time_zone=zone, rows=[])
 
     thread = threading.Thread(target=change)
     thread.start()
     try:
-        return _at_rest(pid)
+        yield
     finally:
         ended.set()
         thread.join()
