@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 from controller.arrays import FloatImage
@@ -18,9 +16,9 @@ from controller.solve.bounded import SMOOTHNESS, solve_bounded
 from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
 from controller.solve.weights import appearance_weights
 from controller.study.drawing import Panel, detail, screen, strip
-from controller.study.measuring import Quality, quality, unbounded_inverse
+from controller.study.measuring import Way, better, quality_table, tried, unbounded_inverse
 from controller.study.subject import Shares, Subject, Wanted
-from controller.study.values import Criterion, Experiment, Figure, Result, Table
+from controller.study.values import Criterion, Experiment, Figure, Result
 from controller.transport import LightTransport
 from controller.transport.any_weights import patches_of_weights
 
@@ -28,31 +26,13 @@ FALLS = ("naive inverse", "+ bounds", "+ Gaussian metapixels", "+ regularisation
 QUADRILATERALS, OURS = "quadrilaterals instead", "shares per camera sample (ours)"
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One row of the figure: its name, frames, what the photograph comes to, and the photograph."""
-
-    name: str
-    frames: Sequence[FloatImage]
-    seconds: float
-    photograph: FloatImage
-    quality: Quality
-
-
 def ablation(subject: Subject) -> Result:
     """Solve the same target with more and more of the method, and photograph each."""
     target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
     wanted = subject.wanted(target)
-    ways = _ways(subject, wanted)
-    steps = []
-    for number, (name, solve) in enumerate(ways):
-        subject.advance(number / len(ways), name)
-        began_s = time.perf_counter()
-        frames = solve()
-        seconds = time.perf_counter() - began_s
-        picture = subject.light.photograph(f"{number}", frames, white=wanted.white)
-        steps.append(Step(name, frames, seconds, picture, quality(subject, picture, wanted)))
-    return Result(_criteria(steps), (_table(steps),), _figures(subject, wanted, steps))
+    steps = tried(subject, wanted, _ways(subject, wanted))
+    table = quality_table("steps", steps, ways="step", seconds="seconds, model and solve")
+    return Result(_criteria(steps), (table,), _figures(subject, wanted, steps))
 
 
 def _ways(subject: Subject, wanted: Wanted) -> list[tuple[str, Callable[[], Sequence[FloatImage]]]]:
@@ -108,52 +88,18 @@ def with_metapixels(calibration: Calibration, metapixels: Sequence[Metapixels]) 
     )
 
 
-def _criteria(steps: Sequence[Step]) -> tuple[Criterion, ...]:
-    made = []
-    by_name = {step.name: step for step in steps}
-    for before, after in pairwise(FALLS):
-        made.append(_better(by_name[after], by_name[before], f"{after} is better than {before}"))
-    made.append(
-        _better(by_name[FALLS[-1]], by_name[QUADRILATERALS], "Gaussian metapixels are better than quadrilaterals")
+def _criteria(steps: Sequence[Way]) -> tuple[Criterion, ...]:
+    by_name = {step.name: step.quality for step in steps}
+    pairs = [(after, before, f"{after} is better than {before}") for before, after in pairwise(FALLS)]
+    pairs.append((FALLS[-1], QUADRILATERALS, "Gaussian metapixels are better than quadrilaterals"))
+    pairs.append((OURS, FALLS[-1], "our shares are better than the paper's metapixels"))
+    return tuple(
+        better(f"{what}: CIEDE2000, RMSE and SSIM", by_name[after], by_name[before], with_p95=True)
+        for after, before, what in pairs
     )
-    made.append(_better(by_name[OURS], by_name[FALLS[-1]], "our shares are better than the paper's metapixels"))
-    return tuple(made)
 
 
-def _better(after: Step, before: Step, what: str) -> Criterion:
-    a, b = after.quality, before.quality
-    told = (
-        f"CIEDE2000 {b.delta_e:.2f} to {a.delta_e:.2f} (95 %: {b.delta_e_p95:.1f} to {a.delta_e_p95:.1f}), "
-        f"RMSE {b.rmse:.4f} to {a.rmse:.4f}, SSIM {b.ssim:.3f} to {a.ssim:.3f}"
-    )
-    pairs = {
-        "CIEDE2000": a.delta_e < b.delta_e,
-        "RMSE": a.rmse < b.rmse,
-        "SSIM": a.ssim > b.ssim,
-    }
-    missed = [name for name, better in pairs.items() if not better]
-    reason = "" if not missed else f"{' and '.join(missed)} not better."
-    return Criterion(f"{what}: CIEDE2000, RMSE and SSIM", told, not missed, reason)
-
-
-def _table(steps: Sequence[Step]) -> Table:
-    columns = ("step", "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda", "seconds, model and solve")
-    rows = tuple(
-        (
-            s.name,
-            s.quality.delta_e,
-            s.quality.delta_e_p95,
-            s.quality.rmse,
-            s.quality.ssim,
-            s.quality.sharpness,
-            s.seconds,
-        )
-        for s in steps
-    )
-    return Table("steps", "Photographed errors", columns, rows)
-
-
-def _figures(subject: Subject, wanted: Wanted, steps: Sequence[Step]) -> tuple[Figure, ...]:
+def _figures(subject: Subject, wanted: Wanted, steps: Sequence[Way]) -> tuple[Figure, ...]:
     whole = crop_around(subject.mask)
     size_px = max(48, subject.mask.shape[1] // 8)
     matrix, white = subject.calibration.camera_to_xyz, wanted.white

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,23 +17,15 @@ from controller.solve.traditional import traditional_compensation
 from controller.solve.weights import appearance_weights
 from controller.study.ablation import paper_model, raw_transport
 from controller.study.drawing import Panel, detail, screen, strip
-from controller.study.measuring import Quality, quality, unbounded_inverse
+from controller.study.measuring import Way, better, quality_table, tried, unbounded_inverse
 from controller.study.residual import brightest_first
 from controller.study.subject import Subject, Wanted
-from controller.study.values import Criterion, Experiment, Figure, Result, Table
+from controller.study.values import Criterion, Experiment, Figure, Result
 from controller.transport import LightTransport
 
 FEATHER = 0.02
 """Of the picture's width: standard deviation of the blur of the seams between projectors."""
 OURS = "ours"
-
-
-@dataclass(frozen=True, slots=True)
-class Made:
-    name: str
-    seconds: float
-    photograph: FloatImage
-    quality: Quality
 
 
 def earlier_systems(subject: Subject) -> Result:
@@ -44,16 +34,9 @@ def earlier_systems(subject: Subject) -> Result:
     target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
     alone = LightTransport.build(subject.with_projectors([best]))
     wanted = subject.wanted(target, transport=alone)
-    ways = _ways(subject, wanted, best)
-    made = []
-    for number, (name, solve) in enumerate(ways):
-        subject.advance(number / len(ways), name)
-        began_s = time.perf_counter()
-        frames = solve()
-        seconds = time.perf_counter() - began_s
-        picture = subject.light.photograph(f"{number}", frames, white=wanted.white)
-        made.append(Made(name, seconds, picture, quality(subject, picture, wanted)))
-    return Result(_criteria(made), (_table(made),), _figures(subject, wanted, made))
+    made = tried(subject, wanted, _ways(subject, wanted, best))
+    table = quality_table("systems", made, ways="system")
+    return Result(_criteria(made), (table,), _figures(subject, wanted, made))
 
 
 def _ways(subject: Subject, wanted: Wanted, best: int) -> list[tuple[str, Callable[[], Sequence[FloatImage]]]]:
@@ -96,43 +79,11 @@ def feathered(calibration: Calibration, target: FloatImage) -> list[FloatImage]:
     return frames
 
 
-def _criteria(made: Sequence[Made]) -> tuple[Criterion, ...]:
-    ours = made[-1].quality
-    found = []
-    for one in made[:-1]:
-        q = one.quality
-        better = {"CIEDE2000": ours.delta_e < q.delta_e, "RMSE": ours.rmse < q.rmse, "SSIM": ours.ssim > q.ssim}
-        missed = [name for name, holds in better.items() if not holds]
-        found.append(
-            Criterion(
-                f"ours is better than: {one.name}",
-                f"CIEDE2000 {q.delta_e:.2f} to {ours.delta_e:.2f}, RMSE {q.rmse:.4f} to {ours.rmse:.4f}, "
-                f"SSIM {q.ssim:.3f} to {ours.ssim:.3f}",
-                not missed,
-                f"{' and '.join(missed)} not better." if missed else "",
-            )
-        )
-    return tuple(found)
+def _criteria(made: Sequence[Way]) -> tuple[Criterion, ...]:
+    return tuple(better(f"ours is better than: {one.name}", made[-1].quality, one.quality) for one in made[:-1])
 
 
-def _table(made: Sequence[Made]) -> Table:
-    columns = ("system", "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda", "seconds")
-    rows = tuple(
-        (
-            m.name,
-            m.quality.delta_e,
-            m.quality.delta_e_p95,
-            m.quality.rmse,
-            m.quality.ssim,
-            m.quality.sharpness,
-            m.seconds,
-        )
-        for m in made
-    )
-    return Table("systems", "Photographed errors", columns, rows)
-
-
-def _figures(subject: Subject, wanted: Wanted, made: Sequence[Made]) -> tuple[Figure, ...]:
+def _figures(subject: Subject, wanted: Wanted, made: Sequence[Way]) -> tuple[Figure, ...]:
     whole = crop_around(subject.mask)
     crop = detail(subject.mask, centre=(0.4, 0.3), size_px=max(48, subject.mask.shape[1] // 8))
     matrix, white = subject.calibration.camera_to_xyz, wanted.white

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from controller.arrays import Float64, FloatImage, Mask
 from controller.solve.metrics import compare, sharpness_windows
 from controller.solve.targets_values import linear_to_srgb
 from controller.study.subject import Subject, Wanted
+from controller.study.values import Criterion, Table
 from controller.transport import LightTransport
 from controller.transport.planes import image_planes, plane_frames
 
@@ -59,6 +61,57 @@ def quality(subject: Subject, achieved: FloatImage, wanted: Wanted, mask: Mask |
     return Quality(
         found.delta_e00_median, found.delta_e00_p95, found.rmse, float(local[mask].mean()), found.sharpness_lambda
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One of several ways to make the same target: how long its ``solve`` took, and its photograph."""
+
+    name: str
+    seconds: float
+    photograph: FloatImage
+    quality: Quality
+
+
+def tried(
+    subject: Subject, wanted: Wanted, ways: Sequence[tuple[str, Callable[[], Sequence[FloatImage]]]]
+) -> list[Way]:
+    """Make ``wanted`` in each way, given as its name and what finds all projectors' frames, and photograph each."""
+    made = []
+    for number, (name, solve) in enumerate(ways):
+        subject.advance(number / len(ways), name)
+        began_s = time.perf_counter()
+        frames = solve()
+        seconds = time.perf_counter() - began_s
+        picture = subject.light.photograph(f"{number}", frames, white=wanted.white)
+        made.append(Way(name, seconds, picture, quality(subject, picture, wanted)))
+    return made
+
+
+def better(asked: str, after: Quality, before: Quality, *, with_p95: bool = False) -> Criterion:
+    """Whether CIEDE2000, RMSE and SSIM are all better after than before; ``with_p95``: the 95 % are told, too."""
+    p95 = f" (95 %: {before.delta_e_p95:.1f} to {after.delta_e_p95:.1f})" if with_p95 else ""
+    reached = (
+        f"CIEDE2000 {before.delta_e:.2f} to {after.delta_e:.2f}{p95}, "
+        f"RMSE {before.rmse:.4f} to {after.rmse:.4f}, SSIM {before.ssim:.3f} to {after.ssim:.3f}"
+    )
+    holds = {
+        "CIEDE2000": after.delta_e < before.delta_e,
+        "RMSE": after.rmse < before.rmse,
+        "SSIM": after.ssim > before.ssim,
+    }
+    missed = [name for name, held in holds.items() if not held]
+    return Criterion(asked, reached, not missed, f"{' and '.join(missed)} not better." if missed else "")
+
+
+def quality_table(name: str, made: Sequence[Way], *, ways: str, seconds: str = "seconds") -> Table:
+    """A row for each way; ``ways`` and ``seconds``: what the first and the last column are called."""
+    columns = (ways, "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda", seconds)
+    rows = []
+    for one in made:
+        q = one.quality
+        rows.append((one.name, q.delta_e, q.delta_e_p95, q.rmse, q.ssim, q.sharpness, one.seconds))
+    return Table(name, "Photographed errors", columns, tuple(rows))
 
 
 def region_means(values: FloatImage, mask: Mask, size_px: int = REGION_PX) -> FloatImage:

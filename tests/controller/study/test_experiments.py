@@ -12,7 +12,7 @@ from controller.capture.dots import dot_patterns
 from controller.study import ablation, earlier
 from controller.study.catalogue import EXPERIMENTS
 from controller.study.earlier import feathered
-from controller.study.measuring import Quality, unbounded_inverse
+from controller.study.measuring import Quality, Way, unbounded_inverse
 from controller.study.photographing import dots_as_shares
 from controller.study.residual import PAPER, Made, _criteria, residual
 from controller.study.sharpness import local_sharpness
@@ -105,7 +105,7 @@ def test_an_ablation_whose_steps_each_help_holds_and_one_step_back_is_told() -> 
     names = (*ablation.FALLS, ablation.QUADRILATERALS, ablation.OURS)
 
     def judged(*errors: float) -> list[bool | None]:
-        steps = [ablation.Step(n, (), 1.0, nothing, quality_of(e)) for n, e in zip(names, errors, strict=True)]
+        steps = [Way(n, 1.0, nothing, quality_of(e)) for n, e in zip(names, errors, strict=True)]
         return [criterion.holds for criterion in ablation._criteria(steps)]
 
     assert judged(7, 6, 5, 4, 3, 4, 2) == [True] * 6
@@ -114,7 +114,7 @@ def test_an_ablation_whose_steps_each_help_holds_and_one_step_back_is_told() -> 
 
 def test_ours_is_compared_with_every_earlier_system() -> None:
     nothing = np.zeros((2, 2, 3), np.float32)
-    made = [earlier.Made(f"system {e}", 1.0, nothing, quality_of(e)) for e in (3, 1, 2)]
+    made = [Way(f"system {e}", 1.0, nothing, quality_of(e)) for e in (3, 1, 2)]
     first, second = earlier._criteria(made)
     assert first.holds
     assert second.holds is False
