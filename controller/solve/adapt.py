@@ -76,21 +76,10 @@ def adapt(
 
     Raises UsageError "image-wrong-size", "target-not-finite" or "adapt-strength".
     """
-    if not (0 <= strength <= 1 and 0 <= given_up < 1):
-        raise UsageError(
-            "adapt-strength",
-            what=f"A contrast adaptation of strength {strength} was asked for, with {given_up} of the pixels given up.",
-            remedy="Ask for a strength from 0 to 1, and give up a share from 0 to below 1.",
-        )
+    _check_strength(strength, given_up)
     drive = Drive(transport) if drive is None else drive
     before = feasibility(transport, wanted, black, drive=drive)
-    lifted = _above_black(np.maximum(wanted, 0), black, strength)
-    needed = drive.of(lifted - black).max(axis=2)
-    needed = np.where(np.isfinite(needed), np.maximum(needed, 0), 0).astype(np.float32)
-    if given_up > 0 and drive.mask.any():
-        needed = np.minimum(needed, np.quantile(needed[drive.mask], 1 - given_up).astype(np.float32))
-    gain = _gain(needed, drive.mask, strength)
-    target = np.where(drive.mask[..., None], black + gain[..., None] * (lifted - black), wanted).astype(np.float32)
+    target, gain = _bent(wanted, black, drive, strength, given_up)
     return Adapted(target, gain, before, feasibility(transport, target, black, drive=drive))
 
 
@@ -109,14 +98,40 @@ def adapt_gently(
     given up, or nothing is adapted at all. ``white`` as in ``contrast_kept``; errors as ``adapt``.
     """
     drive = Drive(transport) if drive is None else drive
+    before = feasibility(transport, wanted, black, drive=drive)
     reach = black + transport.reach()
-    kept: list[tuple[float, Adapted]] = []
+    kept: list[tuple[float, FloatImage, FloatImage]] = []
     for strength, given_up in ((0.0, 0.0), *itertools.product(STRENGTHS, GIVEN_UP)):
-        adapted = adapt(transport, wanted, black, strength=most * strength, given_up=given_up, drive=drive)
-        shown = np.clip(adapted.target, black, reach)
-        kept.append((contrast_kept(shown, wanted, drive.mask, white=white), adapted))
-    best = max(kept, key=lambda one: one[0])
-    return best[1], kept[0][0], best[0]
+        _check_strength(most * strength, given_up)
+        target, gain = _bent(wanted, black, drive, most * strength, given_up)
+        shown = np.clip(target, black, reach)
+        kept.append((contrast_kept(shown, wanted, drive.mask, white=white), target, gain))
+    contrast, target, gain = max(kept, key=lambda one: one[0])
+    after = feasibility(transport, target, black, drive=drive)
+    return Adapted(target, gain, before, after), kept[0][0], contrast
+
+
+def _check_strength(strength: float, given_up: float) -> None:
+    if not (0 <= strength <= 1 and 0 <= given_up < 1):
+        raise UsageError(
+            "adapt-strength",
+            what=f"A contrast adaptation of strength {strength} was asked for, with {given_up} of the pixels given up.",
+            remedy="Ask for a strength from 0 to 1, and give up a share from 0 to below 1.",
+        )
+
+
+def _bent(
+    wanted: FloatImage, black: FloatImage, drive: Drive, strength: float, given_up: float
+) -> tuple[FloatImage, FloatImage]:
+    """The bent target (rows, columns, 3) and the gain (rows, columns); arguments as ``adapt``."""
+    lifted = _above_black(np.maximum(wanted, 0), black, strength)
+    needed = drive.of(lifted - black).max(axis=2)
+    needed = np.where(np.isfinite(needed), np.maximum(needed, 0), 0).astype(np.float32)
+    if given_up > 0 and drive.mask.any():
+        needed = np.minimum(needed, np.quantile(needed[drive.mask], 1 - given_up).astype(np.float32))
+    gain = _gain(needed, drive.mask, strength)
+    target = np.where(drive.mask[..., None], black + gain[..., None] * (lifted - black), wanted).astype(np.float32)
+    return target, gain
 
 
 def _above_black(wanted: FloatImage, black: FloatImage, strength: float) -> FloatImage:
