@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import functools
-import io
 from collections.abc import Callable, Sequence
 from typing import Any, Final, ParamSpec
 
-import cv2
 import numpy as np
 
 from controller.arrays import ByteImage, Float64
 from controller.plan.values import Placement, Surface
+from controller.plotting import figure_of, picture_of
 
 Asked = ParamSpec("Asked")
 BACK, INK, DIM, LINE = "#17181b", "#e8e6e1", "#9b9890", "#34363b"
@@ -39,26 +38,28 @@ def _in_style(draw: Callable[Asked, ByteImage]) -> Callable[Asked, ByteImage]:
 @_in_style
 def layout(placements: Sequence[Placement], surface: Surface, audience_m: Float64) -> ByteImage:
     """The room from above and from the right: object, projectors with their cones of light, and the audience."""
-    figure, (above, side) = _figure(1, 2, (10.0, 4.6))
+    figure = figure_of((10.0, 4.6), dpi=DPI, constrained=True)
+    above, side = figure.subplots(1, 2)
     _room(above, placements, surface, audience_m, across=0, up=2, sign=1.0)
     _room(side, placements, surface, audience_m, across=2, up=1, sign=-1.0)
     above.set(title="from above", xlabel="to the right (m)", ylabel="away from the audience (m)")
     side.set(title="from the right", xlabel="away from the audience (m)", ylabel="up (m)")
-    return _picture(figure)
+    return picture_of(figure)
 
 
 @_in_style
 def value_map(values: Float64, title: str, unit: str, *, lowest: float, highest: float) -> ByteImage:
     """``values`` (rows, columns), NaN beside the object, as colours from ``lowest`` to ``highest`` with their scale."""
     rows, columns = values.shape
-    figure, axes = _figure(1, 1, (1.1 + 2.9 * columns / rows, 3.1))
+    figure = figure_of((1.1 + 2.9 * columns / rows, 3.1), dpi=DPI, constrained=True)
+    axes = figure.add_subplot()
     shown = axes.imshow(values, vmin=lowest, vmax=highest, cmap="viridis", interpolation="nearest")
     axes.set_title(title)
     axes.set_axis_off()
     bar = figure.colorbar(shown, ax=axes, fraction=0.05, pad=0.03)
     bar.set_label(unit)
     bar.outline.set_edgecolor(LINE)
-    return _picture(figure)
+    return picture_of(figure)
 
 
 def _room(
@@ -87,20 +88,3 @@ def _cone(placement: Placement, seen: Float64) -> Float64:
     depth = float(((seen - placement.position_m) @ placement.rotation[2]).mean())
     local = np.concatenate((flat, np.ones((4, 1))), axis=1) * depth
     return np.asarray(placement.position_m + local @ placement.rotation)
-
-
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure: Any = Figure(figsize=size, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns)
-
-
-def _picture(figure: Any) -> ByteImage:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=DPI, facecolor=BACK)
-    decoded = cv2.imdecode(np.frombuffer(data.getvalue(), np.uint8), cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return np.ascontiguousarray(decoded[..., ::-1]).astype(np.uint8)

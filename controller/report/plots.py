@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-import cv2
 import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from cycler import cycler
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from controller.arrays import ByteImage, Float64, FloatImage
+from controller.plotting import figure_of, picture_of
 
 WIDE_IN, HIGH_IN, DPI = 7.2, 4.2, 100
 BACK, INK, DIM = "#1f2125", "#e8e6e1", "#9b9890"
@@ -115,11 +112,6 @@ def field(values: FloatImage, label: str, *, least: float | None = None, most: f
 
 def _plot(draw: Any) -> ByteImage:
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDE_IN, HIGH_IN), dpi=DPI, layout="constrained")
-        canvas = FigureCanvasAgg(figure)
+        figure = figure_of((WIDE_IN, HIGH_IN), dpi=DPI, constrained=True)
         draw(figure.add_subplot())
-        data = io.BytesIO()
-        canvas.print_png(data)  # type: ignore[no-untyped-call]
-    image = cv2.imdecode(np.frombuffer(data.getvalue(), np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
-    return np.ascontiguousarray(image[..., ::-1], np.uint8)
+        return picture_of(figure)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 
 from controller.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.plotting import figure_of, picture_of
 from controller.report.pictures import Crop, crop_around, fitted, to_screen
 
 LARGEST_BYTES = 190_000
 """Of a picture file; a larger one is encoded with less quality, then made smaller."""
 LABEL_PX = 22
+DPI = 110
 _BACKGROUND = (255, 255, 255)
 
 
@@ -102,7 +103,8 @@ def plotted(
     y_range: tuple[float, float] | None = None,
 ) -> ByteImage:
     """Curves as a picture. ``marks``: label -> ("x" or "y", value), drawn as thin lines across."""
-    figure, axes = _figure((7.2, 4.0))
+    figure = figure_of((7.2, 4.0), dpi=DPI)
+    axes = figure.add_subplot()
     for line in lines:
         axes.plot(line.x, line.y, line.style, label=line.name, markersize=3, linewidth=1.3)
     for label, (axis, value) in (marks or {}).items():
@@ -116,7 +118,8 @@ def plotted(
     axes.set_ylabel(y)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.legend(fontsize=8, frameon=False)
-    return _drawn(figure)
+    figure.tight_layout()
+    return picture_of(figure)
 
 
 def maps(
@@ -126,7 +129,7 @@ def maps(
     rows = -(-len(panels) // columns)
     shape = next(iter(panels.values())).shape
     height = 3.6 * shape[0] / shape[1] * rows + 0.35 * rows
-    figure, _ = _figure((3.6 * columns + 1.0, max(height, 1.6)), axes=False)
+    figure = figure_of((3.6 * columns + 1.0, max(height, 1.6)), dpi=DPI, constrained=True)
     grid = figure.subplots(rows, columns, squeeze=False)
     drawn = None
     for place, axes in enumerate(grid.ravel()):
@@ -139,21 +142,4 @@ def maps(
             drawn = axes.imshow(shown, vmin=low, vmax=high, cmap=colours, interpolation="nearest")
     bar = figure.colorbar(drawn, ax=list(grid.ravel()), shrink=0.8, pad=0.02)
     bar.set_label(label, fontsize=9)
-    return _drawn(figure, tight=False)
-
-
-def _figure(size: tuple[float, float], *, axes: bool = True) -> tuple[Any, Any]:
-    # Agg by hand: pyplot would look for a window system, and keeps every figure for ever.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, dpi=110, layout=None if axes else "constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.add_subplot() if axes else None
-
-
-def _drawn(figure: Any, *, tight: bool = True) -> ByteImage:
-    if tight:
-        figure.tight_layout()
-    figure.canvas.draw()
-    return np.array(np.asarray(figure.canvas.buffer_rgba())[..., :3], np.uint8)
+    return picture_of(figure)
