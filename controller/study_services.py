@@ -7,7 +7,6 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,8 @@ from controller.study.keeping import save_result
 from controller.study.pages import publish
 from controller.study.photographing import DOTS_NAME, RigLight, dot_steps
 from controller.study.scenes import SCENES, Scene
-from controller.study.stagehand import RigHand, Stagehand, subject_of
+from controller.study.stagehand import RigHand, subject_of
+from controller.study.subject import Parts
 from controller.study.values import Experiment
 from hal.errors import DeviceError
 
@@ -38,17 +38,6 @@ MARK = "study.json"
 RESULTS = "study"
 """Folder of a run that holds the experiments' results."""
 POWER_DOWN_S = 10.0
-
-
-@dataclass(frozen=True, slots=True)
-class Parts:
-    """What an experiment may use besides the calibrated stage; see ``Subject.parts``."""
-
-    rig: Rig
-    context: Context
-    checked: Checked
-    calibrated: Calibrated
-    hand: Stagehand
 
 
 def study(
@@ -157,7 +146,7 @@ def _experiment(
     hand = RigHand(rig, context, calibrated, one.name, checked.prior, longest_s, disturb, make)
     light = RigLight(rig, context, calibrated, one.name, longest_s)
     subject = make(calibrated, light, context.folder)
-    subject.parts = Parts(rig, context, checked, calibrated, hand)
+    subject.parts = Parts(hand, context)
     try:
         result = one.run(subject)
     finally:

@@ -5,17 +5,21 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import scipy.sparse as sp
 
 from controller.arrays import FloatImage, Mask
 from controller.calibrate.values import Calibration, Geometry, Metapixels
+from controller.session.runner import Context
 from controller.solve.drive import Drive
 from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
 from controller.solve.targets_values import Target
 from controller.transport import LightTransport
+
+if TYPE_CHECKING:
+    from controller.study.stagehand import Stagehand
 
 Shares = sp.csr_matrix[np.float64]
 
@@ -45,13 +49,19 @@ class Light(Protocol):
         """Projector ``n`` as dots show it."""
 
 
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What a session gives besides: ``hand`` moves and calibrates the stage, ``context`` is of the step that runs."""
+
+    hand: Stagehand
+    context: Context
+
+
 @dataclass(slots=True)
 class Subject:
     """A calibrated stage.
 
     ``transport``: of all projectors, as appearances are solved with; ``size``: small, medium or paper; ``seed``
-    ``parts``: what a session gives besides, for experiments that calibrate or move things:
-    ``controller.study_services.Parts``
     """
 
     calibration: Calibration
@@ -61,8 +71,18 @@ class Subject:
     size: str = "small"
     seed: int = 1
     advance: Callable[[float, str], None] = lambda fraction, note: None
-    parts: Any = None
+    _parts: Parts | None = field(default=None, repr=False)
     _drive: Drive | None = field(default=None, repr=False)
+
+    @property
+    def parts(self) -> Parts:
+        """Given to an experiment's subject by a session; a subject of arrays alone has none."""
+        assert self._parts is not None
+        return self._parts
+
+    @parts.setter
+    def parts(self, parts: Parts) -> None:
+        self._parts = parts
 
     @property
     def drive(self) -> Drive:

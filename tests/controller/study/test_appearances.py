@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from controller.study import appearances_targets as targets
 from controller.study.appearances import LeftOut, Shown, appearances
 from controller.study.appearances_targets import LOOKS, Look, leaves, rendered
 from controller.study.measuring import Quality
-from controller.study.subject import Subject, Wanted
+from controller.study.subject import Parts, Subject, Wanted
 from controller.study.values import column
 from tests.controller.study.array_stage import ArrayLight, array_subject
 
@@ -40,7 +41,7 @@ def stage() -> Subject:
 
 def with_folder(folder: Path) -> Subject:
     subject = stage()
-    subject.parts = SimpleNamespace(context=SimpleNamespace(folder=folder))
+    subject.parts = cast(Parts, SimpleNamespace(context=SimpleNamespace(folder=folder)))
     return subject
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from controller.study.drifting import LEVELS_PX, Bumped, _criteria, drifting
 from controller.study.effort import effort
 from controller.study.robustness import TROUBLES, quantised, robustness
 from controller.study.stagehand import Again, Change
-from controller.study.subject import Dots, Subject
+from controller.study.subject import Dots, Parts, Subject
 from controller.study.values import column
 from tests.controller.study.array_stage import ArrayLight, array_subject
 
@@ -94,7 +95,7 @@ def stage() -> tuple[Subject, Clumsy]:
     hand = Clumsy(subject)
     assert isinstance(subject.light, ArrayLight)
     subject.light = Disturbed(subject.light, hand)
-    subject.parts = SimpleNamespace(hand=hand)
+    subject.parts = cast(Parts, SimpleNamespace(hand=hand))
     return subject, hand
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 from controller.study import times as experiment
-from controller.study.subject import Subject
+from controller.study.subject import Parts, Subject
 from controller.study.times import APPEARANCE, BASE, FULL, STAGES, TRANSPORT, Spent, times
 from controller.study.times_quoted import Quote, quoted, seconds_in
 from controller.study.values import column
@@ -55,7 +56,7 @@ STEPS = {
 def stage(size: str = "small") -> Subject:
     subject = array_subject()
     subject.size = size
-    subject.parts = SimpleNamespace(context=SimpleNamespace(journal=SimpleNamespace(steps=lambda: STEPS)))
+    subject.parts = cast(Parts, SimpleNamespace(context=SimpleNamespace(journal=SimpleNamespace(steps=lambda: STEPS))))
     return subject
 
 
