@@ -12,6 +12,7 @@ from controller.checking import Checked
 from controller.config import Stage
 from controller.errors import UsageError
 from controller.session.journal import Journal
+from controller.session.journal_schema import JournalError
 
 
 def stage_trust(stage: Stage) -> Trust:
@@ -22,14 +23,22 @@ def stage_trust(stage: Stage) -> Trust:
 
 
 def finished_calibrations(stage: Path) -> list[Path]:
-    """The run folders whose calibration is complete, the newest first."""
+    """The run folders whose calibration is complete, the newest first.
+
+    One whose journal is damaged counts as not complete, as for whoever resumes it; it takes no other one with it.
+    Raises JournalError for a journal that can't be used now.
+    """
     found = []
     for folder in sorted((stage / "runs").glob("*"), reverse=True):
         if not (folder / Journal.FILE).exists():
             continue
-        with Journal(folder) as journal:
-            if "calibrated" in journal.steps():
-                found.append(folder)
+        try:
+            with Journal(folder) as journal:
+                if "calibrated" in journal.steps():
+                    found.append(folder)
+        except JournalError as error:
+            if error.code not in ("journal-damaged", "journal-not-ours"):
+                raise
     return found
 
 

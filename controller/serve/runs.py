@@ -11,35 +11,48 @@ from typing import Any, Final
 
 from controller.calibrations import finished_calibrations
 from controller.checking import Checked
-from controller.errors import UsageError
+from controller.errors import UsageError, VelaturaError
 from controller.panel.kiosk import Achieved, Comparison, Grade, Results
 from controller.session.compared import all_compared, history_of, pictures_of
-from controller.session.grades import FILE, PICTURE, passes, worst_of
+from controller.session.grades import FILE, PICTURE, graded, passes, worst_of
 
 MOST: Final = 50
 _NAME: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[a-z]+")
 _PICTURES: Final = ("before", "target", "achieved", "error", "resolution")
+_UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
+"""What reading a file of figures raises that is damaged, or that is being removed."""
 
 
 def grades(stage: Path, worst_grade: float) -> tuple[Grade, ...]:
-    """Of every graded run, newest first."""
-    finished = {run.name for run in finished_calibrations(stage)}
+    """Of every graded run, newest first. Without those that can't be read: the kiosk asks for this while it plays."""
+    try:
+        finished = {run.name for run in finished_calibrations(stage)}
+    except (VelaturaError, OSError):
+        finished = set()
     errors = _errors(stage)
     found = []
     for run in sorted((stage / "runs").glob("*"), reverse=True)[:MOST]:
-        if (worst := worst_of(run)) is not None:
-            kept = run.name in finished and passes(run, worst_grade)
-            note = f"{worst[0]} is predicted with {worst[1]:.1f} % error"
-            kind = run.name.rpartition("-")[2]
-            found.append(Grade(run.name, began_s(run.name), kind, _letter(run), kept, errors.get(run.name), note))
+        try:
+            grade = _grade(run, run.name in finished, worst_grade, errors.get(run.name))
+        except _UNREADABLE:
+            continue
+        found += [] if grade is None else [grade]
     return tuple(found)
+
+
+def _grade(run: Path, finished: bool, worst_grade: float, delta_e: float | None) -> Grade | None:
+    if (worst := worst_of(run)) is None:
+        return None
+    note = f"{worst[0]} is predicted with {worst[1]:.1f} % error"
+    kept = finished and passes(run, worst_grade)
+    return Grade(run.name, began_s(run.name), run.name.rpartition("-")[2], _letter(run), kept, delta_e, note)
 
 
 def began_s(run: str) -> float:
     """Unix seconds of the beginning, as the folder's name tells in local time; 0 for another name."""
     try:
         return datetime.strptime(run[:15], "%Y%m%d-%H%M%S").astimezone().timestamp()
-    except ValueError:
+    except (ValueError, OverflowError):
         return 0.0
 
 
@@ -50,8 +63,15 @@ def _letter(run: Path) -> str:
 
 def names(stage: Path) -> tuple[str, ...]:
     """Runs that have something to show, newest first."""
-    found = [run.name for run in (stage / "runs").glob("*") if (run / FILE).exists() and _NAME.fullmatch(run.name)]
+    found = [run.name for run in (stage / "runs").glob("*") if _NAME.fullmatch(run.name) and _is_graded(run)]
     return tuple(sorted(found, reverse=True)[:MOST])
+
+
+def _is_graded(run: Path) -> bool:
+    try:
+        return graded(run) is not None
+    except _UNREADABLE:
+        return False
 
 
 def report(stage: Path, run: str, checked: Checked) -> Path:
@@ -94,7 +114,12 @@ def comparisons(stage: Path, appearances: Sequence[str]) -> tuple[Comparison, ..
 def _errors(stage: Path) -> dict[str, float]:
     """By calibration, the largest of the newest median colour differences of its appearances."""
     newest: dict[str, dict[str, float]] = {}
-    for known in all_compared(stage).values():
+    try:
+        compared = all_compared(stage)
+    except OSError:
+        # A run was removed between two looks.
+        return {}
+    for known in compared.values():
         for one in known:
             newest.setdefault(one.calibration, {})[one.name] = one.delta_e00_median
     return {calibration: max(medians.values()) for calibration, medians in newest.items()}
@@ -115,7 +140,6 @@ def results(stage: Path, run: str, worst_grade: float) -> Results:
     for name in _PICTURES:
         if (folder / f"{name}.png").exists():
             pictures[name] = folder / f"{name}.png"
-    content: dict[str, Any] = json.loads((folder / FILE).read_text())
-    figures = [(f"Error of {name}", f"{100 * values['relative_rms']:.2f} %") for name, values in content.items()]
+    figures = [(f"Error of {name}", f"{percent:.2f} %") for name, percent in (graded(folder) or {}).items()]
     grade = next((one for one in grades(stage, worst_grade) if one.run == run), None)
     return Results(run, grade, pictures, tuple(figures))

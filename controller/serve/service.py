@@ -38,6 +38,7 @@ from hal.errors import DeviceError
 STEP_S: Final = 0.25
 LOOK_S: Final = 1.0
 END_WORK_S: Final = 30.0
+AFTER_CRASH_S: Final = 5.0
 
 
 class Service:
@@ -92,19 +93,29 @@ class Service:
         notifier = Notifier()
         ready = False
         while not cancel.is_set():
-            self.conductor.step()
-            if self.devices.mains is not None:
-                self.devices.mains.want_on = self._light_wanted()
-            if self.works.job is not None:
-                self.log.keep("job", str(self.works.job.number))
-            self.lamp_history.note(self.lamps, date.today())
-            self.changed()
+            try:
+                self._decide()
+            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
+                # systemd's watchdog is not fed: what lasts is mended by a new start.
+                what = f"The conductor met an error that Velatura does not know ({type(error).__name__}: {error})."
+                self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
+                cancel.wait(AFTER_CRASH_S)
+                continue
             if not ready and self.player.view.shown is not None:
                 ready = True
                 notifier.ready()
             notifier.alive()
             cancel.wait(STEP_S)
         notifier.stopping()
+
+    def _decide(self) -> None:
+        self.conductor.step()
+        if self.devices.mains is not None:
+            self.devices.mains.want_on = self._light_wanted()
+        if self.works.job is not None:
+            self.log.keep("job", str(self.works.job.number))
+        self.lamp_history.note(self.lamps, date.today())
+        self.changed()
 
     def end(self, *, leave_lit: bool) -> None:
         """Stop the work, cool the lamps (unless they are to stay lit for the next start), and let go of everything."""
@@ -177,7 +188,7 @@ class Service:
                 except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
                     what = f"{name} met an error that Velatura does not know ({type(error).__name__}: {error})."
                     self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
-                    self._stop.wait(5.0)
+                    self._stop.wait(AFTER_CRASH_S)
                 self._stop.wait(every_s)
 
         thread = threading.Thread(target=loop, name=name, daemon=True)
