@@ -21,10 +21,10 @@ from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from plugins.player_display import DRIVER, PlayerDisplay
 from tests.controller.play.test_live_gl import OUTPUTS, TARGET, maps_of, random_live, write
-from tests.controller.play.test_live_stream import eventually
 from tests.controller.play.test_live_window import is_on_the_screen
 from tests.controller.play.test_windows import Framebuffer, framebuffer
 from tests.controller.play.wire import Frames
+from tests.waiting import eventually
 
 __all__ = ["framebuffer"]
 

@@ -19,10 +19,10 @@ from controller.play.frames import FrameFile, OutputSize
 from controller.session.live_parts import live_maps
 from controller.session.solving import Calibrated
 from hal.values import Power
-from tests.controller.play.test_live_stream import eventually
 from tests.controller.play.wire import Frames
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.program import Bench, Command, lamps, powers, processes_on, strikes, velatura, wrong_code
+from tests.waiting import eventually
 
 pytestmark = pytest.mark.timeout(1200)
 CAMERA_PX = (776, 520)

@@ -12,6 +12,7 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
+from hal.values import Power
 from plugins.emulated.board_sanyo import SanyoBoard
 from plugins.emulated.boards_binary import Ep910Board, NecBoard
 from plugins.emulated.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
@@ -23,6 +24,7 @@ from plugins.pjlink_projector import PjLinkProjector, open_pjlink_projector
 from plugins.profile_files import load_profile
 from plugins.serial_projector import SerialProjector, open_serial_projector
 from tests.plugins.pjlink_advance import NOTICE, pjlink_advance_python
+from tests.waiting import wait_for
 
 collect_ignore = [] if pjlink_advance_python() else ["test_pjlink_advance_peer.py"]
 
@@ -70,6 +72,10 @@ def hasty(text: str) -> str:
     for key, (slow_s, quick_s) in times.items():
         text = text.replace(f"{key} = {slow_s}", f"{key} = {quick_s}")
     return text
+
+
+def wait_for_power(driver: SerialProjector, power: Power) -> None:
+    wait_for(lambda: driver.status(deadline=in_seconds(30)).power is power)
 
 
 def each(names: Iterable[str], work: Callable[[str], object]) -> None:

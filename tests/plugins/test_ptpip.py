@@ -18,6 +18,7 @@ from hal.transcript import Transcript, Way, parse_transcript
 from plugins.ptp_link import LinkEvent
 from plugins.ptpip import PtpIpLink
 from plugins.ptpip_wire import PtpIpAddress
+from tests.waiting import wait_for
 
 OK = 0x2001
 ACK = struct.pack("<I", 7) + bytes(16) + "Camera\0".encode("utf-16-le") + struct.pack("<I", 0x10000)
@@ -117,13 +118,6 @@ def link(camera: Scripted) -> Iterator[PtpIpLink]:
     link.close()
 
 
-def until(condition: Callable[[], object]) -> None:
-    limit = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.005)
-
-
 def test_the_first_request_is_number_zero_and_its_data_and_parameters_come_back(
     camera: Scripted, link: PtpIpLink
 ) -> None:
@@ -181,7 +175,7 @@ def test_pings_are_answered_on_both_connections(camera: Scripted, link: PtpIpLin
     thread = threading.Thread(target=lambda: link.transact(0x1001, deadline=in_seconds(20)))
     thread.start()
     assert camera.events.recv(100) == packet(14)
-    until(lambda: (14, b"") in camera.heard)
+    wait_for(lambda: (14, b"") in camera.heard)
     thread.join()
 
 
@@ -212,7 +206,7 @@ def test_noise_on_the_event_connection_breaks_the_link(camera: Scripted, link: P
     assert camera.events is not None
     camera.events.sendall(noise)
     with pytest.raises(ProtocolError):
-        until(link.events)
+        wait_for(link.events)
     assert link.broken
 
 

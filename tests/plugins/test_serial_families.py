@@ -17,24 +17,16 @@ from plugins.emulated.board_sanyo import SanyoBoard
 from plugins.emulated.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.profile_files import shipped_profiles
-from plugins.serial_projector import SerialProjector
-from tests.plugins.conftest import each, hasty
+from tests.plugins.conftest import each, hasty, wait_for_power
 
 SOON = 30.0
 SERIAL = [name for name in shipped_profiles() if name != "pjlink"]
 SWITCHABLE = [name for name in SERIAL if name != "optoma-ep910"]
 
 
-def wait_for(driver: SerialProjector, power: Power) -> None:
-    deadline = in_seconds(SOON)
-    while driver.status(deadline=in_seconds(SOON)).power is not power:
-        assert not deadline.passed
-        time.sleep(0.02)
-
-
 def burn(pair: Any) -> None:
     pair.driver.switch_on(deadline=in_seconds(SOON))
-    wait_for(pair.driver, Power.ON)
+    wait_for_power(pair.driver, Power.ON)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +119,7 @@ def test_a_lost_acknowledgement_strikes_once_and_is_confirmed_by_the_state(open_
         pair.emulator.faults.loses_this_one = lose_the_second
         pair.driver.switch_on(deadline=in_seconds(SOON))
         assert pair.emulator.lamp.strikes == 1
-        wait_for(pair.driver, Power.ON)
+        wait_for_power(pair.driver, Power.ON)
 
     each(SWITCHABLE, lost)
 
@@ -227,7 +219,7 @@ def test_a_booting_projector_is_not_polled_into_a_wedge(open_serial: Any) -> Non
     def boot(profile: str) -> None:
         pair = open_serial(profile=profile, name=profile, timing=LampTiming(1.0, 0.4), wedges_below_s=0.02, edit=slower)
         pair.driver.switch_on(deadline=in_seconds(SOON))
-        wait_for(pair.driver, Power.ON)
+        wait_for_power(pair.driver, Power.ON)
         assert not pair.emulator.wedged
 
     each(SWITCHABLE, boot)
@@ -276,5 +268,5 @@ def test_a_sanyo_whose_lamp_failed_cools_and_then_reports_a_fault(open_serial: A
     pair = open_serial(profile="sanyo")
     burn(pair)
     pair.emulator.lamp.fail()
-    wait_for(pair.driver, Power.FAULT)
+    wait_for_power(pair.driver, Power.FAULT)
     assert pair.driver.status(deadline=in_seconds(SOON)).faults == ("error-standby",)

@@ -30,16 +30,9 @@ from plugins.emulated.optoma import OptomaQuirks
 from plugins.emulated.quick_profile import quick_profile
 from plugins.profile_files import load_profile, shipped_profiles
 from plugins.serial_projector import SerialProjector, open_serial_projector
-from tests.plugins.conftest import hasty
+from tests.plugins.conftest import hasty, wait_for_power
 
 SOON = 30.0
-
-
-def wait_for(driver: SerialProjector, power: Power) -> None:
-    deadline = in_seconds(SOON)
-    while driver.status(deadline=in_seconds(SOON)).power is not power:
-        assert not deadline.passed
-        time.sleep(0.02)
 
 
 def test_a_lost_answer_is_asked_again_and_never_mistaken_for_the_next(open_serial: Any) -> None:
@@ -178,7 +171,7 @@ def test_a_port_that_stays_away_is_gone_and_comes_back_later(open_serial: Any) -
 def test_a_starting_projector_is_not_asked_more_often_than_its_profile_allows(open_serial: Any) -> None:
     pair = open_serial(timing=LampTiming(1.5, 0.4))
     pair.driver.switch_on(deadline=in_seconds(SOON))
-    wait_for(pair.driver, Power.ON)
+    wait_for_power(pair.driver, Power.ON)
     sent = [
         entry.at_s
         for entry in parse_transcript(pair.transcript())

@@ -6,7 +6,7 @@ import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pytest
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 from tests.controller.play.conftest import OUTPUTS, START
 from tests.controller.play.wire import Frames, Wire, dark, noise, same
+from tests.waiting import eventually
 
 SIZES = [OutputSize(*output) for output in OUTPUTS]
 DYING_WRITER = """
@@ -39,15 +40,6 @@ def writer(folder: Path) -> Iterator[FrameFile]:
     (folder / "live.frame").unlink(missing_ok=True)
     with contextlib.closing(FrameFile(folder / "live.frame", SIZES)) as file:
         yield file
-
-
-def eventually(holds: Callable[[], bool]) -> bool:
-    ends = time.monotonic() + 20
-    while not holds():
-        if time.monotonic() > ends:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def live(wire: Wire) -> dict[str, Any]:

@@ -16,9 +16,10 @@ from controller.bundle.live_maps import compensate
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 from tests.controller.play.conftest import START
 from tests.controller.play.test_live_gl import OUTPUTS, TARGET, maps_of, random_live, write
-from tests.controller.play.test_live_stream import eventually, live
+from tests.controller.play.test_live_stream import live
 from tests.controller.play.test_windows import Framebuffer, framebuffer
 from tests.controller.play.wire import Wire
+from tests.waiting import eventually
 
 __all__ = ["framebuffer"]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +16,7 @@ from controller.session.machine import State
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone
 from hal.values import DeviceIdentity, PanelCapabilities
+from tests.waiting import wait_for
 
 
 class Panel:
@@ -72,33 +72,26 @@ class Desk:
         self.service.stop()
 
 
-def until(what: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 5
-    while not what():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.01)
-
-
 def test_keys_call_what_the_state_allows_and_nothing_else() -> None:
     with Desk(State.READY) as desk:
         for key in (0, 1, 3, 2, 14):
             desk.panel.pressed.put(key)
-        until(lambda: len(desk.called) == 3)
+        wait_for(lambda: len(desk.called) == 3)
         assert desk.called == ["play", "recalibrate", "stop"]
         desk.state = State.CALIBRATING
         for key in (1, 3, 2):
             desk.panel.pressed.put(key)
-        until(lambda: len(desk.called) == 4)
-        until(desk.panel.pressed.empty)
+        wait_for(lambda: len(desk.called) == 4)
+        wait_for(desk.panel.pressed.empty)
         assert desk.called[3:] == ["stop"]
 
 
 def test_pictures_follow_the_state() -> None:
     with Desk(State.OFF) as desk:
-        until(lambda: len(desk.panel.shown) == 4)
+        wait_for(lambda: len(desk.panel.shown) == 4)
         off = desk.panel.shown[0].copy()
         desk.state = State.FAULT
-        until(lambda: not np.array_equal(desk.panel.shown[0], off))
+        wait_for(lambda: not np.array_equal(desk.panel.shown[0], off))
         assert desk.panel.shown[0][2, 2].tolist() == [230, 50, 40]
 
 
@@ -113,16 +106,16 @@ def test_every_state_looks_unlike_another_and_dim_keys_are_those_that_do_nothing
 def test_an_unplugged_panel_is_told_once_and_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keys, "RETRY_S", 0.1)
     with Desk(State.READY) as desk:
-        until(lambda: len(desk.panel.shown) == 4)
+        wait_for(lambda: len(desk.panel.shown) == 4)
         desk.panel.gone = True
-        until(lambda: desk.troubles)
+        wait_for(lambda: desk.troubles)
         desk.panel.shown.clear()
         desk.panel.gone = False
-        until(lambda: len(desk.troubles) == 2)
+        wait_for(lambda: len(desk.troubles) == 2)
         assert desk.troubles[1] is None
         assert len(desk.panel.shown) == 4
         desk.panel.pressed.put(1)
-        until(lambda: desk.called)
+        wait_for(lambda: desk.called)
 
 
 def test_stopping_ends_the_thread_at_once() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,6 +25,7 @@ from plugins.emulated.usb_bus_process import UsbBusProcess
 from plugins.hid_relay import RelayBoard
 from plugins.serial_projector import open_serial_projector
 from tests.controller.session.lamp_model import Shelf
+from tests.waiting import eventually
 
 LAMP = LampTiming(warm_up_s=0.2, cool_down_s=600.0)
 QUICK = LampTiming(warm_up_s=0.2, cool_down_s=0.8)
@@ -72,16 +73,7 @@ class Hall:
 
     def answers(self, name: str, answer: bytes) -> bool:
         """Whether it gives this answer about its power before long."""
-        return until(lambda: self.say(name, b"~00124 1\r", wait_s=0.3) == answer)
-
-
-def until(true: Callable[[], bool]) -> bool:
-    ends_s = time.monotonic() + SOON_S
-    while not true():
-        if time.monotonic() > ends_s:
-            return False
-        time.sleep(0.02)
-    return True
+        return eventually(lambda: self.say(name, b"~00124 1\r", wait_s=0.3) == answer)
 
 
 @pytest.fixture(params=[LAMP])
@@ -107,8 +99,8 @@ def test_mains_cut_from_a_burning_lamp_are_damage_and_from_a_cold_one_are_none(h
     assert hall.say("left", b"~0000 1\r") == b"P\r"
     assert hall.lamp("left").light_level() > 0
     subprocess.run(["usbrelay", "MAINS_1=0", "MAINS_2=0"], timeout=SOON_S, check=True, capture_output=True)
-    assert until(lambda: hall.lamp("left").light_level() == 0)
-    assert until(lambda: ("right", False, 0) in hall.told[2:])
+    assert eventually(lambda: hall.lamp("left").light_level() == 0)
+    assert eventually(lambda: ("right", False, 0) in hall.told[2:])
     assert (hall.lamp("left").damages, hall.lamp("right").damages) == (1, 0)
     hall.board.switch(1, True, deadline=in_seconds(SOON_S))
     assert hall.answers("left", b"OK0\r")
@@ -121,14 +113,14 @@ def test_a_pulse_shorter_than_any_look_counts(hall: Hall) -> None:
     assert hall.say("left", b"~0000 1\r") == b"P\r"
     hall.bus.call("relay", "set_report", 3, 0, [0xFD, 1])
     hall.bus.call("relay", "set_report", 3, 0, [0xFF, 1])
-    assert until(lambda: hall.lamp("left").damages == 1)
+    assert eventually(lambda: hall.lamp("left").damages == 1)
 
 
 def test_a_board_that_is_unplugged_lets_go_of_its_relays(hall: Hall) -> None:
     hall.board.switch(1, True, deadline=in_seconds(SOON_S))
     assert hall.answers("left", b"OK0\r")
     hall.bus.unplug("relay")
-    assert until(lambda: not hall.wires["left"].awake)
+    assert eventually(lambda: not hall.wires["left"].awake)
     hall.bus.plug("relay")
     assert hall.board.state(1, deadline=in_seconds(SOON_S)) is False
     assert not hall.wires["left"].awake
@@ -149,7 +141,7 @@ def test_the_session_gives_mains_lights_and_cuts_them_without_damage(hall: Hall)
         for name in hall.wires
     ]  # fmt: skip
     try:
-        assert until(lambda: _answers(guards))
+        assert eventually(lambda: _answers(guards))
         light(guards, deadline=in_seconds(60), advance=lambda fraction, note: None)
         named = {guard.name: guard for guard in guards}
         with pytest.raises(DeviceRefused) as caught:
@@ -160,7 +152,7 @@ def test_the_session_gives_mains_lights_and_cuts_them_without_damage(hall: Hall)
     finally:
         for guard in guards:
             guard.close()
-    assert until(lambda: not any(wire.awake for wire in hall.wires.values()))
+    assert eventually(lambda: not any(wire.awake for wire in hall.wires.values()))
     assert [hall.lamp(name).strikes for name in hall.wires] == [1, 1]
     assert [hall.lamp(name).damages for name in hall.wires] == [0, 0]
 

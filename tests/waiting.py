@@ -1,0 +1,20 @@
+"""Waiting for what happens elsewhere: in another thread, another process, on another machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+
+def eventually(so: Callable[[], object], *, within_s: float = 30.0, every_s: float = 0.02) -> bool:
+    """Whether it becomes so; ``within_s`` is long, because a loaded machine is slow, and is waited only in vain."""
+    ends_s = time.monotonic() + within_s
+    while not so():
+        if time.monotonic() > ends_s:
+            return False
+        time.sleep(every_s)
+    return True
+
+
+def wait_for(so: Callable[[], object], *, within_s: float = 30.0, every_s: float = 0.02) -> None:
+    assert eventually(so, within_s=within_s, every_s=every_s), f"it did not happen within {within_s:g} s"
