@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from plugins.emulated.usb_bus_device import Stall, UsbNames
 from plugins.emulated.usb_bus_hid import FEATURE, INPUT, EmulatedHidDevice
@@ -27,6 +28,8 @@ class EmulatedLightSensor(EmulatedHidDevice):
         "0a01021500250675089501b1020a0e0315002700ffffff75209501b102"
         "0a01021500250675089501810 20a02021500250575089501810 20ad1041500 27ffffff7f75209501550e8102c0".replace(" ", "")
     )
+    wrongs: Mapping[str, tuple[Any, ...]] = {"lux": (300.0,), "state": (5, 7, 9)}
+    """A bright room; "initializing" for ever, "error", and a state that does not exist."""
 
     def __init__(self, *, lux: float = 0.5, serial: str = "") -> None:
         super().__init__(UsbNames(0x273F, 0x1008, "Hughski Ltd.", "ColorHugALS", serial))

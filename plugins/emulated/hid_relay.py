@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 from plugins.emulated.usb_bus_device import Stall, UsbNames
 from plugins.emulated.usb_bus_hid import FEATURE, EmulatedHidDevice
@@ -19,6 +20,7 @@ class EmulatedRelayBoard(EmulatedHidDevice):
     """
 
     hid_descriptor = bytes.fromhex("0600ff0901a1010902150026ff00750895080902b102c0")
+    wrongs: Mapping[str, tuple[Any, ...]] = {"stuck": ([1], [1, 2])}
 
     def __init__(self, *, channels: int = 2, serial: str = "BITFT") -> None:
         super().__init__(UsbNames(0x16C0, 0x05DF, "www.dcttech.com", f"USBRelay{channels}"))

@@ -30,8 +30,8 @@ _WIRE: Final[dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]] =
     "busy": ({"busy": True}, {"busy": False}, {}),
 }
 """What to set at the beginning and at the end of an event, and for an event of a single answer."""
-_LAMP: Final = ("lamp-failure", "overheat")
-DEEDS: Final = (*_WIRE, "slow", *_LAMP, "unplug")
+LAMP_DEEDS: Final = ("lamp-failure", "overheat")
+DEEDS: Final = (*_WIRE, "slow", *LAMP_DEEDS, "unplug")
 _NEVER: Final = -1.0
 
 
@@ -161,7 +161,7 @@ class ScenarioPlayer:
 
     def _deed(self, event: Event) -> tuple[Callable[[], None], Callable[[], None] | None]:
         """How an event begins and ends."""
-        if event.do in _LAMP:
+        if event.do in LAMP_DEEDS:
             if self._lamp is None:
                 return (lambda: None), None
             return (self._lamp.fail if event.do == "lamp-failure" else self._lamp.overheat), self._lamp.mend

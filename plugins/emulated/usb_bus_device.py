@@ -5,9 +5,9 @@ from __future__ import annotations
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 BULK, INTERRUPT = 2, 3
 _DEVICE, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT, _HID, _REPORT = 1, 2, 3, 4, 5, 0x21, 0x22
@@ -133,6 +133,8 @@ class EmulatedUsbDevice:
     endpoints: tuple[Endpoint, ...] = ()
     hid_descriptor: bytes = b""
     kernel_driver: str = ""
+    wrongs: Mapping[str, tuple[Any, ...]] = {}
+    """Knobs of its own, besides ``faults``, and what each may be turned to for something to go wrong."""
 
     def __init__(self, names: UsbNames) -> None:
         self.names = names

@@ -59,6 +59,10 @@ class UsbBusProcess:
         """Play the events of a TOML scenario (see ``plugins.emulated.scenario``) on a device."""
         self._ask({"do": "play", "name": name, "scenario": scenario})
 
+    def rest(self, name: str) -> None:
+        """End the scenario of a device; what it has done stays done."""
+        self._ask({"do": "rest", "name": name})
+
     def told(self, name: str) -> list[list[Any]]:
         """What a scenario has done so far: [seconds, deed] each."""
         told: list[list[Any]] = self._ask({"do": "told", "name": name})
@@ -154,6 +158,8 @@ class _Commands:
         match command["do"]:
             case "play":
                 self._play(name, device, command["scenario"])
+            case "rest":
+                self._rest(name)
             case "told":
                 return self._scenarios[name].told
             case "plug":
@@ -184,9 +190,12 @@ class _Commands:
             self._bus.unplug(device)
         self._devices.clear()
 
-    def _play(self, name: str, device: EmulatedUsbDevice, text: str) -> None:
+    def _rest(self, name: str) -> None:
         if name in self._scenarios:
             self._scenarios.pop(name).close()
+
+    def _play(self, name: str, device: EmulatedUsbDevice, text: str) -> None:
+        self._rest(name)
         self._scenarios[name] = UsbScenario(
             parse_scenario(text, file=name),
             device,

@@ -6,9 +6,12 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final
 
+from plugins.emulated import scenario as scripts
 from plugins.emulated.scenario import Scenario, ScenarioPlayer
 from plugins.emulated.usb_bus_device import EmulatedUsbDevice
 
+DEEDS: Final = tuple(deed for deed in scripts.DEEDS if deed not in scripts.LAMP_DEEDS)
+"""What of ``scenario.DEEDS`` can happen to a USB device."""
 _FOR_GOOD: Final = 1_000_000_000
 _TICK_S: Final = 0.02
 _COUNTS: Final = {"busy": "stalls", "garbage": "garble", "cut": "cut", "drop": "drop", "garble": "garble"}
@@ -67,6 +70,7 @@ class UsbScenario:
         self._later(self._plug)
 
     def close(self) -> None:
+        self._device.on_control = lambda count: None
         self._stopped.set()
         self._thread.join()
 

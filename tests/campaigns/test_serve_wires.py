@@ -1,26 +1,40 @@
 from __future__ import annotations
 
-import random
 from pathlib import Path
 
 import pytest
 
-from tests.campaigns.serve_wires import STEPS, cases, judge
-from tests.campaigns.wired_kiosk import WiredKiosk, prepare_wired
+from tests.campaigns.serve_wires import STEPS, campaign, cases, drawn
+from tests.campaigns.usb_faults import usb_faults
 
-COUNT = 2
-"""Of some hundred; all of them: ``python -m tests.campaigns.serve_wires``."""
+SEED = 6
+ON_USB = frozenset(fault.name for fault in usb_faults())
+
+
+def short(*, usb: bool) -> int:
+    """The first case on a wire, or on USB, that needs little waiting; all of them: ``tests.campaigns.serve_wires``."""
+    matrix = cases()
+    quick = (number for number in drawn(SEED) if not (matrix[number][1].lasts or matrix[number][1].told))
+    return next(
+        number for number in quick if matrix[number][0] != "calibrating" and (matrix[number][1].name in ON_USB) is usb
+    )
 
 
 @pytest.mark.timeout(900)
 def test_faults_on_real_wires_end_explained_and_are_mended(tmp_path: Path) -> None:
-    short = [(step, fault) for step, fault in cases() if not fault.lasts and step != "calibrating"]
-    with WiredKiosk(prepare_wired(tmp_path)) as kiosk:
-        for step, fault in random.Random(6).sample(short, COUNT):
-            judge(kiosk, step, fault)
+    rows = campaign([short(usb=False), short(usb=True)], 1, tmp_path)
+    assert [row["wrong"] for row in rows] == ["", ""], rows
 
 
 def test_every_emulated_devices_knobs_are_rows_of_the_matrix_at_every_step() -> None:
     names = {fault.name for _, fault in cases()}
     assert {"wire silent=True", "camera lost_events=1", "unplug of left for good", "player hung"} <= names
+    assert {"board stuck=[1]", "light lux=300.0", "keys silent=True", "unplug of keys for good"} <= names
     assert len(cases()) == len(names) * len(STEPS)
+
+
+def test_a_part_of_a_campaign_is_drawn_in_the_same_order_whatever_else_there_is() -> None:
+    matrix, everything = cases(), drawn(SEED)
+    assert sorted(everything) == list(range(len(matrix)))
+    of_the_board = [number for number in everything if matrix[number][1].name.startswith("board")]
+    assert drawn(SEED, "board") == of_the_board

@@ -1,36 +1,83 @@
-"""A kiosk's service on real drivers: pseudo terminals, TCP, a player process; every device an emulator with knobs."""
+"""A kiosk's service on real drivers: pseudo terminals, TCP, USB, a player process; every device an emulator with knobs.
+
+The devices on USB are there where this very process runs under the preload library, with a bus (``usb_environment``).
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import signal
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from benchmarks.serve import install_grey
+from controller.serve import service as services
+from controller.serve.conductor import Limits
 from controller.serve.service import Service, serving
 from controller.session.machine import State
 from plugins.emulated.lamp import LampTiming
+from plugins.emulated.mains import Mains
 from plugins.emulated.ptp_body import CameraNames
 from plugins.emulated.ptp_camera import EmulatedPtpCamera
 from plugins.emulated.serial_projector import EmulatedSerialProjector
-from plugins.emulated.truth import read_truth
+from plugins.emulated.truth import MainsTruth, read_truth
+from plugins.emulated.usb_bus import environment
+from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
 from tests.campaigns.kills import children
 from tests.campaigns.mini_stage import HonestLamp, SteadyWorld, prepare_mini
 
 POLL_S: Final = 0.02
 STEADY_S: Final = 3.0
 """A state that has lasted so long is settled."""
+BOOT_S: Final = 0.3
+COOL_S: Final = 100.0
+"""For so long a lamp may not go off before that is a fault: 900 s in a kiosk, and nothing else happens in between."""
+USB: Final[Mapping[str, Mapping[str, Any]]] = {
+    "board": {"kind": "relay", "channels": 2, "serial": "MAINS"},
+    "light": {"kind": "light", "lux": 0.5},
+    "keys": {"kind": "keys"},
+}
+_TABLES: Final = """
+[[relays]]
+name = "board"
+driver = "usb-relay"
+serial = "MAINS"
+boot_s = 0.5
+[[relays.mains]]
+channel = 1
+feeds = ["left"]
+[[relays.mains]]
+channel = 2
+feeds = ["right"]
+
+[light_sensor]
+driver = "colorhug-als"
+most_lux = 2.0
+
+[key_panel]
+driver = "stream-deck"
+"""
 
 
-def prepare_wired(out: Path) -> Path:
+@contextlib.contextmanager
+def usb_environment() -> Iterator[dict[str, str]]:
+    """What a kiosk's process must have in its environment, so that it has USB devices."""
+    with tempfile.TemporaryDirectory(prefix="usb", dir="/tmp") as folder:
+        yield environment(Path(folder))
+
+
+def prepare_wired(out: Path, *, usb: bool = False) -> Path:
     """A stage with a bundle to play and its rays cast, to be copied for as many kiosks as there shall be."""
     stage = prepare_mini(out)
+    if usb:
+        with (stage / "stage.toml").open("a", encoding="utf-8") as known:
+            known.write(_TABLES)
     install_grey(stage)
     truth = read_truth(stage)
     with SteadyWorld(stage, truth, [HonestLamp(LampTiming(1.0, 1.0)) for _ in truth.projectors]):
@@ -38,7 +85,10 @@ def prepare_wired(out: Path) -> Path:
 
 
 class WiredKiosk:
-    """One kiosk. Knobs: ``projectors`` and ``lamps`` by name, ``camera``, and the player's process."""
+    """One kiosk. Knobs: ``projectors`` and ``lamps`` by name, ``camera``, ``bus``, and the player's process.
+
+    ``well``: what the knobs of the USB devices' own stand at while nothing is wrong.
+    """
 
     def __init__(self, stage: Path) -> None:
         self.stage = stage
@@ -51,8 +101,12 @@ class WiredKiosk:
             lamp.told = lambda sin, name=name: self.sins.append(f"{name} {sin}")  # type: ignore[misc]
         self._world = SteadyWorld(stage, truth, list(self.lamps.values()))
         self.projectors = {
-            one.name: EmulatedSerialProjector(stage / one.port, self.lamps[one.name]) for one in truth.projectors
+            one.name: EmulatedSerialProjector(stage / one.port, self.lamps[one.name], boot_s=BOOT_S)
+            for one in truth.projectors
         }
+        self.bus: UsbBusProcess | None = None
+        self.well: dict[str, dict[str, Any]] = {}
+        self._damages = 0
         self.camera = EmulatedPtpCamera(
             self._world.expose, command_port=truth.camera.command_port, event_port=truth.camera.event_port,
             names=CameraNames(serial=truth.camera.serial_number), time_scale=0.0, raw=truth.camera.raw,
@@ -67,6 +121,9 @@ class WiredKiosk:
             for projector in self.projectors.values():
                 stack.enter_context(projector)
             stack.enter_context(self.camera)
+            if "UMOCKDEV_DIR" in os.environ:
+                self.bus = stack.enter_context(self._usb(Path(os.environ["UMOCKDEV_DIR"])))
+            vars(services)["Limits"] = lambda power_up_s, cool_down_s: Limits(power_up_s, COOL_S)
             self.service = stack.enter_context(serving(self.stage, threading.Event()))
             self.service.changed = self._beat
             self._stack = stack.pop_all()
@@ -76,6 +133,30 @@ class WiredKiosk:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    @contextlib.contextmanager
+    def _usb(self, folder: Path) -> Iterator[UsbBusProcess]:
+        """The bus with its devices, and mains that go through its relays."""
+        with UsbBusProcess(folder) as bus:
+            for name, settings in USB.items():
+                bus.add(name, **settings)
+                own = getattr(KINDS[settings["kind"]], "wrongs", {})
+                self.well[name] = {knob: bus.get(name, knob) for knob in own}
+            circuits = [MainsTruth("board", channel, (name,)) for channel, name in enumerate(self.projectors, start=1)]
+
+            def moves(relay: str, count: int) -> list[tuple[int, bool]]:
+                return [(channel, closed) for channel, closed in bus.call(relay, "moves_since", count)]
+
+            with Mains(circuits, self.projectors, moves, self._fed):
+                yield bus
+
+    def _fed(self, projector: str, on: bool, _: int) -> None:
+        """A hot lamp that loses its mains is a sin of ours, unless the board was unplugged."""
+        before, self._damages = self._damages, sum(lamp.damages for lamp in self.lamps.values())
+        if self._damages > before and self.bus is not None:
+            with contextlib.suppress(RuntimeError):
+                self.bus.bus("address_of", "board")
+                self.sins.append(f"the mains of {projector} were cut while its lamp was hot")
 
     def _beat(self) -> None:
         now_s = time.monotonic()

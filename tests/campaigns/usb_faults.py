@@ -1,0 +1,96 @@
+"""What goes wrong on the USB of a kiosk: every knob and deed of the emulated relay board, light sensor and keys.
+
+The lists are the emulators' own: ``UsbFaults``, the ``wrongs`` of each kind of device, and what a script may do on USB.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, Final
+
+from plugins.emulated.usb_bus_device import EmulatedUsbDevice, UsbFaults
+from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
+from plugins.emulated.usb_bus_scenario import DEEDS
+from tests.campaigns.wired_faults import FOR_S, SLOW_S, Fault, Turn, goes_on, mend_projectors, values_of
+from tests.campaigns.wired_kiosk import USB, WiredKiosk
+
+WORDS: Final = {"board": "relay", "light": "light sensor", "keys": "key panel"}
+"""What a technician calls each of them."""
+ASKED: Final = ("board", "light")
+"""The devices that are asked something again and again, so that one which does not answer is noticed at any step."""
+
+
+def usb_faults() -> Iterator[Fault]:
+    """Every knob and deed of every device of the kiosk's bus."""
+    for name in USB:
+        yield from _wire(name)
+        yield from _wrongs(name)
+        yield from _deeds(name)
+
+
+def _wire(name: str) -> Iterator[Fault]:
+    for knob in dataclasses.fields(UsbFaults):
+        for value in values_of(knob):
+            blocks = goes_on(value) and not isinstance(value, float) and name in ASKED
+            turn, told = _turn(name, f"faults.{knob.name}", value), WORDS[name] if blocks else ""
+            # Who was told has noticed.
+            yield Fault(f"{name} {knob.name}={value}", turn, mend_usb, goes_on(value) and not blocks, told)
+
+
+def _wrongs(name: str) -> Iterator[Fault]:
+    kind = KINDS[USB[name]["kind"]]
+    assert isinstance(kind, type)
+    assert issubclass(kind, EmulatedUsbDevice)
+    for knob, values in kind.wrongs.items():
+        for value in values:
+            yield Fault(f"{name} {knob}={value}", _turn(name, knob, value), mend_usb)
+
+
+def _deeds(name: str) -> Iterator[Fault]:
+    for deed in DEEDS:
+        for for_s in (FOR_S, 0.0):
+            event = f'[[event]]\ndo = "{deed}"\nat_s = 0.0\nfor_s = {for_s}\ndelay_s = {SLOW_S}\n'
+
+            def strike(kiosk: WiredKiosk, name: str = name, event: str = event) -> None:
+                _bus(kiosk).play(name, event)
+
+            last = f"for {for_s:g} s" if for_s else "for good"
+            away = deed == "unplug" and not for_s
+            yield Fault(f"{deed} of {name} {last}", strike, mend_usb, not for_s, WORDS[name] if away else "")
+
+
+def _turn(name: str, knob: str, value: Any) -> Turn:
+    return lambda kiosk: _bus(kiosk).set(name, knob, value)
+
+
+def mend_usb(kiosk: WiredKiosk) -> None:
+    """Whole cables, boards and sensors. Nothing on a kiosk without USB."""
+    if kiosk.bus is None:
+        return
+    for name in USB:
+        kiosk.bus.rest(name)
+        for knob in dataclasses.fields(UsbFaults):
+            kiosk.bus.set(name, f"faults.{knob.name}", knob.default)
+        for knob_name, value in kiosk.well[name].items():
+            kiosk.bus.set(name, knob_name, value)
+        kiosk.bus.plug(name)
+    mend_projectors(kiosk)  # the mains went with the board
+
+
+def usb_well(kiosk: WiredKiosk) -> str:
+    """What is not in use again on a playing kiosk; "" for nothing."""
+    if kiosk.bus is None:
+        return ""
+    devices = kiosk.service.devices
+    wrong = [keeper.problem.text for keeper in (devices.mains, devices.sensor) if keeper and keeper.problem]
+    if kiosk.bus.get("board", "state") != [True, True]:
+        wrong.append("A projector has no mains.")
+    if not kiosk.bus.call("keys", "picture_of", 0):
+        wrong.append("The keys are dark.")
+    return " ".join(wrong)
+
+
+def _bus(kiosk: WiredKiosk) -> UsbBusProcess:
+    assert kiosk.bus is not None, "this kiosk has no USB"
+    return kiosk.bus
