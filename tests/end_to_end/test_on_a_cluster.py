@@ -11,8 +11,8 @@ import pytest
 from controller.bundle.reader import Bundle
 from tests.controller.cluster.machines import machines
 from tests.end_to_end.conftest import FinishedDemo
+from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import Command, velatura
-from tests.end_to_end.test_takeover import copied
 
 pytestmark = pytest.mark.timeout(900)
 TINTS = {"warm": [0.9, 0.6, 0.4], "cold": [0.4, 0.6, 0.9]}

@@ -12,8 +12,8 @@ import pytest
 from controller.demo.bench_process import BenchProcess
 from controller.serve.control import ask
 from tests.end_to_end.conftest import FinishedDemo
+from tests.end_to_end.kiosk import codes, copied, wait_for
 from tests.end_to_end.program import Command, velatura
-from tests.end_to_end.test_takeover import codes, wait_for
 
 pytestmark = pytest.mark.timeout(600)
 NAME = "gloss"
@@ -22,8 +22,7 @@ NAME = "gloss"
 def test_the_kiosk_photographs_an_appearance_and_finds_what_the_demo_found(
     finished_demo: FinishedDemo, tmp_path: Path
 ) -> None:
-    stage, left = tmp_path / "stage", shutil.ignore_patterns("run")
-    shutil.copytree(finished_demo.stage, stage, symlinks=True, ignore=left)
+    stage = copied(finished_demo.stage, tmp_path / "stage")
     rows = json.loads((finished_demo.out / "report.json").read_text())["appearances"]
     (then,) = (row for row in rows if row["name"] == NAME)
     with BenchProcess(stage, cancel=threading.Event()), Command("serve", stage, "--no-panel") as kiosk:

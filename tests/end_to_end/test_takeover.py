@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +13,13 @@ from controller.arrays import FloatImage, load_arrays
 from controller.calibrations import finished_calibration
 from controller.checking import check_stage
 from controller.demo.bench_process import BenchProcess
-from controller.errors import VelaturaError
 from controller.serve.control import ask
 from controller.services import make_appearances
 from controller.session.progress import Silent
 from controller.session.solving import Calibrated
 from tests.end_to_end.conftest import FinishedDemo
-from tests.end_to_end.program import LONGEST_S, Command
+from tests.end_to_end.kiosk import codes, copied, wait_for
+from tests.end_to_end.program import Command
 
 pytestmark = pytest.mark.timeout(600)
 NAME, DEAD = "checkerboard", "above"
@@ -34,15 +31,6 @@ on_message = 12
 """
 
 
-def copied(stage: Path, to: Path) -> Path:
-    """What is only ever replaced is linked; databases and mapped files are written to."""
-
-    def keep(source: str, target: str) -> None:
-        (os.link if source.endswith((".npz", ".dng")) else shutil.copy2)(source, target)
-
-    return Path(shutil.copytree(stage, to, copy_function=keep, ignore=shutil.ignore_patterns("run")))
-
-
 def shown(stage: Path) -> list[bool]:
     """Whether each output shows anything."""
     outputs = check_stage(stage).stage.tables.display.outputs
@@ -52,20 +40,6 @@ def shown(stage: Path) -> list[bool]:
         lit.append(bool(np.any(data[at : at + size])))
         at += size + -size % 4096
     return lit
-
-
-def wait_for(what: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + LONGEST_S
-    while not what():
-        assert time.monotonic() < until_s
-        time.sleep(0.2)
-
-
-def codes(stage: Path) -> list[str]:
-    try:
-        return [row["code"] for row in ask(stage, "events")]
-    except VelaturaError:  # it is not there yet
-        return []
 
 
 def error_of(seen: FloatImage, target: FloatImage, where: np.ndarray[tuple[int, int], np.dtype[np.bool_]]) -> float:
