@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from hal.deadline import in_seconds
 from hal.values import ExposureSettings
 from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
@@ -84,6 +86,18 @@ def running(flavour: Flavour, *, studio: Studio | None = None, **options: object
             yield Rig(emulator, studio, driver)
         finally:
             driver.close()
+
+
+@pytest.fixture(params=FLAVOURS)
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with running(request.param) as rig:
+        yield rig
+
+
+@pytest.fixture(params=["eos-new", "eos-old"])
+def card_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with running(request.param, to_card=True) as rig:
+        yield rig
 
 
 def when(so: Callable[[], bool], do: Callable[[], object]) -> None:

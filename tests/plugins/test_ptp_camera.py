@@ -20,19 +20,9 @@ from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
 from plugins.ptp_camera import DRIVER, open_camera
 from plugins.ptp_still import PtpCamera
 from plugins.ptpip_wire import PtpIpAddress
-from tests.plugins.ptp_rig import FLAVOURS, Rig, Studio, left_behind, running
+from tests.plugins.ptp_rig import Rig, Studio, card_rig, left_behind, rig, running
 
-
-@pytest.fixture(params=FLAVOURS)
-def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with running(request.param) as rig:
-        yield rig
-
-
-@pytest.fixture(params=["eos-new", "eos-old"])
-def card_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with running(request.param, to_card=True) as rig:
-        yield rig
+__all__ = ["card_rig", "rig"]
 
 
 class EveryFlavour(CameraConformance):

@@ -25,24 +25,26 @@ from hal.values import ExposureSettings
 from plugins.emulated.ptp_body import CameraNames
 from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
 from plugins.ptp_camera import open_camera
-from tests.plugins.ptp_rig import FLAVOURS, HASTY, SHORT, Rig, Studio, connect, left_behind, running, when
+from tests.plugins.ptp_rig import (
+    FLAVOURS,
+    HASTY,
+    SHORT,
+    Rig,
+    Studio,
+    card_rig,
+    connect,
+    left_behind,
+    rig,
+    running,
+    when,
+)
 
-
-@pytest.fixture(params=FLAVOURS)
-def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with running(request.param) as rig:
-        yield rig
+__all__ = ["card_rig", "rig"]
 
 
 @pytest.fixture(params=FLAVOURS)
 def hasty_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     with running(request.param, timing=HASTY) as rig:
-        yield rig
-
-
-@pytest.fixture(params=["eos-new", "eos-old"])
-def card_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with running(request.param, to_card=True) as rig:
         yield rig
 
 

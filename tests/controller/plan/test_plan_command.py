@@ -12,15 +12,7 @@ import pytest
 
 from controller.errors import UsageError
 from controller.plan_services import plan, write_example
-from controller.session.progress import Progress, Silent
-
-
-class Kept(Silent):
-    def __init__(self) -> None:
-        self.fractions: list[float] = []
-
-    def progress(self, now: Progress) -> None:
-        self.fractions.append(now.fraction)
+from tests.controller.session.listening import Listening
 
 
 def test_the_example_with_a_mesh_becomes_a_page_and_figures(tmp_path: Path, ball: Path) -> None:
@@ -32,10 +24,11 @@ def test_the_example_with_a_mesh_becomes_a_page_and_figures(tmp_path: Path, ball
     text = re.sub(r"positions_m = .*", "positions_m = [[0.0, -0.2, -1.5]]", text)
     file.write_text(text + "points = 500\n")
     shutil.copy(ball, tmp_path / "ball.ply")
-    told = Kept()
+    told = Listening()
     result = plan(file=file, out=tmp_path / "out", reporter=told, cancel=threading.Event())
-    assert told.fractions == sorted(told.fractions)
-    assert told.fractions[-1] == 1.0
+    fractions = [now.fraction for now in told.told]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
     figures = json.loads(Path(result["figures"]).read_text())
     assert result["quality"] == pytest.approx(figures["quality"], abs=1e-3)
     assert len(figures["projectors"]) == 3

@@ -2,18 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from controller.session.progress import Level, Phase, Progress, Tracker
-
-
-class Listening:
-    def __init__(self) -> None:
-        self.told: list[Progress] = []
-
-    def progress(self, now: Progress) -> None:
-        self.told.append(now)
-
-    def say(self, text: str, level: Level = Level.INFO) -> None:
-        """Not needed here."""
+from controller.session.progress import Phase, Tracker
+from tests.controller.session.listening import Listening
 
 
 class Hands:

@@ -9,22 +9,12 @@ import pytest
 from controller.errors import WorkError
 from controller.session.journal import Journal
 from controller.session.machine import Event, Machine, State
-from controller.session.progress import Level, Phase, Progress
+from controller.session.progress import Phase
 from controller.session.runner import Context, Runner, Step
 from controller.storage import write_atomically
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceGone
-
-
-class Listening:
-    def __init__(self) -> None:
-        self.told: list[Progress] = []
-
-    def progress(self, now: Progress) -> None:
-        self.told.append(now)
-
-    def say(self, text: str, level: Level = Level.INFO) -> None:
-        """Not needed here."""
+from tests.controller.session.listening import Listening
 
 
 @pytest.fixture

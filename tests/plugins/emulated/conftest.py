@@ -14,6 +14,16 @@ from plugins.emulated.truth import BenchTruth, Lens, ObjectTruth
 CAMERA_PX, PROJECTOR_PX = (96, 64), (70, 52)
 
 
+class Clock:
+    """Turned by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
 def resized(lens: Lens, size_px: tuple[int, int]) -> Lens:
     share = size_px[0] / lens.size_px[0]
     x, y = ((at + 0.5) * share - 0.5 for at in lens.centre_px)
@@ -28,6 +38,11 @@ def shrunk(truth: BenchTruth) -> BenchTruth:
         camera=dataclasses.replace(truth.camera, lens=resized(truth.camera.lens, CAMERA_PX)),
         projectors=tuple(dataclasses.replace(p, lens=resized(p.lens, PROJECTOR_PX)) for p in truth.projectors),
     )
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
 
 
 @pytest.fixture(scope="session")

@@ -15,19 +15,7 @@ from plugins.emulated.boards_text import (
     PanasonicBoard,
 )
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
+from tests.plugins.emulated.conftest import Clock
 
 
 @pytest.fixture

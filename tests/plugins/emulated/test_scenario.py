@@ -15,14 +15,7 @@ from plugins.emulated.faults import Faults
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.scenario import ScenarioPlayer, parse_scenario, read_scenario
 from plugins.emulated.serial_projector import EmulatedSerialProjector
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now_s = 50.0
-
-    def __call__(self) -> float:
-        return self.now_s
+from tests.plugins.emulated.conftest import Clock
 
 
 class Plugged:

@@ -18,7 +18,7 @@ from plugins.emulated.shot import ShotSettings
 from plugins.emulated.usb_bus_process import UsbBusProcess
 from plugins.ptp_still import PtpCamera
 from plugins.ptp_usb_bus import UsbAddress, UsbFinder
-from tests.plugins.ptp_rig import PATIENT, SHORT
+from tests.plugins.ptp_rig import FLAVOURS, PATIENT, SHORT
 
 SIZE = 300_000
 NAMES = ("camera", "other", "relay", "a", "b")
@@ -74,3 +74,9 @@ def running(bus: UsbBusProcess, flavour: str, *, address: str = "usb:", **option
         yield Rig(bus, driver)
     finally:
         driver.close()
+
+
+@pytest.fixture(params=FLAVOURS)
+def rig(request: pytest.FixtureRequest, bus: UsbBusProcess) -> Iterator[Rig]:
+    with running(bus, request.param) as rig:
+        yield rig

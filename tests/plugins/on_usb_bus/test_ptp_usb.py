@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,18 +13,10 @@ from hal.values import ExposureSettings, FileKind
 from plugins.emulated.usb_bus_process import UsbBusProcess
 from plugins.ptp_camera import open_camera
 from plugins.ptp_usb_bus import UsbAddress, UsbFinder, usb_cameras
-from tests.plugins.on_usb_bus.camera_rig import SIZE, Rig, bus, lasting_bus, running
+from tests.plugins.on_usb_bus.camera_rig import SIZE, Rig, bus, lasting_bus, rig, running
 from tests.plugins.ptp_rig import SHORT
 
-__all__ = ["bus", "lasting_bus"]
-
-FLAVOURS = ("generic", "eos-new", "eos-old")
-
-
-@pytest.fixture(params=FLAVOURS)
-def rig(request: pytest.FixtureRequest, bus: UsbBusProcess) -> Iterator[Rig]:
-    with running(bus, request.param) as rig:
-        yield rig
+__all__ = ["bus", "lasting_bus", "rig"]
 
 
 def test_a_picture_has_the_bytes_of_the_camera(rig: Rig, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,18 +12,10 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceGone, DeviceTimeout
 from hal.values import ExposureSettings
 from plugins.emulated.usb_bus_process import UsbBusProcess
-from tests.plugins.on_usb_bus.camera_rig import Rig, bus, lasting_bus, running
-from tests.plugins.ptp_rig import HASTY, SHORT, when
+from tests.plugins.on_usb_bus.camera_rig import Rig, bus, lasting_bus, rig, running
+from tests.plugins.ptp_rig import FLAVOURS, HASTY, SHORT, when
 
-__all__ = ["bus", "lasting_bus"]
-
-FLAVOURS = ("generic", "eos-new", "eos-old")
-
-
-@pytest.fixture(params=FLAVOURS)
-def rig(request: pytest.FixtureRequest, bus: UsbBusProcess) -> Iterator[Rig]:
-    with running(bus, request.param) as rig:
-        yield rig
+__all__ = ["bus", "lasting_bus", "rig"]
 
 
 @pytest.mark.parametrize("fault", ["drop_after_exposure", "drop_in_transfer", "wrong_lengths"])
