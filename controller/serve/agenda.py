@@ -21,6 +21,7 @@ class Agenda:
         self._monotonic, self._patience_s = monotonic, patience_s
         self._waiting: tuple[Request | None, float] = (None, 0.0)
         self._queue: deque[Request] = deque()
+        self._cancelled = False
 
     @property
     def head(self) -> Request | None:
@@ -53,9 +54,12 @@ class Agenda:
         return True
 
     def cancel(self) -> None:
-        """Drop what waits, and ask what runs to end."""
-        self._settle("cancelled")
+        """Drop what waits, and ask what runs to end: nothing follows from it any more, should it end well."""
+        if self._queue:
+            self._settle("cancelled")
+            self._log.tell(_CANCELLED)
         if self._works.running is not None:
+            self._cancelled = True
             self._works.cancel()
 
     def take_finished(self) -> Finished | None:
@@ -64,6 +68,10 @@ class Agenda:
         if finished is None:
             return None
         self._log.tell(finished.outcome)
+        if self._cancelled and finished.then:
+            finished = replace(finished, then=())
+            self._log.tell(_CANCELLED)
+        self._cancelled = False
         key = finished.request.key
         if key and not any(one.key == key for one in finished.then):
             self._log.mark_done(key, finished.outcome.code)
@@ -128,6 +136,7 @@ class Agenda:
         self._queue.clear()
 
 
+_CANCELLED: Final = Decision("work-cancelled", "Work that waited was cancelled.")
 _TOO_LATE: Final = Decision(
     "lamps-not-steady", "The work was given up: the lamps were not lit and steady in time.",
     "See the projectors' own problems, or give them a longer power_up_s under [safety].", "error",

@@ -91,7 +91,8 @@ class Conductor:
     @property
     def working(self) -> bool:
         """Whether work runs or waits."""
-        return self._agenda.head is not None
+        with self._lock:
+            return self._agenda.head is not None
 
     def open(self) -> None:
         """Play until the schedule says otherwise the next time."""

@@ -27,26 +27,26 @@ def ask_and_follow(
 ) -> Mapping[str, Any]:
     """Ask for a job, and return what came of it; ``cancel`` cancels the job, too.
 
-    Raises UsageError("not-serving"), what the kiosk refuses the job with, WorkError("job-failed") with the kiosk's own
-    sentence, and Cancelled.
-    """  # fmt: skip
+    Raises UsageError("not-serving"), what the kiosk refuses the job with, WorkError("job-given-up") where it will
+    never begin (the lamps did not light, somebody cancelled it, the kiosk began anew), WorkError("job-failed") with the
+    kiosk's own sentence, and Cancelled.
+    """
     number, began_s = int(ask(stage, op, **arguments)["number"]), time.monotonic()
     last: object = None
     while True:
-        job = ask(stage, "status")["job"]
-        if job is not None and job["number"] >= number:
-            if job["number"] > number or job["ended"]:
-                return _ended(job)
-            if job["steps"] != last and job["steps"]:
-                last = job["steps"]
-                reporter.progress(_progress(job, time.monotonic() - began_s))
+        job = ask(stage, "job", number=number)
+        if job is not None and job["ended"]:
+            return _ended(job)
+        if job is not None and job["steps"] != last and job["steps"]:
+            last = job["steps"]
+            reporter.progress(_progress(job, time.monotonic() - began_s))
         if cancel.wait(every_s):
             ask(stage, "cancel")
             raise Cancelled
 
 
 def _ended(job: Mapping[str, Any]) -> Mapping[str, Any]:
-    if job["ended"] and job["failed"]:
+    if job["failed"]:
         raise WorkError("job-failed", what=f"{job['name']}: {job['outcome']}",
                         remedy="`velatura events` tells what was decided and why.")  # fmt: skip
     return {"job": job["name"], "outcome": job["outcome"], **({"run": job["run"]} if job["run"] else {})}

@@ -148,12 +148,23 @@ class StageKiosk:
             raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
                              remedy=f"It is one of {', '.join(service.checked.names)}.")  # fmt: skip
         asked = Request(kind, light=True) if projector is None else Request("projector", True, arguments=(projector,))
-        service.ask(asked)
-        return self._job(service, title_of(asked))
+        return self._begun(service, asked, title_of(asked))
 
-    def _job(self, service: Service, name: str) -> Job:
-        last = service.works.job
-        return Job(1 if last is None else last.number + 1, name)
+    def _begun(self, service: Service, asked: Request, name: str) -> Job:
+        # Before it is asked for: it may begin at once.
+        number = service.works.number + 1
+        service.ask(asked)
+        return Job(number, name)
+
+    def job(self, number: int) -> Job | None:
+        """A job that was asked for; None while it waits. Raises WorkError("job-given-up") where it never will begin."""
+        service = self.service
+        # In this order: what is neither waiting nor running, and yet not known then, was given up.
+        waits = service.conductor.working
+        if (found := service.works.known(number)) is None and not waits:
+            raise WorkError("job-given-up", what="The kiosk gave the work up before it began.",
+                            remedy="`velatura events` tells why.")  # fmt: skip
+        return found
 
     def cancel(self) -> None:
         self.service.conductor.cancel()
@@ -182,8 +193,7 @@ class StageKiosk:
         service.conductor.check_idle()
         write_atomically(kept, target.read_bytes())
         settings.add_picture(self.stage, name, kept)
-        service.ask(Request("compute", arguments=(name,)))
-        return self._job(service, "New appearance")
+        return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def feasibility(self, target: Path) -> Path:
         return aim.feasibility_map(self.stage, target)
@@ -205,8 +215,7 @@ class StageKiosk:
         service = self.service
         service.stock.check_name(name)
         asked = Request("compare", light=True, arguments=() if name is None else (name,))
-        service.ask(asked)
-        return self._job(service, title_of(asked))
+        return self._begun(service, asked, title_of(asked))
 
     def comparisons(self) -> Sequence[Comparison]:
         return runs.comparisons(self.stage, self.service.stock.names())
@@ -277,10 +286,10 @@ class StageKiosk:
 
     def test_shots(self) -> Job:
         service, asked = self.service, Request("aim", light=True)
-        service.ask(asked)
+        job = self._begun(service, asked, title_of(asked))
         # Whoever aims takes them again and again; a lamp must not be struck for each.
         service.conductor.light_for(AIMING_S, closed_too=True)
-        return self._job(service, title_of(asked))
+        return job
 
     def find_devices(self) -> Sequence[FoundDevice]:
         return finding.find(self.stage)

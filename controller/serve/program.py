@@ -159,7 +159,7 @@ def operations(kiosk: StageKiosk) -> dict[str, Operation]:
         kiosk.remove_appearance, kiosk.schedule, kiosk.lamp_history, kiosk.identify, kiosk.doctor, kiosk.backup,
         kiosk.diagnostics, kiosk.settings, kiosk.validate_settings, kiosk.save_settings, kiosk.runs, kiosk.results,
         kiosk.report, kiosk.compare, kiosk.comparisons, kiosk.aiming, kiosk.test_shots, kiosk.find_devices,
-        kiosk.try_device,
+        kiosk.try_device, kiosk.job,
     )  # fmt: skip
     table: dict[str, Operation] = {method.__name__.replace("_", "-"): method for method in same}
     return table | {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,10 @@ TITLES: Final[Mapping[str, str]] = {
     "takeover": "Frames without a projector",
     "variants": "Frames for the loss of a projector",
 }
+
+
+REMEMBERED: Final = 16
+"""Jobs that ended, for whoever follows one and looks only now and then."""
 
 
 def title_of(request: Request) -> str:
@@ -79,6 +84,7 @@ class ThreadWorks:
         self._lock = threading.Lock()
         self._request: Request | None = None
         self._reporter: JobReporter | None = None
+        self._ended: OrderedDict[int, Job] = OrderedDict()
         self._cancel = threading.Event()
         self._finished: Finished | None = None
         self._thread: threading.Thread | None = None
@@ -87,6 +93,16 @@ class ThreadWorks:
     def job(self) -> Job | None:
         """The work that is going on, or ended last."""
         return None if self._reporter is None else self._reporter.job
+
+    @property
+    def number(self) -> int:
+        """That of the last job that began, also in a service before; the next one's is larger by one."""
+        return self._number
+
+    def known(self, number: int) -> Job | None:
+        """The job of this number, if it goes on or ended lately; None while it waits, and where it never began."""
+        job = self.job
+        return job if job is not None and job.number == number else self._ended.get(number)
 
     @property
     def running(self) -> Request | None:
@@ -129,12 +145,15 @@ class ThreadWorks:
             finished = Finished(request, Decision(error.code, error.what, error.remedy), failed=True)
         except (VelaturaError, DeviceError) as error:
             finished = Finished(request, Decision(error.code, error.what, error.remedy, "error"), failed=True)
-        except Exception as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk goes on, and says it
+        except BaseException as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk goes on, and says it
             what = f"The work met an error that Velatura does not know ({type(error).__name__}: {error})."
             finished = Finished(request, Decision("crash", what, "Export the diagnostics.", "error"), failed=True)
         reporter.job = replace(
             reporter.job, ended=True, failed=finished.failed, outcome=finished.outcome.text, left_s=None
         )
+        self._ended[reporter.job.number] = reporter.job
+        while len(self._ended) > REMEMBERED:
+            self._ended.popitem(last=False)
         with self._lock:
             self._finished = finished
         self._changed()

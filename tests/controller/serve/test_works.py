@@ -1,0 +1,210 @@
+"""Work in a thread of its own: whatever comes of it is told, kept for whoever follows it, and ends nothing else."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.checking import check_stage
+from controller.errors import VelaturaError, WorkError
+from controller.panel.kiosk import ComputeSettings, Job
+from controller.serve.control import NAME, ControlServer
+from controller.serve.eventlog import Decision, EventLog
+from controller.serve.following import ask_and_follow
+from controller.serve.kiosk import StageKiosk
+from controller.serve.ports import Finished, Request
+from controller.serve.program import operations
+from controller.serve.service import Service
+from controller.serve.works import JobReporter, Kind, ThreadWorks, run_name
+from controller.session.progress import Level, Phase, Progress, Silent
+from controller.storage import runtime_folder
+from hal.deadline import Cancelled
+from hal.errors import DeviceGone
+from tests.controller.serve.vase import graded_run, vase
+
+
+def well(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+    return Finished(request, Decision("done", "It is done."))
+
+
+def raising(error: BaseException) -> Kind:
+    def do(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        raise error
+
+    return Kind(do)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[EventLog]:
+    found = EventLog(tmp_path / "events.sqlite", durable=False)
+    yield found
+    found.close()
+
+
+class Ended(threading.Event):
+    """Set by the works' last change of a job."""
+
+    works: ThreadWorks
+
+    def changed(self) -> None:
+        if self.works.job is not None and self.works.job.ended:
+            self.set()
+
+
+def worked(log: EventLog, kind: Kind, number: int = 0) -> tuple[ThreadWorks, Finished]:
+    ended = Ended()
+    works = ended.works = ThreadWorks({"work": kind}, log, ended.changed, number=number)
+    works.begin(Request("work"))
+    assert ended.wait(20)
+    works.close(20)
+    finished = works.finished()
+    assert finished is not None
+    return works, finished
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "level"),
+    [
+        (Cancelled(), Cancelled().code, "info"),
+        (WorkError("no-space", what="Full.", remedy="Free some."), "no-space", "error"),
+        (DeviceGone("camera-gone", what="Gone.", remedy="Plug it in."), "camera-gone", "error"),
+        (KeyError("nobody thought of this"), "crash", "error"),
+        (MemoryError(), "crash", "error"),
+        (SystemExit(3), "crash", "error"),
+    ],
+)
+def test_whatever_ends_the_work_is_its_outcome(log: EventLog, error: BaseException, code: str, level: str) -> None:
+    works, finished = worked(log, raising(error))
+    assert finished.failed
+    assert (finished.outcome.code, finished.outcome.level) == (code, level)
+    assert works.running is None
+    assert works.job is not None
+    assert (works.job.ended, works.job.failed, works.job.outcome) == (True, True, finished.outcome.text)
+
+
+def test_it_is_finished_once_and_can_be_asked_for_by_its_number(log: EventLog) -> None:
+    works, finished = worked(log, Kind(well), number=41)
+    assert works.finished() is None
+    assert not finished.failed
+    assert works.number == 42
+    job = works.known(42)
+    assert job is not None
+    assert (job.ended, job.outcome) == (True, "It is done.")
+    assert works.known(41) is None
+    assert works.known(43) is None
+
+
+def test_only_the_last_jobs_are_remembered(log: EventLog) -> None:
+    ended = Ended()
+    works = ended.works = ThreadWorks({"work": Kind(well)}, log, ended.changed)
+    for _ in range(20):
+        ended.clear()
+        works.begin(Request("work"))
+        assert ended.wait(20)
+        works.close(20)
+        works.finished()
+    assert [number for number in range(25) if works.known(number) is not None] == list(range(5, 21))
+
+
+def test_the_steps_of_a_job_are_those_up_to_the_present_one(log: EventLog) -> None:
+    changes: list[int] = []
+    reporter = JobReporter(Job(1, "work"), log, lambda: changes.append(1))
+
+    def at(index: int, count: int, phase: Phase, share: float) -> list[tuple[str, float]]:
+        reporter.progress(Progress(f"step {index}", index, count, phase, 0.5, share, 1.0, 2.0))
+        return [(step.title, step.done) for step in reporter.job.steps]
+
+    assert at(0, 3, Phase.RUNNING, 0.25) == [("step 0", 0.25)]
+    assert at(0, 3, Phase.DONE, 0.25) == [("step 0", 1.0)]
+    assert at(1, 3, Phase.RUNNING, 0.5) == [("step 0", 1.0), ("step 1", 0.5)]
+    # Resumed, or another runner: as many steps as that one has.
+    assert at(1, 2, Phase.RUNNING, 0.75) == [("", 0.0), ("step 1", 0.75)]
+    reporter.say("Look at this.", Level.WARNING)
+    assert (reporter.job.count, reporter.job.left_s, len(changes)) == (2, 2.0, 5)
+    assert [(row.level, row.text) for row in log.after(0)] == [("warning", "Look at this.")]
+
+
+def test_the_name_of_a_run_is_that_of_its_folder() -> None:
+    assert run_name({"run": "/somewhere/runs/20260101-100000-calibrate"}) == "20260101-100000-calibrate"
+    assert run_name({}) == ""
+
+
+PNG = b"\x89PNG, as far as anybody looks"
+
+
+@pytest.fixture
+def kiosk(tmp_path: Path) -> Iterator[StageKiosk]:
+    """A calibrated stage whose service has done seven jobs before it began anew; it is moved by hand."""
+    stage = vase(tmp_path)
+    graded_run(stage, "20260101-100000-calibrate", {"left": 0.01})
+    (stage / "target.png").write_bytes(PNG)
+    log = EventLog(stage / EventLog.FILE, durable=False)
+    log.keep("job", "7")
+    found = StageKiosk(stage)
+    found.attach(Service(check_stage(stage), log))
+    yield found
+    found.service.works.close(20)
+    log.close()
+
+
+def asked(kiosk: StageKiosk) -> Job:
+    return kiosk.compute("wood", kiosk.stage / "target.png", ComputeSettings())
+
+
+def test_jobs_are_numbered_on_over_restarts_of_the_service(kiosk: StageKiosk) -> None:
+    job = asked(kiosk)
+    assert job.number == 8
+    assert kiosk.job(8) is None, "it waits"
+    kiosk.service.conductor.step()
+    kiosk.service.works.close(20)
+    ended = kiosk.job(8)
+    assert ended is not None
+    assert (ended.number, ended.ended, ended.failed) == (8, True, True)
+
+
+def test_work_that_is_given_up_before_it_begins_is_told_to_whoever_follows_it(kiosk: StageKiosk) -> None:
+    number = asked(kiosk).number
+    kiosk.cancel()
+    with pytest.raises(WorkError) as caught:
+        kiosk.job(number)
+    assert caught.value.code == "job-given-up"
+    assert "work-cancelled" in [row.code for row in kiosk.events()]
+
+
+def followed(kiosk: StageKiosk, **instead: Any) -> Mapping[str, Any]:
+    served = operations(kiosk) | instead
+    with ControlServer(runtime_folder(kiosk.stage.resolve()) / NAME, served):
+        arguments = {"name": "wood", "target": str(kiosk.stage / "target.png")}
+        return ask_and_follow(stage=kiosk.stage, op="compute", arguments=arguments, reporter=Silent(),
+                              cancel=threading.Event(), every_s=0.01)  # fmt: skip
+
+
+def test_who_follows_work_that_never_begins_does_not_wait_for_ever(kiosk: StageKiosk) -> None:
+    def compute(name: str, target: str) -> Job:
+        job = asked(kiosk)
+        kiosk.stop()
+        return job
+
+    with pytest.raises(VelaturaError) as caught:
+        followed(kiosk, compute=compute)
+    assert caught.value.code == "job-given-up"
+
+
+def test_who_follows_hears_of_his_own_job_though_another_one_has_begun_since(kiosk: StageKiosk) -> None:
+    def compute(name: str, target: str) -> Job:
+        first = asked(kiosk)
+        kiosk.service.conductor.step()
+        kiosk.service.works.close(20)
+        kiosk.service.conductor.step()
+        asked(kiosk)
+        kiosk.service.conductor.step()
+        return first
+
+    with pytest.raises(WorkError) as caught:
+        followed(kiosk, compute=compute)
+    assert caught.value.code == "job-failed"
+    assert caught.value.what.startswith("New appearance wood: ")
