@@ -54,8 +54,11 @@ def measure_tiles(captures: Captures, plan: PatternPlan, black: FloatImage, whit
     axes = [decode_cells(captures, plan, axis, black.sum(axis=2) + half, half) for axis in range(2)]
     across, down = cells_of_frame(plan.size_px)
     tile = (axes[1].cell // side) * -(-across // side) + axes[0].cell // side
-    seen = (axes[0].weak == 0) & (axes[1].weak == 0) & (axes[0].cell < across) & (axes[1].cell < down)
-    inside = _interior(np.where(seen, tile, -1).astype(np.int32), _lit(white))
+    framed = (axes[0].cell < across) & (axes[1].cell < down)
+    seen = (axes[0].weak == 0) & (axes[1].weak == 0) & framed
+    # At a border of cells: of two tiles, or of two cells of one tile. Their neighbours tell which.
+    between = axes[0].sure & axes[1].sure & framed & ~seen
+    inside = _interior(np.where(seen, tile, -1).astype(np.int32), between, _lit(white))
     number = -(-across // side) * -(-down // side)
     which = tile[inside]
     count = np.bincount(which, minlength=number)
@@ -93,8 +96,11 @@ def _lit(white: FloatImage) -> Mask:
     return np.asarray(known & np.all(white > LIT_SHARE * bright, axis=2) & np.all(bright > 0))
 
 
-def _interior(tile: npt.NDArray[np.int32], lit: Mask) -> Mask:
-    """Lit camera pixels around which, as far as a neighbouring tile's light may reach, all is the same tile."""
+def _interior(tile: npt.NDArray[np.int32], between: Mask, lit: Mask) -> Mask:
+    """Lit camera pixels around which, as far as a neighbouring tile's light may reach, all is the same tile.
+
+    ``tile``: -1 where it is not known; what is ``between`` is taken for whatever lies around it
+    """
     counts = np.bincount(tile[lit & (tile >= 0)]) if np.any(lit & (tile >= 0)) else np.zeros(1, np.int64)
     sizes = counts[counts > 0]
     if not sizes.size:
@@ -103,5 +109,6 @@ def _interior(tile: npt.NDArray[np.int32], lit: Mask) -> Mask:
     reach = max(1, round(BORDER_SHARE * side_px))
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     value = tile.astype(np.float32)  # exact up to 16 million tiles
-    same = cv2.erode(value, kernel) == cv2.dilate(value, kernel)
-    return np.asarray(lit & same & (tile >= 0))
+    least = cv2.erode(np.where(between, np.float32(np.inf), value), kernel)
+    most = cv2.dilate(np.where(between, np.float32(-np.inf), value), kernel)
+    return np.asarray(lit & (least == most) & (tile >= 0))

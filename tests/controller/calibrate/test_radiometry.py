@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 
 from controller.arrays import Float64, FloatImage
 from controller.calibrate.radiometry import check_linearity, measure_radiometry
+from controller.calibrate.tiles import measure_tiles
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternKind, device_frame, plan_patterns
 from controller.errors import CalibrationError
@@ -53,6 +54,20 @@ def test_neighbouring_tiles_do_not_tint_each_other_out_of_focus(blur_px: float) 
     defocused = scene(projector_blur_px=blur_px)
     radiometry, _ = measure_radiometry(before_response(defocused), PLAN)
     assert max(off(radiometry, defocused)) < 0.01
+
+
+def test_tiles_of_several_cells_are_measured_across_the_borders_of_their_cells() -> None:
+    # As at 1400x1050, where a tile is 2x2 cells; in sharp focus the line between two cells is in doubt everywhere.
+    plan = replace(PLAN, patterns=tuple(replace(p, tile_cells=2) if p.kind is PatternKind.MOSAIC else p for p in PLAN))
+    sharp = scene(projector_blur_px=0.1)
+    stage = Stage(sharp)
+    captures = {p.name: stage.photograph(device_frame(p, SIZE_PX)) for p in plan if not p.needs_response}
+    black = captures["black"]
+    tiles = measure_tiles(captures, plan, black, captures["white"] - black)
+    assert len(tiles.ratio) >= 60
+    light = [sharp.response()[channel][tiles.levels[:, channel]] for channel in range(3)]
+    shown = np.stack(light, axis=1) @ np.array(sharp.mixing).T
+    assert np.median(np.abs(tiles.ratio - shown)) < 0.02
 
 
 def test_a_reflection_that_only_some_pixels_see_does_not_bend_the_response() -> None:
