@@ -7,7 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
+from controller.transport import LightTransport
 
 IDENTITY_MIXING = np.eye(3)
 
@@ -48,6 +50,18 @@ def random_calibration(
     mask = rng.random(camera) > 0.05 if masked else np.ones(camera, np.bool_)
     black = rng.uniform(0, 0.01, (*camera, 3)).astype(np.float32)
     return Calibration(tuple(projectors), black, mask, np.eye(3))
+
+
+def random_frames(transport: LightTransport, seed: int = 0) -> list[FloatImage]:
+    rng = np.random.default_rng(seed)
+    return [rng.random((*size, 3), np.float32) for size in transport.sizes]
+
+
+def products(transport: LightTransport, frames: list[FloatImage], r: FloatImage) -> tuple[float, float]:
+    """<T p, r> and <p, T' r>: the same where the adjoint is the transpose."""
+    forward = np.vdot(transport.forward(frames).astype(np.float64), r)
+    backward = sum(np.vdot(a.astype(np.float64), b) for a, b in zip(transport.adjoint(r), frames, strict=True))
+    return float(forward), float(backward)
 
 
 @pytest.fixture

@@ -15,13 +15,9 @@ from controller.calibrate.values import Calibration, Metapixels
 from controller.errors import UsageError
 from controller.transport import LightTransport
 from controller.transport.any_weights import patches_of_weights
+from tests.controller.transport.conftest import random_frames
 
 Stage = Callable[..., Calibration]
-
-
-def frames_of(transport: LightTransport) -> list[np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
-    random = np.random.default_rng(0)
-    return [random.random((*size, 3), np.float32) for size in transport.sizes]
 
 
 def on_grids(calibration: Calibration) -> Calibration:
@@ -42,7 +38,7 @@ def test_gaussians_as_a_matrix_give_the_same_transport(stage: Stage) -> None:
     weights = [gaussian_weights(part.metapixels, shape) for part in calibration.projectors]
     direct = LightTransport.build(calibration)
     other = LightTransport.build(calibration, patches=patches_of_weights(weights, shape))
-    frames = frames_of(direct)
+    frames = random_frames(direct)
     np.testing.assert_allclose(other.forward(frames), direct.forward(frames), rtol=1e-3, atol=1e-5)
 
 
@@ -51,7 +47,7 @@ def test_quadrilaterals_give_a_transport_with_the_same_white_and_their_own_share
     shape = (calibration.object_mask.shape[0], calibration.object_mask.shape[1])
     weights = [quadrilateral_weights(part.metapixels, shape) for part in calibration.projectors]
     transport = LightTransport.build(calibration, patches=patches_of_weights(weights, shape))
-    frames = frames_of(transport)
+    frames = random_frames(transport)
     for n, part in enumerate(calibration.projectors):
         white = transport.project_one(n, np.ones_like(frames[n]))
         np.testing.assert_allclose(white[transport.lit[n]], part.white[transport.lit[n]], rtol=1e-4)

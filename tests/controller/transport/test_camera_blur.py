@@ -15,6 +15,7 @@ from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
 from controller.transport import LightTransport
 from controller.transport.blur import gaussian_taps, without_blur
+from tests.controller.transport.conftest import products
 
 Stage = Callable[..., Calibration]
 BLUR_PX = (0.9, 0.7, 0.9)
@@ -40,8 +41,7 @@ def test_with_blur_the_adjoint_is_still_the_transpose(stage: Stage, seed: int, s
     rng = np.random.default_rng(seed)
     frames = [rng.random((*size, 3), np.float32) for size in transport.sizes]
     r = rng.random((*transport.shape, 3), np.float32)
-    forward = np.vdot(transport.forward(frames).astype(np.float64), r)
-    backward = sum(np.vdot(a.astype(np.float64), b) for a, b in zip(transport.adjoint(r), frames, strict=True))
+    forward, backward = products(transport, frames, r)
     assert forward == pytest.approx(backward, rel=2e-5)
 
 

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from controller.calibrate.values import Calibration, Metapixels
 from controller.errors import UsageError
 from controller.transport import LightTransport
+from tests.controller.transport.conftest import products, random_frames
 
 Stage = Callable[..., Calibration]
 slow_start = settings(
@@ -43,11 +44,6 @@ def dense_shares(calibration: Calibration, n: int) -> npt.NDArray[np.float64]:
     return normalised
 
 
-def random_frames(transport: LightTransport, seed: int) -> list[npt.NDArray[np.float32]]:
-    rng = np.random.default_rng(seed)
-    return [rng.random((*size, 3), np.float32) for size in transport.sizes]
-
-
 def test_a_product_follows_the_definition_of_the_model(stage: Stage) -> None:
     calibration = stage(1)
     transport = LightTransport.build(calibration)
@@ -65,8 +61,7 @@ def test_the_adjoint_is_the_transpose_for_any_geometry(stage: Stage, seed: int, 
     transport = LightTransport.build(stage(seed, largest_sigma=sigma, masked=masked))
     frames = random_frames(transport, seed)
     r = np.random.default_rng(seed + 1).random((*transport.shape, 3), np.float32)
-    forward = np.vdot(transport.forward(frames).astype(np.float64), r)
-    backward = sum(np.vdot(a.astype(np.float64), b) for a, b in zip(transport.adjoint(r), frames, strict=True))
+    forward, backward = products(transport, frames, r)
     assert forward == pytest.approx(backward, rel=2e-6)
 
 

@@ -23,6 +23,7 @@ from controller.transport.patch_transport import PatchTransport
 from controller.transport.window_matrix import box_rows
 from controller.transport.window_transport import WindowTransport
 from controller.transport.windows import SORTS
+from tests.controller.transport.conftest import products, random_frames
 
 Stage = Callable[..., Calibration]
 Floats = npt.NDArray[np.float32]
@@ -78,11 +79,6 @@ def on_frame(calibration: Calibration) -> Calibration:
     return dataclasses.replace(calibration, projectors=tuple(parts))
 
 
-def frames_of(transport: LightTransport, seed: int = 0) -> list[Floats]:
-    rng = np.random.default_rng(seed)
-    return [rng.random((*size, 3), np.float32) for size in transport.sizes]
-
-
 def expected(calibration: Calibration, frames: list[Floats]) -> Floats:
     """The model from SciPy's sparse shares and the controller's own development."""
     shape = calibration.object_mask.shape
@@ -113,7 +109,7 @@ def test_a_product_follows_the_definition_of_the_model(stage: Stage, mosaic: npt
     calibration = on_frame(mapped(stage(1, masked=False, sizes=((40, 50), (17, 15))), 1, mosaic=mosaic, ordered=True))
     transport = LightTransport.build(calibration)
     assert isinstance(transport, WindowTransport)
-    frames = frames_of(transport)
+    frames = random_frames(transport)
     got, wanted = transport.forward(frames), expected(calibration, frames)
     # blur is rounded by up to 1 %, places to 1/512 pixel, the cut is square instead of elliptical
     error = np.sqrt(np.mean((got - wanted) ** 2) / np.mean(wanted**2))
@@ -135,7 +131,7 @@ def test_small_windows_follow_the_definition_whatever_their_skew(stage: Stage) -
     upright, skewed, other = np.diff(transport.windows.first).reshape(-1, SORTS).sum(axis=0)
     assert min(upright, skewed) > 100
     assert other < 0.2 * skewed
-    frames = frames_of(transport)
+    frames = random_frames(transport)
     got, wanted = transport.forward(frames), expected(calibration, frames)
     assert np.sqrt(np.mean((got - wanted) ** 2) / np.mean(wanted**2)) < 0.01
     np.testing.assert_allclose(transport.reach()[transport.object_mask], whites(calibration), rtol=2e-5)
@@ -157,10 +153,9 @@ def test_the_adjoint_is_the_transpose_for_any_geometry(
         ]
         calibration = dataclasses.replace(calibration, projectors=tuple(parts))
     transport = LightTransport.build(calibration)
-    frames = frames_of(transport, seed)
+    frames = random_frames(transport, seed)
     r = np.random.default_rng(seed + 1).random((*transport.shape, 3), np.float32)
-    forward = np.vdot(transport.forward(frames).astype(np.float64), r)
-    backward = sum(np.vdot(a.astype(np.float64), b) for a, b in zip(transport.adjoint(r), frames, strict=True))
+    forward, backward = products(transport, frames, r)
     assert forward == pytest.approx(backward, rel=2e-6)
 
 
@@ -201,7 +196,7 @@ def test_a_fold_sees_the_same_projector_pixels_twice(stage: Stage) -> None:
     white = np.ones_like(part.white)
     part = dataclasses.replace(part, phase_map=PhaseMap(folded, part.phase_map.spread_px2), white=white)
     transport = LightTransport.build(dataclasses.replace(calibration, projectors=(part,)))
-    light = transport.forward(frames_of(transport))
+    light = transport.forward(random_frames(transport))
     np.testing.assert_allclose(light[:, :150], light[:, :149:-1], rtol=1e-5)
     left, right = np.zeros_like(light), np.zeros_like(light)
     left[:, :150], right[:, 150:] = 1, 1
@@ -232,7 +227,7 @@ def test_products_are_the_same_to_the_bit_for_any_number_of_threads(
     transport = LightTransport.build(
         mapped(stage(5, camera=(150, 600), sizes=((200, 170), (50, 70))), 5, mosaic=mosaic)
     )
-    frames = frames_of(transport, 5)
+    frames = random_frames(transport, 5)
     r = np.random.default_rng(5).random((*transport.shape, 3), np.float32)
 
     def products() -> tuple[Floats, list[Floats], Floats]:
@@ -289,7 +284,7 @@ def test_a_saved_transport_is_mapped_back_unchanged(stage: Stage, tmp_path: Path
     loaded = LightTransport.load(tmp_path / "transport")
     assert isinstance(loaded, WindowTransport)
     assert loaded.sizes == transport.sizes
-    frames = frames_of(transport, 6)
+    frames = random_frames(transport, 6)
     np.testing.assert_array_equal(loaded.forward(frames), transport.forward(frames))
 
 
