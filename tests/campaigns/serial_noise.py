@@ -26,9 +26,6 @@ from hal.errors import DeviceError
 from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.board_sanyo import SanyoBoard
-from plugins.emulated.boards_binary import Ep910Board, NecBoard
-from plugins.emulated.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
 from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
 from plugins.emulated.optoma import OptomaBoard
 from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
@@ -37,17 +34,9 @@ from plugins.emulated.scenario import ScenarioPlayer, parse_scenario
 from plugins.emulated.serial_projector import Board, EmulatedSerialProjector
 from plugins.pjlink_projector import open_pjlink_projector
 from plugins.serial_projector import open_serial_projector
+from tests.plugins.boards import BOARDS as OTHERS
 
-BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {
-    "optoma-later": OptomaBoard,
-    "epson-escvp21": EpsonBoard,
-    "benq": BenqBoard,
-    "christie": ChristieBoard,
-    "nec": NecBoard,
-    "optoma-ep910": Ep910Board,
-    "panasonic": PanasonicBoard,
-    "sanyo": SanyoBoard,
-}
+BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {"optoma-later": OptomaBoard, **OTHERS}
 FAMILIES = (*BOARDS, "pjlink")
 DEADLINE_S = 0.6
 GRACE_S = 0.3

@@ -13,16 +13,14 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.board_sanyo import SanyoBoard
-from plugins.emulated.boards_binary import Ep910Board, NecBoard
-from plugins.emulated.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
 from plugins.emulated.quick_profile import quick_profile
-from plugins.emulated.serial_projector import Board, EmulatedSerialProjector
+from plugins.emulated.serial_projector import EmulatedSerialProjector
 from plugins.pjlink_projector import PjLinkProjector, open_pjlink_projector
 from plugins.profile_files import load_profile
 from plugins.serial_projector import SerialProjector, open_serial_projector
+from tests.plugins.boards import BOARDS
 from tests.plugins.pjlink_advance import NOTICE, pjlink_advance_python
 from tests.waiting import wait_for
 
@@ -35,16 +33,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 LAMP = LampTiming(warm_up_s=0.25, cool_down_s=0.4)
-BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {
-    "epson-escvp21": EpsonBoard,
-    "benq": BenqBoard,
-    "christie": ChristieBoard,
-    "nec": NecBoard,
-    "optoma-ep910": Ep910Board,
-    "panasonic": PanasonicBoard,
-    "sanyo": SanyoBoard,
-}
-"""The emulated control board of each shipped profile but the first, Optoma's."""
 
 
 @dataclass(frozen=True)
