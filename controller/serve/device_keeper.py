@@ -81,6 +81,7 @@ class DeviceKeeper:
 
     def _lost(self, problem: Decision) -> None:
         self.close()
+        self._values = ()
         self._next_s = self._monotonic() + _REOPEN_S[min(self._failures, len(_REOPEN_S) - 1)]
         self._failures += 1
         if self._problem is None or self._problem.code != problem.code:

@@ -70,10 +70,12 @@ def _wrong(what: str, value: str, allowed: str) -> UsageError:
 
 
 def _date(text: str) -> date | None:
+    """One written as ``date.isoformat`` writes it: a date's rows are found by that text, and "2026-W53-4" never is."""
     try:
-        return date.fromisoformat(text) if len(text) == 10 else None
+        found = date.fromisoformat(text)
     except ValueError:
         return None
+    return found if found.isoformat() == text else None
 
 
 def moment(day: date, clock: str, zone: ZoneInfo) -> float:

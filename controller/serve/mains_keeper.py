@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import cast
 
 from controller.panel.kiosk import LiveValue
-from controller.serve.device_keeper import DeviceKeeper
+from controller.serve.device_keeper import LOOK_S, DeviceKeeper
 from controller.serve.eventlog import Decision
 from controller.serve.projector_keeper import ProjectorKeeper
 from controller.session.mains import Circuit
 from controller.session.safety import LampGuard
-from hal.deadline import Deadline
+from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device
 from hal.values import DeviceIdentity
@@ -34,10 +36,16 @@ class Boards:
 
 
 class MainsKeeper(DeviceKeeper):
-    """Closes the relays while light is wanted, and opens each once the lamps behind it have cooled."""
+    """Closes the relays while light is wanted, and opens each once the lamps behind it have cooled.
 
-    def __init__(self, driver: str, open_it: Callable[[Deadline], Device], tell: Tell) -> None:
-        super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0)
+    One relay that fails keeps no other from being switched, and a projector that is silent costs no other its time.
+    """
+
+    def __init__(
+        self, driver: str, open_it: Callable[[Deadline], Device], tell: Tell,
+        *, monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0, monotonic=monotonic)
         self.want_on = True
         self.keepers: tuple[ProjectorKeeper, ...] = ()
         self._off: frozenset[str] = frozenset()
@@ -49,32 +57,54 @@ class MainsKeeper(DeviceKeeper):
 
     def _switch(self, device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
         boards = cast("Boards", device)
+        act: Callable[[Circuit], str]
         if self.want_on:
-            for circuit in boards.circuits:
-                if circuit.close(deadline=deadline):
-                    self._tell(Decision("mains-on", f"Mains on: {circuit.name}."))
-                    ready_s = self._monotonic() + circuit.boot_s
-                    self._booted_at_s |= dict.fromkeys(circuit.feeds, ready_s)
+            # From now on they are asked: one that stays without mains is to be told of as lost, not as dark.
             self._off = frozenset()
-            return tuple(LiveValue(circuit.name, "on") for circuit in boards.circuits)
-        guards = {keeper.name: keeper.guard for keeper in self.keepers}
-        values = []
+            act = self._give
+        else:
+            guards = {keeper.name: keeper.guard for keeper in self.keepers}
+            act = partial(self._cut, guards=guards)
+        values, failed = [], list[DeviceError]()
         for circuit in boards.circuits:
-            values.append(LiveValue(circuit.name, self._cut(circuit, guards, deadline)))
+            try:
+                values.append(LiveValue(circuit.name, act(circuit)))
+            except DeviceError as error:
+                failed.append(error)
+        if failed:
+            raise failed[0]
         return tuple(values)
 
-    def _cut(self, circuit: Circuit, guards: dict[str, LampGuard | None], deadline: Deadline) -> str:
+    def _give(self, circuit: Circuit) -> str:
+        if circuit.close(deadline=in_seconds(LOOK_S)):
+            self._tell(Decision("mains-on", f"Mains on: {circuit.name}."))
+            self._booted_at_s |= dict.fromkeys(circuit.feeds, self._monotonic() + circuit.boot_s)
+        return "on"
+
+    def _cut(self, circuit: Circuit, guards: dict[str, LampGuard | None]) -> str:
         if self._off.issuperset(circuit.feeds):
             return "off"
         known = {name: guard for name, guard in guards.items() if guard is not None}
         if any(name not in known for name in circuit.feeds):
             return "as it was"
         try:
-            circuit.open(known, deadline=deadline)
+            circuit.open(known, deadline=in_seconds(LOOK_S))
         except DeviceError as error:
-            if error.code != "mains-lamp-hot":
-                raise
-            return "on until the lamps have cooled"
+            if error.code == "mains-lamp-hot":
+                return "on until the lamps have cooled"
+            if not _answer([known[name] for name in circuit.feeds]):
+                return "on, for nobody knows whether the lamps have cooled"
+            raise
         self._off |= frozenset(circuit.feeds)
         self._tell(Decision("mains-off", f"Mains off: {circuit.name}."))
         return "off"
+
+
+def _answer(guards: Sequence[LampGuard]) -> bool:
+    """Whether all these projectors do; what is wrong with one that doesn't is told by its own keeper."""
+    try:
+        for guard in guards:
+            guard.status(deadline=in_seconds(guard.answer_s))
+    except DeviceError:
+        return False
+    return True

@@ -38,13 +38,17 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """``open`` None: nobody knows the time. ``due`` can begin now, ``expired`` can't any more and were not done."""
+    """``open`` None: nobody knows the time. ``due`` can begin now, ``expired`` can't any more and were not done.
+
+    ``changes_s``: the next moment (Unix seconds) at which ``open`` will be another; None where none is in sight.
+    """
 
     open: bool | None
     appearance: str = ""
     due: tuple[Task, ...] = ()
     expired: tuple[Task, ...] = ()
     next: NextEvent | None = None
+    changes_s: float | None = None
 
 
 def believed(now_s: float, latest_s: float | None, *, synchronised: bool) -> float | None:
@@ -68,7 +72,8 @@ def plan(now_s: float | None, schedule: Schedule, done: Collection[str], *, sinc
     known = openings(schedule, now_s)
     present = [opening for opening in known if opening.begins_s <= now_s < opening.ends_s]
     due, expired = _tasks(now_s, schedule, done, since_s)
-    return Plan(bool(present), present[-1].appearance if present else "", due, expired, _next(known, now_s, schedule))
+    appearance, following = present[-1].appearance if present else "", _next(known, now_s, schedule)
+    return Plan(bool(present), appearance, due, expired, following, _changes_s(known, now_s))
 
 
 def merged(known: Sequence[Opening]) -> list[Opening]:
@@ -80,6 +85,11 @@ def merged(known: Sequence[Opening]) -> list[Opening]:
         else:
             found.append(opening)
     return found
+
+
+def _changes_s(known: Sequence[Opening], now_s: float) -> float | None:
+    edges = (edge for one in merged(known) for edge in (one.begins_s, one.ends_s))
+    return min((edge for edge in edges if edge > now_s), default=None)
 
 
 def _next(known: Sequence[Opening], now_s: float, schedule: Schedule) -> NextEvent | None:

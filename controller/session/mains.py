@@ -26,15 +26,24 @@ class Circuit:
     boot_s: float
     _switch: PowerSwitch = field(repr=False)
 
+    def on(self, *, deadline: Deadline) -> bool:
+        """Whether its relay is closed now, as the board says."""
+        return self._switch.state(self.channel, deadline=deadline)
+
     def close(self, *, deadline: Deadline) -> bool:
         """Give mains; whether there were none before."""
-        if self._switch.state(self.channel, deadline=deadline):
+        if self.on(deadline=deadline):
             return False
         self._switch.switch(self.channel, True, deadline=deadline)
         return True
 
     def open(self, guards: Mapping[str, LampGuard], *, deadline: Deadline) -> None:
-        """Cut the mains. Raises DeviceRefused("mains-lamp-hot") unless every lamp behind it is known to be cold."""
+        """Cut the mains; harmless where they are cut.
+
+        Raises DeviceRefused("mains-lamp-hot") unless every lamp behind it is known to be cold.
+        """
+        if not self._switch.state(self.channel, deadline=deadline):
+            return  # nobody behind it could answer
         hot = [name for name in self.feeds if not guards[name].may_open_mains(deadline=deadline)]
         if hot:
             raise DeviceRefused(
