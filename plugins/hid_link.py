@@ -137,7 +137,8 @@ class HidLink(WorkerLink[OpenHid]):
         return DeviceRefused(
             "hid-not-opened",
             what=f"The {self._kind.name} is plugged in, but cannot be opened ({error}).",
-            remedy="End other programs that use it, and install firmware_configs/udev/70-velatura-hid.rules.",
+            remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and install"
+            " firmware_configs/udev/70-velatura-hid.rules.",
         )
 
 

@@ -116,7 +116,8 @@ class StreamDeckPanel(WorkerLink[Any]):
                 raise DeviceRefused(
                     "hid-not-opened",
                     what=f"The key panel is plugged in, but cannot be opened ({error}).",
-                    remedy="End other programs that use it, and install firmware_configs/udev/70-velatura-hid.rules.",
+                    remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and"
+                    " install firmware_configs/udev/70-velatura-hid.rules.",
                 ) from error
             if deck.is_visual() and self._serial in ("", serial):
                 matching.append((deck, serial))

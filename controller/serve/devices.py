@@ -100,7 +100,14 @@ class Devices:
             stack.callback(display.close)
             held = [guard for guard in guards if guard is not None]
             rig = rig_of(self._checked.stage, held, cast("Camera", camera), display)
-            yield replace(rig, darkness=self._darkness())
+            try:
+                yield replace(rig, darkness=self._darkness())
+            except DeviceGone as error:
+                # Its keeper lost it and let go of it, which is all that the work has noticed.
+                lost = any(keeper.guard is not guard for keeper, guard in zip(self.projectors, guards, strict=True))
+                if lost and (missing := self.missing_for_work()) is not None:
+                    raise DeviceGone("device-missing", what=missing.reason, remedy=missing.remedy) from error
+                raise
 
     def close(self) -> None:
         for projector in self.projectors:
@@ -120,7 +127,12 @@ class Devices:
             return LampGuard(table.name, projector, self._ledger, at_least=at_least)
 
         silenced = None if self.mains is None else partial(self.mains.silences, table.name)
-        return ProjectorKeeper(table.name, open_guard, self._tell, asleep=silenced)
+        unfed = partial(self._unfed, table.name)
+        return ProjectorKeeper(table.name, open_guard, self._tell, asleep=silenced, unfed=unfed)
+
+    def _unfed(self, projector: str) -> Decision | None:
+        feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]
+        return self.mains.problem if self.mains is not None and projector in feeds else None
 
     def _open_camera(self, deadline: Deadline) -> Device:
         table, (driver, settings) = self._checked.stage.tables.camera, self._checked.camera

@@ -29,7 +29,7 @@ _LISTS: Final = ("projectors", "relays")
 def findings(stage: Path, service: Service | None) -> Sequence[Finding]:
     """What is wrong: the devices' own problems, the disk, and what the buses say."""
     found = []
-    for row in () if service is None else service.devices.rows():
+    for row in () if service is None else service.rows():
         if row.problem is not None:
             found.append(Finding("error", f"{row.kind} {row.name}", row.problem, row.remedy))
     if service is not None and service.player.view.problem is not None:

@@ -29,7 +29,8 @@ _LOOKS: Final = {
     Power.ON: Condition.LIT, Power.WARMING: Condition.LIGHTING, Power.COOLING: Condition.COOLING,
     Power.OFF: Condition.DARK,
 }  # fmt: skip
-_REOPEN_S: Final = (2.0, 5.0, 15.0, 60.0)
+_REOPEN_S: Final = (2.0, 5.0, 15.0)
+"""Not longer: who has plugged a cable in again stands there and waits."""
 
 
 class ProjectorKeeper:
@@ -40,6 +41,7 @@ class ProjectorKeeper:
     open_guard : opens the projector; raises DeviceError or VelaturaError while that can't be done
     tell : hears what was noticed and decided
     asleep : whether it has no mains now, or boots, so that its silence means nothing
+    unfed : what is wrong with the relays that it gets its mains through, which may be why it is silent
     """
 
     def __init__(
@@ -50,11 +52,12 @@ class ProjectorKeeper:
         *,
         clock: Clock | None = None,
         asleep: Callable[[], bool] | None = None,
+        unfed: Callable[[], Decision | None] | None = None,
     ) -> None:
         self.name = name
         self._open_guard, self._tell = open_guard, tell
         self._clock = clock or SystemClock()
-        self._asleep = asleep or (lambda: False)
+        self._asleep, self._unfed = asleep or (lambda: False), unfed or (lambda: None)
         self._guard: LampGuard | None = None
         self._want_lit: bool | None = None
         self._view = ProjectorView(name)
@@ -95,6 +98,7 @@ class ProjectorKeeper:
         wanted = self._want_lit
         if self._asleep():
             self._silent_since_s = None
+            self._reopen_at_s, self._reopened = 0.0, 0
             self._show(ProjectorView(self.name, Condition.DARK, Power.OFF, looked=True, hours=self._view.hours,
                                      strikes=self._view.strikes, counter_hours=self._view.counter_hours))  # fmt: skip
             return
@@ -155,8 +159,11 @@ class ProjectorKeeper:
         self._reopen_at_s = self._clock.now_s() + _REOPEN_S[min(self._reopened, len(_REOPEN_S) - 1)]
         self._reopened += 1
         self._struck_at_s = None
+        problem, unfed = _decision(error), self._unfed()
+        if unfed is not None:
+            problem = replace(problem, reason=f"{problem.reason} {unfed.reason}", remedy=unfed.remedy)
         self._show(replace(self._view, condition=Condition.LOST, power=Power.UNKNOWN, maybe_lit=maybe_lit, looked=True,
-                           problem=_decision(error)))  # fmt: skip
+                           problem=problem))  # fmt: skip
 
     # -- lit
 

@@ -13,9 +13,9 @@ from typing import Final
 from controller.app import stage_lock
 from controller.calibrations import finished_calibrations, stage_trust
 from controller.checking import Checked, check_stage
-from controller.errors import UsageError, VelaturaError, WorkError
+from controller.errors import UsageError, WorkError
 from controller.opening import player_settings, technicians_panel
-from controller.panel.kiosk import Lamp
+from controller.panel.kiosk import DeviceRow, Lamp
 from controller.play.launch import PlayerSettings
 from controller.play.notify import Notifier
 from controller.serve import archive
@@ -23,6 +23,7 @@ from controller.serve.clock import Clockwork, beginning
 from controller.serve.conductor import Conductor, Limits
 from controller.serve.devices import Devices
 from controller.serve.eventlog import Decision, EventLog
+from controller.serve.keys_keeper import KeysKeeper
 from controller.serve.kinds import Kinds
 from controller.serve.lamp_history import LampHistory
 from controller.serve.player_keeper import PlayerKeeper
@@ -33,7 +34,7 @@ from controller.serve.works import ThreadWorks
 from controller.session.machine import State
 from controller.storage import runtime_folder
 from hal.deadline import in_seconds
-from hal.errors import DeviceError
+from hal.interfaces import ButtonPanel
 
 STEP_S: Final = 0.25
 LOOK_S: Final = 1.0
@@ -71,7 +72,7 @@ class Service:
         self.changed: Callable[[], None] = lambda: None
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._keys: contextlib.ExitStack | None = None
+        self.keys = self._keys_keeper()
         self._known_runs: tuple[float, bool] = (0.0, False)
 
     def start(self) -> None:
@@ -86,7 +87,8 @@ class Service:
             self._thread(f"projector {projector.name}", projector.step, LOOK_S)
         for keeper in self.devices.others:
             self._thread(keeper.name, keeper.step, STEP_S)
-        self._thread("keys", self._find_keys, 2.0)
+        if self.keys is not None:
+            self._thread("keys", self.keys.step, 2.0)
 
     def run(self, cancel: threading.Event) -> None:
         """Decide, over and over, until ``cancel``. Feeds systemd's watchdog."""
@@ -128,12 +130,16 @@ class Service:
         self._stop.set()
         for thread in self._threads:
             thread.join(5.0)
-        if self._keys is not None:
-            self._keys.close()
+        if self.keys is not None:
+            self.keys.close()
         self.lamp_history.note(self.lamps, date.today(), now=True)
         self.player.close()
         self.devices.close()
         self.log.tell(Decision("service-ended", "The kiosk ends."))
+
+    def rows(self) -> tuple[DeviceRow, ...]:
+        """Every device as the panel shows it."""
+        return (*self.devices.rows(), *(() if self.keys is None else (self.keys.row,)))
 
     def ask(self, *requests: Request) -> None:
         self.conductor.ask(*requests)
@@ -195,34 +201,24 @@ class Service:
         self._threads.append(thread)
         thread.start()
 
-    def _find_keys(self) -> None:
-        if self._keys is not None or self.checked.key_panel is None:
-            return
-        from controller.session.keys import KeyService, technicians_keys
+    def _keys_keeper(self) -> KeysKeeper | None:
+        table = self.checked.stage.tables.key_panel
+        if table is None:
+            return None
 
-        with contextlib.ExitStack() as stack:
-            try:
-                panel = stack.enter_context(technicians_panel(self.checked, deadline=in_seconds(20.0)))
-            except (DeviceError, VelaturaError):
-                return
-            assert panel is not None
-            commands = technicians_keys(self.conductor.open, self.conductor.shut, self._recalibrate)
-            service = KeyService(panel, commands, state=lambda: self.conductor.machine.state, trouble=self._key_trouble)
-            service.start()
-            stack.callback(service.stop)
-            self._keys = stack.pop_all()
+        @contextlib.contextmanager
+        def opened() -> Iterator[ButtonPanel]:
+            with technicians_panel(self.checked, deadline=in_seconds(20.0)) as panel:
+                assert panel is not None
+                yield panel
+
+        presses = (self.conductor.open, self.conductor.shut, self._recalibrate)
+        return KeysKeeper(table.driver, opened, presses, lambda: self.conductor.machine.state, self.log.tell)
 
     def _recalibrate(self) -> None:
         # A refusal is in the log; the key has nothing to show it on.
         with contextlib.suppress(WorkError):
             self.conductor.ask(Request("quick", light=True))
-
-    def _key_trouble(self, error: DeviceError | None) -> None:
-        self.log.tell(
-            Decision("keys-back", "The technician's keys work again.")
-            if error is None
-            else Decision(error.code, error.what, error.remedy, "warning")
-        )
 
 
 @contextlib.contextmanager

@@ -41,7 +41,7 @@ class Snapshots:
             state=state,
             reason=machine.reason,
             since_unix_s=self._since[1],
-            devices=(*service.devices.rows(), self._player_row(service), *self._disk_row(service)),
+            devices=(*service.rows(), self._player_row(service), *self._disk_row(service)),
             job=service.works.job,
             playing=shown.appearance if shown is not None else "",
             next_event=service.conductor.plan.next,

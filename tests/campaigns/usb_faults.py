@@ -84,11 +84,13 @@ def usb_well(kiosk: WiredKiosk) -> str:
         return ""
     devices = kiosk.service.devices
     wrong = [keeper.problem.text for keeper in (devices.mains, devices.sensor) if keeper and keeper.problem]
+    assert kiosk.service.keys is not None
+    wrong.append(kiosk.service.keys.row.problem or "")
     if kiosk.bus.get("board", "state") != [True, True]:
         wrong.append("A projector has no mains.")
     if not kiosk.bus.call("keys", "picture_of", 0):
         wrong.append("The keys are dark.")
-    return " ".join(wrong)
+    return " ".join(filter(None, wrong))
 
 
 def _bus(kiosk: WiredKiosk) -> UsbBusProcess:

@@ -153,3 +153,41 @@ def test_without_mains_it_counts_as_dark_and_nobody_asks_it() -> None:
     asleep.step()
     assert asleep.view.condition is Condition.DARK
     assert kept.told == []
+
+
+def test_a_projector_behind_a_relay_board_that_is_away_says_so(kept: Kept) -> None:
+    kept.there = False
+    board = Decision("hid-unplugged", "No relay board is plugged in.", "Check its hub.", "error")
+    fed: list[Decision] = []
+    keeper = ProjectorKeeper(
+        "left", kept._opened, kept.told.append, clock=kept.world, unfed=lambda: fed[0] if fed else None
+    )
+    keeper.step()
+    assert keeper.view.problem is not None
+    assert keeper.view.problem.text == "The cable is away. Plug it in."
+    fed.append(board)
+    kept.world.time_s += 2.0
+    keeper.step()
+    assert keeper.view.problem.text == "The cable is away. No relay board is plugged in. Check its hub."
+
+
+def test_a_projector_that_got_its_mains_back_is_spoken_to_at_once(kept: Kept) -> None:
+    kept.there, dark = False, False
+    keeper = ProjectorKeeper("left", kept._opened, kept.told.append, clock=kept.world, asleep=lambda: dark)
+    for _ in range(60):
+        keeper.step()
+        kept.world.time_s += 1.0
+    assert keeper.view.condition is Condition.LOST
+    kept.there = dark = True
+    keeper.step()
+    dark = False
+    keeper.want_lit = True
+    keeper.step()
+    assert kept.lamp.strikes == 1
+
+
+def test_a_projector_that_was_plugged_in_again_is_found_within_a_quarter_of_a_minute(kept: Kept) -> None:
+    kept.there = False
+    assert kept.run(300) is Condition.LOST
+    kept.there = True
+    assert kept.run(16) is Condition.DARK
