@@ -16,7 +16,8 @@ from hal.interfaces import Device
 
 OPEN_S: Final = 20.0
 LOOK_S: Final = 10.0
-_REOPEN_S: Final = (2.0, 5.0, 15.0, 60.0)
+_REOPEN_S: Final = (2.0, 5.0, 15.0)
+"""Not longer: who has plugged a cable in again stands there and waits."""
 
 Look = Callable[[Device, Deadline], tuple[LiveValue, ...]]
 

@@ -83,7 +83,10 @@ class MainsKeeper(DeviceKeeper):
 
     def _cut(self, circuit: Circuit, guards: dict[str, LampGuard | None]) -> str:
         if self._off.issuperset(circuit.feeds):
-            return "off"
+            # Asked although it is known: a board that is away is to be told of now, and not at the next opening.
+            if not circuit.on(deadline=in_seconds(LOOK_S)):
+                return "off"
+            self._off -= frozenset(circuit.feeds)  # closed by a hand, or by another program
         known = {name: guard for name, guard in guards.items() if guard is not None}
         if any(name not in known for name in circuit.feeds):
             return "as it was"

@@ -147,7 +147,7 @@ def test_a_silent_projector_keeps_its_own_mains_and_those_of_no_other(mains: Mai
     mains.lamps["left"].trouble = "silent"
     mains.run(30)
     assert mains.closed == ["left"], "nobody knows whether its lamp has cooled"
-    assert mains.relays.problem is None, "the relays are well"
+    assert "device-back" not in [one.code for one in mains.told], "the relays were well all the time"
     mains.lamps["left"].trouble = ""
     mains.run(60)
     assert mains.closed == []
@@ -181,6 +181,30 @@ def test_a_projector_whose_mains_can_not_be_given_is_told_of_as_lost(mains: Main
     mains.run(60)
     assert mains.keepers["left"].view.problem is not None
     assert mains.lamps["right"].lit_at_s is not None
+
+
+def test_a_board_that_leaves_while_its_mains_are_cut_is_told_of_before_the_next_opening(mains: Mains) -> None:
+    mains.want(False)
+    mains.run(30)
+    mains.boards["left"].gone = True
+    mains.run(10)
+    assert mains.relays.problem is not None
+    assert mains.keepers["left"].view.problem is None
+    mains.boards["left"].gone = False
+    mains.run(20)
+    assert mains.values == {"left": "off", "right": "off"}
+
+
+def test_mains_that_somebody_else_gave_are_cut_again_once_the_lamps_are_known_to_be_cold(mains: Mains) -> None:
+    mains.want(False)
+    mains.run(30)
+    mains.boards["left"].closed = True
+    mains.lamps["left"].trouble = "silent"
+    mains.run(10)
+    assert mains.closed == ["left"]
+    mains.lamps["left"].trouble = ""
+    mains.run(10)
+    assert mains.closed == []
 
 
 def test_a_service_that_begins_while_the_mains_are_cut_asks_nobody_behind_them(mains: Mains) -> None:
@@ -245,7 +269,7 @@ def test_a_device_is_opened_again_less_and_less_often_and_told_of_once_a_trouble
     assert [value.text for value in keeper.row.values] == ["Sensor"]
     sensor.trouble, sensor.looks = "silent", 0
     run(100)
-    assert sensor.looks == 5, "and after 2, 5, 15 and 60 s"
+    assert sensor.looks == 9, "and after 2, 5 and every 15 s"
     assert sensor.open == 0, "what does not answer is let go of"
     assert (keeper.row.problem, keeper.row.remedy, keeper.row.values) == ("It is silent.", "Mend it.", ())
     sensor.trouble = "burning"
