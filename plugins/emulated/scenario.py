@@ -31,6 +31,8 @@ _WIRE: Final[dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]] =
 }
 """What to set at the beginning and at the end of an event, and for an event of a single answer."""
 LAMP_DEEDS: Final = ("lamp-failure", "overheat")
+ONCE: Final = (*(deed for deed, (_, _, once) in _WIRE.items() if once), "slow")
+"""What hits a single answer where an event does not say for how long."""
 DEEDS: Final = (*_WIRE, "slow", *LAMP_DEEDS, "unplug")
 _NEVER: Final = -1.0
 

@@ -9,10 +9,11 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any, Final
 
+from plugins.emulated.scenario import ONCE
 from plugins.emulated.usb_bus_device import EmulatedUsbDevice, UsbFaults
 from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
 from plugins.emulated.usb_bus_scenario import DEEDS
-from tests.campaigns.wired_faults import FOR_S, SLOW_S, Fault, Turn, goes_on, mend_projectors, values_of
+from tests.campaigns.wired_faults import FOR_S, SLOW_S, Fault, Turn, goes_on, how_long, mend_projectors, values_of
 from tests.campaigns.wired_kiosk import USB, WiredKiosk
 
 WORDS: Final = {"board": "relay", "light": "light sensor", "keys": "key panel"}
@@ -55,9 +56,9 @@ def _deeds(name: str) -> Iterator[Fault]:
             def strike(kiosk: WiredKiosk, name: str = name, event: str = event) -> None:
                 _bus(kiosk).play(name, event)
 
-            last = f"for {for_s:g} s" if for_s else "for good"
-            away = deed == "unplug" and not for_s
-            yield Fault(f"{deed} of {name} {last}", strike, mend_usb, not for_s, WORDS[name] if away else "")
+            lasts = not for_s and deed not in ONCE
+            told = WORDS[name] if lasts and (name in ASKED or deed == "unplug") else ""
+            yield Fault(f"{deed} of {name} {how_long(deed, for_s)}", strike, mend_usb, lasts, told)
 
 
 def _turn(name: str, knob: str, value: Any) -> Turn:

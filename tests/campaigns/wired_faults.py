@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from plugins.emulated.faults import WireFaults
 from plugins.emulated.ptp_body import CameraFaults
-from plugins.emulated.scenario import DEEDS, Event, Scenario, ScenarioPlayer
+from plugins.emulated.scenario import DEEDS, ONCE, Event, Scenario, ScenarioPlayer
 from tests.campaigns.wired_kiosk import WiredKiosk
 
 FOR_S: Final = 8.0
@@ -73,6 +73,10 @@ def camera_faults() -> Iterator[Fault]:
             yield Fault(f"camera {knob.name}={value}", turn, back, lasts=False)
 
 
+def how_long(deed: str, for_s: float) -> str:
+    return f"for {for_s:g} s" if for_s else "once" if deed in ONCE else "for good"
+
+
 def deeds() -> Iterator[Fault]:
     """What a script may do to a projector, for a while and for good; and to all of them at once."""
     for deed in DEEDS:
@@ -86,8 +90,8 @@ def deeds() -> Iterator[Fault]:
                             scenario, device=name, faults=wire.faults, lamp=kiosk.lamps[name], plug=wire
                         )
 
-                last = f"for {for_s:g} s" if for_s else "for good"
-                yield Fault(f"{deed} of {who or 'everyone'} {last}", strike, mend_projectors, not for_s)
+                name = f"{deed} of {who or 'everyone'} {how_long(deed, for_s)}"
+                yield Fault(name, strike, mend_projectors, not for_s and deed not in ONCE)
 
 
 def mend_projectors(kiosk: WiredKiosk) -> None:
