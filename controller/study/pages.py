@@ -26,14 +26,20 @@ def publish(made: Iterable[Path], pages: Path, experiments: Sequence[Experiment]
         folder.mkdir(parents=True, exist_ok=True)
     for path in made:
         kept = read_result(path)
-        for old in [*(pages / PICTURES).glob(f"{kept.name}-*"), *(pages / DATA).glob(f"{kept.name}-*.csv")]:
-            old.unlink()
+        for old in [*(pages / PICTURES).iterdir(), *(pages / DATA).glob("*.csv")]:
+            if _owner(old.name, experiments) == kept.name:
+                old.unlink()
         for file, _ in kept.figures:
             shutil.copyfile(path.with_name(file), pages / PICTURES / file)
         for table in kept.tables:
             write_atomically(pages / DATA / f"{kept.name}-{table.name}.csv", _csv(table).encode())
         write_atomically(pages / DATA / path.name, path.read_bytes())
     return write_pages(pages, experiments)
+
+
+def _owner(file: str, experiments: Sequence[Experiment]) -> str:
+    """The experiment that a picture or table is of: the longest of those names that the file's begins with."""
+    return max((one.name for one in experiments if file.startswith(f"{one.name}-")), key=len, default="")
 
 
 def write_pages(pages: Path, experiments: Sequence[Experiment]) -> Path:

@@ -74,6 +74,15 @@ def test_a_second_study_keeps_the_pages_of_the_first(tmp_path: Path) -> None:
     assert "not done" not in text
 
 
+def test_an_experiment_done_again_leaves_the_files_of_one_with_a_longer_name(tmp_path: Path) -> None:
+    both = [experiment("alpha"), experiment("alpha-six")]
+    for one in (both[1], both[0], both[0]):
+        publish(save_result(tmp_path, one, result(), {})[:1], tmp_path / "pages", both)
+    pictures = {path.name for path in (tmp_path / "pages/pictures").iterdir()}
+    assert pictures == {"alpha-dots.webp", "alpha-six-dots.webp"}
+    assert (tmp_path / "pages/data/alpha-six-rows.csv").exists()
+
+
 def test_a_table_with_a_row_too_long_is_refused() -> None:
     with pytest.raises(ValueError, match="2 cells"):
         Table("t", "T", ("a", "b"), ((1, 2, 3),))
