@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import ssl
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,7 @@ from controller.panel.operations import APPEARANCE
 LONGEST_PAUSE_S: Final = 60.0
 MOST_COMMANDS_WAITING: Final = 20
 LONGEST_PAYLOAD: Final = 256
+_LOG: Final = logging.getLogger("velatura.panel")
 
 
 class BuildingControl:
@@ -49,8 +51,10 @@ class BuildingControl:
                 began_s = loop.time()
                 try:
                     await self._connected()
-                except (aiomqtt.MqttError, OSError):
+                except (aiomqtt.MqttError, OSError, ValueError) as error:
                     # The kiosk goes on without the building; whoever watches "available" sees that it is cut off.
+                    if isinstance(error, ValueError):
+                        _LOG.warning("A password file that is no text, or a topic that can be none: %s", error)
                     pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
                 await asyncio.sleep(pause_s)
                 pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
@@ -124,6 +128,9 @@ class BuildingControl:
                     "what": error.what,
                     "remedy": error.remedy,
                 }
+            except Exception:  # noqa: BLE001 - the panel's live pages must not end with one command
+                _LOG.exception("A command of the building failed.")
+                answer = {"command": word, "done": False, "code": "crash"}
         await client.publish(f"{self._options.topic}/answer", json.dumps(answer), qos=1)
 
     def _command(self, word: str, payload: bytes) -> Callable[[], None] | None:

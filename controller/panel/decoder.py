@@ -11,6 +11,10 @@ import io
 import resource
 import sys
 import warnings
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 NOT_A_PICTURE, TOO_MANY_PIXELS = 3, 4
@@ -28,6 +32,8 @@ def limit(memory_bytes: int, seconds: int) -> None:
 def decode(data: bytes, most_pixels: int) -> bytes:
     """``data`` as PNG: RGB, 8 bit, turned as its EXIF says, without any metadata. Raises ValueError, OSError,
     SyntaxError.
+
+    Of 16 bits the higher ones are kept. A picture of floats, or of 32 bits, says nowhere what is white: ValueError.
     """
     from PIL import Image, ImageOps
 
@@ -35,12 +41,24 @@ def decode(data: bytes, most_pixels: int) -> bytes:
     with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
         if picture.width * picture.height > most_pixels:
             raise SystemExit(TOO_MANY_PIXELS)
-        plain = ImageOps.exif_transpose(picture).convert("RGB")
+        plain = _eight_bits(ImageOps.exif_transpose(picture)).convert("RGB")
     # A fresh picture of the bare pixels: nothing else of the file can come along.
     clean = Image.frombytes("RGB", plain.size, plain.tobytes())
     out = io.BytesIO()
     clean.save(out, "PNG", compress_level=1)
     return out.getvalue()
+
+
+def _eight_bits(picture: Image.Image) -> Image.Image:
+    """Pillow itself would take every 16-bit grey above 255 for white."""
+    from PIL import Image
+
+    if picture.mode in ("I", "F"):
+        raise ValueError(picture.mode)
+    if not picture.mode.startswith("I;16"):
+        return picture
+    high = 0 if picture.mode == "I;16B" else 1
+    return Image.frombytes("L", picture.size, picture.tobytes()[high::2])
 
 
 def main() -> None:

@@ -78,10 +78,17 @@ class Drawing:
         }
 
     def _moment(self, unix_s: float) -> str:
-        return datetime.fromtimestamp(unix_s, self._zone).strftime("%a %d %b %Y, %H:%M:%S")
+        return self._local(unix_s, "%a %d %b %Y, %H:%M:%S")
 
     def _clock(self, unix_s: float) -> str:
-        return datetime.fromtimestamp(unix_s, self._zone).strftime("%a %H:%M")
+        return self._local(unix_s, "%a %H:%M")
+
+    def _local(self, unix_s: float, form: str) -> str:
+        try:
+            return datetime.fromtimestamp(unix_s, self._zone).strftime(form)
+        except (ValueError, OverflowError, OSError):
+            # A file or a clock says so; no page is to be lost for it.
+            return "at an unknown time"
 
 
 def _source(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,9 @@ from controller.errors import UsageError
 
 NAME: Final = r"^[A-Za-z0-9\u00C0-\u024F][A-Za-z0-9\u00C0-\u024F ._-]{0,63}$"
 """Names that end up in addresses and file names."""
+
+_NO_TEXT: Final = re.compile("[\\x00\\ud800-\\udfff]")
+"""Half a character of UTF-16 can be said in JSON, and written to no file and no answer."""
 
 Kind = Literal["text", "integer", "number", "boolean", "file", "rows"]
 Where = Literal["body", "path", "query"]
@@ -121,7 +123,7 @@ def _raise(field: Field) -> Any:
 
 
 def _text(field: Field, value: object) -> str:
-    if not isinstance(value, str) or len(value) > field.longest or "\x00" in value:
+    if not isinstance(value, str) or len(value) > field.longest or _NO_TEXT.search(value):
         raise _wrong(field)
     if field.choices and value not in field.choices:
         raise _wrong(field)
@@ -139,10 +141,9 @@ def _number_in(field: Field, value: object) -> int | float:
 
 
 def _number(field: Field, value: object) -> int | float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise _wrong(field)
-    if field.kind == "integer" and value != int(value):
-        raise _wrong(field)
-    if not field.least <= value <= field.most:
+    # In this order: not a number is never within bounds, and infinity is no whole number.
+    if not field.least <= value <= field.most or (field.kind == "integer" and value != int(value)):
         raise _wrong(field)
     return int(value) if field.kind == "integer" else value

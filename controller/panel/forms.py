@@ -12,6 +12,7 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 
+from controller.errors import UsageError
 from controller.panel import answers
 from controller.panel.context import Panel, Values
 from controller.panel.fields import parse
@@ -132,11 +133,17 @@ def _values(operation: Operation, sent: Sent) -> Values:
 
 
 def _schedule_values(operation: Operation, sent: Sent) -> Values:
-    """The rows of the form's table; one without a day is a row that was left empty."""
+    """The rows of the form's table; one without a day is a row that was left empty.
+
+    Raises UsageError("form-cut") where a column is shorter than another: hours must not be lost, or moved to another
+    row, unseen.
+    """
     columns = [sent.many.get(column.name, []) for column in ROW]
+    if len({len(column) for column in columns}) > 1:
+        raise UsageError("form-cut", what="The table of hours did not arrive whole.", remedy="Load the page again.")
     rows = [
         {column.name: text.strip() for column, text in zip(ROW, row, strict=True)}
-        for row in zip(*columns, strict=False)
+        for row in zip(*columns, strict=True)
         if row[0].strip()
     ]
     others: dict[str, Any] = {name: sent.texts.get(name, "") for name in ("time_zone", "drift_check")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -44,10 +45,24 @@ class LampStory:
 
 def stories(lamps: Sequence[Lamp], history: Sequence[LampDay], events: Sequence[EventRow]) -> list[LampStory]:
     """One story a lamp, in the order of ``lamps``."""
-    return [_story(lamp, history, events) for lamp in lamps]
+    told = [row for row in events if row.code.startswith("lamp-")]
+    longest_first = sorted((lamp.projector for lamp in lamps), key=len, reverse=True)
+    named = [(row, _named(row.text, longest_first)) for row in told]
+    return [_story(lamp, history, [row for row, names in named if lamp.projector in names]) for lamp in lamps]
 
 
-def _story(lamp: Lamp, history: Sequence[LampDay], events: Sequence[EventRow]) -> LampStory:
+def _named(text: str, longest_first: Sequence[str]) -> set[str]:
+    """The projectors of which a text speaks; "left" is not meant where it says "far left"."""
+    found = set()
+    for name in longest_first:
+        whole = re.compile(rf"(?<![^\s,]){re.escape(name)}(?![^\s,.;:])")
+        if whole.search(text):
+            found.add(name)
+            text = whole.sub("\x00", text)
+    return found
+
+
+def _story(lamp: Lamp, history: Sequence[LampDay], told: Sequence[EventRow]) -> LampStory:
     own = [one for one in history if one.projector == lamp.projector]
     burnt = [
         # A counter that went back was set back with a new lamp.
@@ -57,5 +72,4 @@ def _story(lamp: Lamp, history: Sequence[LampDay], events: Sequence[EventRow]) -
     if len(own) > 0 and own[0].strikes > 1:
         # What the counter held before the history began belongs to no day.
         burnt = burnt[1:]
-    told = [row for row in events if row.code.startswith("lamp-") and f" {lamp.projector} " in row.text]
     return LampStory(lamp, tuple(burnt[::-1][:SHOWN_DAYS]), tuple(told[::-1][:SHOWN_EVENTS]))

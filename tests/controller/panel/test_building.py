@@ -154,3 +154,42 @@ def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path) -> None:
                 await asyncio.to_thread(started.__exit__, None, None, None)
 
     asyncio.run(story())
+
+
+class Fragile(MemoryKiosk):
+    """Meets an error that nobody thought of when it is to close."""
+
+    def stop(self) -> None:
+        raise RuntimeError("nobody thought of this")
+
+
+def test_an_error_that_nobody_knows_ends_neither_the_connection_nor_the_panel(tmp_path: Path) -> None:
+    kiosk, port = Fragile(tmp_path / "pictures"), free_port()
+
+    async def story() -> None:
+        async with building(port) as (client, heard), controlled(kiosk, options(tmp_path, port)):
+            await wait_for(heard, "available", "online")
+            await client.publish("hall/velatura/command/close")
+            assert json.loads(await wait_for(heard, "answer", "close"))["code"] == "crash"
+            await client.publish("hall/velatura/command/play", "warm wood")
+            await wait_for(heard, "state", "warm wood")
+
+    with broker(tmp_path / "broker", port):
+        asyncio.run(story())
+
+
+def test_a_password_file_that_is_no_text_is_tried_again_until_it_is_mended(tmp_path: Path) -> None:
+    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+    settings = options(tmp_path, port)
+    assert settings.password_file is not None
+    settings.password_file.write_bytes(b"\xff\xfe\x00")
+
+    async def story() -> None:
+        async with building(port) as (_, heard), controlled(kiosk, settings):
+            await asyncio.sleep(0.15)
+            assert heard.empty()
+            options(tmp_path, port)
+            await wait_for(heard, "available", "online")
+
+    with broker(tmp_path / "broker", port):
+        asyncio.run(story())

@@ -31,3 +31,37 @@ def test_only_what_the_log_says_of_this_lamp_is_told() -> None:
     ]
     (story,) = stories([LEFT], (), rows)
     assert [row.number for row in story.events] == [1]
+
+
+def test_a_lamp_is_told_nothing_of_one_whose_name_holds_its_own() -> None:
+    names = ("left", "far left", "left.", "right, upper", ".*")
+    rows = [
+        EventRow(number, 0.0, "info", text, "lamp-struck")
+        for number, text in enumerate((
+            "The lamp of projector far left is struck.", "The lamp of left, far left could not be switched off.",
+            "The lamp of projector left", "The lamp of projector right, upper is struck.", "Nothing on the leftmost.",
+            "The lamp of projector .* is struck.",
+        ))
+    ]  # fmt: skip
+    told = stories([Lamp(name, 1.0, 1, True) for name in names], (), rows)
+    assert [[row.number for row in story.events] for story in told] == [[2, 1], [1, 0], [], [3], [5]]
+
+
+def test_only_the_last_days_and_events_are_shown_newest_first() -> None:
+    history = [LampDay("left", f"2026-01-{day:02d}", 5.0 * day, day) for day in range(1, 32)]
+    rows = [EventRow(number, 0.0, "info", "The lamp of left is struck.", "lamp-struck") for number in range(40)]
+    (story,) = stories([LEFT], history, rows)
+    assert [day.day for day in story.days] == [f"2026-01-{day:02d}" for day in range(31, 10, -1)]
+    assert {(day.hours, day.strikes) for day in story.days} == {(5.0, 1)}
+    assert [row.number for row in story.events] == list(range(39, 27, -1))
+
+
+def test_a_lamp_is_worn_by_strikes_that_were_many_and_short() -> None:
+    def worn(hours: float, strikes: int) -> tuple[bool, float | None]:
+        (story,) = stories([Lamp("left", hours, strikes, True)], (), ())
+        return story.worn_by_strikes, story.hours_a_strike
+
+    assert worn(0.0, 0) == (False, None)
+    assert worn(9.0, 20) == (True, 0.45)
+    assert worn(9.0, 19)[0] is False
+    assert worn(10.0, 20)[0] is False

@@ -1,0 +1,75 @@
+"""What the decoder makes of pictures that people have: the same light, in eight bits."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from controller.panel import decoder
+from controller.panel.decoder import decode
+
+RAMP = np.linspace(0, 65535, 256).astype(np.uint16)[None].repeat(8, axis=0)
+EIGHT = (RAMP >> 8).astype(np.uint8)
+
+
+def pixels(data: bytes) -> npt.NDArray[np.uint8]:
+    png = decode(data, 10_000)
+    assert png.startswith(b"\x89PNG")
+    with Image.open(io.BytesIO(png)) as picture:
+        assert picture.mode == "RGB"
+        return np.asarray(picture)
+
+
+def encoded(kind: str, picture: npt.NDArray[Any]) -> bytes:
+    return bytes(cv2.imencode(kind, picture)[1])
+
+
+def saved(picture: Image.Image, kind: str, **options: Any) -> bytes:
+    out = io.BytesIO()
+    picture.save(out, kind, **options)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("kind", [".png", ".tiff"])
+@pytest.mark.parametrize("layers", [1, 3])
+def test_sixteen_bits_become_eight_and_not_white(kind: str, layers: int) -> None:
+    found = pixels(encoded(kind, RAMP if layers == 1 else np.dstack([RAMP] * 3)))
+    assert np.abs(found.astype(int) - EIGHT[..., None]).max() <= 1
+
+
+def test_big_endian_sixteen_bits_too() -> None:
+    big = Image.frombytes("I;16B", (256, 8), RAMP.astype(">u2").tobytes())
+    assert np.array_equal(pixels(saved(big, "TIFF")), np.dstack([EIGHT] * 3))
+
+
+def test_a_picture_that_says_nowhere_what_is_white_is_refused() -> None:
+    for picture in (Image.fromarray((RAMP / 65535).astype(np.float32)), Image.fromarray(RAMP.astype(np.int32))):
+        with pytest.raises(ValueError, match=r"^[IF]$"):
+            decode(saved(picture, "TIFF"), 10_000)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA", "LA", "CMYK", "YCbCr"])
+def test_every_mode_becomes_rgb_of_the_same_colours(mode: str) -> None:
+    grey = Image.fromarray(EIGHT).point(lambda value: 255 * (value > 127))
+    data = saved(grey.convert("RGB").convert(mode), "TIFF" if mode in ("CMYK", "YCbCr") else "PNG")
+    assert np.abs(pixels(data).astype(int) - np.asarray(grey)[..., None]).max() <= 2
+
+
+def test_it_is_turned_as_the_camera_was_held() -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    found = pixels(saved(Image.fromarray(np.dstack([EIGHT] * 3)), "PNG", exif=exif))
+    assert found.shape == (256, 8, 3)
+    assert found[0].max() < found[-1].min()
+
+
+def test_too_many_pixels_are_told_before_they_are_decoded() -> None:
+    with pytest.raises(SystemExit) as caught:
+        decode(saved(Image.new("RGB", (101, 100)), "PNG"), 10_000)
+    assert caught.value.code == decoder.TOO_MANY_PIXELS
