@@ -11,6 +11,7 @@ import typer
 from controller import console
 from controller.commands.running import Json, StageFolder, work
 from controller.errors import UsageError
+from controller.text import printable
 
 
 def serve(
@@ -98,7 +99,7 @@ def events(
     if level not in LEVELS:
         raise UsageError("wrong-use", what=f"There is no level {level}.", remedy=f"One of {', '.join(LEVELS)}.")
     rows = [row for row in call(stage, "events", after=after) if LEVELS.index(row["level"]) >= LEVELS.index(level)]
-    lines = [f"{row['number']:>7} {_local(row['unix_s'])} {row['level']:<7} {row['text']}" for row in rows]
+    lines = [f"{row['number']:>7} {_local(row['unix_s'])} {row['level']:<7} {printable(row['text'])}" for row in rows]
     console.show_result({"events": rows} if as_json else "\n".join(lines), as_json=as_json)
 
 

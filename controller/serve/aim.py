@@ -14,7 +14,7 @@ import numpy.typing as npt
 from controller.arrays import Mask
 from controller.calibrations import finished_calibration, finished_calibrations
 from controller.checking import Checked, check_stage
-from controller.errors import WorkError
+from controller.errors import VelaturaError, WorkError
 from controller.panel.kiosk import Aiming, ProjectorAim
 from controller.serve.devices import Devices
 from controller.serve.runs import began_s
@@ -35,6 +35,7 @@ DARK = 0.1
 FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
 """As ``controller.session.aiming`` writes them, which is not loaded before there is something to photograph."""
 _ANSWER_S = 5.0
+_UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
 _measured: dict[Path, Aiming] = {}
 _lock = threading.Lock()
 
@@ -43,18 +44,19 @@ def camera_picture(devices: Devices) -> bytes | None:
     """The camera's live picture, decoded and encoded anew, as JPEG; None without live view, or while it works."""
     import cv2
 
-    camera = devices.camera.device
-    if not isinstance(camera, LiveViewCamera) or not camera.capabilities.live_view:
-        return None
     if not devices.camera.lent.acquire(timeout=0.5):
         return None
     try:
+        # Not before it is ours: its keeper may let go of it and open it anew meanwhile.
+        camera = devices.camera.device
+        if not isinstance(camera, LiveViewCamera) or not camera.capabilities.live_view:
+            return None
         data = camera.live_view(deadline=in_seconds(_ANSWER_S))
     except DeviceError:
         return None
     finally:
         devices.camera.lent.release()
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if picture is None:
         return None
     done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
@@ -62,26 +64,42 @@ def camera_picture(devices: Devices) -> bytes | None:
 
 
 def aiming(checked: Checked) -> Aiming:
-    """Coverage, overlap and focus by the newest test shots, or by the calibration where that is newer or alone."""
+    """Coverage, overlap and focus by the newest test shots, or by the calibration where that is newer or alone.
+
+    Where that one can't be read, by the test shots that there are; without any, the hint says what is wrong.
+    """
     folder = checked.stage.folder
     shots = _of_shots(folder / FOLDER)
-    run = next(iter(finished_calibrations(folder)), None)
-    if run is None or (shots is not None and shots.measured_unix_s > began_s(run.name)):
-        return shots or Aiming()
+    try:
+        run = next(iter(finished_calibrations(folder)), None)
+        if run is None or (shots is not None and shots.measured_unix_s > began_s(run.name)):
+            return shots or Aiming()
+        return _remembered(run, checked.names)
+    except VelaturaError as error:
+        return shots or Aiming(hints=(f"{error.what} {error.remedy}",))
+    except _UNREADABLE as error:
+        return shots or Aiming(hints=(f"The calibration can't be read ({type(error).__name__}). Calibrate anew.",))
+
+
+def _remembered(run: Path, names: Sequence[str]) -> Aiming:
     from controller.session.solving import Calibrated
 
     with _lock:
         if run not in _measured:
             _measured.clear()
-            _measured[run] = _of_calibration(Calibrated(run, checked.names))
+            _measured[run] = _of_calibration(Calibrated(run, names))
         return _measured[run]
 
 
 def _of_shots(folder: Path) -> Aiming | None:
     try:
-        found: dict[str, Any] = json.loads((folder / FIGURES).read_text())
-    except (OSError, ValueError):
+        return _judged(folder, json.loads((folder / FIGURES).read_text()))
+    except _UNREADABLE:
+        # New ones are taken in seconds; damaged ones must not keep anybody from the page where that is asked for.
         return None
+
+
+def _judged(folder: Path, found: dict[str, Any]) -> Aiming:
     aims = tuple(ProjectorAim(**row) for row in found["projectors"])
     exposure, camera = found["exposure"], found["camera_focus"]
     hints = [*_hints(aims), *_shared_hints(found["too_dark"], found["too_soft"])]

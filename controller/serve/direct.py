@@ -21,6 +21,7 @@ from controller.serve.hours import check_schedule
 from controller.serve.lamp_history import LampHistory
 from controller.serve.schedule_file import ScheduleFile
 from controller.serve.stock import BundleStock
+from controller.text import printable
 
 _DIRECT: Final[dict[str, Callable[..., Any]]] = {}
 LEVELS: Final = ("info", "warning", "error")
@@ -70,7 +71,7 @@ def status_of(stage: Path) -> dict[str, Any]:
 
 
 def status_text(state: Mapping[str, Any]) -> str:
-    """For people."""
+    """For people: what devices said in it reaches no terminal as it came."""
     lines = [f"{state['stage']}: {state['state']}" + (f" ({state['reason']})" if state["reason"] else "")]
     if state.get("playing"):
         lines.append(f"Playing {state['playing']}.")
@@ -83,7 +84,7 @@ def status_text(state: Mapping[str, Any]) -> str:
     if job and not job["ended"]:
         step = job["steps"][-1] if job["steps"] else {"title": "", "done": 0.0}
         lines.append(f"{job['name']}: {step['title']} {step['done']:.0%}")
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def changed_schedule(
@@ -122,7 +123,8 @@ def schedule_text(schedule: Mapping[str, Any]) -> str:
     if not schedule["rows"]:
         lines.append("  always open")
     check = schedule["drift_check"]
-    return "\n".join([*lines, f"Drift check at {check}" if check else "No nightly drift check"])
+    lines.append(f"Drift check at {check}" if check else "No nightly drift check")
+    return "\n".join(map(printable, lines))
 
 
 def _appearances(folder: Path) -> Any:
@@ -172,9 +174,9 @@ def aiming_text(found: Mapping[str, Any]) -> str:
     lines.append(f"Lit by two or more {found['overlap']:.0%}, too dark {found['too_dark']:.0%}, "
                  f"too grazing {found['too_grazing']:.0%}")  # fmt: skip
     if not found["source"]:
-        return "Nothing has been measured yet. Take test shots: `velatura aim STAGE --shots`."
+        lines = ["Nothing has been measured yet. Take test shots: `velatura aim STAGE --shots`."]
     pictures = [f"Picture: {found['picture']}"] if found["picture"] else []
-    return "\n".join([*lines, *found["hints"], *pictures])
+    return "\n".join(map(printable, [*lines, *found["hints"], *pictures]))
 
 
 _DIRECT.update(

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from controller.config.writer import toml_text
-from controller.doctor.examine import examine
+from controller.doctor.examine import Tools, examine
+from controller.doctor.values import Examination
 from controller.errors import VelaturaError
 from controller.panel.kiosk import Finding, FoundDevice, TriedDevice
 from controller.serve.service import Service
@@ -26,7 +27,7 @@ _TABLES: Final = {"projector": "projectors", "power_switch": "relays", "button_p
 _LISTS: Final = ("projectors", "relays")
 
 
-def findings(stage: Path, service: Service | None) -> Sequence[Finding]:
+def findings(stage: Path, service: Service | None, *, tools: Tools | None = None) -> Sequence[Finding]:
     """What is wrong: the devices' own problems, the disk, and what the buses say."""
     found = []
     for row in () if service is None else service.rows():
@@ -41,15 +42,20 @@ def findings(stage: Path, service: Service | None) -> Sequence[Finding]:
     if shutil.disk_usage(stage).free < LOW_DISK_BYTES:
         found.append(Finding("warning", "disk", "Less than 2 GiB are free on the stage's disk.",
                              "Delete old runs or backups; playback goes on, calibrating may not."))  # fmt: skip
-    seen = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event())
+    seen = _search(tools)
     for one in seen.findings:
-        found.append(Finding("warning", printable(one.device or "bus"), one.problem.what, one.problem.remedy))
+        found.append(Finding("warning", printable(one.device or "bus"), printable(one.problem.what),
+                             printable(one.problem.remedy)))  # fmt: skip
     return found
 
 
-def find(stage: Path) -> Sequence[FoundDevice]:
+def _search(tools: Tools | None) -> Examination:
+    return examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event(), tools=tools)
+
+
+def find(stage: Path, *, tools: Tools | None = None) -> Sequence[FoundDevice]:
     """Every device of every bus, with its table for stage.toml."""
-    seen = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event())
+    seen = _search(tools)
     return [_found(one) for one in seen.found]
 
 
@@ -62,16 +68,17 @@ def _found(one: Found) -> FoundDevice:
     return FoundDevice(f"{one.bus}:{one.address}", one.kind, one.driver, printable(one.what), text)
 
 
-def try_device(stage: Path, key: str) -> TriedDevice:
+def try_device(stage: Path, key: str, *, tools: Tools | None = None) -> TriedDevice:
     """Open the device and ask it who it is; changes nothing."""
-    seen = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event())
+    seen = _search(tools)
     one = next((one for one in seen.found if f"{one.bus}:{one.address}" == key), None)
     if one is None:
         return TriedDevice(False, "It is not there any more. Plug it in and search again.")
     if not one.driver:
         return TriedDevice(False, "Nobody knows what drives it. Write its table into stage.toml by hand.")
     try:
-        driver = load_drivers(benches=False).get(one.kind, one.driver)
+        drivers = tools.drivers if tools is not None and tools.drivers is not None else load_drivers(benches=False)
+        driver = drivers.get(one.kind, one.driver)
         opened = driver.open(dict(one.settings), OpenContext(stage=stage), in_seconds(20.0))
     except (DeviceError, VelaturaError) as error:
         return TriedDevice(False, f"{error.what} {error.remedy}")
