@@ -92,7 +92,7 @@ def reach(kiosk: WiredKiosk, step: str) -> None:
 
 def judge(kiosk: WiredKiosk, step: str, fault: Fault) -> None:
     """Reach, strike, wait, look; mend, wait, look again. Raises AssertionError."""
-    assert kiosk.until_settled((State.PLAYING,), REACH_S), f"not playing before: {kiosk.state.value} {kiosk.reason}"
+    assert kiosk.until(lambda: kiosk.state is State.PLAYING, REACH_S), f"not playing before: {kiosk.reason}"
     kiosk.longest_gap_s, before = 0.0, kiosk.service.log.number
     reach(kiosk, step)
     struck = kiosk.service.log.number
