@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from controller.errors import WorkError
+from controller.errors import VelaturaError, WorkError
 from controller.serve.control import ask
 from controller.session.progress import Phase, Progress, Reporter
 from hal.deadline import Cancelled
@@ -41,7 +42,8 @@ def ask_and_follow(
             last = job["steps"]
             reporter.progress(_progress(job, time.monotonic() - began_s))
         if cancel.wait(every_s):
-            ask(stage, "cancel")
+            with contextlib.suppress(VelaturaError):  # it may have ended meanwhile
+                ask(stage, "cancel")
             raise Cancelled
 
 

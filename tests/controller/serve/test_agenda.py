@@ -90,6 +90,7 @@ def test_what_follows_comes_before_what_waits_and_in_its_order(desk: Desk) -> No
     assert desk.begin(LIT) == FULL
     desk.works.end(PUBLISH, QUICK)
     desk.agenda.take_finished()
+    assert desk.told == ["ended"]
     for expected in (PUBLISH, QUICK, REPORT):
         assert desk.begin(LIT) == expected
         assert desk.begin(LIT) is None, "one at a time"
@@ -114,6 +115,9 @@ def test_other_work_is_refused_while_some_waits_or_runs_and_a_refusal_is_told(de
     assert (caught.value.code, desk.told[-1]) == ("camera-gone", "camera-gone")
     assert not desk.agenda.offer(PUBLISH)
     assert desk.agenda.head is None
+    desk.works.refused = None
+    assert desk.agenda.offer(PUBLISH)
+    assert desk.agenda.head == PUBLISH
 
 
 def test_nothing_follows_from_work_that_was_cancelled_though_it_ended_well(desk: Desk) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from controller.errors import UsageError
 from controller.panel.kiosk import Schedule, ScheduleRow
-from controller.serve.hours import WEEKDAYS, check_schedule, moment, openings, rows_of, zone_of
+from controller.serve.hours import MOST_ROWS, WEEKDAYS, check_schedule, moment, openings, rows_of, zone_of
 
 ZONES = ("UTC", "Europe/Vienna", "America/New_York", "Australia/Lord_Howe", "Asia/Kathmandu", "America/St_Johns",
          "Africa/Casablanca", "Pacific/Chatham", "America/Asuncion")  # fmt: skip
@@ -109,3 +109,10 @@ def _open_by_wall(rows: list[ScheduleRow], now: datetime) -> bool:
         if row.opens and row.opens <= reading and (reading < row.closes or row.closes <= row.opens):
             return True
     return any(row.opens and row.closes <= row.opens and reading < row.closes for row in of(now.date() - timedelta(1)))
+
+
+def test_no_more_rows_than_anybody_reads() -> None:
+    row = ScheduleRow("mon", "10:00", "11:00")
+    check_schedule(Schedule("UTC", (row,) * MOST_ROWS))
+    with pytest.raises(UsageError, match="number of rows"):
+        check_schedule(Schedule("UTC", (row,) * (MOST_ROWS + 1)))

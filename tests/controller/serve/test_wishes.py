@@ -66,6 +66,8 @@ def test_who_closes_or_opens_by_hand_is_heard_until_the_hours_say_something_new(
     assert open_at(wishes, "05T20:00", "06T09:59", "06T10:00", "06T18:00") == [True, True, True, False]
     wishes.override(False, at("06T20:00"))
     assert open_at(wishes, "07T10:00") == [True], "what the schedule says anyway binds nobody"
+    told = [row.code for row in memory.log.after(0)]
+    assert told == ["asked", "schedule-rules", "asked", "schedule-rules", "asked"]
 
 
 @pytest.mark.parametrize(

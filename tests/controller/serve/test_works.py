@@ -175,12 +175,33 @@ def test_work_that_is_given_up_before_it_begins_is_told_to_whoever_follows_it(ki
     assert "work-cancelled" in [row.code for row in kiosk.events()]
 
 
-def followed(kiosk: StageKiosk, **instead: Any) -> Mapping[str, Any]:
+def followed(kiosk: StageKiosk, cancel: threading.Event | None = None, **instead: Any) -> Mapping[str, Any]:
     served = operations(kiosk) | instead
     with ControlServer(runtime_folder(kiosk.stage.resolve()) / NAME, served):
         arguments = {"name": "wood", "target": str(kiosk.stage / "target.png")}
         return ask_and_follow(stage=kiosk.stage, op="compute", arguments=arguments, reporter=Silent(),
-                              cancel=threading.Event(), every_s=0.01)  # fmt: skip
+                              cancel=cancel or threading.Event(), every_s=0.01)  # fmt: skip
+
+
+def test_who_stops_following_a_job_that_ends_at_that_moment_has_stopped(kiosk: StageKiosk) -> None:
+    cancel = threading.Event()
+
+    def job(number: int) -> Job:
+        kiosk.cancel()
+        cancel.set()
+        return Job(number, "New appearance")
+
+    with pytest.raises(Cancelled):
+        followed(kiosk, cancel, job=job)
+    assert not kiosk.service.conductor.working
+
+
+def test_who_stops_following_cancels_the_job(kiosk: StageKiosk) -> None:
+    cancel = threading.Event()
+    cancel.set()
+    with pytest.raises(Cancelled):
+        followed(kiosk, cancel)
+    assert not kiosk.service.conductor.working
 
 
 def test_who_follows_work_that_never_begins_does_not_wait_for_ever(kiosk: StageKiosk) -> None:
