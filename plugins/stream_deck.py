@@ -12,7 +12,7 @@ import numpy.typing as npt
 from StreamDeck.DeviceManager import DeviceManager, ProbeError
 from StreamDeck.Transport.Transport import TransportError
 
-from hal.deadline import Deadline
+from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceRefused, PluginError, ProtocolError
 from hal.ptp import printable
 from hal.registry import Driver, OpenContext, setting
@@ -20,6 +20,8 @@ from hal.values import DeviceIdentity, PanelCapabilities
 from plugins.worker_link import WorkerLink
 
 _SLICE_S: Final = 0.1
+_LOOK_S: Final = 5.0
+"""After so long a look whether the panel is still there has failed; on a busy machine it may well take a second."""
 _MOST_WAITING: Final = 16
 """Presses that are kept for a caller who does not ask; older ones are forgotten."""
 _ENCODINGS: Final = {"JPEG": ".jpg", "BMP": ".bmp"}
@@ -70,14 +72,17 @@ class StreamDeckPanel(WorkerLink[Any]):
         self._pictures[key] = encoded
 
     def wait_pressed(self, *, deadline: Deadline) -> int | None:
-        """See ``hal.interfaces.ButtonPanel.wait_pressed``. Raises DeviceGone while it is unplugged."""
+        """See ``hal.interfaces.ButtonPanel.wait_pressed``. Raises DeviceGone while it is unplugged.
+
+        A panel that hangs is told of 5 s after the deadline at the latest.
+        """
         while True:
             deadline.sleep(0.0)  # a cancelled wait ends
             with contextlib.suppress(queue.Empty):
                 return self._pressed.get(timeout=min(_SLICE_S, deadline.left_s()) or 1e-6)
             if deadline.left_s() < _SLICE_S / 10:
                 return None
-            self.call(_still_open, deadline=deadline)
+            self.call(_still_open, deadline=in_seconds(_LOOK_S, deadline.cancel))
 
     def find(self) -> Any:
         """See ``WorkerLink.find``. Raises DeviceGone, or DeviceRefused (several of them, or no permission)."""

@@ -17,6 +17,7 @@ from controller.session.machine import Event, Machine, State
 from hal.conformance import ButtonPanelConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
+from plugins import stream_deck
 from plugins.emulated.usb_bus_process import UsbBusProcess
 from plugins.stream_deck import StreamDeckPanel
 
@@ -100,6 +101,22 @@ def test_an_unplugged_panel_is_gone_and_gets_its_pictures_back(bus: UsbBusProces
     assert on_key(bus, 1).mean() == pytest.approx(200, abs=3)
     bus.call("keys", "press", 5)
     assert panel.wait_pressed(deadline=in_seconds(20)) == 5
+
+
+def test_a_machine_that_is_busy_for_longer_than_a_wait_is_no_failure_of_the_panel(
+    bus: UsbBusProcess, panel: StreamDeckPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = threading.Event()
+
+    def slowly(deck: object) -> None:
+        time.sleep(0.4)
+        looked.set()
+
+    monkeypatch.setattr(stream_deck, "_still_open", slowly)
+    assert panel.wait_pressed(deadline=in_seconds(0.2)) is None
+    assert looked.is_set()
+    bus.call("keys", "press", 4)
+    assert panel.wait_pressed(deadline=in_seconds(20)) == 4
 
 
 def test_a_silent_panel_ends_at_the_deadline(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
