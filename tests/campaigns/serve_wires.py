@@ -30,7 +30,7 @@ from controller.panel.kiosk import EventRow
 from controller.serve.ports import Request
 from controller.session.machine import State
 from tests.campaigns.kills import REPOSITORY, copy
-from tests.campaigns.usb_faults import mend_usb, usb_faults, usb_well
+from tests.campaigns.usb_faults import WORDS, mend_usb, usb_faults, usb_well
 from tests.campaigns.wired_faults import Fault, camera_faults, deeds, mend_projectors, processes, wire_faults
 from tests.campaigns.wired_kiosk import WiredKiosk, prepare_wired, usb_environment
 
@@ -106,6 +106,7 @@ def judge(kiosk: WiredKiosk, step: str, fault: Fault) -> None:
     mend(kiosk, fault)
     assert kiosk.until_settled((State.PLAYING,), MENDED_S), f"not mended: {kiosk.state.value} {kiosk.reason}"
     assert kiosk.until(lambda: not usb_well(kiosk), MENDED_S), f"not mended: {usb_well(kiosk)}"
+    _nothing_else(kiosk, before, fault)
     assert not kiosk.sins, kiosk.sins
     assert max(kiosk.longest_gap_s, kiosk.silent_s) < GAP_S, f"nothing was decided for {kiosk.longest_gap_s:.0f} s"
 
@@ -139,6 +140,14 @@ def _explained(kiosk: WiredKiosk, before: int) -> None:
 
 def _told(kiosk: WiredKiosk, before: int, word: str) -> bool:
     return any(word in row.text and _remedied(row) for row in kiosk.service.log.after(before))
+
+
+def _nothing_else(kiosk: WiredKiosk, before: int, fault: Fault) -> None:
+    """Nobody was told of a device to which nothing was done."""
+    others = [word for name, word in WORDS.items() if name not in fault.name.split()]
+    told = [row.text for row in kiosk.service.log.after(before) if row.level != "info"]
+    wrong = [text for text in told if any(word in text for word in others)]
+    assert not wrong, f"nothing is wrong with what is told of: {wrong}"
 
 
 def _remedied(row: EventRow) -> bool:
