@@ -97,7 +97,11 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
             token = form.get("csrf")
             if not isinstance(token, str) or not visitor.session.matches(token):
                 return refused()
-            await _read(form, sent, panel.options.folder / "incoming")
+            try:
+                await _read(form, sent, panel.options.folder / "incoming")
+            except OSError as error:
+                said = f"The file could not be kept: {error.strerror}. Free some space on the disk, and send it again."
+                return PlainTextResponse(said, 507)
             return await handler(request, visitor, sent)
         finally:
             if sent.file is not None:

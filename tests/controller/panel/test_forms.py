@@ -64,6 +64,18 @@ def test_a_file_that_nobody_asked_for_is_removed_and_leaves_the_form_as_it_is(fr
     assert list(incoming.iterdir()) == []
 
 
+def test_a_disk_that_takes_no_upload_is_told_in_words(fresh: Served) -> None:
+    incoming: Path = fresh.app.state.panel.options.folder / "incoming"
+    incoming.write_bytes(b"no folder")
+    with fresh.entered("otto") as client:
+        form = {"csrf": csrf(client.get("/appearances/new").text)}
+        answer = client.post("/do/upload-target", data=form, files={"file": ("a.png", b"x")})
+        assert answer.status_code == 507
+        assert "Free some space" in answer.text
+        assert "set-schedule" in sent(client, FORM), "the panel goes on"
+    assert len(fresh.kiosk.schedule().rows) == 2
+
+
 def test_a_form_that_is_none_is_refused_and_ends_no_session(fresh: Served) -> None:
     with fresh.entered("otto") as client:
         token = csrf(client.get("/schedule").text)

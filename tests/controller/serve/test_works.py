@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +84,25 @@ def test_whatever_ends_the_work_is_its_outcome(log: EventLog, error: BaseExcepti
     assert works.running is None
     assert works.job is not None
     assert (works.job.ended, works.job.failed, works.job.outcome) == (True, True, finished.outcome.text)
+
+
+@pytest.mark.parametrize("how", [lambda works: works.cancel(), lambda works: works.close(20)], ids=["cancel", "close"])
+def test_work_is_asked_to_end(log: EventLog, how: Callable[[ThreadWorks], None]) -> None:
+    def waits(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        if not cancel.wait(20):
+            raise AssertionError("nobody asked")
+        raise Cancelled
+
+    ended = Ended()
+    works = ended.works = ThreadWorks({"work": Kind(waits)}, log, ended.changed)
+    works.begin(Request("work"))
+    assert works.running == Request("work")
+    how(works)
+    assert ended.wait(20)
+    finished = works.finished()
+    assert finished is not None
+    assert finished.outcome.code == Cancelled().code
+    works.close(20)
 
 
 def test_it_is_finished_once_and_can_be_asked_for_by_its_number(log: EventLog) -> None:
