@@ -47,7 +47,8 @@ class Wishes:
         """The schedule's opinion has been worked out anew."""
         if self._override is not None:
             self._follow(self._override, plan)
-        if plan.appearance != self._scheduled:
+        # A clock that is lost for a while is no new opinion.
+        if plan.open is not None and plan.appearance != self._scheduled:
             self._scheduled = plan.appearance
             self._log.keep("scheduled", plan.appearance)
             if plan.appearance:

@@ -136,6 +136,8 @@ def test_an_appearance_is_played_until_the_schedule_names_another(memory: Memory
     assert shown("04T11:00") == "glass"
     wishes = memory.wishes()
     assert shown("04T11:30") == "glass", "a restart is no new opinion of the schedule"
+    wishes.follow(Plan(None))
+    assert shown("04T11:31") == "glass", "nor is a clock that was lost for a while"
     assert shown("04T12:00") == "shine", "the bundle has none of that name"
     assert shown("05T12:00") == "shine"
     assert wishes.appearance(at("05T12:00", schedule), ()) == ""
