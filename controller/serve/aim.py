@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections.abc import Sequence
@@ -14,10 +15,11 @@ import numpy.typing as npt
 from controller.arrays import Mask
 from controller.calibrations import finished_calibration, finished_calibrations
 from controller.checking import Checked, check_stage
-from controller.errors import VelaturaError, WorkError
+from controller.errors import VelaturaError
 from controller.panel.kiosk import Aiming, ProjectorAim
 from controller.serve.devices import Devices
 from controller.serve.runs import began_s
+from controller.storage import write_atomically
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import LiveViewCamera
@@ -34,6 +36,7 @@ DARK = 0.1
 """Below this share of the median light of the object, a place is too dark to work with."""
 FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
 """As ``controller.session.aiming`` writes them, which is not loaded before there is something to photograph."""
+MAPS, MAPS_KEPT = "kiosk/feasibility", 20
 _ANSWER_S = 5.0
 _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
 _measured: dict[Path, Aiming] = {}
@@ -175,7 +178,10 @@ def read_geometry_of(calibrated: Calibrated) -> Geometry:
 
 
 def feasibility_map(stage: Path, target: Path) -> Path:
-    """A PNG of how far the target is out of reach. Raises UsageError("not-calibrated", "target-unreadable")."""
+    """A PNG of how far the target is out of reach; the newest ``MAPS_KEPT`` stay on the disk.
+
+    Raises UsageError("not-calibrated", "target-unreadable"), WorkError("no-space").
+    """
     import cv2
 
     from controller.session.solving import Calibrated
@@ -183,6 +189,8 @@ def feasibility_map(stage: Path, target: Path) -> Path:
     from controller.solve.targets import load_target
 
     checked = check_stage(stage)
+    path = checked.stage.folder / MAPS / f"{target.stem[:64]}.png"
+    _keep_newest(path.parent, MAPS_KEPT - 1)
     calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
     transport, black = calibrated.transport, calibrated.calibration.black
     asked = load_target(target, (black.shape[1], black.shape[0]))
@@ -190,8 +198,14 @@ def feasibility_map(stage: Path, target: Path) -> Path:
     found = feasibility(transport, np.float32(exposure) * asked.image, black)
     worst = np.maximum(found.too_bright, found.too_dark).max(axis=2)
     grey = np.where(calibrated.calibration.object_mask, np.clip(worst, 0, 1), 0)
-    path = stage / "kiosk" / "feasibility" / f"{target.stem[:64]}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), (255 * grey).astype(np.uint8)):
-        raise WorkError("cannot-write", what=f"{path.name} could not be written.", remedy="Look at the disk.")
+    # Whole or not at all: somebody may ask for the same one at the same time.
+    write_atomically(path, cv2.imencode(".png", (255 * grey).astype(np.uint8))[1].tobytes())
     return path
+
+
+def _keep_newest(folder: Path, most: int) -> None:
+    """Every target that somebody uploads gets a map of its own, for months."""
+    with contextlib.suppress(FileNotFoundError):  # somebody else does the same at the same time
+        for _, file in sorted((file.stat().st_mtime_ns, file) for file in folder.glob("*.png"))[:-most]:
+            file.unlink()

@@ -128,6 +128,16 @@ def test_mains_are_cut_when_the_lamps_have_cooled_and_the_projectors_are_left_in
     assert [one.code for one in mains.told].count("mains-off") == 2
 
 
+def test_a_service_that_begins_gives_mains_so_that_it_can_ask_what_the_lamps_do() -> None:
+    mains = Mains()
+    mains.relays.step()
+    assert mains.closed == ["left", "right"]
+    assert [one.code for one in mains.told] == ["mains-on", "mains-on"]
+    mains.world.time_s += 2.0
+    mains.relays.step()
+    assert len(mains.told) == 2, "once"
+
+
 def test_projectors_that_boot_are_asked_nothing(mains: Mains) -> None:
     mains.want(False)
     mains.run(30)
