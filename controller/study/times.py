@@ -99,9 +99,11 @@ def _facts(subject: Subject, load: float) -> str:
     parts = subject.calibration.projectors
     pixels = sum(part.metapixels.valid.size for part in parts) / len(parts)
     rows, columns = subject.mask.shape
+    times_fewer = round(PAPER_PX / pixels)
+    beside = f"{times_fewer} times fewer than" if times_fewer > 1 else "as many as"
     return (
-        f"*This run*: size {subject.size}, {len(parts)} projectors of {pixels:.0f} pixels, {PAPER_PX / pixels:.0f}"
-        f" times fewer than the paper's, and a camera of {columns}x{rows}; {_cores()} cores, {numba.get_num_threads()}"
+        f"*This run*: size {subject.size}, {len(parts)} projectors of {pixels:.0f} pixels, {beside}"
+        f" the paper's, and a camera of {columns}x{rows}; {_cores()} cores, {numba.get_num_threads()}"
         f" of them used for the solves, a load of {load:.1f} when those began."
     )
 
@@ -208,8 +210,9 @@ The calibration's seconds are those of this run's own journal, by the clock; the
 photograph, shares the machine with them, and the load at that time was not kept. What follows the calibration was done
 once more for this table, compiled before: the least of nine for the new appearance, one for the others, by the clock
 and of the processor. The paper calibrated with a real camera and 256 dots a projector, on eight cores of 3 GHz. An
-emulated camera says nothing about a real one's time, so the photographs and the whole are not judged. A full solve for
-each new appearance is what the paper avoids; it tells no time of one."""
+emulated camera says nothing about how long a real one takes: the photographs and the whole are judged at the paper's
+size alone, and hold for an emulated one. A full solve for each new appearance is what the paper avoids; it tells no
+time of one."""
 
 TIMES = Experiment(
     name="times",
