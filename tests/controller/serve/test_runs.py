@@ -111,3 +111,22 @@ def test_a_kept_grade_is_one_that_passes_or_was_accepted(tmp_path: Path) -> None
     assert [one.kept for one in runs.grades(tmp_path, 8.0)] == [False]
     (run / "accepted.json").write_text(json.dumps({}))
     assert [one.kept for one in runs.grades(tmp_path, 8.0)] == [True]
+
+
+def test_a_report_that_is_there_is_not_made_again_and_an_unknown_run_has_none(tmp_path: Path) -> None:
+    stage = vase(tmp_path)
+    run = graded_run(stage, FIRST, {"left": 0.01})
+    photographs = stage / "runs" / "20260102-100000-compare"
+    photographs.mkdir()
+    figures = {"name": "marble", "title": "Marble", "calibration": FIRST, "photographed_unix_s": 1e9,
+               "delta_e00_median": 1.0, "delta_e00_p95": 2.0, "rmse": 0.1, "sharpness_lambda": 0.5,
+               "reachable_share": None, "window_px": 16}  # fmt: skip
+    (photographs / "compared-marble.json").write_text(json.dumps(figures))
+    checked = check_stage(stage)
+    for folder in (run, photographs):
+        (folder / "report.html").write_text("as it was")
+        assert runs.report(stage, folder.name, checked).read_text() == "as it was"
+    for name in ("20260103-100000-calibrate", "..", f"../runs/{FIRST}"):
+        with pytest.raises(UsageError) as caught:
+            runs.report(stage, name, checked)
+        assert caught.value.code == "run-unknown"
