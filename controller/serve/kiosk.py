@@ -162,7 +162,7 @@ class StageKiosk:
         # In this order: what is neither waiting nor running, and yet not known then, was given up.
         waits = service.conductor.working
         if (found := service.works.known(number)) is None and not waits:
-            raise WorkError("job-given-up", what="The kiosk gave the work up before it began.",
+            raise WorkError("job-given-up", what="The kiosk gave the work up, or began anew meanwhile.",
                             remedy="`velatura events` tells why.")  # fmt: skip
         return found
 
