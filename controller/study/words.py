@@ -65,7 +65,7 @@ It moves the few centres that dots located badly, so the large errors fall (RMSE
     ("ablation", "+ smoothness"): """\
 Smoothness takes noise out of the frames, and a little detail with it. This calibration leaves little noise.""",
     ("earlier", "ours is better than: bounded, no pixel model"): """\
-Dots photographed as well as here are as good a light transport as our shares, at the price of 49 more
+Dots photographed as well as here are as good a light transport as our shares, at the price of 49 and more
 photographs a projector (see the ablation); the smoothness of ours costs a little SSIM.""",
     ("frequency", "F_3 / F_1"): """\
 The projectors' blur. At size medium and seed 1, the calibration measures a standard deviation of 0.53, 0.58 and
