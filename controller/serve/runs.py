@@ -31,7 +31,8 @@ def grades(stage: Path, worst_grade: float) -> tuple[Grade, ...]:
         finished = set()
     errors = _errors(stage)
     found = []
-    for run in sorted((stage / "runs").glob("*"), reverse=True)[:MOST]:
+    ours = (run for run in (stage / "runs").glob("*") if _NAME.fullmatch(run.name))
+    for run in sorted(ours, reverse=True)[:MOST]:
         try:
             grade = _grade(run, run.name in finished, worst_grade, errors.get(run.name))
         except _UNREADABLE:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from pathlib import Path
@@ -62,6 +63,14 @@ def test_a_run_that_vanishes_between_two_looks_leaves_the_grades(tmp_path: Path)
     graded_run(tmp_path, FIRST, {"left": 0.01})
     (tmp_path / "runs" / "20260104-100000-compare").symlink_to(tmp_path / "nowhere")
     assert [one.run for one in runs.grades(tmp_path, 8.0)] == [FIRST]
+
+
+@pytest.mark.parametrize("name", [b"20260104-100000-\xff", b"zz <script>", b"20260104-100000-calibrate (copy)"])
+def test_a_folder_that_is_no_run_of_ours_is_shown_nowhere(tmp_path: Path, name: bytes) -> None:
+    graded_run(tmp_path, FIRST, {"left": 0.01})
+    graded_run(tmp_path, os.fsdecode(name), {"left": 0.01})
+    assert [one.run for one in runs.grades(tmp_path, 8.0)] == [FIRST]
+    assert runs.names(tmp_path) == (FIRST,)
 
 
 def test_no_name_leads_out_of_the_runs(tmp_path: Path) -> None:
