@@ -141,6 +141,7 @@ def test_a_job_is_followed_from_before_it_begins_to_its_end(tmp_path: Path) -> N
     with ModelJob(None, job(4, 0.25), job(4, 0.5), job(4, 1.0, ended=True)).served(tmp_path):
         assert follow(tmp_path, told) == {"job": "Full recalibration", "outcome": "It is so.", "run": "one"}
     assert [(one.step_fraction, one.count) for one in told.kept] == [(0.25, 7), (0.5, 7)]
+    assert all(one.fraction == pytest.approx(one.elapsed_s / (one.elapsed_s + 3.0)) for one in told.kept)
 
 
 def test_a_job_that_failed_is_an_error_with_the_kiosks_own_sentence(tmp_path: Path) -> None:
