@@ -82,11 +82,11 @@ class MainsKeeper(DeviceKeeper):
         return "on"
 
     def _cut(self, circuit: Circuit, guards: dict[str, LampGuard | None]) -> str:
-        if self._off.issuperset(circuit.feeds):
-            # Asked although it is known: a board that is away is to be told of now, and not at the next opening.
-            if not circuit.on(deadline=in_seconds(LOOK_S)):
-                return "off"
-            self._off -= frozenset(circuit.feeds)  # closed by a hand, or by another program
+        # Asked although it may be known, and before anybody behind it: a board that is away is to be told of now, and
+        # not to be taken for the silence of those who have lost their mains with it.
+        if not circuit.on(deadline=in_seconds(LOOK_S)):
+            return self._is_off(circuit)
+        self._off -= frozenset(circuit.feeds)  # closed by a hand, or by another program
         known = {name: guard for name, guard in guards.items() if guard is not None}
         if any(name not in known for name in circuit.feeds):
             return "as it was"
@@ -98,8 +98,12 @@ class MainsKeeper(DeviceKeeper):
             if not _answer([known[name] for name in circuit.feeds]):
                 return "on, for nobody knows whether the lamps have cooled"
             raise
-        self._off |= frozenset(circuit.feeds)
-        self._tell(Decision("mains-off", f"Mains off: {circuit.name}."))
+        return self._is_off(circuit)
+
+    def _is_off(self, circuit: Circuit) -> str:
+        if not self._off.issuperset(circuit.feeds):
+            self._off |= frozenset(circuit.feeds)
+            self._tell(Decision("mains-off", f"Mains off: {circuit.name}."))
         return "off"
 
 

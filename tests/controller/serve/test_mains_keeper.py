@@ -205,6 +205,18 @@ def test_a_board_that_leaves_while_its_mains_are_cut_is_told_of_before_the_next_
     assert mains.values == {"left": "off", "right": "off"}
 
 
+def test_a_board_that_takes_its_projectors_mains_with_it_is_told_of_and_not_their_silence(mains: Mains) -> None:
+    mains.boards["left"].gone, mains.boards["left"].closed, mains.lamps["left"].trouble = True, False, "silent"
+    mains.want(False)
+    mains.run(30)
+    assert mains.relays.problem is not None
+    assert mains.relays.problem.code == "hid-unplugged"
+    mains.boards["left"].gone = False
+    mains.run(20)
+    assert mains.values == {"left": "off", "right": "off"}
+    assert mains.keepers["left"].view.problem is None, "it has no mains"
+
+
 def test_mains_that_somebody_else_gave_are_cut_again_once_the_lamps_are_known_to_be_cold(mains: Mains) -> None:
     mains.want(False)
     mains.run(30)
