@@ -13,7 +13,7 @@ from urllib.parse import quote
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 
-from controller.errors import UsageError, VelaturaError
+from controller.errors import UsageError, VelaturaError, WorkError
 from controller.panel.context import Panel, Values
 from controller.panel.fields import Field, parse
 from controller.panel.operation import BytesAnswer, FileAnswer, Operation
@@ -24,9 +24,16 @@ FAILURES: Final = (VelaturaError, DeviceError)
 
 Failure = VelaturaError | DeviceError
 
+NOT_KEPT: Final = "upload-not-kept"
+
 
 def status_of(error: Failure) -> int:
-    """404 for what is not there, 422 for what is wrong, 409 for what can't be now, 502 for a device that failed."""
+    """404 for what is not there, 422 for what is wrong, 409 for what can't be now, 502 for a device that failed.
+
+    507 for an upload that the disk did not take.
+    """
+    if error.code == NOT_KEPT:
+        return 507
     if error.code.endswith("-unknown") and not error.code.startswith(("field-", "stage-key-")):
         return 404
     if isinstance(error, UsageError):
@@ -81,16 +88,26 @@ async def json_values(operation: Operation, request: Request) -> Values:
 
 
 async def body_file(request: Request, folder: Path) -> Path:
-    """The request's whole body as a private temporary file, which the caller removes."""
-    path = temporary(folder)
+    """The request's whole body as a private temporary file, which the caller removes. Raises as ``not_kept`` says."""
+    path = None
     try:
+        path = temporary(folder)
         with path.open("wb") as file:
             async for chunk in request.stream():
                 file.write(chunk)
-    except BaseException:
-        path.unlink(missing_ok=True)
+    except BaseException as error:
+        if path is not None:
+            path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise not_kept(error) from error
         raise
     return path
+
+
+def not_kept(error: OSError) -> WorkError:
+    """What the disk did not take of an upload."""
+    return WorkError(NOT_KEPT, what=f"The file could not be kept: {error.strerror}.",
+                     remedy="Free some space on the disk, and send it again.")  # fmt: skip
 
 
 def temporary(folder: Path) -> Path:

@@ -110,7 +110,7 @@ def _described(operation: Operation) -> dict[str, Any]:
         "description": f"Needs the role {operation.role.name.lower()} or above.",
         "responses": {
             "200": {"description": "Done", "content": content},
-            **dict.fromkeys(("401", "403", "404", "409", "422", "429", "502"), _ERROR),
+            **dict.fromkeys(("401", "403", "404", "409", "422", "429", "502", "507"), _ERROR),
             "413": {"$ref": "#/components/responses/Plain"},
         },
     }

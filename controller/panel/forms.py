@@ -100,8 +100,8 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
             try:
                 await _read(form, sent, panel.options.folder / "incoming")
             except OSError as error:
-                said = f"The file could not be kept: {error.strerror}. Free some space on the disk, and send it again."
-                return PlainTextResponse(said, 507)
+                told = answers.not_kept(error)
+                return PlainTextResponse(f"{told.what} {told.remedy}", answers.status_of(told))
             return await handler(request, visitor, sent)
         finally:
             if sent.file is not None:

@@ -83,6 +83,15 @@ def test_the_api_does_what_its_document_says(case: schemathesis.Case[Any], quick
     )
 
 
+def test_a_disk_that_takes_no_upload_is_told_in_words(fresh: Served) -> None:
+    incoming: Path = fresh.app.state.panel.options.folder / "incoming"
+    incoming.write_bytes(b"no folder")
+    with fresh.client() as client:
+        answer = client.post(f"{PREFIX}/targets", content=jpeg(), headers=fresh.token(Role.TECHNICIAN))
+    assert (answer.status_code, answer.json()["code"]) == (507, "upload-not-kept")
+    assert "space" in answer.json()["remedy"]
+
+
 def test_every_operation_stands_in_the_document_with_its_role() -> None:
     paths = document()["paths"]
     for operation in OPERATIONS:
