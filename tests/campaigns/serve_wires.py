@@ -44,6 +44,8 @@ NOTICED_S: Final = 25.0
 """By then a fault that lasts has been noticed where it matters; a short silence is no event for 15 s."""
 TOLD_S: Final = 90.0
 """By then the technician is told of a device that does not answer: it is looked at every 10 s, with 20 s to open it."""
+STARVED_S: Final = 1.0
+"""Where the machine itself stood still for so long at once, a device may well have been late for our clock."""
 
 
 def cases() -> list[tuple[str, Fault]]:
@@ -93,7 +95,8 @@ def reach(kiosk: WiredKiosk, step: str) -> None:
 def judge(kiosk: WiredKiosk, step: str, fault: Fault) -> None:
     """Reach, strike, wait, look; mend, wait, look again. Raises AssertionError."""
     assert kiosk.until(lambda: kiosk.state is State.PLAYING, REACH_S), f"not playing before: {kiosk.reason}"
-    kiosk.longest_gap_s, before = 0.0, kiosk.service.log.number
+    kiosk.longest_gap_s = kiosk.starved_s = 0.0
+    before = kiosk.service.log.number
     reach(kiosk, step)
     struck = kiosk.service.log.number
     fault.strike(kiosk)
@@ -106,9 +109,11 @@ def judge(kiosk: WiredKiosk, step: str, fault: Fault) -> None:
     mend(kiosk, fault)
     assert kiosk.until_settled((State.PLAYING,), MENDED_S), f"not mended: {kiosk.state.value} {kiosk.reason}"
     assert kiosk.until(lambda: not usb_well(kiosk), MENDED_S), f"not mended: {usb_well(kiosk)}"
-    _nothing_else(kiosk, before, fault)
+    if kiosk.starved_s < STARVED_S:
+        _nothing_else(kiosk, before, fault)
     assert not kiosk.sins, kiosk.sins
-    assert max(kiosk.longest_gap_s, kiosk.silent_s) < GAP_S, f"nothing was decided for {kiosk.longest_gap_s:.0f} s"
+    gap_s = max(kiosk.longest_gap_s, kiosk.silent_s) - kiosk.starved_s
+    assert gap_s < GAP_S, f"nothing was decided for {gap_s:.0f} s"
 
 
 def mend(kiosk: WiredKiosk, fault: Fault) -> None:
@@ -170,7 +175,8 @@ def lane(stage: Path, most_s: float, numbers: list[int]) -> int:
                 why, failed = str(error) or type(error).__name__, failed + 1
                 mend(kiosk, fault)
                 kiosk.sins.clear()
-            row = {"case": f"{step}, {fault.name}", "seconds": round(time.monotonic() - began_s, 1), "wrong": why}
+            row = {"case": f"{step}, {fault.name}", "seconds": round(time.monotonic() - began_s, 1),
+                   "starved_s": round(kiosk.starved_s, 1), "wrong": why}  # fmt: skip
             print(json.dumps(row), flush=True)
     return failed
 
@@ -218,7 +224,8 @@ def main() -> int:
     wrong = [row for row in rows if row["wrong"]]
     print(Counter(row["case"].partition(",")[0] for row in rows))
     for row in wrong:
-        print(f"WRONG: {row['case']}: {row['wrong']}")
+        # Where the machine itself stood still for seconds, that is what was judged: run such a case again.
+        print(f"WRONG: {row['case']}: {row['wrong']} (starved for {row.get('starved_s', 0):g} s)")
     print(f"{len(rows)} of {len(cases())} cases, {len(wrong)} wrong, {time.monotonic() - began_s:.0f} s")
     return 1 if wrong or (len(rows) < len(numbers) and most_s == 1e9) else 0
 

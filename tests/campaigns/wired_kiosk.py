@@ -113,6 +113,7 @@ class WiredKiosk:
         )  # fmt: skip
         self._stack = contextlib.ExitStack()
         self._beaten_s, self.longest_gap_s = time.monotonic(), 0.0
+        self.starved_s = 0.0
         self.service: Service
 
     def __enter__(self) -> Self:
@@ -182,13 +183,19 @@ class WiredKiosk:
                 if b"controller.play" in Path(f"/proc/{pid}/cmdline").read_bytes():
                     os.kill(pid, number)
 
+    def _rest(self) -> None:
+        """``starved_s``: the longest that this process was not let go on when it should have been."""
+        began_s = time.monotonic()
+        time.sleep(POLL_S)
+        self.starved_s = max(self.starved_s, time.monotonic() - began_s - POLL_S)
+
     def until(self, reached: Callable[[], bool], within_s: float) -> bool:
         """Wait; whether it was reached."""
         until_s = time.monotonic() + within_s
         while not reached():
             if time.monotonic() > until_s:
                 return False
-            time.sleep(POLL_S)
+            self._rest()
         return True
 
     def until_settled(self, states: tuple[State, ...], within_s: float) -> bool:
@@ -199,5 +206,5 @@ class WiredKiosk:
                 last, since_s = self.state, time.monotonic()
             if last in states and time.monotonic() - since_s > STEADY_S:
                 return True
-            time.sleep(POLL_S)
+            self._rest()
         return False
