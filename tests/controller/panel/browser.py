@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
 from tests.controller.panel.served import PASSWORD
 
@@ -36,6 +36,11 @@ def chromium() -> Iterator[Browser]:
             browser.close()
 
 
+PATIENCE_MS = 30_000
+"""For what comes within a second on a free machine."""
+expect.set_options(timeout=PATIENCE_MS)
+
+
 @contextlib.contextmanager
 def tab(browser: Browser, address: str, *, phone: bool = False) -> Iterator[Page]:
     """A page of a fresh profile. Whatever the browser's console calls an error fails the test."""
@@ -43,7 +48,7 @@ def tab(browser: Browser, address: str, *, phone: bool = False) -> Iterator[Page
         base_url=address, viewport={"width": 390, "height": 844} if phone else {"width": 1100, "height": 900}
     )
     page = context.new_page()
-    page.set_default_timeout(10_000)
+    page.set_default_timeout(PATIENCE_MS)
     complaints: list[str] = []
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("console", lambda line: complaints.append(line.text) if "Content Security Policy" in line.text else None)
