@@ -120,7 +120,7 @@ def _criteria(made: Sequence[Made]) -> tuple[Criterion, ...]:
         holds = worst > 0 if lacking else worst > -NOT_WORSE
         asked = "more contrast is kept than by cutting off" if lacking else "nothing is lost where little is lacking"
         reason = "" if holds else (
-            "So little lacks light that a dimming would lose elsewhere what it wins there: nothing was adapted."
+            "So little lacks light that a dimming would lose elsewhere what it wins there: next to nothing was adapted."
             if abs(after.kept - before.kept) < NOT_WORSE else
             "Adaptation is chosen by what a perfect stage would show of it; the photograph shows less."
         )  # fmt: skip
