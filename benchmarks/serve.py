@@ -31,6 +31,7 @@ from controller.checking import check_stage
 from controller.demo.bench_process import BenchProcess
 from controller.errors import VelaturaError
 from controller.serve.control import ask
+from controller.serve.hours import WEEKDAYS
 from controller.services import KEY_FILE, output_sizes
 from controller.storage import runtime_folder
 from tests.controller.play.wire import Wire
@@ -74,7 +75,7 @@ def measure(size: str) -> list[Row]:
 
 
 def _panels(stage: Path) -> list[Row]:
-    """The first page, and what open panels cost: nothing to tell, and four changes a second (the schedule's)."""
+    """The first page, and what open panels cost: nothing to tell, and four changes a second (the closing hour)."""
     make_account(stage)
     with service(stage, "--panel", f"127.0.0.1:{PORT}") as served:
         wait_for(stage, "playing")
@@ -132,14 +133,15 @@ def _busy(stage: Path, pid: int) -> float:
 
 @contextlib.contextmanager
 def _changing(stage: Path) -> Iterator[None]:
-    """Inside, the schedule's time zone changes, which leaves what is played as it is."""
+    """Inside, the hour at which the stage closes changes, which leaves what is played as it is."""
     ended = threading.Event()
 
     def change() -> None:
-        for zone in itertools.cycle(("Europe/Berlin", "UTC")):
+        for closes in itertools.cycle(("23:58", "23:59")):
             if ended.wait(0.25):
                 return
-            ask(stage, "set-schedule", time_zone=zone, rows=[])
+            hours = {"opens": "00:00", "closes": closes, "appearance": NAME}
+            ask(stage, "set-schedule", time_zone="UTC", rows=[{"day": day, **hours} for day in WEEKDAYS])
 
     thread = threading.Thread(target=change)
     thread.start()
