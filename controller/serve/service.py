@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -30,6 +31,7 @@ from controller.serve.player_keeper import PlayerKeeper
 from controller.serve.ports import BLACK, Condition, Request
 from controller.serve.schedule_file import ScheduleFile
 from controller.serve.stock import BundleStock
+from controller.serve.tidying import TIDY_S, forget_old_photographs
 from controller.serve.works import ThreadWorks
 from controller.session.machine import State
 from controller.storage import runtime_folder
@@ -89,6 +91,8 @@ class Service:
             self._thread(keeper.name, keeper.step, STEP_S)
         if self.keys is not None:
             self._thread("keys", self.keys.step, 2.0)
+        forget_old = partial(forget_old_photographs, self.stage, self.log, time.time)
+        self._thread("old photographs", forget_old, TIDY_S, first_s=TIDY_S)
 
     def run(self, cancel: threading.Event) -> None:
         """Decide, over and over, until ``cancel``. Feeds systemd's watchdog."""
@@ -186,8 +190,9 @@ class Service:
             self.log.tell(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
                                    "Switch it off by its remote control.", "error"))  # fmt: skip
 
-    def _thread(self, name: str, step: Callable[[], None], every_s: float) -> None:
+    def _thread(self, name: str, step: Callable[[], None], every_s: float, *, first_s: float = 0.0) -> None:
         def loop() -> None:
+            self._stop.wait(first_s)
             while not self._stop.is_set():
                 try:
                     step()
