@@ -22,6 +22,8 @@ from controller.panel.operations import APPEARANCE
 LONGEST_PAUSE_S: Final = 60.0
 MOST_COMMANDS_WAITING: Final = 20
 LONGEST_PAYLOAD: Final = 256
+AGAIN_S: Final = 1.0
+"""After a state that could not be found out."""
 _LOG: Final = logging.getLogger("velatura.panel")
 
 
@@ -91,7 +93,14 @@ class BuildingControl:
         while True:
             await self._changed.wait()
             self._changed.clear()
-            now = json.dumps(await anyio.to_thread.run_sync(self._state))
+            try:
+                now = json.dumps(await anyio.to_thread.run_sync(self._state))
+            except Exception:  # noqa: BLE001 - whatever it was, the next state may be told
+                # The building would see an old state for good: this task has nobody above it to start it again.
+                _LOG.exception("The state could not be told to the building; it is tried again.")
+                await asyncio.sleep(AGAIN_S)
+                self._changed.set()
+                continue
             if now != last:
                 await client.publish(f"{self._options.topic}/state", now, qos=1, retain=True)
                 last = now

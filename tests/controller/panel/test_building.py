@@ -17,6 +17,7 @@ import pytest
 
 from controller.panel.broker import BrokerOptions
 from controller.panel.building import BuildingControl
+from controller.panel.kiosk import KioskState
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 
 MOSQUITTO = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
@@ -173,6 +174,34 @@ def test_an_error_that_nobody_knows_ends_neither_the_connection_nor_the_panel(tm
             assert json.loads(await wait_for(heard, "answer", "close"))["code"] == "crash"
             await client.publish("hall/velatura/command/play", "warm wood")
             await wait_for(heard, "state", "warm wood")
+
+    with broker(tmp_path / "broker", port):
+        asyncio.run(story())
+
+
+class Dazed(MemoryKiosk):
+    """Cannot say how it is for a while."""
+
+    dazed = False
+
+    def snapshot(self) -> KioskState:
+        if self.dazed:
+            raise RuntimeError("nobody thought of this either")
+        return super().snapshot()
+
+
+def test_a_state_that_cannot_be_told_for_a_while_is_told_afterwards(tmp_path: Path) -> None:
+    kiosk, port = Dazed(tmp_path / "pictures"), free_port()
+
+    async def story() -> None:
+        async with building(port) as (client, heard), controlled(kiosk, options(tmp_path, port)):
+            await wait_for(heard, "state", "playing")
+            kiosk.dazed = True
+            await client.publish("hall/velatura/command/close")
+            await wait_for(heard, "answer", "close")
+            await asyncio.sleep(0.3)  # so that the change itself meets the error
+            kiosk.dazed = False
+            await wait_for(heard, "state", "cooling")
 
     with broker(tmp_path / "broker", port):
         asyncio.run(story())
