@@ -10,7 +10,7 @@ SEED ?= 1
 OBJECT ?=
 NAME ?=
 COUNT ?=
-WORKERS ?= 2
+WORKERS ?= 3
 
 .PHONY: demo blender test lint bench campaign lock clean
 

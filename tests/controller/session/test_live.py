@@ -49,10 +49,25 @@ class Numbers:
         self.closed = True
 
 
+class Patient(Numbers):
+    """Has its next picture when the one before was shown, however long that takes on a busy machine."""
+
+    def __init__(self, count: int, *, fails_at: int = -1) -> None:
+        super().__init__(count, fails_at=fails_at)
+        self.seen: list[Frames] = []
+
+    def show(self, frames: Frames) -> None:
+        self.seen.append([frame.copy() for frame in frames])
+
+    def next(self, at_s: float) -> LivePicture | None:
+        failed = 0 < self.fails_at <= self.at
+        return super().next(at_s) if self.at == len(self.seen) + failed else None
+
+
 def test_every_picture_of_a_slow_source_is_shown_in_order(maker: FrameMaker) -> None:
-    seen: list[int] = []
-    source = Numbers(12)
-    figures = run_live(source, maker, lambda frames: seen.append(_level(frames)), rate_hz=40)
+    source = Patient(12)
+    figures = run_live(source, maker, source.show, rate_hz=40)
+    seen = [_level(frames) for frames in source.seen]
     assert figures.made == 12
     assert figures.late == 0
     assert seen == sorted(seen)
@@ -86,16 +101,16 @@ def test_a_stop_takes_hold_and_leaves_no_thread(maker: FrameMaker) -> None:
 
 
 def test_a_bad_picture_is_passed_over_and_told_of(maker: FrameMaker) -> None:
-    figures = run_live(Numbers(9, fails_at=3), maker, lambda frames: None, rate_hz=100)
+    source = Patient(9, fails_at=3)
+    figures = run_live(source, maker, source.show, rate_hz=100)
     assert (figures.made, figures.bad) == (8, 1)
     assert figures.told()["trouble"] == "Damaged. Write it again."
 
 
 def test_targets_are_handed_on_at_their_size() -> None:
-    seen: list[tuple[tuple[int, ...], int]] = []
-    run_live(
-        Numbers(3), TargetMaker((30, 24)), lambda frames: seen.append((frames[0].shape, _level(frames))), rate_hz=99
-    )
+    source = Patient(3)
+    run_live(source, TargetMaker((30, 24)), source.show, rate_hz=99)
+    seen = [(frames[0].shape, _level(frames)) for frames in source.seen]
     assert seen == [((24, 30, 3), 21), ((24, 30, 3), 22), ((24, 30, 3), 23)]
 
 
