@@ -46,7 +46,7 @@ from controller.solve.scaling_lanes import STEPS
 from controller.transport import LightTransport
 
 BLOCK_SIGMA_PX: Final = 0.56
-"""A projector pixel's light is about so many blocks wide, as a standard deviation: four blocks hold it."""
+"""A projector pixel's Gaussian is about so many blocks wide, as a standard deviation: four blocks hold it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,8 @@
 
 P_s is the mean of the scale image C_s over a projector pixel's light in the camera (paper eq. 6). The light transport
 gives that mean exactly; here each pixel keeps the centre and the covariance of its weights, which are those of a
-Gaussian to within what a stage's grade leaves open (docs/decisions/0021).
+Gaussian to within what a stage's grade leaves open (docs/decisions/0021), and the mean is taken over a narrower one
+(docs/decisions/0033).
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ WAVE_PX: Final = 64.0
 """Of the waves by which spreads are measured: long beside any projector pixel, short enough for single precision."""
 LEAST_SIGMA_PX: Final = 0.3
 MOST_CORRELATION: Final = 0.95
+NARROWED: Final = 0.4
+"""The mean is taken over this part of a projector pixel's spread: shown, the pixel blurs the scale a second time."""
 
 
 def scaling_maps(
@@ -39,10 +42,12 @@ def scaling_maps(
     names: Sequence[str] | None = None,
     *,
     largest_px: int = LARGEST_TARGET_PX,
+    spread: float = NARROWED,
 ) -> LiveMaps:
     """The maps of a stage with the black image ``black`` (rows, columns, 3).
 
-    One radiometry and one of ``names``, those of the outputs, a projector; targets' sides are at most ``largest_px``.
+    One radiometry and one of ``names``, those of the outputs, a projector; targets' sides are at most ``largest_px``;
+    means are taken over the part ``spread`` of a pixel's spread, 1 for those of the paper (eq. 6).
     Raises UsageError("response-not-rising").
     """
     factor = reduction(transport.shape, largest_px)
@@ -52,7 +57,7 @@ def scaling_maps(
     centre, sigma, correlation = footprints(transport, factor)
     sides = np.maximum(np.array(present.shape[::-1], np.float32) - 1, np.float32(1))
     places = np.asarray(np.rint(FULL * np.clip(centre / sides, 0, 1)), np.uint16)
-    shapes = packed_shape(sigma, correlation)
+    shapes = packed_shape(np.where(sigma > 0, np.maximum(np.float32(spread) * sigma, LEAST_SIGMA_PX), 0), correlation)
     mixed = plane_frames(base.mixed, transport.sizes)
     outputs = []
     for n, size in enumerate(transport.sizes):
