@@ -152,7 +152,7 @@ def _error_of_maps(
     ]
     away = _away(scaler.maps, scaler.frames(radiance), wanted)
     return at_most(
-        "error of a new appearance's frames against every camera sample with its own share, mean",
+        "error of frames by eq. 6's means against every camera sample with its own share, mean",
         float(away.mean()),
         None,
         unit="of 255",
