@@ -17,7 +17,7 @@ from typing import Any, Final
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
-from plugins.emulated.bench_usb import UsbDevices, read_usb
+from plugins.emulated.bench_usb import STAGE_CAMERA, UsbDevices, read_usb
 from plugins.emulated.bumps import bumps_of, write_bumps
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.mains import Mains, boot_times, check_mains
@@ -37,7 +37,8 @@ from plugins.emulated.staging import (
     size_named,
 )
 from plugins.emulated.stands import SETTINGS, Stands, read_stands
-from plugins.emulated.truth import FOLDER, ObjectTruth, read_truth, write_truth
+from plugins.emulated.truth import FOLDER, CameraTruth, ObjectTruth, read_truth, write_truth
+from plugins.emulated.usb_stage_camera import Exposures
 from plugins.emulated.world import World, object_of
 
 OBJECT_FILE: Final = f"{FOLDER}/object.npz"
@@ -154,12 +155,13 @@ def _start(
     stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
 ) -> World:
     """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
-    truth = read_truth(stage)
-    _require_free(truth.camera.command_port, truth.camera.event_port)
+    truth, usb = read_truth(stage), read_usb(stage)
+    on_usb = any(device.kind == STAGE_CAMERA for device in usb)
+    if not on_usb:
+        _require_free(truth.camera.command_port, truth.camera.event_port)
     if script is None and truth.scenario:
         script = stage / truth.scenario
     scenario = read_scenario(script) if script is not None else None
-    usb = read_usb(stage)
     check_mains(truth.mains, truth.projectors, usb)
     lamps = [EmulatedLamp(LampTiming(p.lamp.warm_up_s, p.lamp.cool_down_s)) for p in truth.projectors]
 
@@ -181,26 +183,35 @@ def _start(
             wire.scenario = ScenarioPlayer(scenario, device=projector.name, faults=wire.faults, lamp=lamp, plug=wire)
         stack.enter_context(wire)
         out.served(projector.name, "projector", str(wire.port))
-    # The world spends the exposure time itself, since it must know what is visible meanwhile.
-    camera = EmulatedPtpCamera(
-        world.expose,
-        host=HOST,
-        command_port=truth.camera.command_port,
-        event_port=truth.camera.event_port,
-        names=CameraNames(serial=truth.camera.serial_number),
-        time_scale=0.0,
-        raw=truth.camera.raw,
-    )
-    stack.enter_context(camera)
-    out.served("camera", "camera", camera.address)
+    if not on_usb:
+        camera = stack.enter_context(_network_camera(world, truth.camera))
+        out.served("camera", "camera", camera.address)
     out.served("display", "display", str(stage / truth.frames))
     if usb:
-        bus = stack.enter_context(UsbDevices(usb, script.read_text(encoding="utf-8") if script is not None else ""))
+        told: dict[str, Any] = {}
+        if on_usb:
+            exposures = stack.enter_context(Exposures(world.expose))
+            told = {"exposures": exposures.address, "serial": truth.camera.serial_number, "raw": truth.camera.raw}
+        text = script.read_text(encoding="utf-8") if script is not None else ""
+        bus = stack.enter_context(UsbDevices(usb, text, stage_camera=told))
         for device in usb:
             out.served(device.name, device.kind, "usb")
         stack.enter_context(Mains(truth.mains, wires, bus.moves, out.mains))
         out.environment(bus.environment)
     return world
+
+
+def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:
+    # The world spends the exposure time itself, since it must know what is visible meanwhile.
+    return EmulatedPtpCamera(
+        world.expose,
+        host=HOST,
+        command_port=truth.command_port,
+        event_port=truth.event_port,
+        names=CameraNames(serial=truth.serial_number),
+        time_scale=0.0,
+        raw=truth.raw,
+    )
 
 
 def _follow_bumps(world: World, out: _Lines) -> None:

@@ -22,17 +22,22 @@ from plugins.emulated.usb_bus import PRELOAD, environment
 from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
 
 FILE: Final = f"{FOLDER}/usb.toml"
+STAGE_CAMERA: Final = "stage-camera"
 _SETTINGS: Final[Mapping[str, tuple[str, ...]]] = {
     "relay": ("serial", "channels"),
     "light": ("serial", "lux"),
     "keys": ("serial",),
     "camera": ("serial",),
+    STAGE_CAMERA: (),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class UsbDeviceTruth:
-    """One device. ``kind``: relay, light, keys or camera; ``channels`` of a relay board, ``lux`` at a light sensor."""
+    """One device. ``kind``: relay, light, keys, camera, or stage-camera: the one that looks at the stage, here on USB
+
+    and not on the network. ``channels`` of a relay board, ``lux`` at a light sensor.
+    """
 
     name: str
     kind: str
@@ -63,17 +68,30 @@ def read_usb(stage: Path) -> tuple[UsbDeviceTruth, ...]:
                 remedy=f"Give every device a name of its own, and one of the kinds {', '.join(_SETTINGS)}.",
             )
         names.add(device.name)
+    if sum(device.kind == STAGE_CAMERA for device in devices) > 1:
+        raise DeviceError(
+            "usb-kind",
+            what=f"{path}: two devices are the camera that looks at the stage.",
+            remedy=f"Leave one of kind {STAGE_CAMERA}; others of kind camera make pictures of their own.",
+        )
     return devices
 
 
 class UsbDevices:
     """The bus with its devices plugged in, in a process of its own; a context.
 
+    ``stage_camera``: the settings of ``usb_stage_camera.stage_camera``, for the device that is one;
     ``environment``: what a program's environment must have besides, so that it sees them. Raises DeviceError
     ("usb-no-preload") where the preload library is missing.
     """
 
-    def __init__(self, devices: tuple[UsbDeviceTruth, ...], scenario: str = "") -> None:
+    def __init__(
+        self,
+        devices: tuple[UsbDeviceTruth, ...],
+        scenario: str = "",
+        *,
+        stage_camera: Mapping[str, Any] | None = None,
+    ) -> None:
         try:
             ctypes.CDLL(PRELOAD)
         except OSError as error:
@@ -91,7 +109,8 @@ class UsbDevices:
             bus = self._stack.enter_context(UsbBusProcess(folder))
             self._bus = bus
             for device in devices:
-                bus.add(device.name, device.kind, **_settings(device))
+                told = (stage_camera or {}) if device.kind == STAGE_CAMERA else _settings(device)
+                bus.add(device.name, device.kind, **told)
                 if scenario:
                     bus.play(device.name, scenario)
         except BaseException:

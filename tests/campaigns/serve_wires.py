@@ -30,10 +30,11 @@ from controller.panel.kiosk import EventRow
 from controller.serve.ports import Request
 from controller.session.machine import State
 from tests.campaigns.kills import REPOSITORY, copy
-from tests.campaigns.usb_faults import WORDS, mend_usb, usb_faults, usb_well
+from tests.campaigns.usb_faults import WORDS, mend_usb, tether_faults, usb_faults, usb_well
 from tests.campaigns.wired_faults import Fault, camera_faults, deeds, mend_projectors, processes, wire_faults
 from tests.campaigns.wired_kiosk import WiredKiosk, prepare_wired, usb_environment
 
+LANE: Final = (sys.executable, "-m", "tests.campaigns.serve_wires", "lane")
 SETTLED: Final = (State.PLAYING, State.DEGRADED, State.FAULT, State.OFF)
 STEPS: Final = ("off", "powering", "warming", "playing", "calibrating", "degraded", "cooling")
 REACH_S, SETTLE_S, MENDED_S, GAP_S = 120.0, 300.0, 240.0, 30.0
@@ -50,7 +51,7 @@ STARVED_S: Final = 1.0
 
 def cases() -> list[tuple[str, Fault]]:
     """The matrix."""
-    faults = (*wire_faults(), *camera_faults(), *deeds(), *processes(), *usb_faults())
+    faults = (*wire_faults(), *camera_faults(), *deeds(), *processes(), *usb_faults(), *tether_faults())
     return [(step, fault) for step in STEPS for fault in faults]
 
 
@@ -182,19 +183,25 @@ def lane(stage: Path, most_s: float, numbers: list[int]) -> int:
 
 
 def campaign(numbers: list[int], lanes: int, folder: Path, *, most_s: float = 1e9) -> list[dict[str, Any]]:
-    """Share the cases among so many processes; what each line said."""
-    begun = prepare_wired(folder / "begun", usb=True)
-    words = [sys.executable, "-m", "tests.campaigns.serve_wires", "lane"]
-    stages = [copy(begun, folder / f"lane-{number}") for number in range(min(lanes, len(numbers)))]
+    """Share the cases among so many processes, one more where some need a camera on USB; what each line said."""
+    matrix = cases()
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:
-        running = []
-        for number, stage in enumerate(stages):
-            said = stack.enter_context((folder / f"lane-{number}.said").open("w"))
-            command = [*words, str(stage), str(most_s), *map(str, numbers[number::lanes])]
-            usb = stack.enter_context(usb_environment())
-            running.append(subprocess.Popen(command, stdout=said, cwd=REPOSITORY, env={**os.environ, **usb}))
-            stack.callback(_end, running[-1])
+        running: list[subprocess.Popen[bytes]] = []
+        for tethered in (False, True):
+            some = [number for number in numbers if matrix[number][1].tethered is tethered]
+            if not some:
+                continue
+            begun = prepare_wired(folder / f"begun-{tethered}", usb=True, tethered=tethered)
+            count = min(len(some), max(1, round(lanes * len(some) / len(numbers))))
+            for one in range(count):
+                name = f"lane-{len(running)}"
+                stage = copy(begun, folder / name)
+                said = stack.enter_context((folder / f"{name}.said").open("w"))
+                command = [*LANE, str(stage), str(most_s), *map(str, some[one::count])]
+                usb = stack.enter_context(usb_environment())
+                running.append(subprocess.Popen(command, stdout=said, cwd=REPOSITORY, env={**os.environ, **usb}))
+                stack.callback(_end, running[-1])
         for process in running:
             process.wait()
     for number, process in enumerate(running):

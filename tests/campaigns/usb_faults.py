@@ -1,6 +1,7 @@
-"""What goes wrong on the USB of a kiosk: every knob and deed of the emulated relay board, light sensor and keys.
+"""What goes wrong on the USB of a kiosk: every knob and deed of the emulated relay board, light sensor, keys, camera.
 
-The lists are the emulators' own: ``UsbFaults``, the ``wrongs`` of each kind of device, and what a script may do on USB.
+The lists are the emulators' own: ``UsbFaults``, the ``wrongs`` of each kind of device, ``CameraFaults`` and
+``UsbCameraFaults``, and what a script may do on USB.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from plugins.emulated.usb_bus_device import EmulatedUsbDevice, UsbFaults
 from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
 from plugins.emulated.usb_bus_scenario import DEEDS
 from tests.campaigns.wired_faults import FOR_S, SLOW_S, Fault, Turn, goes_on, how_long, mend_projectors, values_of
-from tests.campaigns.wired_kiosk import USB, WiredKiosk
+from tests.campaigns.wired_kiosk import TETHER, TETHER_KNOBS, USB, WiredKiosk
 
 WORDS: Final = {"board": "relay", "light": "light sensor", "keys": "key panel"}
 """What a technician calls each of them."""
@@ -30,13 +31,29 @@ def usb_faults() -> Iterator[Fault]:
         yield from _deeds(name)
 
 
+def tether_faults() -> Iterator[Fault]:
+    """Every knob and deed of a camera on USB. A kiosk plays on without it, and looks at it once a minute."""
+    yield from (dataclasses.replace(fault, tethered=True) for fault in (*_wire(TETHER), *_deeds(TETHER)))
+    for path, kind in TETHER_KNOBS.items():
+        for knob in dataclasses.fields(kind):
+            for value in values_of(knob):
+                turn = _turn(TETHER, f"{path}.{knob.name}", value)
+                yield Fault(f"{TETHER} {knob.name}={value}", turn, mend_usb, lasts=False, tethered=True)
+
+    def off_and_on(kiosk: WiredKiosk) -> None:
+        _bus(kiosk).call(TETHER, "camera_off_and_on")
+
+    yield Fault(f"{TETHER} off and on", off_and_on, mend_usb, lasts=False, tethered=True)
+
+
 def _wire(name: str) -> Iterator[Fault]:
     for knob in dataclasses.fields(UsbFaults):
         for value in values_of(knob):
             blocks = goes_on(value) and not isinstance(value, float) and name in ASKED
             turn, told = _turn(name, f"faults.{knob.name}", value), WORDS[name] if blocks else ""
+            words = f"{name} wire" if name == TETHER else name
             # Who was told has noticed.
-            yield Fault(f"{name} {knob.name}={value}", turn, mend_usb, goes_on(value) and not blocks, told)
+            yield Fault(f"{words} {knob.name}={value}", turn, mend_usb, goes_on(value) and not blocks, told)
 
 
 def _wrongs(name: str) -> Iterator[Fault]:
@@ -57,7 +74,7 @@ def _deeds(name: str) -> Iterator[Fault]:
                 _bus(kiosk).play(name, event)
 
             lasts = not for_s and deed not in ONCE
-            told = WORDS[name] if lasts and (name in ASKED or deed == "unplug") else ""
+            told = WORDS.get(name, "camera") if lasts and (name in ASKED or deed == "unplug") else ""
             yield Fault(f"{deed} of {name} {how_long(deed, for_s)}", strike, mend_usb, lasts, told)
 
 
@@ -66,10 +83,10 @@ def _turn(name: str, knob: str, value: Any) -> Turn:
 
 
 def mend_usb(kiosk: WiredKiosk) -> None:
-    """Whole cables, boards and sensors. Nothing on a kiosk without USB."""
+    """Whole cables, boards, sensors and cameras. Nothing on a kiosk without USB."""
     if kiosk.bus is None:
         return
-    for name in USB:
+    for name in kiosk.well:
         kiosk.bus.rest(name)
         for knob in dataclasses.fields(UsbFaults):
             kiosk.bus.set(name, f"faults.{knob.name}", knob.default)
@@ -84,7 +101,8 @@ def usb_well(kiosk: WiredKiosk) -> str:
     if kiosk.bus is None:
         return ""
     devices = kiosk.service.devices
-    wrong = [keeper.problem.text for keeper in (devices.mains, devices.sensor) if keeper and keeper.problem]
+    keepers = [devices.mains, devices.sensor, *([devices.camera] if TETHER in kiosk.well else [])]
+    wrong = [keeper.problem.text for keeper in keepers if keeper and keeper.problem]
     assert kiosk.service.keys is not None
     wrong.append(kiosk.service.keys.row.problem or "")
     if kiosk.bus.get("board", "state") != [True, True]:

@@ -26,13 +26,17 @@ Turn = Callable[[WiredKiosk], None]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """``lasts``: until it is mended; ``told``: words in what the technician must then be told of at every step."""
+    """``lasts``: until it is mended; ``told``: words in what the technician must then be told of at every step.
+
+    ``tethered``: strikes only where the camera is on USB.
+    """
 
     name: str
     strike: Turn
     mend: Turn
     lasts: bool = True
     told: str = ""
+    tethered: bool = False
 
 
 def values_of(knob: dataclasses.Field[Any]) -> tuple[Any, ...]:

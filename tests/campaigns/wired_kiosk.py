@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -23,12 +24,14 @@ from controller.serve.service import Service, serving
 from controller.session.machine import State
 from plugins.emulated.lamp import LampTiming
 from plugins.emulated.mains import Mains
-from plugins.emulated.ptp_body import CameraNames
+from plugins.emulated.ptp_body import CameraFaults, CameraNames
 from plugins.emulated.ptp_camera import EmulatedPtpCamera
+from plugins.emulated.ptp_usb_camera import UsbCameraFaults
 from plugins.emulated.serial_projector import EmulatedSerialProjector
 from plugins.emulated.truth import MainsTruth, read_truth
 from plugins.emulated.usb_bus import environment
 from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
+from plugins.emulated.usb_stage_camera import Exposures
 from tests.campaigns.kills import children
 from tests.campaigns.mini_stage import HonestLamp, SteadyWorld, prepare_mini
 
@@ -43,6 +46,12 @@ USB: Final[Mapping[str, Mapping[str, Any]]] = {
     "light": {"kind": "light", "lux": 0.5},
     "keys": {"kind": "keys"},
 }
+_ADDRESS: Final = "ptpip:127.0.0.1:"
+TETHER: Final = "tether"
+"""The stage's camera, where it is on USB."""
+TETHER_KNOBS: Final[Mapping[str, type[CameraFaults] | type[UsbCameraFaults]]] = {
+    "camera_faults": CameraFaults, "pipe_faults": UsbCameraFaults,
+}  # fmt: skip
 _TABLES: Final = """
 [[relays]]
 name = "board"
@@ -72,20 +81,34 @@ def usb_environment() -> Iterator[dict[str, str]]:
         yield environment(Path(folder))
 
 
-def prepare_wired(out: Path, *, usb: bool = False) -> Path:
-    """A stage with a bundle to play and its rays cast, to be copied for as many kiosks as there shall be."""
+def prepare_wired(out: Path, *, usb: bool = False, tethered: bool = False) -> Path:
+    """A stage with a bundle to play and its rays cast, to be copied for as many kiosks as there shall be.
+
+    ``tethered``: its camera is on USB, and not on the network.
+    """
     stage = prepare_mini(out)
     if usb:
         with (stage / "stage.toml").open("a", encoding="utf-8") as known:
             known.write(_TABLES)
-    install_grey(stage)
+    if tethered:
+        tether(stage)
     truth = read_truth(stage)
+    install_grey(stage)
     with SteadyWorld(stage, truth, [HonestLamp(LampTiming(1.0, 1.0)) for _ in truth.projectors]):
         return stage
 
 
+def tether(stage: Path) -> None:
+    """Let ``stage.toml`` name the camera on USB."""
+    known, camera = stage / "stage.toml", read_truth(stage).camera
+    text, address = known.read_text(), f'"{_ADDRESS}{camera.command_port}:{camera.event_port}"'
+    assert address in text
+    known.write_text(text.replace(address, f'"usb:{camera.serial_number}"'))
+
+
 class WiredKiosk:
     """One kiosk. Knobs: ``projectors`` and ``lamps`` by name, ``camera``, ``bus``, and the player's process.
+    On a tethered stage the camera is ``TETHER`` on the bus, and ``camera`` is not there.
 
     ``well``: what the knobs of the USB devices' own stand at while nothing is wrong.
     """
@@ -93,6 +116,7 @@ class WiredKiosk:
     def __init__(self, stage: Path) -> None:
         self.stage = stage
         truth = read_truth(stage)
+        self._tethered = _ADDRESS not in (stage / "stage.toml").read_text()
         self.sins: list[str] = []
         self.lamps = {
             one.name: HonestLamp(LampTiming(one.lamp.warm_up_s, one.lamp.cool_down_s)) for one in truth.projectors
@@ -111,6 +135,7 @@ class WiredKiosk:
             self._world.expose, command_port=truth.camera.command_port, event_port=truth.camera.event_port,
             names=CameraNames(serial=truth.camera.serial_number), time_scale=0.0, raw=truth.camera.raw,
         )  # fmt: skip
+        self._tether = {"serial": truth.camera.serial_number, "raw": truth.camera.raw}
         self._stack = contextlib.ExitStack()
         self._beaten_s, self.longest_gap_s = time.monotonic(), 0.0
         self.starved_s = 0.0
@@ -121,7 +146,8 @@ class WiredKiosk:
             stack.enter_context(self._world)
             for projector in self.projectors.values():
                 stack.enter_context(projector)
-            stack.enter_context(self.camera)
+            if not self._tethered:
+                stack.enter_context(self.camera)
             if "UMOCKDEV_DIR" in os.environ:
                 self.bus = stack.enter_context(self._usb(Path(os.environ["UMOCKDEV_DIR"])))
             vars(services)["Limits"] = lambda power_up_s, cool_down_s: Limits(power_up_s, COOL_S)
@@ -138,11 +164,16 @@ class WiredKiosk:
     @contextlib.contextmanager
     def _usb(self, folder: Path) -> Iterator[UsbBusProcess]:
         """The bus with its devices, and mains that go through its relays."""
-        with UsbBusProcess(folder) as bus:
+        with contextlib.ExitStack() as stack, UsbBusProcess(folder) as bus:
             for name, settings in USB.items():
                 bus.add(name, **settings)
                 own = getattr(KINDS[settings["kind"]], "wrongs", {})
                 self.well[name] = {knob: bus.get(name, knob) for knob in own}
+            if self._tethered:
+                exposures = stack.enter_context(Exposures(self._world.expose))
+                bus.add(TETHER, "stage-camera", exposures=exposures.address, **self._tether)
+                knobs = [f"{path}.{knob.name}" for path, kind in TETHER_KNOBS.items() for knob in fields(kind)]
+                self.well[TETHER] = {knob: bus.get(TETHER, knob) for knob in knobs}
             circuits = [MainsTruth("board", channel, (name,)) for channel, name in enumerate(self.projectors, start=1)]
 
             def moves(relay: str, count: int) -> list[tuple[int, bool]]:

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -64,9 +64,9 @@ def share_of_the_cores() -> dict[str, str]:
 
 
 class Command:
-    """``velatura WORDS --json`` in a process of its own, its lines read as they come."""
+    """``velatura WORDS --json`` in a process of its own, its lines read as they come; ``more``: of its environment."""
 
-    def __init__(self, *words: str | Path) -> None:
+    def __init__(self, *words: str | Path, more: Mapping[str, str] | None = None) -> None:
         self.records: list[Record] = []
         self._seen = threading.Condition()
         self._ended = False
@@ -79,7 +79,7 @@ class Command:
                 stderr=subprocess.PIPE,
                 text=True,
                 cwd=REPOSITORY,
-                env=os.environ | {"PYTHONFAULTHANDLER": "1"} | share_of_the_cores(),
+                env=os.environ | {"PYTHONFAULTHANDLER": "1"} | share_of_the_cores() | dict(more or {}),
             )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -104,6 +104,11 @@ class Command:
             return bool(progress["step"].startswith(step) and progress["step_fraction"] >= fraction)
 
         self._wait(reached, step)
+
+    def wait_for_key(self, key: str) -> Record:
+        """The first record that has it."""
+        self._wait(lambda record: key in record, key)
+        return next(record for record in self.records if key in record)
 
     def wait_for_message(self, text: str) -> None:
         """Until it has said a sentence that begins so."""

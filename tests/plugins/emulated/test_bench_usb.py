@@ -71,3 +71,10 @@ def test_a_wrong_file_is_refused(tmp_path: Path, right: str, wrong: str) -> None
     with pytest.raises(DeviceError) as caught:
         read_usb(written(tmp_path, USB.replace(right, wrong)))
     assert "usb.toml" in caught.value.what
+
+
+def test_only_one_camera_looks_at_the_stage(tmp_path: Path) -> None:
+    two = "".join(f'[[device]]\nname = "{name}"\nkind = "stage-camera"\n' for name in ("one", "other"))
+    with pytest.raises(DeviceError) as caught:
+        read_usb(written(tmp_path, two))
+    assert caught.value.code == "usb-kind"

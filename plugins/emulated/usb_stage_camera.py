@@ -1,0 +1,82 @@
+"""The stage's camera on the emulated USB bus: the bus is a process of its own, and asks the bench for its pictures.
+
+Over a unix socket, one message each: the settings of an exposure as JSON; then its raw file and its JPEG, either of
+them empty where it was not wanted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import threading
+from multiprocessing.connection import Client, Connection, Listener
+from typing import Self
+
+from plugins.emulated.ptp_body import JPEG, CameraNames
+from plugins.emulated.ptp_usb_camera import EmulatedUsbCamera
+from plugins.emulated.shot import Expose, ShotFiles, ShotSettings
+
+
+class Exposures:
+    """The bench's side: makes the files of every exposure that a camera asks for; a context."""
+
+    def __init__(self, expose: Expose) -> None:
+        self._expose = expose
+        self._listener = Listener(None, "AF_UNIX")
+        self._open: list[Connection] = []
+        self._ended = False
+        self._thread = threading.Thread(target=self._accept, name="exposures", daemon=True)
+
+    @property
+    def address(self) -> str:
+        """For ``stage_camera``."""
+        return str(self._listener.address)
+
+    def _accept(self) -> None:
+        while not self._ended:
+            with contextlib.suppress(OSError):
+                connection = self._listener.accept()
+                self._open.append(connection)
+                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: Connection) -> None:
+        with contextlib.suppress(EOFError, OSError), connection:
+            while True:
+                files = self._expose(ShotSettings(**json.loads(connection.recv_bytes())))
+                connection.send_bytes(files.raw or b"")
+                connection.send_bytes(files.jpeg or b"")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended = True
+        # who waits for a connection hears of nothing but a connection
+        with contextlib.suppress(OSError):
+            Client(self.address, "AF_UNIX").close()
+        self._thread.join()
+        self._listener.close()
+        for connection in self._open:
+            connection.close()
+
+
+def stage_camera(exposures: str, serial: str, *, raw: bool = True) -> EmulatedUsbCamera:
+    """A camera whose pictures are those of the stage; ``exposures``: the address of its ``Exposures``."""
+    turn = threading.Lock()
+    asked: list[Connection] = []
+
+    def expose(settings: ShotSettings) -> ShotFiles:
+        with turn:
+            if not asked:
+                asked.append(Client(exposures, "AF_UNIX"))
+            asked[0].send_bytes(json.dumps(dataclasses.asdict(settings)).encode())
+            found, shown = asked[0].recv_bytes(), asked[0].recv_bytes()
+        return ShotFiles(raw=found or None, jpeg=shown or None)
+
+    # The world behind it spends the exposure time itself, since it must know what is visible meanwhile.
+    camera = EmulatedUsbCamera(expose, names=CameraNames(serial=serial), time_scale=0.0)
+    if not raw:
+        camera.body.capture_formats = (JPEG,)
+    return camera
