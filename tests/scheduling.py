@@ -22,6 +22,7 @@ LONGEST_FIRST: Final = (
     "tests/end_to_end/test_technician.py",
     "tests/campaigns/test_kills.py",
     "tests/campaigns/test_serve_wires.py",
+    "tests/end_to_end/test_usb_camera.py",
     "tests/controller/calibrate/test_chain.py",
     "tests/controller/solve/test_regions.py",
     "tests/plugins/test_on_usb_bus.py",
