@@ -13,6 +13,7 @@ from controller.study.drifting import DRIFTING
 from controller.study.earlier import EARLIER
 from controller.study.effort import EFFORT
 from controller.study.frequency import FREQUENCY
+from controller.study.live import LIVE
 from controller.study.placement import PLACEMENT
 from controller.study.regions import REGIONS
 from controller.study.residual import RESIDUAL, RESIDUAL_SIX
@@ -36,6 +37,7 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     DRIFTING,
     ROBUSTNESS,
     ADAPTATION,
+    LIVE,
 )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from controller.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.plotting import figure_of, picture_of
@@ -112,6 +113,11 @@ def plotted(
         draw(value, color="0.45", linewidth=0.8, linestyle="--", label=label)
     if log_y:
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    if all(float(place).is_integer() for line in lines for place in line.x):
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if y_range is not None:
         axes.set_ylim(*y_range)
     axes.set_xlabel(x)

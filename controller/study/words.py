@@ -49,6 +49,14 @@ projector and blends the seams, in the spirit of Raskar 2001. *Unconstrained inv
 photographed dots and clips afterwards, in the spirit of Wetzstein and Bimber 2007. *Bounded, no pixel model*
 keeps the bounds inside the solve on the same dots. These are our own implementations on our calibration, which
 is better than theirs was; none of their code was run.""",
+    "live": """\
+One target by base times scale: base and scale are multiplied projector pixel by projector pixel, which takes
+milliseconds where a solve takes seconds. By *eq. 6* a pixel's scale is the mean over its light; shown, the pixel
+blurs it a second time. *Narrower means* are what `velatura live` shows: means over a Gaussian 0.4 times as wide
+(decision 33), in 8-bit frames, where those of eq. 6 are dithered from floating point. The base *white* cancels
+the object's own pattern at full resolution; *minimum* leaves that to the scale, and speckles by either means
+where it has next to no light itself, at depth edges above all. The seconds hold what is prepared once: maps and
+compiled code.""",
 }
 SAID_OF_SIX: Final = f"""\
 {SAID["residual"]} The projectors are taken by how much of the picture they light, so the first three are not those

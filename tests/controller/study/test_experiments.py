@@ -9,7 +9,7 @@ import pytest
 
 from controller.calibrate.values import PhaseMap
 from controller.capture.dots import dot_patterns
-from controller.study import ablation, earlier
+from controller.study import ablation, earlier, live
 from controller.study.catalogue import EXPERIMENTS
 from controller.study.earlier import feathered
 from controller.study.measuring import Quality, Way, unbounded_inverse
@@ -119,3 +119,13 @@ def test_ours_is_compared_with_every_earlier_system() -> None:
     assert first.holds
     assert second.holds is False
     assert "CIEDE2000 and RMSE and SSIM" in second.reason
+
+
+def test_live_pictures_are_judged_for_both_bases_and_the_full_solve_is_best() -> None:
+    subject = array_subject()
+    result = live.live_pictures(subject)
+    assert [criterion.holds for criterion in result.criteria] == [True, True]
+    (table,) = result.tables
+    rmse = dict(zip(column(table, "way"), column(table, "RMSE"), strict=True))
+    assert min(rmse, key=lambda way: float(str(rmse[way]))) == live.FULL
+    assert {figure.name for figure in result.figures} == {"photographs", "crops"}
