@@ -17,7 +17,11 @@ TOGETHER: Final = {
 """A fixture of the session is made once a worker, and the finished demo takes minutes."""
 LONGEST_FIRST: Final = (
     "the finished demo",
+    "tests/plugins/test_on_usb_bus.py",
+    "tests/controller/panel/test_in_browser.py",
     "tests/end_to_end/test_going_on.py",
+    "tests/plugins/test_gphoto2_peer.py",
+    "tests/plugins/finding/test_serial_ports.py",
     "tests/end_to_end/test_drift.py",
     "tests/end_to_end/test_technician.py",
     "tests/campaigns/test_kills.py",
@@ -25,15 +29,13 @@ LONGEST_FIRST: Final = (
     "tests/end_to_end/test_usb_camera.py",
     "tests/controller/calibrate/test_chain.py",
     "tests/controller/solve/test_regions.py",
-    "tests/plugins/test_on_usb_bus.py",
     "tests/end_to_end/test_refusing_devices.py",
     "tests/controller/cluster/test_cluster.py",
-    "tests/controller/panel/test_in_browser.py",
     "tests/end_to_end/test_killed_demo.py",
     "tests/controller/study/test_beyond.py",
-    "tests/plugins/test_gphoto2_peer.py",
 )
-"""What would keep one worker busy for a minute after the other has ended, were it to come last."""
+"""What would keep one worker busy for a minute after the other has ended, were it to come last. While the demo compiles
+every kernel (a minute and a half, kept on disk), the others have tests that need none: they would compile them, too."""
 
 
 class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
