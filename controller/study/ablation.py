@@ -13,11 +13,11 @@ from controller.calibrate.values import Calibration, Metapixels
 from controller.report.pictures import crop_around
 from controller.session.dotting import CLEAR_GAIN
 from controller.solve.bounded import SMOOTHNESS, solve_bounded
-from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
 from controller.solve.weights import appearance_weights
 from controller.study.drawing import Panel, detail, screen, strip
 from controller.study.measuring import Way, better, quality_table, tried, unbounded_inverse
 from controller.study.subject import Shares, Subject, Wanted
+from controller.study.trial import photograph_target
 from controller.study.values import Criterion, Experiment, Figure, Result
 from controller.transport import LightTransport
 from controller.transport.any_weights import patches_of_weights
@@ -28,7 +28,7 @@ QUADRILATERALS, OURS = "quadrilaterals instead", "shares per camera sample (ours
 
 def ablation(subject: Subject) -> Result:
     """Solve the same target with more and more of the method, and photograph each."""
-    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+    target = photograph_target(subject)
     wanted = subject.wanted(target)
     steps = tried(subject, wanted, _ways(subject, wanted))
     table = quality_table("steps", steps, ways="step", seconds="seconds, model and solve")

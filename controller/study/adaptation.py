@@ -15,9 +15,9 @@ from controller.solve.adapt import adapt, adapt_gently, contrast_kept
 from controller.solve.bounded import SMOOTHNESS, solve_bounded
 from controller.solve.feasibility import choose_exposure, feasibility
 from controller.solve.metrics import compare
-from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
 from controller.study.drawing import Line, Panel, plotted, screen, strip
 from controller.study.subject import Subject
+from controller.study.trial import photograph_target
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, Table
 
 SHARES: Final = (0.95, 0.85, 0.7, 0.5)
@@ -46,7 +46,7 @@ class Made:
 
 def adaptation(subject: Subject) -> Result:
     """Make a photograph at four exposures that ask for more and more light than there is, in three ways each."""
-    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+    target = photograph_target(subject)
     made: list[Made] = []
     for number, share in enumerate(SHARES):
         subject.advance(number / len(SHARES), f"{share:.0%} in reach")

@@ -12,14 +12,14 @@ from controller.calibrate.values import Calibration
 from controller.report.pictures import crop_around, error_picture
 from controller.solve.bounded import SMOOTHNESS, solve_bounded
 from controller.solve.metrics import colour_difference
-from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
 from controller.solve.traditional import traditional_compensation
 from controller.solve.weights import appearance_weights
 from controller.study.ablation import paper_model, raw_transport
-from controller.study.drawing import Panel, detail, screen, strip
-from controller.study.measuring import Way, better, quality_table, tried, unbounded_inverse
+from controller.study.drawing import Panel, strip
+from controller.study.measuring import Way, better, quality_table, side_by_side, tried, unbounded_inverse
 from controller.study.residual import brightest_first
 from controller.study.subject import Subject, Wanted
+from controller.study.trial import photograph_target
 from controller.study.values import Criterion, Experiment, Figure, Result
 from controller.transport import LightTransport
 
@@ -31,7 +31,7 @@ OURS = "ours"
 def earlier_systems(subject: Subject) -> Result:
     """Make one target in five ways and photograph each."""
     best = brightest_first(subject)[0]
-    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+    target = photograph_target(subject)
     alone = LightTransport.build(subject.with_projectors([best]))
     wanted = subject.wanted(target, transport=alone)
     made = tried(subject, wanted, _ways(subject, wanted, best))
@@ -85,19 +85,14 @@ def _criteria(made: Sequence[Way]) -> tuple[Criterion, ...]:
 
 def _figures(subject: Subject, wanted: Wanted, made: Sequence[Way]) -> tuple[Figure, ...]:
     whole = crop_around(subject.mask)
-    crop = detail(subject.mask, centre=(0.4, 0.3), size_px=max(48, subject.mask.shape[1] // 8))
     matrix, white = subject.calibration.camera_to_xyz, wanted.white
-    named = [("target", wanted.radiance), *((one.name, one.photograph) for one in made)]
     errors = []
-    for name, image in named[1:]:
-        difference = colour_difference(image, wanted.radiance, matrix, white, wanted.mask)
+    for one in made:
+        difference = colour_difference(one.photograph, wanted.radiance, matrix, white, wanted.mask)
         cut = error_picture(difference, wanted.mask)[whole.rows, whole.columns]
-        errors.append(Panel(name, np.ascontiguousarray(cut)))
+        errors.append(Panel(one.name, np.ascontiguousarray(cut)))
     return (
-        Figure("photographs", "The target and a photograph of each.",
-               strip([Panel(name, screen(image, matrix, white, whole)) for name, image in named], columns=3)),
-        Figure("crops", "The same, closer: camera pixels enlarged.",
-               strip([Panel(name, screen(image, matrix, white, crop)) for name, image in named], columns=3)),
+        *side_by_side(subject, wanted, made),
         Figure("errors", "CIEDE2000 of each, black 0, bright 12 and more; grey is not compared.",
                strip(errors, columns=3)),
     )  # fmt: skip

@@ -6,17 +6,15 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from controller.arrays import FloatImage
-from controller.report.pictures import crop_around
 from controller.solve.appearance import Base, BaseKind, base_image, scale_frames, solve_base
 from controller.solve.bounded import solve_bounded
 from controller.solve.dither import to_light
 from controller.solve.interactive import Interactive
 from controller.solve.scaling import scaling_maps
-from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
-from controller.study.drawing import Panel, detail, screen, strip
-from controller.study.measuring import Way, better, quality_table, tried
+from controller.study.measuring import better, quality_table, side_by_side, tried
 from controller.study.subject import Subject, Wanted
-from controller.study.values import Experiment, Figure, Result
+from controller.study.trial import photograph_target
+from controller.study.values import Experiment, Result
 
 BASES: tuple[BaseKind, ...] = ("white", "minimum")
 PAPERS, OURS, FULL = "eq. 6", "narrower means", "full solve"
@@ -24,8 +22,7 @@ PAPERS, OURS, FULL = "eq. 6", "narrower means", "full solve"
 
 def live_pictures(subject: Subject) -> Result:
     """Make one target by base times scale, from two bases and by two means, and by a solve; photograph each."""
-    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
-    wanted = subject.wanted(target)
+    wanted = subject.wanted(photograph_target(subject))
     made = tried(subject, wanted, _ways(subject, wanted))
     quality = {one.name: one.quality for one in made}
     criteria = []
@@ -33,7 +30,7 @@ def live_pictures(subject: Subject) -> Result:
         asked = f"base {kind}: {OURS} are better than {PAPERS}"
         criteria.append(better(asked, quality[_named(kind, OURS)], quality[_named(kind, PAPERS)]))
     table = quality_table("ways", made, ways="way", seconds="seconds, first time")
-    return Result(tuple(criteria), (table,), _figures(subject, wanted, made))
+    return Result(tuple(criteria), (table,), side_by_side(subject, wanted, made))
 
 
 def _named(kind: BaseKind, means: str) -> str:
@@ -58,19 +55,6 @@ def _ways(subject: Subject, wanted: Wanted) -> list[tuple[str, Callable[[], Sequ
         base = solve_base(transport, base_image(calibration, kind), black)
         ways += [(_named(kind, PAPERS), partial(papers, base)), (_named(kind, OURS), partial(live, base))]
     return [*ways, (FULL, lambda: solve_bounded(transport, wanted.radiance, black).frames)]
-
-
-def _figures(subject: Subject, wanted: Wanted, made: Sequence[Way]) -> tuple[Figure, ...]:
-    whole = crop_around(subject.mask)
-    crop = detail(subject.mask, centre=(0.4, 0.3), size_px=max(48, subject.mask.shape[1] // 8))
-    matrix, white = subject.calibration.camera_to_xyz, wanted.white
-    named = [("target", wanted.radiance), *((one.name, one.photograph) for one in made)]
-    return (
-        Figure("photographs", "The target and a photograph of each.",
-               strip([Panel(name, screen(image, matrix, white, whole)) for name, image in named], columns=3)),
-        Figure("crops", "The same, closer: camera pixels enlarged.",
-               strip([Panel(name, screen(image, matrix, white, crop)) for name, image in named], columns=3)),
-    )  # fmt: skip
 
 
 LIVE = Experiment(

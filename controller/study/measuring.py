@@ -10,11 +10,13 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, lsmr
 from skimage.metrics import structural_similarity
 
-from controller.arrays import Float64, FloatImage, Mask
+from controller.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.report.pictures import Crop, crop_around
 from controller.solve.metrics import compare, sharpness_windows
 from controller.solve.targets_values import linear_to_srgb
+from controller.study.drawing import Panel, detail, screen, strip
 from controller.study.subject import Subject, Wanted
-from controller.study.values import Criterion, Table
+from controller.study.values import Criterion, Figure, Table
 from controller.transport import LightTransport
 from controller.transport.planes import image_planes, plane_frames
 
@@ -112,6 +114,22 @@ def quality_table(name: str, made: Sequence[Way], *, ways: str, seconds: str = "
         q = one.quality
         rows.append((one.name, q.delta_e, q.delta_e_p95, q.rmse, q.ssim, q.sharpness, one.seconds))
     return Table(name, "Photographed errors", columns, tuple(rows))
+
+
+def side_by_side(subject: Subject, wanted: Wanted, made: Sequence[Way]) -> tuple[Figure, Figure]:
+    """The target and each way's photograph: whole, and a detail of it."""
+    whole = crop_around(subject.mask)
+    crop = detail(subject.mask, centre=(0.4, 0.3), size_px=max(48, subject.mask.shape[1] // 8))
+    matrix, white = subject.calibration.camera_to_xyz, wanted.white
+    named = [("target", wanted.radiance), *((one.name, one.photograph) for one in made)]
+
+    def pictures(cut: Crop) -> ByteImage:
+        return strip([Panel(name, screen(image, matrix, white, cut)) for name, image in named], columns=3)
+
+    return (
+        Figure("photographs", "The target and a photograph of each.", pictures(whole)),
+        Figure("crops", "The same, closer: camera pixels enlarged.", pictures(crop)),
+    )
 
 
 def region_means(values: FloatImage, mask: Mask, size_px: int = REGION_PX) -> FloatImage:

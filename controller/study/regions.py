@@ -11,10 +11,10 @@ import numpy as np
 from controller.arrays import FloatImage, Mask
 from controller.solve.bounded import solve_bounded
 from controller.solve.regions import solve_regions
-from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
 from controller.study.drawing import Panel, detail, maps, screen, strip
 from controller.study.measuring import predicted
 from controller.study.subject import Subject, Wanted
+from controller.study.trial import photograph_target
 from controller.study.values import Criterion, Experiment, Figure, Result, Table
 
 SIZES = (8, 16, 32)
@@ -35,7 +35,7 @@ class Made:
 
 def regions(subject: Subject) -> Result:
     """Solve a piece of one target by regions and globally; photograph each."""
-    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+    target = photograph_target(subject)
     wanted = subject.wanted(target)
     crop = detail(subject.mask, centre=(0.4, 0.3), size_px=CROP_PX[subject.size])
     weights = np.zeros(subject.mask.shape, np.float32)

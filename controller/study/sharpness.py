@@ -10,13 +10,13 @@ import numpy as np
 from controller.arrays import FloatImage
 from controller.report.pictures import crop_around
 from controller.solve.bounded import solve_bounded
-from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
 from controller.solve.weights import appearance_weights
 from controller.study.ablation import paper_model, raw_transport
 from controller.study.drawing import Panel, maps, screen, strip
 from controller.study.measuring import sharpness_map, unbounded_inverse
 from controller.study.residual import brightest_first
 from controller.study.subject import Subject, Wanted
+from controller.study.trial import photograph_target
 from controller.study.values import Criterion, Experiment, Figure, Result, Table
 from controller.transport import LightTransport
 
@@ -38,7 +38,7 @@ def local_sharpness(subject: Subject) -> Result:
     order = brightest_first(subject)
     every = list(range(len(order)))
     alone = LightTransport.build(subject.with_projectors(order[:1]))
-    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+    target = photograph_target(subject)
     wanted = subject.wanted(target, transport=alone)
     window_px = max(24, subject.mask.shape[1] // 20)
     made = []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from controller.arrays import FloatImage
 from controller.solve.bounded import SMOOTHNESS, solve_bounded
-from controller.solve.targets import shipped_photograph, through_camera, wrap_photograph
+from controller.solve.targets import Target, shipped_photograph, through_camera, wrap_photograph
 from controller.solve.weights import appearance_weights
 from controller.study.measuring import Quality, quality
 from controller.study.subject import Subject, Wanted
@@ -23,10 +23,14 @@ class Trial:
     quality: Quality
 
 
+def photograph_target(subject: Subject) -> Target:
+    """The shipped photograph wrapped on the reconstructed object, as the camera can see it."""
+    return through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+
+
 def trial(subject: Subject, name: str) -> Trial:
     """A photograph wrapped on the reconstructed object, at an exposure that 95 % of it can reach."""
-    target = through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
-    wanted = subject.wanted(target)
+    wanted = subject.wanted(photograph_target(subject))
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
     black = subject.calibration.black
     solution = solve_bounded(subject.transport, wanted.radiance, black, weights=weights, smoothness=SMOOTHNESS)
