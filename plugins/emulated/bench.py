@@ -17,7 +17,7 @@ from typing import Any, Final
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
-from plugins.emulated.bench_usb import STAGE_CAMERA, UsbDevices, read_usb
+from plugins.emulated.bench_usb import UsbDevices, read_usb
 from plugins.emulated.bumps import bumps_of, write_bumps
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.mains import Mains, boot_times, check_mains
@@ -38,7 +38,7 @@ from plugins.emulated.staging import (
 )
 from plugins.emulated.stands import SETTINGS, Stands, read_stands
 from plugins.emulated.truth import FOLDER, CameraTruth, ObjectTruth, read_truth, write_truth
-from plugins.emulated.usb_stage_camera import Exposures
+from plugins.emulated.usb_stage_camera import STAGE_CAMERA, Exposures
 from plugins.emulated.world import World, object_of
 
 OBJECT_FILE: Final = f"{FOLDER}/object.npz"
@@ -188,10 +188,7 @@ def _start(
         out.served("camera", "camera", camera.address)
     out.served("display", "display", str(stage / truth.frames))
     if usb:
-        told: dict[str, Any] = {}
-        if on_usb:
-            exposures = stack.enter_context(Exposures(world.expose))
-            told = {"exposures": exposures.address, "serial": truth.camera.serial_number, "raw": truth.camera.raw}
+        told = stack.enter_context(Exposures(world.expose)).camera(truth.camera) if on_usb else None
         text = script.read_text(encoding="utf-8") if script is not None else ""
         bus = stack.enter_context(UsbDevices(usb, text, stage_camera=told))
         for device in usb:

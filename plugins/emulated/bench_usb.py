@@ -20,9 +20,9 @@ from plugins.emulated.tables import Between, load
 from plugins.emulated.truth import FOLDER
 from plugins.emulated.usb_bus import PRELOAD, environment
 from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
+from plugins.emulated.usb_stage_camera import STAGE_CAMERA
 
 FILE: Final = f"{FOLDER}/usb.toml"
-STAGE_CAMERA: Final = "stage-camera"
 _SETTINGS: Final[Mapping[str, tuple[str, ...]]] = {
     "relay": ("serial", "channels"),
     "light": ("serial", "lux"),
@@ -80,7 +80,7 @@ def read_usb(stage: Path) -> tuple[UsbDeviceTruth, ...]:
 class UsbDevices:
     """The bus with its devices plugged in, in a process of its own; a context.
 
-    ``stage_camera``: the settings of ``usb_stage_camera.stage_camera``, for the device that is one;
+    ``stage_camera``: what ``usb_stage_camera.Exposures.camera`` tells, for the device that is one;
     ``environment``: what a program's environment must have besides, so that it sees them. Raises DeviceError
     ("usb-no-preload") where the preload library is missing.
     """

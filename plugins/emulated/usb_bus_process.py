@@ -25,14 +25,14 @@ from plugins.emulated.scenario import parse_scenario
 from plugins.emulated.usb_bus import UsbBus
 from plugins.emulated.usb_bus_device import EmulatedUsbDevice
 from plugins.emulated.usb_bus_scenario import UsbScenario
-from plugins.emulated.usb_stage_camera import stage_camera
+from plugins.emulated.usb_stage_camera import STAGE_CAMERA, stage_camera
 
 KINDS: Final[Mapping[str, Callable[..., EmulatedUsbDevice]]] = {
     "relay": EmulatedRelayBoard,
     "light": EmulatedLightSensor,
     "keys": EmulatedKeyPanel,
     "camera": numbered_camera,
-    "stage-camera": stage_camera,
+    STAGE_CAMERA: stage_camera,
 }
 _PATIENCE_S: Final = 10.0
 

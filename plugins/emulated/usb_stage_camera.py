@@ -11,37 +11,34 @@ import dataclasses
 import json
 import threading
 from multiprocessing.connection import Client, Connection, Listener
-from typing import Self
+from typing import Any, Final, Self
 
 from plugins.emulated.ptp_body import JPEG, CameraNames
 from plugins.emulated.ptp_usb_camera import EmulatedUsbCamera
 from plugins.emulated.shot import Expose, ShotFiles, ShotSettings
+from plugins.emulated.truth import CameraTruth
+
+STAGE_CAMERA: Final = "stage-camera"
+"""This kind of device, in bench/usb.toml and to the bus."""
 
 
 class Exposures:
-    """The bench's side: makes the files of every exposure that a camera asks for; a context."""
+    """The bench's side: makes the files of every exposure that its one camera asks for.
+
+    A context, and around that of the bus: the camera is gone before it ends.
+    """
 
     def __init__(self, expose: Expose) -> None:
         self._expose = expose
         self._listener = Listener(None, "AF_UNIX")
-        self._open: list[Connection] = []
-        self._ended = False
-        self._thread = threading.Thread(target=self._accept, name="exposures", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="exposures", daemon=True)
 
-    @property
-    def address(self) -> str:
-        """For ``stage_camera``."""
-        return str(self._listener.address)
+    def camera(self, truth: CameraTruth) -> dict[str, Any]:
+        """The settings of the ``stage_camera`` that asks here."""
+        return {"exposures": str(self._listener.address), "serial": truth.serial_number, "raw": truth.raw}
 
-    def _accept(self) -> None:
-        while not self._ended:
-            with contextlib.suppress(OSError):
-                connection = self._listener.accept()
-                self._open.append(connection)
-                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
-
-    def _serve(self, connection: Connection) -> None:
-        with contextlib.suppress(EOFError, OSError), connection:
+    def _serve(self) -> None:
+        with contextlib.suppress(EOFError, OSError), self._listener.accept() as connection:
             while True:
                 files = self._expose(ShotSettings(**json.loads(connection.recv_bytes())))
                 connection.send_bytes(files.raw or b"")
@@ -52,18 +49,15 @@ class Exposures:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ended = True
-        # who waits for a connection hears of nothing but a connection
+        # A camera that never asked: who waits for a connection hears of nothing but a connection.
         with contextlib.suppress(OSError):
-            Client(self.address, "AF_UNIX").close()
+            Client(str(self._listener.address), "AF_UNIX").close()
         self._thread.join()
         self._listener.close()
-        for connection in self._open:
-            connection.close()
 
 
 def stage_camera(exposures: str, serial: str, *, raw: bool = True) -> EmulatedUsbCamera:
-    """A camera whose pictures are those of the stage; ``exposures``: the address of its ``Exposures``."""
+    """A camera whose pictures are those of the stage; its arguments are what ``Exposures.camera`` tells."""
     turn = threading.Lock()
     asked: list[Connection] = []
 

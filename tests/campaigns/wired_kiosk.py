@@ -31,7 +31,7 @@ from plugins.emulated.serial_projector import EmulatedSerialProjector
 from plugins.emulated.truth import MainsTruth, read_truth
 from plugins.emulated.usb_bus import environment
 from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
-from plugins.emulated.usb_stage_camera import Exposures
+from plugins.emulated.usb_stage_camera import STAGE_CAMERA, Exposures
 from tests.campaigns.kills import children
 from tests.campaigns.mini_stage import HonestLamp, SteadyWorld, prepare_mini
 
@@ -135,7 +135,7 @@ class WiredKiosk:
             self._world.expose, command_port=truth.camera.command_port, event_port=truth.camera.event_port,
             names=CameraNames(serial=truth.camera.serial_number), time_scale=0.0, raw=truth.camera.raw,
         )  # fmt: skip
-        self._tether = {"serial": truth.camera.serial_number, "raw": truth.camera.raw}
+        self._camera = truth.camera
         self._stack = contextlib.ExitStack()
         self._beaten_s, self.longest_gap_s = time.monotonic(), 0.0
         self.starved_s = 0.0
@@ -171,7 +171,7 @@ class WiredKiosk:
                 self.well[name] = {knob: bus.get(name, knob) for knob in own}
             if self._tethered:
                 exposures = stack.enter_context(Exposures(self._world.expose))
-                bus.add(TETHER, "stage-camera", exposures=exposures.address, **self._tether)
+                bus.add(TETHER, STAGE_CAMERA, **exposures.camera(self._camera))
                 knobs = [f"{path}.{knob.name}" for path, kind in TETHER_KNOBS.items() for knob in fields(kind)]
                 self.well[TETHER] = {knob: bus.get(TETHER, knob) for knob in knobs}
             circuits = [MainsTruth("board", channel, (name,)) for channel, name in enumerate(self.projectors, start=1)]
