@@ -34,9 +34,10 @@ _SETTINGS: Final[Mapping[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class UsbDeviceTruth:
-    """One device. ``kind``: relay, light, keys, camera, or stage-camera: the one that looks at the stage, here on USB
+    """One device. ``kind``: relay, light, keys, camera or stage-camera.
 
-    and not on the network. ``channels`` of a relay board, ``lux`` at a light sensor.
+    ``channels`` of a relay board, ``lux`` at a light sensor. The stage-camera is that of bench.toml, which looks at the
+    stage, on USB instead of the network.
     """
 
     name: str
