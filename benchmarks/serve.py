@@ -44,6 +44,7 @@ PACED_S = 20.0
 RATE_HZ = 30.0
 PAGES = 15
 OPEN = 50
+CHANGES, LISTEN_S = 10, 2.0
 PORT = 18377
 NAME = "grey"
 
@@ -89,6 +90,7 @@ def _panels(stage: Path) -> list[Row]:
             busy = _busy(stage, served.pid)
             told = (panels.received - before) / OPEN / REST_S
             busy_paced = _paced(stage)
+            told_s = _told_after(stage, panels)
         quiet_paced = _paced(stage, changes=False)
     seconds = [seconds for seconds, _ in pages]
     return [
@@ -102,6 +104,7 @@ def _panels(stage: Path) -> list[Row]:
                 unit="% of a core", how=f"as above; {told:.0f} bytes a second to each"),
         at_most(f"swaps late at {RATE_HZ:g} Hz, {OPEN} open panels, something changes", float(busy_paced.late), 0.0,
                 unit="", how=f"more than a tick late, over {PACED_S:g} s; {quiet_paced.late} with no panel"),
+        at_most(f"a change of the state on {OPEN} open pages", max(told_s), 1.0, unit="s", how=_spread(told_s)),
         at_most(f"p99 at {RATE_HZ:g} Hz, {OPEN} open panels, something changes", busy_paced.p99_ms, None, unit="ms",
                 how=f"{quiet_paced.p99_ms:.1f} ms with no panel"),
     ]  # fmt: skip
@@ -140,8 +143,7 @@ def _changing(stage: Path) -> Iterator[None]:
         for closes in itertools.cycle(("23:58", "23:59")):
             if ended.wait(0.25):
                 return
-            hours = {"opens": "00:00", "closes": closes, "appearance": NAME}
-            ask(stage, "set-schedule", time_zone="UTC", rows=[{"day": day, **hours} for day in WEEKDAYS])
+            _close_at(stage, closes)
 
     thread = threading.Thread(target=change)
     thread.start()
@@ -150,6 +152,25 @@ def _changing(stage: Path) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+def _close_at(stage: Path, closes: str) -> None:
+    hours = {"opens": "00:00", "closes": closes, "appearance": NAME}
+    ask(stage, "set-schedule", time_zone="UTC", rows=[{"day": day, **hours} for day in WEEKDAYS])
+
+
+def _told_after(stage: Path, panels: OpenPanels) -> list[float]:
+    """Seconds from a change of the kiosk's state until the last of the open pages has heard of it, over several."""
+    spans = []
+    for minute in range(10, 10 + CHANGES):
+        heard, began_s, last_s = panels.received, time.perf_counter(), float("inf")
+        _close_at(stage, f"23:{minute}")
+        while time.perf_counter() < began_s + LISTEN_S:
+            if panels.received > heard:
+                heard, last_s = panels.received, time.perf_counter()
+            time.sleep(0.001)
+        spans.append(last_s - began_s)
+    return spans
 
 
 def install_grey(stage: Path) -> None:
