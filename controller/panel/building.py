@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import ssl
@@ -24,19 +25,25 @@ MOST_COMMANDS_WAITING: Final = 20
 LONGEST_PAYLOAD: Final = 256
 AGAIN_S: Final = 1.0
 """After a state that could not be found out."""
+LEAVE_S: Final = 2.0
+"""The longest that a stop waits for a broker to hear of it."""
 _LOG: Final = logging.getLogger("velatura.panel")
 
 
 class BuildingControl:
     """One connection to a broker, made again for as long as it takes, each time after a longer pause.
 
-    Topics: ``T/available`` "online" or "offline" (retained, also by the broker when we vanish); ``T/state`` JSON
+    Topics: ``T/available`` "online" or "offline" (retained; the broker's word when we vanish); ``T/state`` JSON
     (retained); ``T/command/open``, ``T/command/close``, ``T/command/play`` (payload: the appearance's name);
-    ``T/answer`` what came of it. Who may publish to ``T/command`` is the broker's to decide.
+    ``T/answer`` what came of it. Who may publish to ``T/command`` is the broker's to decide. A broker that confirms
+    nothing for ``patience_s`` is connected to anew.
     """
 
-    def __init__(self, kiosk: Kiosk, options: BrokerOptions, *, first_pause_s: float = 1.0) -> None:
-        self._kiosk, self._options, self._first_pause_s = kiosk, options, first_pause_s
+    def __init__(
+        self, kiosk: Kiosk, options: BrokerOptions, *, first_pause_s: float = 1.0, patience_s: float = 10.0
+    ) -> None:
+        self._kiosk, self._options = kiosk, options
+        self._first_pause_s, self._patience_s = first_pause_s, patience_s
         self._changed = asyncio.Event()
 
     async def run(self) -> None:
@@ -53,11 +60,14 @@ class BuildingControl:
                 began_s = loop.time()
                 try:
                     await self._connected()
-                except (aiomqtt.MqttError, OSError, ValueError) as error:
+                except* ValueError as errors:
+                    _LOG.warning("A password file that is no text, or a topic that can be none: %s", errors.exceptions)
+                except* (aiomqtt.MqttError, OSError):
                     # The kiosk goes on without the building; whoever watches "available" sees that it is cut off.
-                    if isinstance(error, ValueError):
-                        _LOG.warning("A password file that is no text, or a topic that can be none: %s", error)
-                    pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
+                    _LOG.debug("No broker at %s", self._options.host, exc_info=True)
+                except* Exception:  # noqa: BLE001 - neither the panel nor the next try ends with one connection
+                    _LOG.exception("The connection to the building's broker ended; it is made again.")
+                pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
                 await asyncio.sleep(pause_s)
                 pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
         finally:
@@ -75,18 +85,26 @@ class BuildingControl:
             password=password,
             will=will,
             tls_context=tls,
+            timeout=self._patience_s,
             max_queued_incoming_messages=MOST_COMMANDS_WAITING,
         ) as client:
             await client.subscribe(f"{topic}/command/+", qos=1)
             await client.publish(f"{topic}/available", "online", qos=1, retain=True)
-            self._changed.set()
-            publishing = asyncio.create_task(self._publish(client))
             try:
-                async for message in client.messages:
-                    await self._obey(client, message)
+                await self._both_ways(client)
             finally:
-                publishing.cancel()
-                await asyncio.gather(publishing, return_exceptions=True)
+                # The broker says it of itself only when we vanish, not when we take our leave.
+                with anyio.move_on_after(LEAVE_S, shield=True), contextlib.suppress(aiomqtt.MqttError):
+                    await client.publish(f"{topic}/available", "offline", qos=1, retain=True)
+
+    async def _both_ways(self, client: aiomqtt.Client) -> None:
+        self._changed.set()
+        # A task group, because it cancels until it is obeyed: `asyncio.wait_for`, inside every publish, loses a
+        # cancellation that meets the broker's answer (Python 3.11), and whoever waited for that task waited for good.
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._publish, client)
+            async for message in client.messages:
+                await self._obey(client, message)
 
     async def _publish(self, client: aiomqtt.Client) -> None:
         last = ""

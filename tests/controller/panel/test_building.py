@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import shutil
 import socket
@@ -13,15 +14,20 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import aiomqtt
+import anyio
 import pytest
 
+from controller.panel.app import make_panel
 from controller.panel.broker import BrokerOptions
 from controller.panel.building import BuildingControl
+from controller.panel.context import PanelOptions
 from controller.panel.kiosk import KioskState
+from controller.panel.server import PanelServer
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 
 MOSQUITTO = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
 pytestmark = pytest.mark.skipif(not Path(MOSQUITTO).exists(), reason="needs mosquitto (a package of the test set-up)")
+CONNECT, PUBLISH, SUBSCRIBE = 1, 3, 8
 USER, SECRET = "kiosk", "word for the broker"
 
 
@@ -91,13 +97,11 @@ async def wait_for(heard: asyncio.Queue[tuple[str, str]], topic: str, words: str
 
 
 @contextlib.asynccontextmanager
-async def controlled(kiosk: MemoryKiosk, settings: BrokerOptions) -> AsyncIterator[None]:
-    running = asyncio.create_task(BuildingControl(kiosk, settings, first_pause_s=0.1).run())
-    try:
+async def controlled(kiosk: MemoryKiosk, settings: BrokerOptions, *, patience_s: float = 10) -> AsyncIterator[None]:
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(BuildingControl(kiosk, settings, first_pause_s=0.1, patience_s=patience_s).run)
         yield
-    finally:
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
+        tasks.cancel_scope.cancel()
 
 
 def test_a_building_opens_closes_and_plays_and_hears_what_came_of_it(tmp_path: Path) -> None:
@@ -155,6 +159,68 @@ def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path) -> None:
                 await asyncio.to_thread(started.__exit__, None, None, None)
 
     asyncio.run(story())
+
+
+@contextlib.asynccontextmanager
+async def forgetful_broker() -> AsyncIterator[tuple[int, asyncio.Queue[int]]]:
+    """Speaks as much of MQTT 3.1.1 as a publisher needs, but does not confirm a state on its first connection. Yields
+    its port, and for every state the number of its connection.
+    """
+    states: asyncio.Queue[int] = asyncio.Queue()
+    connections = itertools.count()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        connection = next(connections)
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError), contextlib.closing(writer):
+            while True:
+                kind = (await reader.readexactly(1))[0] >> 4
+                length, shift, more = 0, 0, 0x80
+                while more & 0x80:
+                    more = (await reader.readexactly(1))[0]
+                    length, shift = length | (more & 0x7F) << shift, shift + 7
+                body = await reader.readexactly(length)
+                if kind == CONNECT:
+                    writer.write(bytes((0x20, 2, 0, 0)))
+                elif kind == SUBSCRIBE:
+                    writer.write(bytes((0x90, 3, *body[:2], 1)))
+                elif kind == PUBLISH:
+                    topic_end = 2 + int.from_bytes(body[:2], "big")
+                    state = body[2:topic_end].endswith(b"/state")
+                    if state:
+                        states.put_nowait(connection)
+                    if connection or not state:
+                        writer.write(bytes((0x40, 2, *body[topic_end : topic_end + 2])))
+
+    server = await asyncio.start_server(serve, "127.0.0.1")
+    async with server:
+        yield server.sockets[0].getsockname()[1], states
+
+
+def test_a_broker_that_does_not_confirm_a_state_is_told_it_again_on_a_new_connection(tmp_path: Path) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
+
+    async def story() -> None:
+        async with forgetful_broker() as (port, states), controlled(kiosk, options(tmp_path, port), patience_s=0.5):
+            async with asyncio.timeout(30):
+                assert [await states.get(), await states.get()] == [0, 1]
+
+    asyncio.run(story())
+
+
+def test_a_building_hears_that_the_panel_takes_its_leave(tmp_path: Path) -> None:
+    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+    settings = PanelOptions(folder=tmp_path / "panel", port=0, broker=options(tmp_path, port))
+    panel = PanelServer(make_panel(kiosk, settings.accounts(), settings), settings)
+
+    async def story() -> None:
+        async with building(port) as (_, heard):
+            await asyncio.to_thread(panel.start)
+            await wait_for(heard, "available", "online")
+            await asyncio.to_thread(panel.stop)
+            await wait_for(heard, "available", "offline")
+
+    with broker(tmp_path / "broker", port):
+        asyncio.run(story())
 
 
 class Fragile(MemoryKiosk):
