@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
+import secrets
 import shlex
 import signal
 import socket
@@ -44,6 +46,7 @@ from plugins.emulated.world import World, object_of
 OBJECT_FILE: Final = f"{FOLDER}/object.npz"
 DEVICE_FAILED: Final = 3
 HOST: Final = "127.0.0.1"
+PORTS: Final = range(20000, 32768)
 
 
 class EmulatedBench:
@@ -222,9 +225,20 @@ def _follow_bumps(world: World, out: _Lines) -> None:
 
 
 def _free_ports() -> tuple[int, int]:
-    """Two TCP ports that nobody listens on now."""
-    with socket.create_server((HOST, 0)) as first, socket.create_server((HOST, 0)) as second:
-        return int(first.getsockname()[1]), int(second.getsockname()[1])
+    """Two TCP ports that nobody listens on now. The stage keeps them while no bench serves it, so they are none of
+    those that the system gives to whoever asks for any.
+    """
+    in_any_order = secrets.SystemRandom().sample(PORTS, len(PORTS))
+    first, second = itertools.islice(filter(_is_free, in_any_order), 2)
+    return first, second
+
+
+def _is_free(port: int) -> bool:
+    try:
+        socket.create_server((HOST, port)).close()
+    except OSError:
+        return False
+    return True
 
 
 def _require_free(*ports: int) -> None:

@@ -24,6 +24,7 @@ from controller.panel.context import PanelOptions
 from controller.panel.kiosk import KioskState
 from controller.panel.server import PanelServer
 from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.ports import kept_port
 
 MOSQUITTO = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
 pytestmark = pytest.mark.skipif(not Path(MOSQUITTO).exists(), reason="needs mosquitto (a package of the test set-up)")
@@ -31,10 +32,10 @@ CONNECT, PUBLISH, SUBSCRIBE = 1, 3, 8
 USER, SECRET = "kiosk", "word for the broker"
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+@pytest.fixture
+def port() -> Iterator[int]:
+    with kept_port() as number:
+        yield number
 
 
 @contextlib.contextmanager
@@ -104,8 +105,8 @@ async def controlled(kiosk: MemoryKiosk, settings: BrokerOptions, *, patience_s:
         tasks.cancel_scope.cancel()
 
 
-def test_a_building_opens_closes_and_plays_and_hears_what_came_of_it(tmp_path: Path) -> None:
-    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+def test_a_building_opens_closes_and_plays_and_hears_what_came_of_it(tmp_path: Path, port: int) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
 
     async def story() -> None:
         async with building(port) as (client, heard), controlled(kiosk, options(tmp_path, port)):
@@ -129,8 +130,8 @@ def test_a_building_opens_closes_and_plays_and_hears_what_came_of_it(tmp_path: P
         asyncio.run(story())
 
 
-def test_a_command_kept_by_the_broker_is_not_obeyed_after_a_restart(tmp_path: Path) -> None:
-    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+def test_a_command_kept_by_the_broker_is_not_obeyed_after_a_restart(tmp_path: Path, port: int) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
 
     async def story() -> None:
         async with building(port) as (client, heard):
@@ -145,8 +146,8 @@ def test_a_command_kept_by_the_broker_is_not_obeyed_after_a_restart(tmp_path: Pa
         asyncio.run(story())
 
 
-def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path) -> None:
-    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path, port: int) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
 
     async def story() -> None:
         async with controlled(kiosk, options(tmp_path, port)):
@@ -207,8 +208,8 @@ def test_a_broker_that_does_not_confirm_a_state_is_told_it_again_on_a_new_connec
     asyncio.run(story())
 
 
-def test_a_building_hears_that_the_panel_takes_its_leave(tmp_path: Path) -> None:
-    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+def test_a_building_hears_that_the_panel_takes_its_leave(tmp_path: Path, port: int) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
     settings = PanelOptions(folder=tmp_path / "panel", port=0, broker=options(tmp_path, port))
     panel = PanelServer(make_panel(kiosk, settings.accounts(), settings), settings)
 
@@ -230,8 +231,8 @@ class Fragile(MemoryKiosk):
         raise RuntimeError("nobody thought of this")
 
 
-def test_an_error_that_nobody_knows_ends_neither_the_connection_nor_the_panel(tmp_path: Path) -> None:
-    kiosk, port = Fragile(tmp_path / "pictures"), free_port()
+def test_an_error_that_nobody_knows_ends_neither_the_connection_nor_the_panel(tmp_path: Path, port: int) -> None:
+    kiosk = Fragile(tmp_path / "pictures")
 
     async def story() -> None:
         async with building(port) as (client, heard), controlled(kiosk, options(tmp_path, port)):
@@ -256,8 +257,8 @@ class Dazed(MemoryKiosk):
         return super().snapshot()
 
 
-def test_a_state_that_cannot_be_told_for_a_while_is_told_afterwards(tmp_path: Path) -> None:
-    kiosk, port = Dazed(tmp_path / "pictures"), free_port()
+def test_a_state_that_cannot_be_told_for_a_while_is_told_afterwards(tmp_path: Path, port: int) -> None:
+    kiosk = Dazed(tmp_path / "pictures")
 
     async def story() -> None:
         async with building(port) as (client, heard), controlled(kiosk, options(tmp_path, port)):
@@ -273,8 +274,8 @@ def test_a_state_that_cannot_be_told_for_a_while_is_told_afterwards(tmp_path: Pa
         asyncio.run(story())
 
 
-def test_a_password_file_that_is_no_text_is_tried_again_until_it_is_mended(tmp_path: Path) -> None:
-    kiosk, port = MemoryKiosk(tmp_path / "pictures"), free_port()
+def test_a_password_file_that_is_no_text_is_tried_again_until_it_is_mended(tmp_path: Path, port: int) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
     settings = options(tmp_path, port)
     assert settings.password_file is not None
     settings.password_file.write_bytes(b"\xff\xfe\x00")

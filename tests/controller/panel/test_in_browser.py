@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
-import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +18,7 @@ from controller.panel.pages import NAVIGATION
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, picture, tab
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import QUICK_HASH, Served, served
+from tests.ports import kept_port
 
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
 
@@ -103,23 +104,18 @@ def test_two_technicians_see_the_same_job_and_only_one_can_begin_it(slow: Served
 
 
 def test_an_open_page_finds_the_service_again_after_a_restart(tmp_path: Path, browser: Browser) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     kiosk = MemoryKiosk(tmp_path / "pictures")
-    with served(kiosk, tmp_path / "private", port=port) as running:
-        address = running.address
-        browser_tab = tab(browser, address)
-        page = browser_tab.__enter__()
-        enter(page, "otto")
-    expect(page.get_by_text("No connection, trying again")).to_be_visible()
-    with served(kiosk, tmp_path / "private", port=port):
-        expect(page.get_by_text("No connection, trying again")).to_be_hidden()
-        kiosk.change(reason="The service was started again.")
-        expect(page.get_by_text("The service was started again.")).to_be_visible()
-        page.get_by_role("button", name="Quick recalibration").click()
-        expect(page.get_by_text("It ended well.")).to_be_visible()
-        browser_tab.__exit__(None, None, None)
+    with kept_port() as port, contextlib.ExitStack() as closing:
+        with served(kiosk, tmp_path / "private", port=port) as running:
+            page = closing.enter_context(tab(browser, running.address))
+            enter(page, "otto")
+        expect(page.get_by_text("No connection, trying again")).to_be_visible()
+        with served(kiosk, tmp_path / "private", port=port):
+            expect(page.get_by_text("No connection, trying again")).to_be_hidden()
+            kiosk.change(reason="The service was started again.")
+            expect(page.get_by_text("The service was started again.")).to_be_visible()
+            page.get_by_role("button", name="Quick recalibration").click()
+            expect(page.get_by_text("It ended well.")).to_be_visible()
 
 
 def test_a_target_is_uploaded_looked_at_and_computed(fresh: Served, browser: Browser) -> None:

@@ -1,0 +1,20 @@
+"""TCP ports for servers that come and go during a test."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator
+
+
+@contextlib.contextmanager
+def kept_port() -> Iterator[int]:
+    """A port of the loopback that is given to nobody else meanwhile, also while the test's server does not run.
+
+    Bound and not listening: connections are refused, and a server may still listen there if it sets SO_REUSEADDR, as
+    asyncio's and Mosquitto's do on Linux.
+    """
+    with socket.socket() as kept:
+        kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        kept.bind(("127.0.0.1", 0))
+        yield int(kept.getsockname()[1])
