@@ -92,10 +92,12 @@ class Hub:
             yield "retry: 10000\nevent: full\ndata: {}\n\n"
             return
         queue: asyncio.Queue[str] = asyncio.Queue(QUEUED)
-        # Those who look already are told too: what is sent later is compared with what was drawn last.
-        await self._redraw()
+        # Before the drawing, or nobody would look when something changes meanwhile, and it would stay unseen.
         self._listeners.add(queue)
         try:
+            # Those who look already are told too: what is sent later is compared with what was drawn last.
+            await self._redraw()
+            _empty(queue)
             yield "retry: 1000\n" + self._message(self._parts)
             while alive() and not self._ended:
                 try:
@@ -109,7 +111,11 @@ class Hub:
 def _put(queue: asyncio.Queue[str], message: str) -> None:
     """A panel that does not read is dropped back to the newest: it will ask again when it wakes up."""
     if queue.full():
-        while not queue.empty():
-            queue.get_nowait()
+        _empty(queue)
         message = "event: reload\ndata: {}\n\n"
     queue.put_nowait(message)
+
+
+def _empty(queue: asyncio.Queue[str]) -> None:
+    while not queue.empty():
+        queue.get_nowait()

@@ -1,9 +1,12 @@
-"""Live values: soon, for many, and cheap."""
+"""Live values: for many, and cheap. How soon they come is measured by `python -m benchmarks serve`."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import itertools
 import json
+import re
 import threading
 import time
 from pathlib import Path
@@ -11,13 +14,14 @@ from pathlib import Path
 import httpx
 
 from controller.panel.context import PanelOptions
+from controller.panel.live import Hub
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, served
 
 
-def test_a_change_is_on_every_one_of_fifty_open_panels_within_a_second(tmp_path: Path) -> None:
+def test_a_change_is_on_every_one_of_fifty_open_panels(tmp_path: Path) -> None:
     kiosk = MemoryKiosk(tmp_path / "pictures")
-    arrivals: list[float] = []
+    arrived: list[str] = []
     ready = threading.Semaphore(0)
 
     def watch(running: Served, cookies: httpx.Cookies) -> None:
@@ -28,7 +32,7 @@ def test_a_change_is_on_every_one_of_fifty_open_panels_within_a_second(tmp_path:
                     if line.startswith("data:") and "Playing" in line and "now for all" not in line:
                         ready.release()
                     if "now for all" in line:
-                        arrivals.append(time.monotonic())
+                        arrived.append(line)
                         return
 
     options = PanelOptions(tmp_path / "private")
@@ -38,13 +42,61 @@ def test_a_change_is_on_every_one_of_fifty_open_panels_within_a_second(tmp_path:
             thread.start()
         for _ in threads:
             assert ready.acquire(timeout=20)
-        time.sleep(0.5)
-        began = time.monotonic()
         kiosk.change(reason="now for all")
         for thread in threads:
             thread.join(20)
-        assert len(arrivals) == 50
-        assert max(arrivals) - began < 1.0
+        assert len(arrived) == 50
+
+
+def test_a_change_while_the_first_picture_is_drawn_is_not_lost() -> None:
+    texts = ["old"]
+
+    async def story() -> list[str]:
+        def draw() -> dict[str, str]:
+            text = texts[-1]
+            if text == "old":
+                texts.append("new")
+                hub.changed()
+                time.sleep(0.3)  # long enough for the hub to hear of it while nobody is served yet
+            return {"top": text}
+
+        hub = Hub(draw, frames_per_s=100, most=1)
+        running = asyncio.create_task(hub.run())
+        await asyncio.sleep(0)
+        stream = hub.stream(lambda: True)
+        try:
+            async with asyncio.timeout(10):
+                return [await anext(stream), await anext(stream)]
+        finally:
+            running.cancel()
+
+    first, second = asyncio.run(story())
+    assert "old" in first
+    assert "new" in second
+
+
+def test_what_was_drawn_before_the_first_picture_does_not_come_after_it() -> None:
+    drawn = itertools.count()
+
+    async def story() -> str:
+        hub = Hub(lambda: {"top": str(next(drawn))}, frames_per_s=100, most=2)
+        running = asyncio.create_task(hub.run())
+        first = hub.stream(lambda: True)
+        await anext(first)
+        second = hub.stream(lambda: True)
+        hub.changed()
+        opening = await anext(second)
+        try:
+            async with asyncio.timeout(0.3):
+                opening += await anext(second)
+        except TimeoutError:
+            pass
+        finally:
+            running.cancel()
+        return opening
+
+    numbers = [int(found) for found in re.findall(r'"top": "(\d+)"', asyncio.run(story()))]
+    assert numbers == sorted(numbers)
 
 
 def test_a_storm_of_changes_is_drawn_a_few_times_only(tmp_path: Path) -> None:
@@ -102,13 +154,3 @@ def test_too_many_panels_are_refused_and_come_back_later(tmp_path: Path) -> None
         lines = stream.iter_lines()
         next(lines)
         assert "event: full" in otto.get("/live").text
-
-
-def test_the_first_page_comes_quickly(panel: Served) -> None:
-    with panel.entered("tina") as client:
-        times = []
-        for _ in range(10):
-            began = time.monotonic()
-            client.get("/")
-            times.append(time.monotonic() - began)
-    assert min(times) < 0.15

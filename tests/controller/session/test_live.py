@@ -126,9 +126,9 @@ def test_a_display_that_fails_ends_it_with_the_error(maker: FrameMaker) -> None:
 
 def test_it_ends_after_the_time_that_was_asked_for(maker: FrameMaker) -> None:
     began_s = time.monotonic()
-    figures = run_live(Numbers(10**6), maker, lambda frames: None, rate_hz=30, seconds=0.5)
-    assert 0.4 < time.monotonic() - began_s < 1.5
-    assert 8 <= figures.made <= 16
+    figures = run_live(Numbers(10**6), maker, lambda frames: None, rate_hz=30, seconds=2)
+    assert 2 <= time.monotonic() - began_s < 10
+    assert 32 <= figures.made <= 61
 
 
 def _level(frames: Frames) -> int:
