@@ -28,7 +28,7 @@ from controller.session.progress import Level
 from controller.session.rig import Rig
 from controller.session.runner import Context
 from controller.storage import write_atomically
-from hal.deadline import Cancelled
+from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError
 
 DELAY_FILE, RAISED = "delay.json", "delay-raised.json"
@@ -81,11 +81,15 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, index: str)
     taken: list[Taken] = []
     before: _Before | None = None
     watch = CameraWatch(rig.camera)
-    for number, planned in enumerate(plan):
-        context.advance(number / len(plan), planned.name)
-        one, before = _take(rig, context, planned, folder, before)
-        taken.append(one)
-        watch.look(context)
+    try:
+        for number, planned in enumerate(plan):
+            context.advance(number / len(plan), planned.name)
+            one, before = _take(rig, context, planned, folder, before)
+            taken.append(one)
+            watch.look(context)
+    except BaseException:
+        forget_unless_lit(rig, taken)
+        raise
     keep_if_lit(rig, context, taken)
     path = context.folder / f"{index}.json"
     rows = [
@@ -100,17 +104,35 @@ def keep_if_lit(rig: Rig, context: Context, taken: Sequence[Taken]) -> None:
 
     Raises as ``Rig.check_light``. A run that goes on takes the forgotten ones again.
     """
-    fresh = [one.path for one in taken if one.fresh]
-    if not fresh:
+    if not any(one.fresh for one in taken):
         return
     try:
         rig.check_light(deadline=context.deadline)
     except Cancelled:
+        forget_unless_lit(rig, taken)
         raise
     except DeviceError:
-        for path in fresh:
-            path.unlink(missing_ok=True)
+        _forget(taken)
         raise
+
+
+def forget_unless_lit(rig: Rig, taken: Sequence[Taken]) -> None:
+    """As ``keep_if_lit`` for photographs whose row did not end: a lamp that went out may be why it was stopped.
+
+    Has its own time, and raises nothing: what ended the row is what the caller has to tell.
+    """
+    if not any(one.fresh for one in taken):
+        return
+    try:
+        rig.check_light(deadline=in_seconds(sum(guard.answer_s for guard in rig.guards)))
+    except DeviceError:
+        _forget(taken)
+
+
+def _forget(taken: Sequence[Taken]) -> None:
+    for one in taken:
+        if one.fresh:
+            one.path.unlink(missing_ok=True)
 
 
 def use_delay(rig: Rig, folder: Path) -> None:

@@ -15,10 +15,11 @@ from controller.session.journal import Journal
 from controller.session.progress import Silent
 from controller.session.runner import Context
 from controller.session.shots import Developed, Planned, Taken, read_index, take_all, take_photograph
-from hal.deadline import Cancelled, in_seconds
+from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceRefused
+from hal.values import CapturedFile, ProjectorStatus
 from tests.controller.rig_model import SIZE_PX, STEADY_S, ModelRig
-from tests.controller.session.lamp_model import soon
+from tests.controller.session.lamp_model import Lamp, soon
 
 
 @pytest.fixture
@@ -38,6 +39,12 @@ def grey(value: int) -> dict[str, ByteImage]:
 
 def plan(values: Sequence[int] = (10, 20, 30), exposure_s: float = 0.5) -> list[Planned]:
     return [Planned(f"grey-{n}", partial(grey, value), exposure_s) for n, value in enumerate(values)]
+
+
+def light_again(stage: ModelRig) -> None:
+    stage.lamps["right"].strike(sin=False)
+    stage.rig.guards[1].status(deadline=soon())
+    stage.world.time_s += STEADY_S
 
 
 def test_each_photograph_shows_its_frames_and_is_listed_in_order(stage: ModelRig, context: Context) -> None:
@@ -86,9 +93,7 @@ def test_photographs_without_a_lamps_light_are_forgotten_but_earlier_ones_are_ke
     with pytest.raises(DeviceRefused, match="went off"):
         take_all(stage.rig, context, plan(), index="greys")
     assert not (context.folder / "greys.json").exists()
-    stage.lamps["right"].strike(sin=False)
-    stage.rig.guards[1].status(deadline=soon())
-    stage.world.time_s += STEADY_S
+    light_again(stage)
     take_all(stage.rig, context, plan(), index="greys")
     assert stage.camera.taken == ["grey-0", "grey-1", "grey-2", "grey-1", "grey-2"]
 
@@ -114,6 +119,50 @@ def test_a_stop_keeps_what_was_taken_so_far(stage: ModelRig, tmp_path: Path) -> 
         again = Context(journal.folder, journal, in_seconds(60), Silent(), {}, lambda fraction, note: None)
         take_all(stage.rig, again, plan(), index="greys")
     assert stage.camera.taken == ["grey-0", "grey-1", "grey-2"]
+
+
+def test_a_stop_forgets_what_was_taken_if_a_lamp_is_out_by_then(stage: ModelRig, tmp_path: Path) -> None:
+    cancel = threading.Event()
+
+    def advance(fraction: float, note: str) -> None:
+        if note == "grey-1":
+            stage.lamps["right"].go_dark()
+        if note == "grey-2":  # somebody has seen it, and pressed Ctrl-C
+            cancel.set()
+
+    with Journal(tmp_path / "run") as journal:
+        context = Context(journal.folder, journal, in_seconds(60, cancel), Silent(), {}, advance)
+        with pytest.raises(Cancelled):
+            take_all(stage.rig, context, plan(), index="greys")
+        light_again(stage)
+        again = Context(journal.folder, journal, in_seconds(60), Silent(), {}, lambda fraction, note: None)
+        take_all(stage.rig, again, plan(), index="greys")
+    assert stage.camera.taken == ["grey-0", "grey-1", "grey-0", "grey-1", "grey-2"]
+
+
+def test_a_stop_just_before_the_lamps_are_looked_at_keeps_nothing_without_their_light(
+    stage: ModelRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cancel = threading.Event()
+    answer, capture = Lamp.status, stage.camera.capture
+
+    def answer_unless_stopped(lamp: Lamp, *, deadline: Deadline) -> ProjectorStatus:
+        deadline.sleep(0.0)
+        return answer(lamp, deadline=deadline)
+
+    def capture_and_stop(destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
+        files = capture(destination, deadline=deadline)
+        stage.lamps["right"].go_dark()
+        cancel.set()
+        return files
+
+    monkeypatch.setattr(Lamp, "status", answer_unless_stopped)
+    monkeypatch.setattr(stage.camera, "capture", capture_and_stop)
+    with Journal(tmp_path / "run") as journal:
+        context = Context(journal.folder, journal, in_seconds(60, cancel), Silent(), {}, lambda fraction, note: None)
+        with pytest.raises(Cancelled):
+            take_all(stage.rig, context, plan()[:1], index="greys")
+        assert not list(journal.folder.rglob("*.raw"))
 
 
 def test_a_camera_that_goes_leaves_the_photographs_before_it(stage: ModelRig, context: Context) -> None:
