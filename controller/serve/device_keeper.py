@@ -39,6 +39,7 @@ class DeviceKeeper:
         self._values: tuple[LiveValue, ...] = ()
         self._problem: Decision | None = None
         self._next_s, self._failures = 0.0, 0
+        self._closed = False
         self.lent = threading.Lock()
 
     @property
@@ -67,12 +68,20 @@ class DeviceKeeper:
         except (DeviceError, VelaturaError) as error:
             self._lost(Decision(error.code, error.what, error.remedy, "error"))
         finally:
+            if self._closed:
+                # While it was opened: nobody else would ever let go of it, and the next service needs it.
+                self._let_go()
             self.lent.release()
 
     def close(self) -> None:
-        if self._device is not None:
-            self._device.close()
-            self._device = None
+        """Let go of the device, for good."""
+        self._closed = True
+        self._let_go()
+
+    def _let_go(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            device.close()
 
     def _well(self) -> None:
         if self._problem is not None:
@@ -81,7 +90,7 @@ class DeviceKeeper:
         self._next_s = self._monotonic() + self._every_s
 
     def _lost(self, problem: Decision) -> None:
-        self.close()
+        self._let_go()
         self._values = ()
         self._next_s = self._monotonic() + _REOPEN_S[min(self._failures, len(_REOPEN_S) - 1)]
         self._failures += 1

@@ -61,6 +61,7 @@ class ProjectorKeeper:
         self._guard: LampGuard | None = None
         self._want_lit: bool | None = None
         self._view = ProjectorView(name)
+        self._stepping = self._closed = False
         self._silent_since_s: float | None = None
         self._reopen_at_s, self._reopened = 0.0, 0
         self._struck_at_s: float | None = None
@@ -76,6 +77,12 @@ class ProjectorKeeper:
     def guard(self) -> LampGuard | None:
         """The opened projector, for work that needs it; None while it can't be opened."""
         return self._guard
+
+    @property
+    def may_light(self) -> bool:
+        """Whether the lamp may be lit, or a step that goes on now, and began when light was wanted, may light it."""
+        # In this order: what a step has done is in the view before the step ends.
+        return self._stepping or self._view.maybe_lit
 
     @property
     def want_lit(self) -> bool | None:
@@ -95,7 +102,13 @@ class ProjectorKeeper:
 
     def step(self) -> None:
         """Look once, and do what follows. Blocks for some answers at most; raises nothing that a device can cause."""
-        wanted = self._want_lit
+        self._stepping = True
+        try:
+            self._step()
+        finally:
+            self._stepping = False
+
+    def _step(self) -> None:
         if self._asleep():
             self._silent_since_s = None
             self._reopen_at_s, self._reopened = 0.0, 0
@@ -111,6 +124,8 @@ class ProjectorKeeper:
             self._silent(error)
             return
         self._silent_since_s, self._reopened = None, 0
+        # Not before: a line takes seconds to open, and a lamp that nobody wants any more must not be struck.
+        wanted = self._want_lit
         try:
             if wanted is None:
                 self._see(_LOOKS.get(status.power, Condition.BROKEN), status, None)
@@ -122,7 +137,8 @@ class ProjectorKeeper:
             self._see(self._view.condition, status, _decision(error))
 
     def close(self) -> None:
-        """Let go of the line; the lamp stays as it is."""
+        """Let go of the line, for good; the lamp stays as it is."""
+        self._closed = True
         if self._guard is not None:
             self._guard.close()
 
@@ -133,6 +149,10 @@ class ProjectorKeeper:
             if self._clock.now_s() < self._reopen_at_s:
                 return None
             self._guard = self._open_guard(in_seconds(ANSWER_S))
+            if self._closed:
+                # While it was opened: nobody else would ever let go of the line, and the next service needs it.
+                self._guard.close()
+                self._guard = None
         return self._guard
 
     def _silent(self, error: DeviceError | VelaturaError) -> None:

@@ -183,7 +183,7 @@ class Service:
 
     def _wait_until_dark(self) -> None:
         until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
-        while any(one.view.maybe_lit for one in self.devices.projectors) and time.monotonic() < until_s:
+        while any(one.may_light for one in self.devices.projectors) and time.monotonic() < until_s:
             time.sleep(0.1)
         names = [one.name for one in self.devices.projectors if one.view.maybe_lit]
         if names:

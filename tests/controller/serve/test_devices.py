@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import threading
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from controller.checking import check_stage
-from controller.serve import projector_keeper
+from controller.serve import projector_keeper, service
+from controller.serve.device_keeper import DeviceKeeper
 from controller.serve.devices import Devices
-from controller.serve.eventlog import Decision
+from controller.serve.eventlog import Decision, EventLog
+from controller.serve.service import Service
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
-from hal.values import ProjectorStatus
+from hal.registry import Driver, Drivers
+from hal.values import ProjectorCapabilities, ProjectorStatus
 from tests.controller.test_app import Models, QuickLamp
 
 
@@ -54,3 +61,92 @@ def test_work_whose_projector_is_lost_meanwhile_says_which_and_not_that_somebody
     assert caught.value.code == "device-missing"
     assert "without projector left" in caught.value.what
     assert "Mend it" in caught.value.remedy
+
+
+class LosesItMeanwhile:
+    """A keeper's lock that somebody waits for while the keeper's look finds the device gone."""
+
+    def __init__(self, keeper: DeviceKeeper) -> None:
+        self._keeper = keeper
+
+    def __enter__(self) -> None:
+        self._keeper.close()
+
+    def __exit__(self, *_: object) -> None:
+        """Free again."""
+
+
+def test_a_camera_that_its_keeper_loses_while_work_waits_for_it_is_not_lent(
+    devices: Devices, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(devices.camera, "lent", LosesItMeanwhile(devices.camera))
+    with pytest.raises(DeviceGone) as caught, devices.lent():
+        pytest.fail("a closed camera was lent")
+    assert caught.value.code == "device-missing"
+
+
+def test_a_device_that_opens_after_its_keeper_was_closed_is_let_go_of() -> None:
+    opened: list[QuickLamp] = []
+
+    def open_slowly(deadline: Deadline) -> QuickLamp:
+        keeper.close()  # the service ends while the device is still being opened
+        opened.append(QuickLamp())
+        return opened[0]
+
+    keeper = DeviceKeeper("camera", "camera", "model", open_slowly, lambda *_: (), lambda _: None)
+    keeper.step()
+    assert [one.open for one in opened] == [False]
+    assert keeper.device is None
+
+
+class SlowLamp(QuickLamp):
+    """Takes its time for a strike, as projectors do that answer nothing while they start."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked, self.answered = threading.Event(), threading.Event()
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        return replace(super().capabilities, power=True)
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        self.asked.set()
+        self.answered.wait(5)
+        super().switch_on(deadline=deadline)
+
+    def switch_off(self, *, deadline: Deadline) -> None:
+        if not self.open:
+            raise DeviceGone("port-closed", what="The port is closed.", remedy="Open it.")
+        super().switch_off(deadline=deadline)
+
+
+def test_a_service_that_ends_in_the_middle_of_a_strike_waits_for_the_lamp_to_go_off(
+    models: Models, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (models.folder / "stage.toml").read_text()
+    (models.folder / "stage.toml").write_text(text.replace("power_down_s = 0.3", "power_down_s = 60"))
+    lamp, log = SlowLamp(), EventLog(models.folder / EventLog.FILE, durable=False)
+    projectors = Driver("projector", "model", "A lamp.", lambda *_: lamp, {"port": "the port"}, ("port",))
+    drivers = Drivers((projectors, models.drivers.get("camera", "model"), models.drivers.get("display", "model")))
+    found = Service(check_stage(models.folder, drivers=drivers), log)
+    keeper, over = found.devices.projectors[0], threading.Event()
+    keeper.want_lit = True
+
+    def looking() -> None:
+        while not over.wait(0.1):
+            keeper.step()
+
+    def answered(seconds: float) -> None:
+        lamp.answered.set()
+        time.sleep(seconds)
+
+    monkeypatch.setattr(service, "time", SimpleNamespace(monotonic=time.monotonic, time=time.time, sleep=answered))
+    thread = threading.Thread(target=looking)
+    thread.start()
+    assert lamp.asked.wait(20)
+    found.end(leave_lit=False)
+    over.set()
+    thread.join(20)
+    log.close()
+    assert not lamp.lit

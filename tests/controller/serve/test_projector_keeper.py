@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from controller.serve.eventlog import Decision
@@ -34,6 +36,17 @@ class TellingLamp(FragileLamp):
 
     def close(self) -> None:
         self.heard = False
+
+
+class ShutMeanwhile(FragileLamp):
+    """Somebody does something while it is looked at."""
+
+    meanwhile: Callable[[], None] = staticmethod(lambda: None)
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        answer = super().status(deadline=deadline)
+        self.meanwhile()
+        return answer
 
 
 class Kept:
@@ -191,3 +204,29 @@ def test_a_projector_that_was_plugged_in_again_is_found_within_a_quarter_of_a_mi
     assert kept.run(300) is Condition.LOST
     kept.there = True
     assert kept.run(16) is Condition.DARK
+
+
+def test_a_stage_that_is_shut_while_a_projector_is_looked_at_costs_no_strike() -> None:
+    kept = Kept(ShutMeanwhile)
+    assert isinstance(kept.lamp, ShutMeanwhile)
+    kept.keeper.want_lit = True
+    kept.lamp.meanwhile = lambda: setattr(kept.keeper, "want_lit", False)
+    kept.keeper.step()
+    assert kept.lamp.strikes == 0
+
+
+def test_a_line_that_opens_after_its_keeper_was_closed_is_let_go_of_and_no_lamp_is_struck() -> None:
+    kept = Kept(TellingLamp)
+    closed: list[str] = []
+
+    def opened_slowly(deadline: Deadline) -> LampGuard:
+        keeper.close()  # the service ends while the line is still being opened
+        return LampGuard("left", kept.lamp, kept.shelf, clock=kept.world)
+
+    kept.lamp.close = lambda: closed.append("left")  # type: ignore[method-assign]
+    keeper = ProjectorKeeper("left", opened_slowly, kept.told.append, clock=kept.world)
+    keeper.want_lit = True
+    keeper.step()
+    assert closed == ["left"]
+    assert kept.lamp.strikes == 0
+    assert keeper.guard is None
