@@ -87,13 +87,15 @@ class Devices:
     @contextlib.contextmanager
     def lent(self) -> Iterator[Rig]:
         """The opened devices for one piece of work. Raises DeviceGone("device-missing") and what opening raises."""
-        camera, guards = self.camera.device, [keeper.guard for keeper in self.projectors]
-        if camera is None or any(guard is None for guard in guards):
-            raise DeviceGone("device-missing", what="A device that the work needs is away.", remedy="See the devices.")
         with contextlib.ExitStack() as stack:
             for keeper in (self.camera, *([] if self.sensor is None else [self.sensor])):
                 # The keeper looks at it from a thread of its own, and must not meanwhile.
                 stack.enter_context(keeper.lent)
+            # Not before it is ours: its keeper may let go of it while it is waited for.
+            camera, guards = self.camera.device, [keeper.guard for keeper in self.projectors]
+            if camera is None or any(guard is None for guard in guards):
+                raise DeviceGone("device-missing", what="A device that the work needs is away.",
+                                 remedy="See the devices.")  # fmt: skip
             driver, settings = self._checked.display
             table = self._checked.stage.tables.display
             display = cast("Display", open_device(table, driver, settings, self._context, in_seconds(20)))

@@ -29,6 +29,7 @@ class KeysKeeper:
         self._open, self._presses, self._state, self._tell = open_panel, presses, state, tell
         self._opened: contextlib.ExitStack | None = None
         self._problem: Decision | None = None
+        self._closed = False
 
     @property
     def row(self) -> DeviceRow:
@@ -51,14 +52,24 @@ class KeysKeeper:
                 return
             commands = technicians_keys(*self._presses)
             service = KeyService(panel, commands, state=self._state, trouble=self._trouble)
+            # Before it starts: the trouble that it meets is told once, and must not be taken back here.
+            self._trouble(None)
             service.start()
             stack.callback(service.stop)
             self._opened = stack.pop_all()
-        self._trouble(None)
+        if self._closed:
+            # While it was opened: nobody else would ever let go of it, and the next service needs it.
+            self._let_go()
 
     def close(self) -> None:
-        if self._opened is not None:
-            self._opened.close()
+        """Let go of the panel, for good."""
+        self._closed = True
+        self._let_go()
+
+    def _let_go(self) -> None:
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.close()
 
     def _trouble(self, error: DeviceError | VelaturaError | None) -> None:
         before, self._problem = self._problem, None

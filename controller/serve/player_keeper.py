@@ -60,6 +60,7 @@ class PlayerKeeper:
         self._identified = False
         self._noticed: tuple[int, tuple[str, ...]] | None = None
         self._hello: dict[str, Any] = {}
+        self._closed = False
 
     @property
     def view(self) -> PlayerView:
@@ -92,10 +93,11 @@ class PlayerKeeper:
             self._trouble(Decision(error.code, error.what, error.remedy, "error"))
 
     def close(self) -> None:
-        """Black, and the player's end."""
+        """Black, and the player's end, for good."""
+        self._closed = True
         self._disconnect()
-        if self._process is not None:
-            self._process.terminate()
+        if (process := self._process) is not None:
+            process.terminate()
 
     # -- starting
 
@@ -104,6 +106,11 @@ class PlayerKeeper:
         try:
             with_bundle = self._failed < STARTS_WITH_BUNDLE or self._failed % 10 == 0
             self._process = PlayerProcess(self._runtime, self._settings(with_bundle))
+            if self._closed:
+                # While it was made ready: it would show its picture after the service's end.
+                self._process.terminate()
+                self._process = None
+                return
             hello = self._process.wait_until_ready(READY_S)
         except (VelaturaError, OSError) as error:
             self._process = None

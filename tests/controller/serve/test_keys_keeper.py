@@ -11,6 +11,7 @@ import pytest
 
 from controller.serve.eventlog import Decision
 from controller.serve.keys_keeper import KeysKeeper
+from controller.session.keys import KeyService
 from controller.session.machine import State
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
@@ -51,6 +52,7 @@ class Panel:
 class Kept:
     def __init__(self) -> None:
         self.panel, self.told, self.done = Panel(), list[Decision](), queue.SimpleQueue[str]()
+        self.meanwhile: Callable[[], None] = lambda: None
         presses = tuple(self._press(name) for name in ("play", "stop", "recalibrate"))
         self.keeper = KeysKeeper("model", self._opened, presses, lambda: State.PLAYING, self.told.append)  # type: ignore[arg-type]
 
@@ -59,6 +61,7 @@ class Kept:
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[Panel]:
+        self.meanwhile()
         self.panel.look()
         with contextlib.closing(self.panel):
             yield self.panel
@@ -110,3 +113,22 @@ def test_closing_closes_the_panel_and_one_that_never_came_needs_none(kept: Kept)
     kept.keeper.step()
     kept.keeper.close()
     assert kept.panel.closed == 1
+
+
+def test_a_panel_that_opens_after_its_keeper_was_closed_is_let_go_of(kept: Kept) -> None:
+    kept.meanwhile = kept.keeper.close
+    kept.keeper.step()
+    assert kept.panel.closed == 1
+
+
+def test_a_panel_that_leaves_at_once_is_shown_as_away(kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = KeyService.start
+
+    def start(service: KeyService) -> None:
+        kept.panel.there = False
+        begin(service)
+        assert kept.until(lambda: "hid-unplugged" in kept.codes)
+
+    monkeypatch.setattr(KeyService, "start", start)
+    kept.keeper.step()
+    assert kept.keeper.row.problem == "No key panel is plugged in."
