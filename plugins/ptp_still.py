@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, TypeVar
@@ -27,6 +27,7 @@ Result = TypeVar("Result")
 _SESSION: Final = 1
 _ATTEMPTS: Final = 4
 _CLOSE_S: Final = 0.7
+_SLICE_S: Final = 0.05
 _ALIVE_S: Final = 1.0
 
 
@@ -100,7 +101,7 @@ class PtpCamera:
         is then looked for on the camera; it is never taken again. Raises DeviceGone("camera-shot-lost") where the
         camera has none.
         """
-        with self._lock:
+        with self._turn(deadline):
             shot = Shot(self._with_body(lambda body: self._exposure_s(body, deadline), deadline))
             try:
                 return self._capture(shot, destination, deadline)
@@ -133,17 +134,18 @@ class PtpCamera:
         # A call that another thread has left hanging must not keep this one from ending.
         mine = self._lock.acquire(timeout=_CLOSE_S)
         try:
-            self._close()
+            self._close(farewell=mine)
         finally:
             if mine:
                 self._lock.release()
 
-    def _close(self) -> None:
+    def _close(self, *, farewell: bool) -> None:
+        """``farewell``: nobody else is on the link, whose answer could be taken for ours and ours for his."""
         deadline = in_seconds(_CLOSE_S)
         body, channel, self._body, self._channel = self._body, self._channel, None, None
         if channel is not None:
             with contextlib.suppress(DeviceError):
-                if body is not None and not channel.link.broken:
+                if farewell and body is not None and not channel.link.broken:
                     body.leave(deadline=deadline)
                     channel.once(Operation.CLOSE_SESSION, deadline=deadline)
             channel.link.close()
@@ -171,7 +173,7 @@ class PtpCamera:
 
     def _with_body(self, work: Callable[[Body], Result], deadline: Deadline) -> Result:
         """Do ``work``; if that breaks the connection, once more on a new one. Only for what may be done twice."""
-        with self._lock:
+        with self._turn(deadline):
             body = self._ready(deadline, self._timing.come_back_s)
             try:
                 return work(body)
@@ -180,6 +182,16 @@ class PtpCamera:
                     raise
                 self._diary.add(error.code, error.what)
             return work(self._ready(deadline, self._timing.come_back_s))
+
+    @contextlib.contextmanager
+    def _turn(self, deadline: Deadline) -> Iterator[None]:
+        """One caller at a time; another's exposure may take longer than this one has."""
+        while not self._lock.acquire(timeout=min(_SLICE_S, deadline.left_s())):
+            _still_time(deadline)
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def _stay_awake(self) -> None:
         """A camera that nobody talks to switches itself off."""
@@ -226,21 +238,15 @@ class PtpCamera:
 
     def _ready(self, deadline: Deadline, patience_s: float) -> Body:
         """The body on a working connection; a broken one is opened again within ``patience_s``."""
-        deadline.check(
-            "camera-no-answer",
-            what="There was no time left to ask the camera.",
-            remedy="Give it more time, then try again.",
-        )
-        if self._closed:
-            raise DeviceGone(
-                "camera-closed", what="The camera's connection was closed.", remedy="Open the camera again."
-            )
+        _still_time(deadline)
+        self._check_open()
         if self._body is not None and not self._link_broken():
             return self._body
         give_up = deadline.within(patience_s)
         pause_s = 0.05
         gone: DeviceGone | None = None
         while True:
+            self._check_open()
             try:
                 return self._reopen(deadline, after_break=True)
             except (DeviceGone, DeviceBusy, DeviceTimeout, ProtocolError) as error:
@@ -250,6 +256,12 @@ class PtpCamera:
                     raise gone or error from None
                 give_up.sleep(pause_s)
                 pause_s = min(1.0, 2 * pause_s)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise DeviceGone(
+                "camera-closed", what="The camera's connection was closed.", remedy="Open the camera again."
+            )
 
     def _link_broken(self) -> bool:
         return self._channel is None or self._channel.link.broken
@@ -273,6 +285,8 @@ class PtpCamera:
             body.prepare(after_break=after_break, deadline=deadline)
             if self._settings is not None:
                 body.configure(self._settings, deadline=deadline)
+            # ``close`` does not wait for ever for whoever is here: nobody else would let go of what it did not find.
+            self._check_open()
         except BaseException:
             link.close()
             raise
@@ -289,3 +303,11 @@ class PtpCamera:
                 remedy="Connect the right camera, or change serial in stage.toml and recalibrate.",
             )
         self._serial = self._serial or info.serial
+
+
+def _still_time(deadline: Deadline) -> None:
+    deadline.check(
+        "camera-no-answer",
+        what="There was no time left to ask the camera.",
+        remedy="Give it more time, then try again.",
+    )
