@@ -16,6 +16,7 @@ from controller.solve.targets import Target, through_camera
 from controller.study.drawing import Line, Panel, plotted, screen, strip
 from controller.study.residual import brightest_first
 from controller.study.subject import Subject, Wanted
+from controller.study.trial import live_frames
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, Table
 from controller.transport import LightTransport
 
@@ -69,9 +70,12 @@ def rising_sinusoid(subject: Subject) -> Result:
     for number, (name, base) in enumerate(bases(wanted, black, subject.mask, first).items()):
         subject.advance(0.5 + 0.16 * number, name)
         solved = solve_base(subject.transport, base, black)
-        frames = scale_frames(subject.transport, solved, wanted.radiance, black)
-        pictures[name] = subject.light.photograph(f"base-{number}", frames, white=wanted.white)
-        contrast[name] = kept_contrast(pictures[name], wanted, waves)
+        ways: dict[str, Sequence[FloatImage]] = {name: scale_frames(subject.transport, solved, wanted.radiance, black)}
+        if name == HIGH:
+            ways[NARROWER] = live_frames(subject, solved, wanted.radiance)
+        for way, made in ways.items():
+            pictures[way] = subject.light.photograph(f"base-{len(pictures)}", made, white=wanted.white)
+            contrast[way] = kept_contrast(pictures[way], wanted, waves)
     limit = {name: last_kept(waves.frequency, kept) for name, kept in contrast.items()}
     return Result(
         _criteria(limit, len(every)), (_table(waves, contrast), _limits(waves, limit)),
@@ -80,7 +84,7 @@ def rising_sinusoid(subject: Subject) -> Result:
 
 
 HIGH, LOWER = "base high-passed at F_1, times scale", "base high-passed at F_1 / 4, times scale"
-LOW = "base low-passed at F_1, times scale"
+NARROWER, LOW = "base high-passed at F_1, narrower means", "base low-passed at F_1, times scale"
 
 
 def _by(count: int, amplitude: float) -> str:

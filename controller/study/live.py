@@ -8,12 +8,9 @@ from functools import partial
 from controller.arrays import FloatImage
 from controller.solve.appearance import Base, BaseKind, base_image, scale_frames, solve_base
 from controller.solve.bounded import solve_bounded
-from controller.solve.dither import to_light
-from controller.solve.interactive import Interactive
-from controller.solve.scaling import scaling_maps
 from controller.study.measuring import better, quality_table, side_by_side, tried
 from controller.study.subject import Subject, Wanted
-from controller.study.trial import photograph_target
+from controller.study.trial import live_frames, photograph_target
 from controller.study.values import Experiment, Result
 
 BASES: tuple[BaseKind, ...] = ("white", "minimum")
@@ -39,13 +36,6 @@ def _named(kind: BaseKind, means: str) -> str:
 
 def _ways(subject: Subject, wanted: Wanted) -> list[tuple[str, Callable[[], Sequence[FloatImage]]]]:
     calibration, transport, black = subject.calibration, subject.transport, subject.calibration.black
-    radiometries = [part.radiometry for part in calibration.projectors]
-
-    def live(base: Base) -> Sequence[FloatImage]:
-        """What ``velatura live`` shows: 8-bit frames."""
-        scaler = Interactive(scaling_maps(transport, base, black, radiometries), transport.shape)
-        pairs = zip(scaler.frames(wanted.radiance), radiometries, strict=True)
-        return [to_light(frame, radiometry) for frame, radiometry in pairs]
 
     def papers(base: Base) -> Sequence[FloatImage]:
         return scale_frames(transport, base, wanted.radiance, black)
@@ -53,7 +43,10 @@ def _ways(subject: Subject, wanted: Wanted) -> list[tuple[str, Callable[[], Sequ
     ways: list[tuple[str, Callable[[], Sequence[FloatImage]]]] = []
     for kind in BASES:
         base = solve_base(transport, base_image(calibration, kind), black)
-        ways += [(_named(kind, PAPERS), partial(papers, base)), (_named(kind, OURS), partial(live, base))]
+        ways += [
+            (_named(kind, PAPERS), partial(papers, base)),
+            (_named(kind, OURS), partial(live_frames, subject, base, wanted.radiance)),
+        ]
     return [*ways, (FULL, lambda: solve_bounded(transport, wanted.radiance, black).frames)]
 
 

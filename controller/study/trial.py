@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from controller.arrays import FloatImage
+from controller.solve.appearance import Base
 from controller.solve.bounded import SMOOTHNESS, solve_bounded
+from controller.solve.dither import to_light
+from controller.solve.interactive import Interactive
+from controller.solve.scaling import scaling_maps
 from controller.solve.targets import Target, shipped_photograph, through_camera, wrap_photograph
 from controller.solve.weights import appearance_weights
 from controller.study.measuring import Quality, quality
@@ -26,6 +30,14 @@ class Trial:
 def photograph_target(subject: Subject) -> Target:
     """The shipped photograph wrapped on the reconstructed object, as the camera can see it."""
     return through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+
+
+def live_frames(subject: Subject, base: Base, radiance: FloatImage) -> Sequence[FloatImage]:
+    """What ``velatura live`` shows of ``radiance`` (rows, columns, 3): base times scale by narrower means, 8 bits."""
+    radiometries = [part.radiometry for part in subject.calibration.projectors]
+    maps = scaling_maps(subject.transport, base, subject.calibration.black, radiometries)
+    frames = Interactive(maps, subject.transport.shape).frames(radiance)
+    return [to_light(frame, radiometry) for frame, radiometry in zip(frames, radiometries, strict=True)]
 
 
 def trial(subject: Subject, name: str) -> Trial:

@@ -87,8 +87,8 @@ light, not contrast. Smoothness takes a part, too: without it the model gives F_
 waves (size small).""",
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
-well below F_1, so what the base leaves to it there is partly lost. With the base's limit at a quarter of F_1
-little is.""",
+well below F_1, so what the base leaves to it there is partly lost. Narrower means (decision 33) reach 0.52 of it at
+size medium, seed 1; with the base's limit at a quarter of F_1 nothing is lost.""",
 }
 """Why a criterion of an experiment is missed, by the experiment's name and the beginning of what is asked."""
 
