@@ -104,8 +104,12 @@ class StreamDeckPanel(WorkerLink[Any]):
             )
         deck, self._serial = matching[0]
         deck.set_key_callback(self._changed)
-        for key, picture in tuple(self._pictures.items()):
-            deck.set_key_image(key, picture)
+        try:
+            for key, picture in tuple(self._pictures.items()):
+                deck.set_key_image(key, picture)
+        except TransportError:  # it has left again
+            self.let_go(deck)
+            raise
         return deck
 
     def _matching(self) -> list[tuple[Any, str]]:

@@ -76,11 +76,12 @@ class WorkerLink(ABC, Generic[Opened]):
         self._turn = threading.Lock()
         self._worker: _Worker[Opened] | None = None
         self._left_behind: _Worker[Opened] | None = None
+        self._opening = threading.Lock()
         self._closed = False
 
     @abstractmethod
     def find(self) -> Opened:
-        """Find and open the device; on the worker's thread. Raises DeviceError."""
+        """Find and open the device; on the worker's thread. Raises DeviceError or ``broken``; nothing is open then."""
 
     @abstractmethod
     def let_go(self, opened: Opened) -> None:
@@ -96,10 +97,7 @@ class WorkerLink(ABC, Generic[Opened]):
             self._still_time(deadline)
         try:
             self._still_time(deadline)
-            if self._closed:
-                raise DeviceGone(
-                    "hid-closed", what=f"The {self._name} was closed.", remedy=f"Open the {self._name} again."
-                )
+            self._check_open()
             given_up = threading.Event()
             return self._on_worker(lambda worker: self._try(worker, work, given_up), deadline, given_up)
         finally:
@@ -107,19 +105,20 @@ class WorkerLink(ABC, Generic[Opened]):
 
     def close(self) -> None:
         """Close the device; a call that hangs is left behind after 0.7 s."""
-        self._closed = True
-        worker, self._worker = self._worker, None
+        with self._opening:
+            self._closed = True
+            worker, self._worker = self._worker, None
         if worker is not None:
             worker.end()
             worker.thread.join(_CLOSE_S)
 
     def _try(self, worker: _Worker[Opened], work: Callable[[Opened], Result], given_up: threading.Event) -> Result:
         for again in (False, True):
-            if worker.open is None:
-                worker.open = self.find()
-            if given_up.is_set():  # nobody wants it done any more: a relay must not move minutes later
-                raise Cancelled
             try:
+                if worker.open is None:
+                    worker.open = self.find()
+                if given_up.is_set():  # nobody wants it done any more: a relay must not move minutes later
+                    raise Cancelled
                 return work(worker.open)
             except self._broken as error:
                 worker.drop()
@@ -136,9 +135,8 @@ class WorkerLink(ABC, Generic[Opened]):
         if (behind := self._left_behind) is not None:
             self._wait(lambda seconds: _ended(behind, seconds), deadline)
             self._left_behind = None
-        worker = self._worker = self._worker or _Worker(self.let_go)
         job: _Job[Result] = _Job(work)
-        worker.start(job)
+        worker = self._begun(job)
         try:
             self._wait(job.done.wait, deadline)
         except DeviceError:
@@ -150,6 +148,18 @@ class WorkerLink(ABC, Generic[Opened]):
         if job.error is not None:
             raise job.error
         return job.result[0]
+
+    def _begun(self, job: _Job[Result]) -> _Worker[Opened]:
+        """The worker that does ``job``; none is made, and none gets a job, once ``close`` has looked for it."""
+        with self._opening:
+            self._check_open()
+            worker = self._worker = self._worker or _Worker(self.let_go)
+            worker.start(job)
+        return worker
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise DeviceGone("hid-closed", what=f"The {self._name} was closed.", remedy=f"Open the {self._name} again.")
 
     def _wait(self, ready: Callable[[float], bool], deadline: Deadline) -> None:
         while not ready(min(_SLICE_S, deadline.left_s())):

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from StreamDeck.DeviceManager import DeviceManager
+from StreamDeck.Devices.StreamDeckOriginalV2 import StreamDeckOriginalV2
 
 from controller.session.keys import KeyService, key_picture, technicians_keys
 from controller.session.machine import Event, Machine, State
@@ -101,6 +102,29 @@ def test_an_unplugged_panel_is_gone_and_gets_its_pictures_back(bus: UsbBusProces
     assert on_key(bus, 1).mean() == pytest.approx(200, abs=3)
     bus.call("keys", "press", 5)
     assert panel.wait_pressed(deadline=in_seconds(20)) == 5
+
+
+def test_a_panel_that_leaves_again_while_it_gets_its_pictures_back_is_gone_until_it_stays(
+    bus: UsbBusProcess, panel: StreamDeckPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel.show(1, np.full((72, 72, 3), 200, np.uint8), deadline=in_seconds(20))
+    bus.unplug("keys")
+    with pytest.raises(DeviceGone):
+        panel.wait_pressed(deadline=in_seconds(20))
+    put = StreamDeckOriginalV2.set_key_image
+
+    def pull_and_put(deck: StreamDeckOriginalV2, key: int, picture: bytes) -> None:
+        bus.unplug("keys")
+        put(deck, key, picture)
+
+    bus.plug("keys")
+    with monkeypatch.context() as loose:
+        loose.setattr(StreamDeckOriginalV2, "set_key_image", pull_and_put)
+        with pytest.raises(DeviceGone):
+            panel.identity(deadline=in_seconds(20))
+    bus.plug("keys")
+    panel.identity(deadline=in_seconds(20))
+    assert on_key(bus, 1).mean() == pytest.approx(200, abs=3)
 
 
 def test_a_machine_that_is_busy_for_longer_than_a_wait_is_no_failure_of_the_panel(
