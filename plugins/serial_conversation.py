@@ -74,9 +74,9 @@ class SerialConversation:
         self._hang_up()
 
     def _hang_up(self) -> None:
-        if self._link is not None:
-            self._link.close()
-            self._link = None
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
 
     def ask(self, question: str, *, deadline: Deadline) -> str:
         """The value of the answer to a question of the profile; asked once more if the answer is lost.
@@ -243,16 +243,20 @@ class SerialConversation:
     def _connected(self, deadline: Deadline) -> ByteLink:
         """The link; opened again, by the same name, if it was lost."""
         patience = deadline.within(REAPPEAR_S)
-        while self._link is None:
+        link = self._link
+        while link is None:
             self._check(deadline)
             self.check_open()
             try:
-                self._link = self._open_link(deadline)
+                link = self._link = self._open_link(deadline)
             except (DeviceGone, DeviceBusy):
                 if patience.passed:
                     raise
                 patience.sleep(0.1)
-        return self._link
+        if self._closed:
+            link.close()  # ``close`` may have looked for it before it was there
+        self.check_open()
+        return link
 
     def _check(self, deadline: Deadline) -> None:
         explained = self.no_answer()

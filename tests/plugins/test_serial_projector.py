@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from hal.deadline import in_seconds
+from hal.deadline import Deadline, in_seconds
 from hal.errors import (
     DeviceBusy,
     DeviceError,
@@ -23,6 +23,7 @@ from hal.errors import (
     ProtocolError,
 )
 from hal.registry import OpenContext
+from hal.serial_link import SerialLink
 from hal.transcript import ReplayLink, parse_transcript
 from hal.values import Power
 from plugins.emulated.lamp import EmulatedLamp, LampTiming
@@ -248,6 +249,25 @@ def test_a_recorded_conversation_replays_without_a_projector(open_serial: Any, t
     assert replayed.identity(deadline=in_seconds(SOON)) == told
     assert replayed.status(deadline=in_seconds(SOON)) == status
     assert link.finished
+
+
+def test_a_projector_that_is_closed_while_its_port_is_opened_again_lets_go_of_the_port(tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    port = Path(os.ttyname(slave))
+
+    def open_meanwhile_closed(deadline: Deadline) -> SerialLink:
+        projector.close()
+        return SerialLink(port, baud=9600, deadline=deadline)
+
+    projector = SerialProjector(open_meanwhile_closed, load_profile("optoma-later", tmp_path), name="left")
+    try:
+        with pytest.raises(DeviceGone) as caught:
+            projector.status(deadline=in_seconds(SOON))
+        assert caught.value.code == "projector-closed"
+        SerialLink(port, baud=9600, deadline=in_seconds(SOON)).close()  # it is held exclusively while it is open
+    finally:
+        os.close(slave)
+        os.close(master)
 
 
 @pytest.mark.parametrize(
