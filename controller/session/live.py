@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
@@ -17,6 +18,8 @@ from controller.solve.interactive import Interactive
 
 IDLE_S: Final = 0.002
 TOLD_EVERY_S: Final = 1.0
+DELAYS: Final = 4096
+"""Of so many pictures, the last ones, the delays are kept."""
 BUFFERS: Final = 3
 """One that is shown, one that waits, one that is being made."""
 
@@ -71,11 +74,11 @@ class LiveFigures:
     bad: int = 0
     trouble: str | None = None
     seconds: float = 0.0
-    delays_s: list[float] = field(default_factory=list)
+    delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
 
     def told(self) -> dict[str, Any]:
         """For a person or a machine; ``delay`` is from when a picture was due to when its frames were handed on."""
-        delays = np.array(self.delays_s[-4096:] or [0.0])
+        delays = np.array(self.delays_s or [0.0])
         return {
             "made": self.made,
             "late": self.late,
@@ -126,6 +129,12 @@ class _Mailbox:
         """A picture that can't be shown: the last good one stays."""
         self.bad, self.trouble = self.bad + 1, f"{error.what} {error.remedy}"
 
+    @property
+    def empty_for_good(self) -> bool:
+        """Whether nothing is there and nothing will come; what came just before the end is still to be taken."""
+        with self._changed:
+            return self.ended and self._full is None
+
     def end(self, error: BaseException | None) -> None:
         with self._changed:
             self.ended, self.error = True, error
@@ -169,7 +178,7 @@ def run_live(
                 figures.made += 1
                 figures.late += late
                 figures.delays_s.append(time.monotonic() - due_s)
-            elif box.ended:
+            elif box.empty_for_good:
                 break
             figures.seconds = time.monotonic() - began_s
             figures.bad, figures.trouble = box.bad, box.trouble

@@ -11,6 +11,7 @@ import pytest
 from benchmarks._synthetic import synthetic_calibration
 from controller.errors import UsageError
 from controller.live.sources import LivePicture
+from controller.session import live
 from controller.session.live import FrameMaker, Frames, LiveFigures, TargetMaker, run_live
 from controller.solve.appearance import base_image, solve_base
 from controller.solve.interactive import interactive
@@ -122,6 +123,51 @@ def test_a_display_that_fails_ends_it_with_the_error(maker: FrameMaker) -> None:
     with pytest.raises(OSError, match="gone"):
         run_live(source, maker, broken, rate_hz=100)
     assert source.closed
+
+
+def test_a_picture_that_comes_with_the_end_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = threading.Event()
+    seen: list[int] = []
+    take = live._Mailbox.take
+
+    class Last(Numbers):
+        def next(self, at_s: float) -> LivePicture | None:
+            assert there.wait(30)
+            return super().next(at_s)
+
+    def take_too_early(box: live._Mailbox, timeout_s: float) -> tuple[Frames, float, int] | None:
+        """Finds nothing, and by the time that is known, the last picture is there and the source has ended."""
+        found = take(box, 0.0)
+        there.set()
+        while found is None and not box.ended:
+            time.sleep(0.001)
+        return found
+
+    monkeypatch.setattr(live._Mailbox, "take", take_too_early)
+    run_live(Last(1), TargetMaker((30, 24)), lambda frames: seen.append(_level(frames)), rate_hz=100)
+    assert seen == [21]
+
+
+def test_a_run_of_months_keeps_no_more_of_its_delays_than_it_tells_of() -> None:
+    class Small:
+        def blank(self) -> Frames:
+            return [np.zeros((1, 1, 3), np.uint8)]
+
+        def make(self, picture: LivePicture, into: Frames) -> None:
+            """Any picture will do."""
+
+    shown = threading.Semaphore(1)
+
+    class Prompt(Numbers):
+        def next(self, at_s: float) -> LivePicture | None:
+            assert shown.acquire(timeout=30)
+            self.at += 1
+            return LivePicture(np.zeros((1, 1, 3), np.uint8), self.at - 1, 0)
+
+    figures = run_live(Prompt(4200), Small(), lambda frames: shown.release(), rate_hz=1e6)
+    assert figures.made == 4200
+    assert len(figures.delays_s) == 4096
+    assert figures.told()["delay_p99_ms"] > 0
 
 
 def test_it_ends_after_the_time_that_was_asked_for(maker: FrameMaker) -> None:
