@@ -44,9 +44,11 @@ def _events(folder: Path, after: int = 0) -> Any:
 
 
 def _set_schedule(folder: Path, time_zone: str, rows: list[dict[str, str]], drift_check: str) -> None:
-    names = BundleStock(folder, stage_trust(load_stage(folder))).names()
     wanted = Schedule(time_zone, tuple(ScheduleRow(**row) for row in rows), drift_check)
-    _schedule(folder).replace(wanted, names)
+    # A kiosk that begins has read its schedule before it answers: it would not know of this one.
+    with stage_lock(folder):
+        names = BundleStock(folder, stage_trust(load_stage(folder))).names()
+        _schedule(folder).replace(wanted, names)
 
 
 def _restore(folder: Path, backup: str) -> None:
@@ -160,8 +162,8 @@ def _results(folder: Path, run: str) -> Any:
 
 def _account(name: str) -> Callable[..., Any]:
     def do(folder: Path, **arguments: Any) -> Any:
-        accounts = stage_accounts(folder)
         with stage_lock(folder):
+            accounts = stage_accounts(folder)
             return account_operations(lambda: accounts, lambda _: None)[name](**arguments)
 
     return do

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controller.app import stage_lock
 from controller.errors import UsageError, VelaturaError
 from controller.panel.kiosk import Aiming, DeviceRow, Job, JobStep, KioskState, LiveValue, ProjectorAim, Schedule
+from controller.serve import direct
 from controller.serve.control import plain
 from controller.serve.direct import aiming_text, call, changed_schedule, schedule_text, status_of, status_text
 from controller.serve.eventlog import Decision, EventLog
@@ -114,3 +118,28 @@ def test_where_nothing_was_measured_the_hints_say_why() -> None:
     text = aiming_text(plain(Aiming(hints=("The calibration can't be read.",))))
     assert text.split("\n")[1:] == ["The calibration can't be read."]
     assert "test shots" in text
+
+
+def test_hours_are_not_changed_behind_the_back_of_a_kiosk_that_begins(tmp_path: Path) -> None:
+    stage = vase(tmp_path)
+    # It holds the stage, has read its schedule, and does not answer yet.
+    with stage_lock(stage), pytest.raises(UsageError) as caught:
+        call(stage, "set-schedule", time_zone="UTC", rows=[], drift_check="03:00")
+    assert caught.value.code == "already-running"
+    assert not (stage / "schedule.toml").exists()
+
+
+def test_of_two_who_make_accounts_at_once_neither_loses_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage, other = vase(tmp_path), ["otto"]
+    (stage / "kiosk/panel/accounts.json").unlink()
+
+    @contextlib.contextmanager
+    def after_another(folder: Path) -> Iterator[None]:
+        if other:
+            call(stage, "add-account", name=other.pop(), role="viewer", password="a good long one")
+        with stage_lock(folder):
+            yield
+
+    monkeypatch.setattr(direct, "stage_lock", after_another)
+    call(stage, "add-account", name="vera", role="viewer", password="a good long one")
+    assert [one["name"] for one in call(stage, "accounts")] == ["otto", "vera"]
