@@ -19,6 +19,8 @@ from hal.errors import DeviceError
 NAME: Final = "kiosk.sock"
 LONGEST_LINE: Final = 1 << 20
 MOST_CONNECTIONS: Final = 16
+AGAIN_S: Final = 1.0
+"""After a connection that the system did not give us: too many open files pass, and nobody begins this thread anew."""
 Operation = Callable[..., Any]
 
 
@@ -28,6 +30,7 @@ class ControlServer:
     def __init__(self, path: Path, operations: Mapping[str, Operation]) -> None:
         self._operations = dict(operations)
         self._path = path
+        self._ended = threading.Event()
         self._places = threading.BoundedSemaphore(MOST_CONNECTIONS)
         path.unlink(missing_ok=True)  # the stage's lock says that nobody else serves here
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -44,17 +47,19 @@ class ControlServer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended.set()
         self._path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
 
     def _accept(self) -> None:
-        while True:
+        while not self._ended.is_set():
             try:
                 channel, _ = self._listener.accept()
             except OSError:
-                return
+                self._ended.wait(AGAIN_S)
+                continue
             if not self._places.acquire(blocking=False):
                 channel.close()
                 continue

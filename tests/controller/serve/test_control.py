@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 import socket
 import stat
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 
 from controller.errors import UsageError, VelaturaError, WorkError
+from controller.serve import control
 from controller.serve.control import MOST_CONNECTIONS, NAME, ControlServer, ask, is_running, plain
 from controller.storage import runtime_folder
 from hal.errors import DeviceGone
@@ -135,3 +137,20 @@ def test_a_kiosk_that_was_killed_leaves_a_socket_that_the_next_one_takes(tmp_pat
 
 def test_values_become_what_json_has() -> None:
     assert plain({1: (Path("x"), {"y"}, None, 1.5, True)}) == {"1": ["x", ["y"], None, 1.5, True]}
+
+
+def test_a_moment_without_free_file_handles_does_not_end_the_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    accept, failures = socket.socket.accept, [OSError(errno.EMFILE, "Too many open files")]
+
+    def accepting(listener: socket.socket) -> tuple[socket.socket, Any]:
+        if failures:
+            raise failures.pop()
+        return accept(listener)
+
+    monkeypatch.setattr(control, "AGAIN_S", 0.01)
+    monkeypatch.setattr(socket.socket, "accept", accepting)
+    with ControlServer(runtime_folder(tmp_path) / NAME, OPERATIONS):
+        assert ask(tmp_path, "status", timeout_s=20) == {"state": "playing"}
+    assert not failures
