@@ -12,6 +12,8 @@ import anyio
 
 KEEP_ALIVE_S: Final = 15.0
 QUEUED: Final = 8
+AGAIN_S: Final = 1.0
+"""After a drawing that failed."""
 _LOG: Final = logging.getLogger("velatura.panel")
 
 Draw = Callable[[], dict[str, str]]
@@ -67,6 +69,9 @@ class Hub:
                     await self._redraw()
                 except Exception:  # noqa: BLE001 - one bad drawing must not end the live parts for good
                     _LOG.exception("The live parts could not be drawn.")
+                    # What has changed is not drawn yet, and nobody says so again.
+                    self._dirty.set()
+                    await asyncio.sleep(AGAIN_S)
             await asyncio.sleep(self._pause_s)
 
     async def _redraw(self) -> None:

@@ -128,8 +128,10 @@ class StageKiosk:
         self._end_notice(service)
         now = self._snapshots.of(service, self._last.revision + 1)
         with self._lock:
-            same = replace(now, revision=self._last.revision) == self._last and self._events == service.log.number
-            self._events = service.log.number
+            # Once: an event that is told between two looks would count as one that the panel was told of.
+            events = service.log.number
+            same = replace(now, revision=self._last.revision) == self._last and self._events == events
+            self._events = events
             if not same:
                 self._last = now
         if not same:

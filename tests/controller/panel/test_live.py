@@ -12,7 +12,9 @@ import time
 from pathlib import Path
 
 import httpx
+import pytest
 
+from controller.panel import live
 from controller.panel.context import PanelOptions
 from controller.panel.live import Hub
 from tests.controller.panel.memory_kiosk import MemoryKiosk
@@ -73,6 +75,33 @@ def test_a_change_while_the_first_picture_is_drawn_is_not_lost() -> None:
     first, second = asyncio.run(story())
     assert "old" in first
     assert "new" in second
+
+
+def test_a_change_whose_drawing_fails_is_drawn_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "AGAIN_S", 0.01)
+    texts, failures = ["old"], list[Exception]()
+
+    def draw() -> dict[str, str]:
+        if failures:
+            raise failures.pop()
+        return {"top": texts[-1]}
+
+    async def story() -> str:
+        hub = Hub(draw, frames_per_s=100, most=1)
+        running = asyncio.create_task(hub.run())
+        stream = hub.stream(lambda: True)
+        await anext(stream)
+        await asyncio.sleep(0.1)  # the drawing at the beginning is over
+        texts.append("new")
+        failures.append(OSError("Too many open files"))
+        hub.changed()
+        try:
+            async with asyncio.timeout(10):
+                return await anext(stream)
+        finally:
+            running.cancel()
+
+    assert "new" in asyncio.run(story())
 
 
 def test_what_was_drawn_before_the_first_picture_does_not_come_after_it() -> None:

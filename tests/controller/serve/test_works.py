@@ -248,3 +248,32 @@ def test_who_follows_hears_of_his_own_job_though_another_one_has_begun_since(kio
         followed(kiosk, compute=compute)
     assert caught.value.code == "job-failed"
     assert caught.value.what.startswith("New appearance wood: ")
+
+
+class ToldMeanwhile(EventLog):
+    """Another thread tells something as soon as somebody has looked at its number."""
+
+    meanwhile: Callable[[], object] | None = None
+
+    @property
+    def number(self) -> int:
+        found, meanwhile = super().number, self.meanwhile
+        self.meanwhile = None
+        if meanwhile is not None:
+            meanwhile()
+        return found
+
+
+def test_an_event_that_is_told_while_the_panel_is_brought_up_to_date_reaches_it(tmp_path: Path) -> None:
+    stage, heard = vase(tmp_path), list[int]()
+    log = ToldMeanwhile(stage / EventLog.FILE, durable=False)
+    found = StageKiosk(stage)
+    found.attach(service := Service(check_stage(stage), log))
+    for _ in range(2):
+        service.changed()
+    found.subscribe(lambda: heard.append(found.events()[-1].number))
+    log.meanwhile = lambda: log.tell(Decision("lamp-went-off", "The lamp went off."))
+    for _ in range(2):
+        service.changed()
+    assert heard[-1:] == [log.number]
+    log.close()
