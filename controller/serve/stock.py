@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import threading
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Final
@@ -32,6 +33,7 @@ class BundleStock:
     def __init__(self, stage: Path, trust: Trust) -> None:
         self._stage, self._trust = stage, trust
         self._known: dict[Path, Index | None] = {}
+        self._previewing = threading.Lock()
 
     def bundle(self) -> Path | None:
         """The installed bundle's file; also one that can't be read: the player's own start finds the way back."""
@@ -64,30 +66,41 @@ class BundleStock:
         if path is None or index is None:
             return {}
         folder = self._stage / PREVIEWS / path.stem
-        if not folder.is_dir():
-            shutil.rmtree(folder.parent, ignore_errors=True)
-            # A full disk costs pictures on a page, and nothing else.
-            with (
-                contextlib.suppress(BundleError, VelaturaError, OSError),
-                Bundle.open_trusted(path, self._trust) as bundle,
-            ):
-                folder.mkdir(parents=True)
-                for number, one in enumerate(index.appearances):
-                    if (data := bundle.thumbnail(one.name)) is not None:
-                        write_atomically(folder / f"{number}.png", data)
+        with self._previewing:
+            if not folder.is_dir():
+                self._preview(path, index, folder)
         files = {one.name: folder / f"{number}.png" for number, one in enumerate(index.appearances)}
         return {name: file for name, file in files.items() if file.exists()}
+
+    def _preview(self, path: Path, index: Index, folder: Path) -> None:
+        shutil.rmtree(folder.parent, ignore_errors=True)
+        # All of them or none: the folder is not looked into again. A full disk costs pictures on a page, and nothing
+        # else.
+        fresh = folder.with_name(f"{folder.name}.part")
+        with (
+            contextlib.suppress(BundleError, VelaturaError, OSError),
+            Bundle.open_trusted(path, self._trust) as bundle,
+        ):
+            fresh.mkdir(parents=True)
+            for number, one in enumerate(index.appearances):
+                if (data := bundle.thumbnail(one.name)) is not None:
+                    write_atomically(fresh / f"{number}.png", data)
+            fresh.rename(folder)
 
     def index(self, path: Path | None) -> Index | None:
         """What an installed bundle holds; None for none, and for one that this stage would not play."""
         if path is None:
             return None
-        if path not in self._known:
-            if len(self._known) > 64:
-                self._known.clear()
-            try:
-                with Bundle.open_trusted(path, self._trust) as bundle:
-                    self._known[path] = bundle.index
-            except (BundleError, VelaturaError, OSError):
-                self._known[path] = None
-        return self._known[path]
+        # Asked by several threads, of which each may forget what another has just read.
+        with contextlib.suppress(KeyError):
+            return self._known[path]
+        if len(self._known) > 64:
+            self._known.clear()
+        found = None
+        with (
+            contextlib.suppress(BundleError, VelaturaError, OSError),
+            Bundle.open_trusted(path, self._trust) as bundle,
+        ):
+            found = bundle.index
+        self._known[path] = found
+        return found

@@ -5,12 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from controller.bundle.export import png
 from controller.bundle.install import install
+from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.errors import WorkError
+from controller.serve import stock as stock_module
 from controller.serve.stock import PREVIEWS, BundleStock, slots_without
+from controller.storage import write_atomically
 
 UNSIGNED = Trust((), allow_unsigned=True)
 
@@ -53,3 +58,34 @@ def test_frames_without_a_projector_serve_what_they_hold(tmp_path: Path) -> None
     installed(tmp_path, 1, ("marble",), slots_without(tmp_path, {"left"}))
     assert stock.without({"left"}, "marble") is not None
     assert stock.without({"left"}, "bare") is None
+
+
+def test_pictures_that_the_disk_did_not_take_are_made_when_there_is_space_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, 1, ("marble", "wood", "bare"))
+    failures = [WorkError("no-space", what="The disk is full.", remedy="Free some.")]
+
+    def write(path: Path, data: bytes) -> None:
+        if path.name == "1.png" and failures:
+            raise failures.pop()
+        write_atomically(path, data)
+
+    monkeypatch.setattr(stock_module, "write_atomically", write)
+    stock = BundleStock(tmp_path, UNSIGNED)
+    stock.previews()
+    assert not failures
+    assert sorted(stock.previews()) == ["marble", "wood"]
+
+
+def test_what_is_read_while_others_are_forgotten_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(tmp_path, 1, ("marble", "bare"))
+    stock, close = BundleStock(tmp_path, UNSIGNED), Bundle.close
+
+    def closing(bundle: Bundle) -> None:
+        close(bundle)
+        for number in range(66):  # another thread, months later: one after the other of these is installed
+            stock.index(tmp_path / f"{number}.vel")
+
+    monkeypatch.setattr(Bundle, "close", closing)
+    assert list(stock.names()) == ["marble", "bare"]
