@@ -25,6 +25,8 @@ FAILURES: Final = (VelaturaError, DeviceError)
 Failure = VelaturaError | DeviceError
 
 NOT_KEPT: Final = "upload-not-kept"
+INCOMING: Final = "incoming"
+"""Folder of the panel: uploads, while they come and until they are taken."""
 
 
 def status_of(error: Failure) -> int:

@@ -50,7 +50,7 @@ def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
         try:
             values = answers.scalar_values(operation, request)
             if operation.upload is not None:
-                uploaded = await answers.body_file(request, panel.options.folder / "incoming")
+                uploaded = await answers.body_file(request, panel.options.folder / answers.INCOMING)
                 values[operation.upload.name] = uploaded
             elif operation.changes:
                 values |= await answers.json_values(operation, request)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import mimetypes
+import shutil
 from collections.abc import AsyncIterator, Callable
 from importlib import resources
 from typing import Final
@@ -16,7 +17,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
 
-from controller.panel import api
+from controller.panel import answers, api
 from controller.panel.accounts import Accounts
 from controller.panel.answers import FAILURES
 from controller.panel.building import BuildingControl
@@ -43,6 +44,8 @@ def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starl
     table of routes is at ``.state.entries``, the panel's parts at ``.state.panel``.
     """
     options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    # Of those who were uploading when the service was killed; a backup may have gigabytes.
+    shutil.rmtree(options.folder / answers.INCOMING, ignore_errors=True)
     drawing = Drawing()
 
     def draw() -> dict[str, str]:

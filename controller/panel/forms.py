@@ -98,7 +98,7 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
             if not isinstance(token, str) or not visitor.session.matches(token):
                 return refused()
             try:
-                await _read(form, sent, panel.options.folder / "incoming")
+                await _read(form, sent, panel.options.folder / answers.INCOMING)
             except OSError as error:
                 told = answers.not_kept(error)
                 return PlainTextResponse(f"{told.what} {told.remedy}", answers.status_of(told))

@@ -67,7 +67,8 @@ class Sessions:
             session = self._sessions.get(digest)
             if session is None:
                 return None
-            if now - session.began_unix_s > LONGEST_S or now - session.seen_unix_s > IDLE_S:
+            # One from the future was begun before the clock was set back: nobody knows its age.
+            if abs(now - session.began_unix_s) > LONGEST_S or abs(now - session.seen_unix_s) > IDLE_S:
                 del self._sessions[digest]
                 return None
             if touch:

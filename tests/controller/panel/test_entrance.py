@@ -114,6 +114,17 @@ def test_sessions_end_by_age_by_silence_and_by_number(tmp_path: Path) -> None:
     assert sessions.get(first) is None
 
 
+def test_a_clock_that_is_set_back_does_not_make_a_session_last_for_years() -> None:
+    clock = Clock()
+    clock.now = 1e9
+    sessions = Sessions(clock=clock)
+    secret, _ = sessions.begin("anna")
+    clock.now -= 60
+    assert sessions.get(secret) is not None, "a clock that is put right by a little ends nothing"
+    clock.now -= 10 * LONGEST_S
+    assert sessions.get(secret) is None
+
+
 def test_sessions_outlive_the_service_and_hold_nothing_to_steal(tmp_path: Path) -> None:
     secret, session = Sessions(tmp_path / "s.json").begin("anna")
     assert secret not in (tmp_path / "s.json").read_text()

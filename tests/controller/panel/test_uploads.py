@@ -15,8 +15,12 @@ from PIL import Image
 
 from controller.errors import UsageError
 from controller.panel.accounts import Role
+from controller.panel.answers import INCOMING, temporary
+from controller.panel.app import make_panel
+from controller.panel.context import PanelOptions
 from controller.panel.uploads import Targets, UploadLimits, decode_picture
-from tests.controller.panel.served import Served, csrf
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.controller.panel.served import QUICK_HASH, Served, csrf
 
 SMALL = UploadLimits(most_bytes=1 << 20, most_pixels=1_000_000, memory_bytes=400 << 20, seconds=3)
 
@@ -140,3 +144,10 @@ def test_a_form_upload_leaves_only_our_own_picture(fresh: Served) -> None:
             == "/appearances/new"
         )
         assert "could not be read as a picture" in client.get("/appearances/new").text
+
+
+def test_what_a_killed_service_left_of_an_upload_is_gone_with_the_next_start(tmp_path: Path) -> None:
+    options = PanelOptions(tmp_path)
+    left = temporary(tmp_path / INCOMING)
+    make_panel(MemoryKiosk(tmp_path / "pictures"), options.accounts(QUICK_HASH), options)
+    assert not left.exists()
