@@ -125,6 +125,7 @@ class FrameFile:
         head, offsets = layout_bytes(outputs)
         size = offsets[-1] + outputs[-1].width_px * outputs[-1].height_px * 3
         if not _has_layout(path, head, size):
+            _refuse_taken(path)
             stream_atomically(path, lambda file: _fill(file.fileno(), head, size), mode=0o600)
         self._file = path.open("r+b")
         try:
@@ -132,11 +133,7 @@ class FrameFile:
             self._map = mmap.mmap(self._file.fileno(), size)
         except BlockingIOError as error:
             self._file.close()
-            raise UsageError(
-                "frames-in-use",
-                what=f"Another player writes to {path}.",
-                remedy="Stop it first, or give this one another file.",
-            ) from error
+            raise _in_use(path) from error
         # One aligned 64-bit store each: a byte-wise store could be read half done.
         self._sequence = np.frombuffer(self._map, "<u8", 1, SEQUENCE_AT)
         self._presented_at = np.frombuffer(self._map, "<f8", 1, PRESENTED_AT)
@@ -184,6 +181,23 @@ class FrameFile:
         with contextlib.suppress(BufferError):
             self._map.close()
         self._file.close()
+
+
+def _in_use(path: Path) -> UsageError:
+    return UsageError(
+        "frames-in-use",
+        what=f"Another player writes to {path}.",
+        remedy="Stop it first, or give this one another file.",
+    )
+
+
+def _refuse_taken(path: Path) -> None:
+    """Raise UsageError("frames-in-use") rather than put another file in the place of one that somebody writes to."""
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise _in_use(path) from error
 
 
 def _has_layout(path: Path, head: bytes, size: int) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 import time
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from controller.errors import UsageError
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 from tests.controller.play.conftest import OUTPUTS, START
 from tests.controller.play.wire import Frames, Wire, dark, noise, same
@@ -142,3 +144,13 @@ def test_a_source_that_is_killed_leaves_its_last_picture_and_another_one_goes_on
             assert live(wire)["source"] == "there"
         player.terminate()
     assert dark(out.read())
+
+
+def test_a_file_that_somebody_writes_to_is_not_put_aside_for_one_of_other_outputs(tmp_path: Path) -> None:
+    with contextlib.closing(FrameFile(tmp_path / "live.frame", SIZES)):
+        before = (tmp_path / "live.frame").stat()
+        with pytest.raises(UsageError) as caught:
+            FrameFile(tmp_path / "live.frame", SIZES[:1])
+        assert caught.value.code == "frames-in-use"
+        assert os.path.samestat((tmp_path / "live.frame").stat(), before)
+    FrameFile(tmp_path / "live.frame", SIZES[:1]).close()
