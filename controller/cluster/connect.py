@@ -8,6 +8,7 @@ sides (address ``tls://``; the files as Dask's own configuration names them, ``d
 from __future__ import annotations
 
 import contextlib
+import secrets
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Final, Generic, TypeVar
@@ -58,7 +59,10 @@ class Cluster:
         future = self._shared.get(shared.key)
         if future is None or future.status != "finished":
             self.wait_for_workers(lambda: None)
-            (future,) = self._client.scatter({shared.key: shared.value}, hash=False).values()
+            # Never twice under one name: a worker that is still asking a lost one for it would drop what it is sent,
+            # while the scheduler believes that it has it, and what needs it would wait there for good.
+            name = f"{shared.key}-{secrets.token_hex(8)}"
+            (future,) = self._client.scatter({name: shared.value}, hash=False).values()
             self._shared[shared.key] = future
         return future
 
