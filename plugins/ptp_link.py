@@ -61,9 +61,8 @@ class Diary:
 
     def take(self) -> list[tuple[str, str]]:
         """(stable code, one sentence) of each since the last call, oldest first."""
-        found = list(self._notes)
-        self._notes.clear()
-        return found
+        # No more than there are now, and one by one: another thread, which keeps the camera awake, may add to them.
+        return [self._notes.popleft() for _ in range(len(self._notes))]
 
 
 class PtpLink(Protocol):

@@ -1,17 +1,20 @@
-"""The PTP camera driver between threads: one waits for another, or closes what another uses."""
+"""The PTP camera driver between threads: one waits for another, or closes what another uses, or tells it something."""
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from types import FrameType
+from typing import Any
 
 import pytest
 
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout
 from plugins.emulated.ptp_camera import EmulatedPtpCamera
-from plugins.ptp_link import MOST_IN_MEMORY, Reply, Sink
+from plugins.ptp_link import MOST_IN_MEMORY, Diary, Reply, Sink
 from plugins.ptp_still import PtpCamera
 from plugins.ptpip import PtpIpLink
 from plugins.ptpip_wire import PtpIpAddress
@@ -122,3 +125,27 @@ def test_a_camera_that_is_closed_while_it_is_opened_again_is_let_go(stand: Stand
     assert caught.value.code == "camera-closed"
     assert len(stand.links) == 2
     assert all(link.broken for link in stand.links)
+
+
+def test_a_note_that_comes_while_the_others_are_taken_is_told_the_next_time() -> None:
+    diary, added = Diary(), 0
+
+    def interrupt(frame: FrameType, event: str, argument: Any) -> Any:
+        """Between any two lines of ``take`` another thread may run."""
+        nonlocal added
+        if frame.f_code is not Diary.take.__code__:
+            return None
+        if event == "line":
+            added += 1
+            diary.add("mended", f"note {added}")
+        return interrupt
+
+    former = sys.gettrace()
+    sys.settrace(interrupt)
+    try:
+        told = diary.take()
+    finally:
+        sys.settrace(former)
+    told += diary.take()
+    assert added > 0
+    assert [what for _, what in told] == [f"note {number}" for number in range(1, added + 1)]
