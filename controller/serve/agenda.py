@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ class Agenda:
         self._waiting: tuple[Request | None, float] = (None, 0.0)
         self._queue: deque[Request] = deque()
         self._cancelled = False
+        self._holder: int | None = None
 
     @property
     def head(self) -> Request | None:
@@ -43,12 +45,20 @@ class Agenda:
 
     def check_idle(self) -> None:
         """Raises WorkError("busy")."""
-        if self.head is not None:
+        if self.head is not None or self._holder not in (None, threading.get_ident()):
             raise WorkError("busy", what="Other work is going on.", remedy="Wait for it to end, or cancel it.")
+
+    def hold(self) -> None:
+        """Let no work begin, and be asked for by nobody but the caller's thread, until ``let_go``. Raises as above."""
+        self.check_idle()
+        self._holder = threading.get_ident()
+
+    def let_go(self) -> None:
+        self._holder = None
 
     def offer(self, request: Request) -> bool:
         """Queue work that nobody waits for, if there is no other; whether it was queued."""
-        if self.head is not None or self._works.refusal(request) is not None:
+        if self.head is not None or self._holder is not None or self._works.refusal(request) is not None:
             return False
         self._queue.append(request)
         return True
@@ -85,7 +95,7 @@ class Agenda:
             self._log.tell(_left_out(task))
         for task in plan.due:
             request = Request("drift", light=True, key=task.key)
-            if playing or self.head is not None:
+            if playing or self.head is not None or self._holder is not None:
                 continue
             if (why := self._works.refusal(request)) is not None:
                 self._log.mark_done(task.key, why.code)
@@ -97,7 +107,7 @@ class Agenda:
 
     def ready(self, views: Sequence[ProjectorView]) -> Request | None:
         """The work that can begin with these lamps; what can't for want of a lamp is dropped, with the reason."""
-        if not self._queue or self._works.running is not None:
+        if not self._queue or self._works.running is not None or self._holder is not None:
             return None
         request = self._queue[0]
         if not request.light:

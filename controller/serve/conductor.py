@@ -6,8 +6,9 @@ device that hangs holds up only its own keeper.
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -122,10 +123,19 @@ class Conductor:
         with self._lock:
             self._agenda.ask(*requests)
 
-    def check_idle(self) -> None:
-        """Raises WorkError("busy") while work runs or waits."""
+    @contextlib.contextmanager
+    def idle(self) -> Iterator[None]:
+        """What work reads may be changed: none begins meanwhile, and only who is here may ask for some.
+
+        Raises WorkError("busy") while work runs or waits, and while somebody else is here.
+        """
         with self._lock:
-            self._agenda.check_idle()
+            self._agenda.hold()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._agenda.let_go()
 
     def cancel(self) -> None:
         """Raises WorkError("nothing-to-cancel")."""

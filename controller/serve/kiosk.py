@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -192,10 +193,10 @@ class StageKiosk:
             raise UsageError("brightness-fixed", what="The brightness of one appearance can't be chosen.",
                              remedy="Set exposure_share under [solve] in stage.toml, for all of them.")  # fmt: skip
         kept = self.stage / "appearances" / f"{name}.png"
-        service.conductor.check_idle()
-        write_atomically(kept, target.read_bytes())
-        settings.add_picture(self.stage, name, kept)
-        return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
+        with service.conductor.idle():
+            write_atomically(kept, target.read_bytes())
+            settings.add_picture(self.stage, name, kept)
+            return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def feasibility(self, target: Path) -> Path:
         return aim.feasibility_map(self.stage, target)
@@ -227,10 +228,10 @@ class StageKiosk:
         if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
             raise UsageError("appearance-in-use", what=f"{name} is playing, or the schedule names it.",
                              remedy="Play another one, and take it out of the schedule.")  # fmt: skip
-        service.conductor.check_idle()
-        settings.remove_picture(self.stage, name)
-        settings.forget_solved(self.stage, name)
-        service.ask(Request("publish"))
+        with service.conductor.idle():
+            settings.remove_picture(self.stage, name)
+            settings.forget_solved(self.stage, name)
+            service.ask(Request("publish"))
 
     def lamp_history(self) -> Sequence[LampDay]:
         return () if self._service is None else self._service.lamp_history.days()
@@ -251,10 +252,9 @@ class StageKiosk:
         return archive.backup(self.stage)
 
     def restore(self, backup: Path) -> None:
-        if self._service is not None:
-            self._service.conductor.check_idle()
-        archive.restore(self.stage, backup)
-        self.reload.set()
+        with self._idle():
+            archive.restore(self.stage, backup)
+            self.reload.set()
 
     def diagnostics(self) -> Path:
         return archive.diagnostics(self.stage, {"state": plain(self._last), "events": plain(self.events())})
@@ -266,10 +266,12 @@ class StageKiosk:
         settings.validate(text)
 
     def save_settings(self, text: str) -> None:
-        if self._service is not None:
-            self._service.conductor.check_idle()
-        settings.save(self.stage, text)
-        self.reload.set()
+        with self._idle():
+            settings.save(self.stage, text)
+            self.reload.set()
+
+    def _idle(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext() if self._service is None else self._service.conductor.idle()
 
     def camera_picture(self) -> bytes | None:
         return None if self._service is None else aim.camera_picture(self._service.devices)

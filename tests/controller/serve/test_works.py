@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 from controller.checking import check_stage
 from controller.errors import VelaturaError, WorkError
 from controller.panel.kiosk import ComputeSettings, Job
+from controller.serve import archive
+from controller.serve import kiosk as kiosk_module
 from controller.serve.control import NAME, ControlServer
 from controller.serve.eventlog import Decision, EventLog
 from controller.serve.following import ask_and_follow
@@ -21,7 +24,7 @@ from controller.serve.program import operations
 from controller.serve.service import Service
 from controller.serve.works import JobReporter, Kind, ThreadWorks, run_name
 from controller.session.progress import Level, Phase, Progress, Silent
-from controller.storage import runtime_folder
+from controller.storage import runtime_folder, write_atomically
 from hal.deadline import Cancelled
 from hal.errors import DeviceGone
 from tests.controller.serve.vase import graded_run, vase
@@ -277,3 +280,47 @@ def test_an_event_that_is_told_while_the_panel_is_brought_up_to_date_reaches_it(
         service.changed()
     assert heard[-1:] == [log.number]
     log.close()
+
+
+def elsewhere(do: Callable[[], object]) -> str:
+    """The code with which another technician is refused; empty where they are not."""
+    with ThreadPoolExecutor(1) as other:
+        error = other.submit(do).exception(20)
+    return error.code if isinstance(error, VelaturaError) else ""
+
+
+def test_of_two_technicians_with_a_new_appearance_at_once_one_is_refused_and_changes_nothing(
+    kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused: list[str] = []
+
+    def other() -> Job:
+        return kiosk.compute("stone", kiosk.stage / "target.png", ComputeSettings())
+
+    def write(path: Path, data: bytes) -> None:
+        if not refused:
+            refused.append("asked")
+            refused.append(elsewhere(other))
+        write_atomically(path, data)
+
+    monkeypatch.setattr(kiosk_module, "write_atomically", write)
+    assert asked(kiosk).name == "New appearance"
+    assert refused == ["asked", "busy"]
+    assert '"wood"' in kiosk.settings()
+    assert '"stone"' not in kiosk.settings()
+
+
+def test_no_work_begins_while_a_backup_takes_the_place_of_what_it_reads(
+    kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused: list[str] = []
+
+    def restore(stage: Path, backup: Path) -> None:
+        refused.append(elsewhere(lambda: kiosk.service.ask(Request("publish"))))
+        kiosk.service.conductor.step()
+
+    monkeypatch.setattr(archive, "restore", restore)
+    kiosk.restore(kiosk.stage / "backup.tar.gz")
+    assert refused == ["busy"]
+    assert kiosk.service.works.job is None
+    assert asked(kiosk).name == "New appearance", "and then it may"
