@@ -7,10 +7,12 @@ port, ``hal.transcript`` the one that replays a recording.
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import select
 import socket
 from abc import ABC, abstractmethod
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
@@ -138,19 +140,24 @@ class TcpLink(BufferedLink):
 
     def _connect(self, host: str, port: int, deadline: Deadline) -> socket.socket:
         self._check(deadline, "was not reached")
+        failure = OSError()
         try:
-            connected = socket.create_connection((host, port), timeout=max(deadline.left_s(), 1e-3))
-        except TimeoutError as error:
+            places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        except OSError as error:
+            raise self._lost(error) from error
+        for number, place in enumerate(places):
+            try:
+                # Of several addresses none may use up the time of the others.
+                return _connected(place, deadline.within(deadline.left_s() / (len(places) - number)))
+            except OSError as error:
+                failure = error
+        if isinstance(failure, TimeoutError):
             raise DeviceTimeout(
                 "link-no-connection",
                 what=f"{self.name} did not accept a connection in time.",
                 remedy="Check the network cable and that the device's network is on in standby.",
-            ) from error
-        except OSError as error:
-            raise self._lost(error) from error
-        connected.setblocking(False)
-        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return connected
+            ) from failure
+        raise self._lost(failure) from failure
 
     def _receive(self, wait_s: float) -> bytes:
         try:
@@ -186,6 +193,28 @@ class TcpLink(BufferedLink):
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._socket.close()
+
+
+def _connected(place: tuple[Any, ...], deadline: Deadline) -> socket.socket:
+    """A connection to what ``getaddrinfo`` found. Raises OSError, TimeoutError at the deadline, Cancelled."""
+    family, kind, protocol, _, address = place
+    connection = socket.socket(family, kind, protocol)
+    try:
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        failure = connection.connect_ex(address)
+        if failure == errno.EINPROGRESS:
+            while not select.select([], [connection], [], min(SLICE_S, deadline.left_s()))[1]:
+                deadline.sleep(0.0)  # a cancelled call ends soon
+                if deadline.passed:
+                    raise TimeoutError
+            failure = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if failure:
+            raise OSError(failure, os.strerror(failure))
+    except BaseException:
+        connection.close()
+        raise
+    return connection
 
 
 def host_and_port(address: str, default_port: int) -> tuple[str, int]:

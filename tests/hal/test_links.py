@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
@@ -73,6 +74,47 @@ def test_a_cancelled_read_ends_at_once(peer: Peer) -> None:
     with pytest.raises(Cancelled):
         peer.link.read_exactly(1, deadline=in_seconds(20, stop))
     assert time.monotonic() - started < 10
+
+
+@pytest.fixture
+def deaf() -> Iterator[int]:
+    """A port at which a call is neither taken nor refused: its queue is full."""
+    with contextlib.ExitStack() as opened:
+        listener = opened.enter_context(socket.socket())
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(0)
+        for _ in range(4):
+            waiting = opened.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(listener.getsockname())
+        yield listener.getsockname()[1]
+
+
+class SetLater(threading.Event):
+    """A cancellation that comes after it was looked at once."""
+
+    def is_set(self) -> bool:
+        found = super().is_set()
+        self.set()
+        return found
+
+
+def test_a_call_that_nobody_takes_can_be_cancelled(deaf: int) -> None:
+    with pytest.raises(Cancelled):
+        TcpLink("127.0.0.1", deaf, deadline=in_seconds(5, SetLater()))
+
+
+def test_one_address_that_nobody_answers_at_leaves_time_for_the_next(
+    deaf: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        places = [(socket.AF_INET, socket.SOCK_STREAM, 0, "", ("127.0.0.1", port)) for port in (deaf, deaf)]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: places)
+        with pytest.raises(DeviceTimeout) as caught:
+            TcpLink("projector", 4352, deadline=in_seconds(0.1))
+        assert caught.value.code == "link-no-connection"
+        places[1] = (socket.AF_INET, socket.SOCK_STREAM, 0, "", listener.getsockname())
+        TcpLink("projector", 4352, deadline=in_seconds(0.4)).close()
 
 
 def test_a_line_that_never_ends_is_refused(peer: Peer) -> None:
