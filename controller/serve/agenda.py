@@ -35,6 +35,10 @@ class Agenda:
         """Whether work waits for, or uses, the lamps."""
         return self.head is not None and self.head.light
 
+    def waits(self, number: int) -> bool:
+        """Whether the job that was promised this number has not begun yet, and will."""
+        return any(request.number == number for request in self._queue)
+
     def ask(self, *requests: Request) -> None:
         """Queue work. Raises WorkError("busy") while there is other work, and with the reason why it can't be done."""
         self.check_idle()

@@ -95,6 +95,11 @@ class Conductor:
         with self._lock:
             return self._agenda.head is not None
 
+    def waits(self, number: int) -> bool:
+        """Whether the job of this number has not begun yet, and will."""
+        with self._lock:
+            return self._agenda.waits(number)
+
     def open(self) -> None:
         """Play until the schedule says otherwise the next time."""
         with self._lock:

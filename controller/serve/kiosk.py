@@ -155,15 +155,15 @@ class StageKiosk:
 
     def _begun(self, service: Service, asked: Request, name: str) -> Job:
         # Before it is asked for: it may begin at once.
-        number = service.works.number + 1
-        service.ask(asked)
+        number = service.works.reserve()
+        service.ask(replace(asked, number=number))
         return Job(number, name)
 
     def job(self, number: int) -> Job | None:
         """A job that was asked for; None while it waits. Raises WorkError("job-given-up") where it never will begin."""
         service = self.service
         # In this order: what is neither waiting nor running, and yet not known then, was given up.
-        waits = service.conductor.working
+        waits = service.conductor.waits(number)
         if (found := service.works.known(number)) is None and not waits:
             raise WorkError("job-given-up", what="The kiosk gave the work up, or began anew meanwhile.",
                             remedy="`velatura events` tells why.")  # fmt: skip

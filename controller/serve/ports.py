@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -114,13 +114,14 @@ class Request:
     a caller adds.
 
     ``light``: with all lamps lit and the display to itself; ``key``: the planner's task that this does;
-    ``arguments`` are the kind's own
+    ``arguments`` are the kind's own; ``number``: the one that its job was promised, 0 for none
     """
 
     kind: str
     light: bool = False
     key: str = ""
     arguments: tuple[str, ...] = ()
+    number: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,8 +118,8 @@ class Service:
         self.conductor.step()
         if self.devices.mains is not None:
             self.devices.mains.want_on = self._light_wanted()
-        if self.works.job is not None:
-            self.log.keep("job", str(self.works.job.number))
+        if self.works.number:
+            self.log.keep("job", str(self.works.number))
         self.lamp_history.note(self.lamps, date.today())
         self.changed()
 

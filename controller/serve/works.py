@@ -96,8 +96,14 @@ class ThreadWorks:
 
     @property
     def number(self) -> int:
-        """That of the last job that began, also in a service before; the next one's is larger by one."""
+        """The last that a job has, or was promised, also in a service before."""
         return self._number
+
+    def reserve(self) -> int:
+        """The number of a job that is asked for now, and may begin later or never; no other gets it."""
+        with self._lock:
+            self._number += 1
+            return self._number
 
     def known(self, number: int) -> Job | None:
         """The job of this number, if it goes on or ended lately; None while it waits, and where it never began."""
@@ -112,10 +118,9 @@ class ThreadWorks:
         return self._kinds[request.kind].refusal(request)
 
     def begin(self, request: Request) -> None:
-        self._number += 1
         self._request, self._cancel = request, threading.Event()
         title = title_of(request)
-        self._reporter = JobReporter(Job(self._number, title), self._log, self._changed)
+        self._reporter = JobReporter(Job(request.number or self.reserve(), title), self._log, self._changed)
         self._log.tell(Decision("work-begins", f"{title} begins."))
         self._thread = threading.Thread(
             target=self._run, args=(request, self._reporter, self._cancel), name=f"work-{request.kind}", daemon=True

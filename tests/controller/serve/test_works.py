@@ -324,3 +324,14 @@ def test_no_work_begins_while_a_backup_takes_the_place_of_what_it_reads(
     assert refused == ["busy"]
     assert kiosk.service.works.job is None
     assert asked(kiosk).name == "New appearance", "and then it may"
+
+
+def test_who_follows_work_that_was_given_up_is_not_told_of_the_next_ones_outcome(kiosk: StageKiosk) -> None:
+    given_up = asked(kiosk)
+    kiosk.cancel()
+    following = asked(kiosk)
+    assert following.number != given_up.number
+    assert kiosk.job(following.number) is None, "it waits"
+    with pytest.raises(WorkError) as caught:
+        kiosk.job(given_up.number)
+    assert caught.value.code == "job-given-up"
