@@ -80,10 +80,16 @@ class StageKiosk:
                 self._show_notice()
         self._notify()
 
+    def detach(self) -> None:
+        """The service has ended, and the next one may have read its files: nothing may be asked of the one that was."""
+        self._service = None
+
     @property
     def service(self) -> Service:
-        """Raises WorkError("not-set-up")."""
+        """Raises WorkError("not-set-up", "begins-anew")."""
         service = self._service
+        if service is None and not self._last.needs_setup:
+            raise WorkError("begins-anew", what="The kiosk begins anew.", remedy="Ask again in a moment.")
         if service is None:
             raise WorkError("not-set-up", what=self._last.reason, remedy="Set the stage up first.")
         return service

@@ -79,6 +79,7 @@ def serve(
                         reporter.say(f"{stage.name} is served.")
                         first = False
                     _wait(kiosk, cancel)
+                kiosk.detach()
             except (VelaturaError, DeviceError) as error:
                 if first and not setup:
                     raise

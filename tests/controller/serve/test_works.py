@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,8 +13,8 @@ import pytest
 
 from controller.checking import check_stage
 from controller.errors import VelaturaError, WorkError
-from controller.panel.kiosk import ComputeSettings, Job
-from controller.serve import archive
+from controller.panel.kiosk import ComputeSettings, Job, Schedule
+from controller.serve import archive, program
 from controller.serve import kiosk as kiosk_module
 from controller.serve.control import NAME, ControlServer
 from controller.serve.eventlog import Decision, EventLog
@@ -335,3 +336,27 @@ def test_who_follows_work_that_was_given_up_is_not_told_of_the_next_ones_outcome
     with pytest.raises(WorkError) as caught:
         kiosk.job(given_up.number)
     assert caught.value.code == "job-given-up"
+
+
+def test_hours_that_are_sent_while_the_service_is_made_anew_are_refused_and_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kiosk, cancel, refused = StageKiosk(vase(tmp_path)), threading.Event(), list[str]()
+
+    @contextlib.contextmanager
+    def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool) -> Iterator[Service]:
+        log = EventLog(stage / EventLog.FILE, durable=False)
+        service = Service(check_stage(stage), log)  # it has read the hours
+        if refused:
+            cancel.set()
+        refused.append(elsewhere(lambda: kiosk.set_schedule(Schedule("UTC"))))
+        kiosk.reload.set()  # somebody has saved settings
+        yield service
+        service.changed()
+        log.close()
+
+    monkeypatch.setattr(program, "serving", serving)
+    monkeypatch.setattr(program, "StageKiosk", lambda stage: kiosk)
+    program.serve(stage=tmp_path, panel=None, leave_lit=False, setup=False, reporter=Silent(), cancel=cancel)
+    assert refused == ["not-set-up", "begins-anew"]
+    assert not (tmp_path / "schedule.toml").exists()
