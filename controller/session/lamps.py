@@ -66,8 +66,14 @@ class LampLedger(Protocol):
         """Durable on return. Raises WorkError("no-space") and the like; the caller's lamp is then as it was."""
 
 
+_UNKNOWN: Final = ""
+
+
 class LampFile:
-    """A ledger in one JSON file of the stage folder. A damaged file makes every lamp of the stage count as hot."""
+    """A ledger in one JSON file of the stage folder. A damaged file makes every lamp of the stage count as hot.
+
+    Those that were not written since then count as hot after a restart too: an entry without a name says so.
+    """
 
     NAME: Final = "lamps.json"
 
@@ -83,7 +89,8 @@ class LampFile:
 
     def write(self, name: str, record: LampRecord) -> None:
         with self._lock:
-            records = {**self._records, name: record}
+            unknown = {_UNKNOWN: LampRecord(lit=True)} if self.damaged else {}
+            records = {**unknown, **self._records, name: record}
             text = json.dumps({key: asdict(value) for key, value in sorted(records.items())}, indent=2)
             write_atomically(self._path, text.encode() + b"\n")
             self._records = records
@@ -91,12 +98,14 @@ class LampFile:
     def _load(self) -> Mapping[str, LampRecord]:
         try:
             content = json.loads(self._path.read_bytes())
-            return {str(name): _record(fields) for name, fields in content.items()}
+            records = {str(name): _record(fields) for name, fields in content.items()}
         except FileNotFoundError:
             return {}
         except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError):
             self.damaged = True
             return {}
+        self.damaged = _UNKNOWN in records
+        return records
 
 
 def _record(fields: Mapping[str, object]) -> LampRecord:

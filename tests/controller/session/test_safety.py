@@ -117,6 +117,21 @@ def test_a_damaged_ledger_makes_the_lamps_hot(tmp_path: Path, content: bytes) ->
     assert lamp.strikes == 0
 
 
+def test_a_damaged_ledger_keeps_a_lamp_hot_of_which_nothing_was_written_before_a_kill(tmp_path: Path) -> None:
+    (tmp_path / LampFile.NAME).write_bytes(b"{")
+    ledger, world = LampFile(tmp_path / LampFile.NAME), World()
+    right = LampGuard("right", Lamp(world), ledger, clock=world)
+    a_guard(world, ledger=ledger)
+    right.status(deadline=soon())
+    # killed here, before the left lamp was looked at
+    guard, lamp = a_guard(world, ledger=LampFile(tmp_path / LampFile.NAME))
+    assert refusal(lambda: guard.switch_on(deadline=soon())) == "lamp-resting"
+    assert lamp.strikes == 0
+    world.time_s += RULES.minimum_off_s
+    guard.switch_on(deadline=soon())
+    assert LampFile(tmp_path / LampFile.NAME).read("right") == ledger.read("right")
+
+
 def test_the_stage_can_make_the_rules_stricter_but_not_laxer() -> None:
     lax = LampRules(0, 0, 0, 0)
     guard = LampGuard("left", Lamp(World()), Shelf(), at_least=replace(lax, stable_s=900.0), clock=World())
