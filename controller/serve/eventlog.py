@@ -57,6 +57,7 @@ class EventLog:
         self._lock = threading.RLock()
         self.problem: str | None = None
         self._retry_at_s = 0.0
+        self._away = False
         self._database = self._opened()
         self._recent: deque[EventRow] = deque(self._load(), SHOWN)
         self._number = self._last_number()
@@ -121,6 +122,8 @@ class EventLog:
         if self.problem is not None and not now and time.monotonic() < self._retry_at_s:
             return
         try:
+            if self._away:
+                self._database, self._away = self._connected(self.path), False
             with self._database as database:
                 for row in self._waiting:
                     database.execute(
@@ -134,7 +137,7 @@ class EventLog:
                         database.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, self._kept[key]))
                 if self._number % _TRIM_EVERY == 0:
                     self._trim(database)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
             self.problem, self._retry_at_s = str(error), time.monotonic() + _RETRY_S
             return
         self._waiting.clear()
@@ -152,13 +155,25 @@ class EventLog:
             return self._connected(self.path)
         except (sqlite3.DatabaseError, OSError) as error:
             self.problem = str(error)
-            # A damaged log must not keep the stage dark; it is kept for whoever wants to look into it.
-            with contextlib.suppress(OSError, sqlite3.Error):
-                self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
-                database = self._connected(self.path)
-                self.problem = None
-                return database
-            return self._connected(Path(":memory:"))
+            if isinstance(error, sqlite3.Error) and _is_damage(error):
+                # A damaged log must not keep the stage dark; it is kept for whoever wants to look into it.
+                with contextlib.suppress(OSError, sqlite3.Error):
+                    self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
+                    database = self._connected(self.path)
+                    self.problem = None
+                    return database
+            self._away = True
+            return self._copied()
+
+    def _copied(self) -> sqlite3.Connection:
+        """In memory, what can be read of a log that can't be opened, as on a disk without space; see ``_flush``."""
+        database = self._connected(Path(":memory:"))
+        with (
+            contextlib.suppress(sqlite3.Error),
+            contextlib.closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?immutable=1", uri=True)) as source,
+        ):
+            source.backup(database)
+        return database
 
     def _connected(self, path: Path) -> sqlite3.Connection:
         if str(path) != ":memory:":
@@ -182,8 +197,8 @@ class EventLog:
         found = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
         if found:
             return int(found[0][0])
-        # After a damaged log numbers go on far above any that it can have had.
-        return int(self._wall()) if list(self.path.parent.glob("*.damaged-*")) else 0
+        # After a damaged log, and beside one that can't be read, numbers go on far above any that it can have had.
+        return int(self._wall()) if self._away or list(self.path.parent.glob("*.damaged-*")) else 0
 
     def _query(self, statement: str) -> list[tuple]:  # type: ignore[type-arg]
         try:
@@ -191,3 +206,12 @@ class EventLog:
         except sqlite3.Error as error:
             self.problem = str(error)
             return []
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    """Whether the file is at fault, and not a disk without space, or a system without free handles."""
+    return error.sqlite_errorcode & 0xFF in _DAMAGE or error.sqlite_errorcode in _UNREADABLE
+
+
+_DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT, sqlite3.SQLITE_ERROR)
+_UNREADABLE: Final = (sqlite3.SQLITE_IOERR_READ, sqlite3.SQLITE_IOERR_SHORT_READ, sqlite3.SQLITE_IOERR_CORRUPTFS)

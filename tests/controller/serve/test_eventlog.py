@@ -1,0 +1,45 @@
+"""The kiosk's memory on a disk that takes nothing when the kiosk begins."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.serve.eventlog import Decision, EventLog
+
+
+def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_when_there_is_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, connect = tmp_path / EventLog.FILE, sqlite3.connect
+    log = EventLog(path, durable=False)
+    log.tell(Decision("first", "One."))
+    log.keep("chosen", "glass")
+    log.close()
+
+    def full(database: Any, **options: Any) -> sqlite3.Connection:
+        if database == path:
+            error = sqlite3.OperationalError("disk I/O error")
+            error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE  # what SQLite says on a file system without space
+            raise error
+        found: sqlite3.Connection = connect(database, **options)
+        return found
+
+    monkeypatch.setattr(sqlite3, "connect", full)
+    log = EventLog(path, durable=False)
+    log.tell(Decision("second", "Two."))
+    log.mark_done("drift-check 2026-01-01", "drift-none")
+    assert log.problem == "disk I/O error"
+    assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
+    monkeypatch.setattr(sqlite3, "connect", connect)
+    log.mark_done("drift-check 2026-01-02", "drift-none")
+    assert log.problem is None
+    log.close()
+    log = EventLog(path, durable=False)
+    assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
+    assert log.done() == {"drift-check 2026-01-01", "drift-check 2026-01-02"}
+    log.close()
+    assert not list(path.parent.glob("*.damaged-*"))
