@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -123,6 +124,12 @@ class FolderSource:
         names = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in PICTURES)
         if not names:
             return None
+        # Whoever fills the folder may clear it, too.
+        with contextlib.suppress(FileNotFoundError):
+            return self._of(names, at_s)
+        return None
+
+    def _of(self, names: Sequence[Path], at_s: float) -> LivePicture | None:
         if self._loop:
             turn = int(at_s * self._rate_hz)
             if turn == self._shown:

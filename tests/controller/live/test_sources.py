@@ -100,6 +100,18 @@ def test_a_half_written_picture_waits_and_a_damaged_one_is_told_of(tmp_path: Pat
     assert refused.value.code == "target-unreadable"
 
 
+@pytest.mark.parametrize("loop", [False, True])
+def test_a_picture_that_is_gone_when_it_is_looked_at_is_passed_over(tmp_path: Path, *, loop: bool) -> None:
+    source = FolderSource(tmp_path, loop=loop, rate_hz=10)
+    (tmp_path / "1.png").symlink_to(tmp_path / "kept" / "1.png")
+    assert source.next(0.0) is None
+    (tmp_path / "kept").mkdir()
+    write(tmp_path / "kept", "1.png", 50)
+    found = source.next(0.1)
+    assert found is not None
+    assert int(found.pixels.mean()) == 50
+
+
 def test_a_looping_folder_shows_its_pictures_in_turn(tmp_path: Path) -> None:
     for number, value in enumerate((10, 110, 210)):
         write(tmp_path, f"{number}.png", value)
