@@ -193,8 +193,8 @@ class Body(Protocol):
     @property
     def capabilities(self) -> CameraCapabilities: ...
 
-    def prepare(self, *, after_break: bool, deadline: Deadline) -> None:
-        """Take control and learn what can be set; ``after_break`` where a connection was lost in the middle."""
+    def prepare(self, *, deadline: Deadline) -> None:
+        """Take control and learn what can be set, whatever another connection was in the middle of when it ended."""
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
         """See ``hal.interfaces.Camera.configure``."""

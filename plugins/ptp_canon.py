@@ -52,12 +52,12 @@ class EosBody:
     def capabilities(self) -> CameraCapabilities:
         return replace(self._state.capabilities, bulb=self._can_bulb, live_view=self._view.able)
 
-    def prepare(self, *, after_break: bool, deadline: Deadline) -> None:
+    def prepare(self, *, deadline: Deadline) -> None:
         for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
             self._channel.ask(operation, 1, doing="let itself be controlled", deadline=deadline)
-        if after_break:
-            self._shutter.close()
-            self._shutter.let_go()
+        # Also at the first connection: a program that was killed may have left both as they were.
+        self._shutter.close()
+        self._shutter.let_go()
         self._talk.drain(deadline)
         self._view.end(deadline)
         self._aim_at_target(deadline)

@@ -65,7 +65,8 @@ class EosShutter:
     def _hold(self, shot: Shot, deadline: Deadline) -> Reply:
         """Hold the shutter open for the exposure."""
         shot.fire()
-        opened = self._channel.once(Operation.EOS_BULB_START, deadline=deadline)
+        # Not cancelled before its answer is here: that would end the connection, and leave the shutter open.
+        opened = self._channel.once(Operation.EOS_BULB_START, deadline=Deadline(deadline.at_s))
         if not opened.ok or any(opened.parameters[:1]):
             return opened
         shot.held = True

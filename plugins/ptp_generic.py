@@ -47,7 +47,7 @@ class GenericBody:
             jpeg=self._jpeg,
         )
 
-    def prepare(self, *, after_break: bool, deadline: Deadline) -> None:
+    def prepare(self, *, deadline: Deadline) -> None:
         if Property.EXPOSURE_PROGRAM in self._info.properties:
             program = self._describe(Property.EXPOSURE_PROGRAM, deadline)
             if program.writable and program.current != _MANUAL and _MANUAL in program.numbers():

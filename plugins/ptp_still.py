@@ -248,7 +248,7 @@ class PtpCamera:
         while True:
             self._check_open()
             try:
-                return self._reopen(deadline, after_break=True)
+                return self._reopen(deadline)
             except (DeviceGone, DeviceBusy, DeviceTimeout, ProtocolError) as error:
                 # A camera that restarts refuses connections at first, or still holds the lost one.
                 gone = error if isinstance(error, DeviceGone) else gone
@@ -266,7 +266,7 @@ class PtpCamera:
     def _link_broken(self) -> bool:
         return self._channel is None or self._channel.link.broken
 
-    def _reopen(self, deadline: Deadline, *, after_break: bool = False) -> Body:
+    def _reopen(self, deadline: Deadline) -> Body:
         if self._channel is not None:
             self._channel.link.close()
         link = self._connect(deadline)
@@ -282,7 +282,7 @@ class PtpCamera:
             )
             self._channel.exposing_until_s = self._exposing_until_s
             body = choose_body(self._channel, info, to_card=self._to_card, keep_on_card=self._keep, both=self._both)
-            body.prepare(after_break=after_break, deadline=deadline)
+            body.prepare(deadline=deadline)
             if self._settings is not None:
                 body.configure(self._settings, deadline=deadline)
             # ``close`` does not wait for ever for whoever is here: nobody else would let go of what it did not find.

@@ -8,27 +8,34 @@ from pathlib import Path
 
 import pytest
 
-from hal.deadline import Cancelled, in_seconds
-from hal.errors import DeviceGone, DeviceRefused
+from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.errors import DeviceError, DeviceGone, DeviceRefused
 from hal.interfaces import LiveViewCamera, WatchedCamera
+from hal.ptp import Operation
 from hal.ptp_eos import exposure_of
 from hal.values import ExposureSettings
+from plugins.emulated.ptp_camera import EmulatedPtpCamera
+from plugins.emulated.ptp_wire import GENERAL_ERROR
 from plugins.ptp_shot import Timing
-from tests.plugins.ptp_rig import FLAVOURS, Rig, running, when
+from plugins.ptp_still import PtpCamera
+from plugins.ptpip import PtpIpLink
+from plugins.ptpip_wire import PtpIpAddress, Wire
+from tests.plugins.ptp_rig import FLAVOURS, HASTY, PATIENT, SHORT, Studio, connect, running, when
+from tests.waiting import wait_for
 
 BULB_S = 0.7
 
 
-def short_shutter(rig: Rig) -> None:
+def short_shutter(emulator: EmulatedPtpCamera) -> None:
     """Make the body believe that a quarter of a second is its longest timed exposure."""
-    body = rig.emulator.body
+    body = emulator.body
     body.shutter_codes(tuple(code for code in body.shutter_codes() if (exposure_of(code) or 0.0) <= 0.25))  # type: ignore[attr-defined]
 
 
 def test_bulb_exposes_for_the_asked_time_where_the_shutter_has_none_so_long(tmp_path: Path) -> None:
     with running("eos-new", time_scale=1.0) as rig:
         assert rig.driver.capabilities.bulb
-        short_shutter(rig)
+        short_shutter(rig.emulator)
         confirmed = rig.driver.configure(ExposureSettings(BULB_S, 200, raw=False), deadline=in_seconds(20))
         assert confirmed.exposure_s == BULB_S
         began_s = time.monotonic()
@@ -42,7 +49,7 @@ def test_bulb_exposes_for_the_asked_time_where_the_shutter_has_none_so_long(tmp_
 
 def test_a_cancelled_bulb_exposure_closes_the_shutter(tmp_path: Path) -> None:
     with running("eos-new", time_scale=1.0) as rig:
-        short_shutter(rig)
+        short_shutter(rig.emulator)
         rig.driver.configure(ExposureSettings(60.0, 200, raw=False), deadline=in_seconds(20))
         stop = threading.Event()
         when(lambda: rig.emulator.exposures == 1, stop.set)
@@ -55,7 +62,7 @@ def test_a_cancelled_bulb_exposure_closes_the_shutter(tmp_path: Path) -> None:
 
 def test_a_bulb_exposure_whose_connection_is_lost_is_told_and_not_kept(tmp_path: Path) -> None:
     with running("eos-new", time_scale=1.0) as rig:
-        short_shutter(rig)
+        short_shutter(rig.emulator)
         rig.driver.configure(ExposureSettings(BULB_S, 200, raw=False), deadline=in_seconds(20))
         when(lambda: rig.emulator.exposures == 1, rig.emulator.drop_connection)
         with pytest.raises(DeviceGone):
@@ -63,6 +70,55 @@ def test_a_bulb_exposure_whose_connection_is_lost_is_told_and_not_kept(tmp_path:
         assert rig.capture(tmp_path, "again") == rig.latest()
         assert rig.studio.shots[-1].exposure_s >= BULB_S - 0.02
         assert [path.name for path in tmp_path.iterdir()] == ["again.jpg"]
+
+
+def test_a_stop_before_the_body_has_answered_that_its_shutter_is_open_closes_it(tmp_path: Path) -> None:
+    stop = threading.Event()
+
+    class Stopped(PtpIpLink):
+        """Is cancelled when the request has gone, and nothing has come."""
+
+        def _send(self, wire: Wire, data: bytes, deadline: Deadline) -> None:
+            super()._send(wire, data, deadline)
+            if int(Operation.EOS_BULB_START).to_bytes(2, "little") in data[12:14]:
+                stop.set()
+
+    with EmulatedPtpCamera(Studio().expose, flavour="eos-new", time_scale=1.0) as emulator:
+        address = PtpIpAddress.parse(emulator.address)
+        driver = PtpCamera(
+            lambda until: Stopped.connect(address, deadline=until), timing=PATIENT, deadline=in_seconds(20)
+        )
+        try:
+            short_shutter(emulator)
+            driver.configure(ExposureSettings(60.0, 200, raw=False), deadline=in_seconds(20))
+            with pytest.raises(Cancelled):
+                driver.capture(tmp_path / "shot", deadline=in_seconds(200, stop))
+            wait_for(lambda: emulator.exposures == 1)
+            assert emulator.body.close_shutter().code == GENERAL_ERROR  # it is closed
+        finally:
+            driver.close()
+
+
+def test_a_shutter_that_a_killed_program_left_open_is_closed_by_the_next(tmp_path: Path) -> None:
+    with running("eos-new", time_scale=1.0) as rig:
+        short_shutter(rig.emulator)
+        rig.driver.configure(ExposureSettings(60.0, 200, raw=False), deadline=in_seconds(20))
+        stop = threading.Event()
+
+        def kill() -> None:
+            rig.emulator.drop_connection()
+            stop.set()
+
+        when(lambda: rig.emulator.exposures == 1, kill)
+        with pytest.raises(DeviceError):
+            rig.driver.capture(tmp_path / "shot", deadline=in_seconds(200, stop))
+        rig.driver.close()
+        another = connect(rig.emulator, timing=HASTY)
+        try:
+            another.configure(SHORT, deadline=in_seconds(20))
+            assert len(another.capture(tmp_path / "next", deadline=in_seconds(30))) == 1
+        finally:
+            another.close()
 
 
 @pytest.mark.parametrize("flavour", ["generic", "eos-old"])
