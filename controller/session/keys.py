@@ -95,10 +95,10 @@ class KeyService:
                     self._trouble(None)
             except Cancelled:
                 return
-            except DeviceError as error:
+            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
                 if not failed:
                     failed = True
-                    self._trouble(error)
+                    self._trouble(error if isinstance(error, DeviceError) else _unknown(error))
                 self._shown = None
                 self._stop.wait(RETRY_S)
 
@@ -124,6 +124,11 @@ class KeyService:
 
     def _deadline(self, seconds: float) -> Deadline:
         return in_seconds(seconds, self._stop)
+
+
+def _unknown(error: Exception) -> DeviceError:
+    what = f"The key panel met an error that Velatura does not know ({type(error).__name__}: {error})."
+    return DeviceError("crash", what=what, remedy="Export the diagnostics.")
 
 
 def key_picture(command: KeyCommand, state: State, size_px: tuple[int, int]) -> ByteImage:

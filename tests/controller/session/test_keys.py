@@ -118,6 +118,24 @@ def test_an_unplugged_panel_is_told_once_and_used_again(monkeypatch: pytest.Monk
         wait_for(lambda: desk.called)
 
 
+def test_an_unknown_error_of_a_panel_is_told_and_its_keys_work_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keys, "RETRY_S", 0.01)
+    desk, errors = Desk(State.READY), [ValueError("a driver's own")]
+
+    def check() -> None:
+        if errors:
+            raise errors.pop()
+
+    monkeypatch.setattr(desk.panel, "check", check)
+    with desk:
+        desk.panel.pressed.put(1)
+        wait_for(lambda: desk.called)
+    told, well = desk.troubles
+    assert told is not None
+    assert (told.code, well) == ("crash", None)
+    assert "ValueError" in told.what
+
+
 def test_stopping_ends_the_thread_at_once() -> None:
     with Desk(State.READY):
         pass
