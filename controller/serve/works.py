@@ -122,10 +122,15 @@ class ThreadWorks:
         title = title_of(request)
         self._reporter = JobReporter(Job(request.number or self.reserve(), title), self._log, self._changed)
         self._log.tell(Decision("work-begins", f"{title} begins."))
-        self._thread = threading.Thread(
+        thread = threading.Thread(
             target=self._run, args=(request, self._reporter, self._cancel), name=f"work-{request.kind}", daemon=True
         )
-        self._thread.start()
+        try:
+            thread.start()
+            self._thread = thread
+        except RuntimeError as error:
+            # Of a system that gives no more threads. Whoever waits for this work would do so for good.
+            self._end(_crashed(request, error), self._reporter)
 
     def finished(self) -> Finished | None:
         with self._lock:
@@ -151,8 +156,10 @@ class ThreadWorks:
         except (VelaturaError, DeviceError) as error:
             finished = Finished(request, Decision(error.code, error.what, error.remedy, "error"), failed=True)
         except BaseException as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk goes on, and says it
-            what = f"The work met an error that Velatura does not know ({type(error).__name__}: {error})."
-            finished = Finished(request, Decision("crash", what, "Export the diagnostics.", "error"), failed=True)
+            finished = _crashed(request, error)
+        self._end(finished, reporter)
+
+    def _end(self, finished: Finished, reporter: JobReporter) -> None:
         reporter.job = replace(
             reporter.job, ended=True, failed=finished.failed, outcome=finished.outcome.text, left_s=None
         )
@@ -162,6 +169,11 @@ class ThreadWorks:
         with self._lock:
             self._finished = finished
         self._changed()
+
+
+def _crashed(request: Request, error: BaseException) -> Finished:
+    what = f"The work met an error that Velatura does not know ({type(error).__name__}: {error})."
+    return Finished(request, Decision("crash", what, "Export the diagnostics.", "error"), failed=True)
 
 
 def run_name(result: Mapping[str, object]) -> str:

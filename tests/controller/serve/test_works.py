@@ -121,6 +121,21 @@ def test_it_is_finished_once_and_can_be_asked_for_by_its_number(log: EventLog) -
     assert works.known(43) is None
 
 
+def test_work_for_which_the_system_has_no_thread_has_failed(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    works = ThreadWorks({"work": Kind(well)}, log)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", start)
+        works.begin(Request("work"))
+    finished = works.finished()
+    assert finished is not None
+    assert (finished.failed, finished.outcome.code) == (True, "crash")
+    assert works.running is None
+    works.close(20)
+
+
 def test_only_the_last_jobs_are_remembered(log: EventLog) -> None:
     ended = Ended()
     works = ended.works = ThreadWorks({"work": Kind(well)}, log, ended.changed)
