@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import json
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from controller.errors import VelaturaError
 from controller.storage import write_atomically
 
 LONGEST_S: Final = 12 * 3600.0
@@ -57,7 +59,9 @@ class Sessions:
             self._sessions[digest_of(secret)] = session
             while len(self._sessions) > MOST_SESSIONS:
                 self._sessions.popitem(last=False)
-            self._write()
+            # A disk that takes nothing costs a login after the next start; it must not keep out who could mend it.
+            with contextlib.suppress(VelaturaError, OSError):
+                self._write()
         return secret, session
 
     def get(self, secret: str, *, touch: bool = True) -> Session | None:

@@ -114,6 +114,13 @@ def test_sessions_end_by_age_by_silence_and_by_number(tmp_path: Path) -> None:
     assert sessions.get(first) is None
 
 
+def test_a_disk_that_takes_nothing_keeps_nobody_out(tmp_path: Path) -> None:
+    (tmp_path / "s.json").mkdir()
+    sessions = Sessions(tmp_path / "s.json")
+    secret, _ = sessions.begin("anna")
+    assert sessions.get(secret) is not None
+
+
 def test_a_clock_that_is_set_back_does_not_make_a_session_last_for_years() -> None:
     clock = Clock()
     clock.now = 1e9
