@@ -8,6 +8,7 @@ the link, because its late answer could be taken for the next one.
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from array import array
 from collections.abc import Callable
@@ -47,7 +48,8 @@ class PtpUsbLink:
         self._first = array("B", bytes(pipes.packet))
         self._block = array("B", bytes(_BLOCK // pipes.packet * pipes.packet))
         self._spare = b""
-        self._in_transaction = False
+        self._at_work = False
+        self._ending = threading.Lock()
         self._closed = False
         self._interrupts = InterruptReader(pipes)
 
@@ -77,23 +79,27 @@ class PtpUsbLink:
         deadline: Deadline,
     ) -> Reply:
         still_time(deadline)
-        self._check_open()
+        with self._ending:
+            self._check_open()
+            self._at_work = True
         self._transaction = (self._transaction + 1) % 0xFFFF_FFFF
         number = self._transaction
-        self._in_transaction = True
+        finished = False
         try:
             self._send(ptp_usb.pack_command(operation, number, parameters), deadline)
             if data is not None:
                 self._send(ptp_usb.pack_data(operation, number, data), deadline)
             reply = self._answer(number, sink, most, deadline)
+            finished = True
         except PipeStalled as stalled:
-            self.close()
             raise camera_lost("it stalled twice") from stalled
-        except BaseException:
-            # The rest of the answer may still come; nobody must take it for the next one.
-            self.close()
-            raise
-        self._in_transaction = False
+        finally:
+            with self._ending:
+                self._at_work = False
+                # The rest of the answer may still come; nobody must take it for the next one.
+                closed = self._closed = self._closed or not finished
+            if closed:
+                self._let_go(unfinished=not finished)
         return reply
 
     def events(self) -> list[LinkEvent]:
@@ -110,10 +116,14 @@ class PtpUsbLink:
                 return
 
     def close(self) -> None:
-        if self._closed:
-            return
-        self._closed = True
-        if self._in_transaction and self._interrupts.ended is None:
+        """A thread that is in a transaction notices, and lets go itself: the pipes are not closed under its feet."""
+        with self._ending:
+            at_work, closed, self._closed = self._at_work, self._closed, True
+        if not closed and not at_work:
+            self._let_go(unfinished=False)
+
+    def _let_go(self, *, unfinished: bool) -> None:
+        if unfinished and self._interrupts.ended is None:
             with contextlib.suppress(DeviceError, PipeStalled):
                 self._pipes.send_request(ClassRequest.CANCEL, ptp_usb.pack_cancel(self._transaction), _REQUEST_S)
         self._interrupts.close()
