@@ -88,6 +88,10 @@ class Entrance:
         panel = self._panel
         panel.sessions.end(request.cookies.get(cookie_name(panel), ""))
         secret, _ = panel.sessions.begin(account.name)
+        if panel.accounts.get(account.name) != account:
+            # Its password was changed while the old one was verified, and its sessions had been ended before this one.
+            panel.sessions.end(secret)
+            return self._form(_WRONG, 403)
         first = "/setup" if panel.kiosk.snapshot().needs_setup and account.role is Role.TECHNICIAN else "/"
         page = RedirectResponse("/password" if account.one_time else first, 303)
         self._set_cookie(page, cookie_name(panel), secret, int(LONGEST_S))

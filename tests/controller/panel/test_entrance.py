@@ -11,7 +11,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from controller.errors import UsageError
-from controller.panel.accounts import Accounts, Role
+from controller.panel.accounts import Account, Accounts, Role
 from controller.panel.sessions import IDLE_S, LONGEST_S, MOST_SESSIONS, LoginLimit, Sessions
 from tests.controller.panel.served import PASSWORD, QUICK_HASH, Served, csrf, log_in
 
@@ -207,3 +207,21 @@ def test_no_secret_is_shown_by_the_api(fresh: Served) -> None:
     stored = json.loads((fresh.app.state.panel.options.folder / "accounts.json").read_text())
     secrets = [row["password_hash"] for row in stored["accounts"]] + [row["digest"] for row in stored["tokens"]]
     assert not [secret for secret in secrets for text in texts if secret in text]
+
+
+def test_an_old_password_that_is_changed_while_it_is_verified_opens_nothing(
+    fresh: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel = fresh.app.state.panel
+    verify = panel.accounts.verify
+
+    def slowly(name: str, password: str) -> Account | None:
+        found: Account | None = verify(name, password)
+        panel.accounts.set_password(name, "another long one")
+        panel.sessions.end_all(name)
+        return found
+
+    monkeypatch.setattr(panel.accounts, "verify", slowly)
+    with fresh.client() as client:
+        assert log_in(client, "vera", PASSWORD).status_code == 403
+        assert client.get("/").status_code == 303
