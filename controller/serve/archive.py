@@ -26,6 +26,8 @@ RESTORING: Final = ".restoring"
 """An unpacked and checked backup: while it is there, its parts are on their way to their places."""
 REPLACED: Final = "kiosk/replaced"
 KEPT: Final = 5
+CUT_OFF_S: Final = 3600.0
+"""A backup to which nothing was written for so long is not being made any more."""
 MOST_FILES: Final = 100_000
 ROOM_SHARE: Final = 0.9
 """Of the free space that a backup may fill when it is unpacked; the kiosk's own log needs some."""
@@ -87,6 +89,16 @@ def finish_restore(stage: Path) -> bool:
     sync_folder(stage)
     shutil.rmtree(fresh)
     return True
+
+
+def clear_cut_off(stage: Path) -> None:
+    """Remove what a kill left of restores and backups, which may be gigabytes each. For the holder of the stage."""
+    for folder in stage.glob(".restore-*"):
+        shutil.rmtree(folder, ignore_errors=True)
+    for part in (stage / FOLDER).glob(".*.part"):
+        with contextlib.suppress(OSError):
+            if time.time() - part.stat().st_mtime > CUT_OFF_S:
+                part.unlink()
 
 
 def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:

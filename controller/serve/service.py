@@ -243,6 +243,7 @@ def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) ->
             remedy='Use the driver "player" under [display] in stage.toml.',
         )
     with stage_lock(checked.stage.folder):
+        archive.clear_cut_off(checked.stage.folder)
         log = EventLog(checked.stage.folder / EventLog.FILE)
         with contextlib.closing(log):
             service = Service(checked, log)

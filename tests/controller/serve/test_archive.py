@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import io
+import os
 import shutil
 import tarfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +13,8 @@ import pytest
 
 from controller.errors import UsageError, VelaturaError, WorkError
 from controller.serve import archive
+from controller.serve.archive import FOLDER
+from controller.serve.service import Service, serving
 from tests.controller.serve.vase import TEXT, graded_run, vase
 
 OLD, NEW = "20260501-100000-calibrate", "20260601-100000-calibrate"
@@ -207,3 +211,25 @@ def test_a_restore_that_is_cut_off_anywhere_leaves_the_old_stage_or_becomes_the_
             break
     assert outcomes == {(True, True), (False, False)}
     assert cut_at > 3
+
+
+def test_what_a_kill_left_of_restores_and_backups_is_gone_with_the_next_start(
+    stage: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(service: Service) -> None:
+        raise WorkError("far-enough", what="This is all.", remedy="None.")
+
+    unpacked, part, going_on = (
+        stage / ".restore-abc/fresh",
+        stage / FOLDER / ".backup-1.part",
+        stage / FOLDER / ".2.part",
+    )
+    unpacked.mkdir(parents=True)
+    (stage / FOLDER).mkdir(parents=True)
+    for file in (unpacked / "stage.toml", part, going_on):
+        file.write_bytes(b"half of it")
+    os.utime(part, (1.0, 1.0))
+    monkeypatch.setattr(Service, "start", start)
+    with pytest.raises(WorkError, match="This is all"), serving(stage, threading.Event()):
+        pass
+    assert [file.exists() for file in (unpacked.parent, part, going_on)] == [False, False, True]
