@@ -46,7 +46,8 @@ _REVISIONS: Final = 1_000_000_000
 class StageKiosk:
     """Goes on while the service is made anew; ``service`` None while stage.toml is missing or wrong.
 
-    ``accounts`` and ``sessions_ended`` are the panel's, where there is one. ``reload`` is set when somebody changed the
+    ``accounts`` are those of panel and socket, once somebody needs them; ``sessions_ended`` is the panel's, where there
+    is one. ``reload`` is set when somebody changed the
     settings: whoever runs the service then starts it again.
     """
 

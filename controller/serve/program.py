@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.errors import UsageError, VelaturaError
+from controller.panel.accounts import Accounts
 from controller.panel.broker import BrokerOptions
 from controller.panel.kiosk import ComputeSettings, Schedule, ScheduleRow
 from controller.serve.account_ops import FOLDER, account_operations, stage_accounts
@@ -116,10 +117,10 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
     )  # fmt: skip
     options = replace(options, hosts=(*options.hosts, where.host, *where.names))
     options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    accounts = options.accounts()
+    accounts = _accounts(kiosk)
     password = accounts.first_start()
     app = make_panel(kiosk, accounts, options)
-    kiosk.accounts, kiosk.sessions_ended = accounts, app.state.panel.sessions.end_all
+    kiosk.sessions_ended = app.state.panel.sessions.end_all
     server = PanelServer(app, options)
     address = server.start()
     reporter.say(f"The panel is at {address}.")
@@ -166,5 +167,16 @@ def operations(kiosk: StageKiosk) -> dict[str, Operation]:
     return table | {
         "status": kiosk.snapshot, "set-schedule": set_schedule, "compute": compute, "restore": restore,
         "feasibility": feasibility, "camera-picture": camera_picture,
-        **account_operations(lambda: kiosk.accounts or stage_accounts(kiosk.stage), sessions_ended),
+        **account_operations(lambda: _accounts(kiosk), sessions_ended),
     }  # fmt: skip
+
+
+_opening_accounts: Final = threading.Lock()
+
+
+def _accounts(kiosk: StageKiosk) -> Accounts:
+    """The one that the panel and everybody at the socket change: another would write over what they have written."""
+    with _opening_accounts:
+        if kiosk.accounts is None:
+            kiosk.accounts = stage_accounts(kiosk.stage)
+        return kiosk.accounts

@@ -13,6 +13,7 @@ import pytest
 
 from controller.checking import check_stage
 from controller.errors import VelaturaError, WorkError
+from controller.panel.accounts import Accounts, Role
 from controller.panel.kiosk import ComputeSettings, Job, Schedule
 from controller.serve import archive, program
 from controller.serve import kiosk as kiosk_module
@@ -375,3 +376,19 @@ def test_hours_that_are_sent_while_the_service_is_made_anew_are_refused_and_not_
     program.serve(stage=tmp_path, panel=None, leave_lit=False, setup=False, reporter=Silent(), cancel=cancel)
     assert refused == ["not-set-up", "begins-anew"]
     assert not (tmp_path / "schedule.toml").exists()
+
+
+def test_of_two_at_the_socket_of_a_kiosk_without_panel_neither_loses_an_account(
+    kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (kiosk.stage / "kiosk/panel/accounts.json").unlink()
+    asked_for, add, other = operations(kiosk), Accounts.add, ["otto"]
+
+    def slowly(accounts: Accounts, name: str, role: Role, password: str) -> None:
+        if other:
+            asked_for["add-account"](other.pop(), "viewer", "a good long one")
+        add(accounts, name, role, password)
+
+    monkeypatch.setattr(Accounts, "add", slowly)
+    asked_for["add-account"]("vera", "viewer", "a good long one")
+    assert [one["name"] for one in asked_for["accounts"]()] == ["otto", "vera"]
