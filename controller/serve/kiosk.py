@@ -47,8 +47,7 @@ class StageKiosk:
     """Goes on while the service is made anew; ``service`` None while stage.toml is missing or wrong.
 
     ``accounts`` are those of panel and socket, once somebody needs them; ``sessions_ended`` is the panel's, where there
-    is one. ``reload`` is set when somebody changed the
-    settings: whoever runs the service then starts it again.
+    is one. ``reload`` is set when somebody changed the settings: whoever runs the service then starts it again.
     """
 
     def __init__(self, stage: Path) -> None:
