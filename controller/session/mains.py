@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -44,14 +45,21 @@ class Circuit:
         """
         if not self._switch.state(self.channel, deadline=deadline):
             return  # nobody behind it could answer
-        hot = [name for name in self.feeds if not guards[name].may_open_mains(deadline=deadline)]
+        self._refuse([name for name in self.feeds if not guards[name].may_open_mains(deadline=deadline)])
+        with contextlib.ExitStack() as held:
+            for name in self.feeds:
+                held.enter_context(guards[name].unstruck())
+            # By another thread, since it was looked at.
+            self._refuse([name for name in self.feeds if guards[name].may_be_lit])
+            self._switch.switch(self.channel, False, deadline=deadline)
+
+    def _refuse(self, hot: Sequence[str]) -> None:
         if hot:
             raise DeviceRefused(
                 "mains-lamp-hot",
                 what=f"Relay {self.name} stays closed: the lamp of {', '.join(hot)} is lit or has not cooled.",
                 remedy="Switch the projector off and wait until its fans stand still.",
             )
-        self._switch.switch(self.channel, False, deadline=deadline)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from controller.errors import VelaturaError
@@ -192,6 +193,12 @@ class LampGuard:
             # A lamp without a record may have been switched off a moment before this program started.
             off_since_s = self._born_s if self._record.since_s is None else self._record.since_s
             return not self._record.lit and self._now() - off_since_s >= self._rules.cool_down_s
+
+    @contextlib.contextmanager
+    def unstruck(self) -> Iterator[None]:
+        """While it lasts no other thread strikes the lamp, and ``may_be_lit`` stays what it is."""
+        with self._lock:
+            yield
 
     def use(self) -> LampUse:
         """Strikes and hours so far."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from dataclasses import dataclass, field
 
 import pytest
@@ -10,7 +12,7 @@ from controller.session.mains import Circuit, close_circuits, open_circuits
 from controller.session.power import power_down
 from controller.session.safety import LampGuard
 from hal.deadline import Deadline
-from hal.errors import DeviceGone, DeviceRefused
+from hal.errors import DeviceError, DeviceGone, DeviceRefused
 from hal.values import DeviceIdentity
 from tests.controller.session.lamp_model import RULES, Lamp, Shelf, World, soon
 
@@ -124,6 +126,55 @@ def test_no_caller_opens_a_circuit_with_a_hot_lamp(hall: Hall) -> None:
         hall.circuits[0].open(guards, deadline=soon())
     assert caught.value.code == "mains-lamp-hot"
     assert hall.board.closed[1]
+
+
+def test_no_lamp_is_struck_between_the_look_at_it_and_the_cut(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    hall.close()
+    hall.world.time_s += 100
+    both = Circuit("board 1", 1, ("left", "right"), 3.0, hall.board)
+    switch, lamp = hall.board.switch, hall.lamps["left"]
+    lit_at_the_cut: list[bool] = []
+
+    def strike() -> None:
+        with contextlib.suppress(DeviceError):
+            hall.guards[0].switch_on(deadline=soon())
+
+    striking = threading.Thread(target=strike)
+
+    def switch_while_somebody_strikes(channel: int, closed: bool, *, deadline: Deadline) -> None:
+        striking.start()
+        striking.join(0.3)
+        lit_at_the_cut.append(lamp.lit_at_s is not None)
+        switch(channel, closed, deadline=deadline)
+        lamp.trouble = "gone"
+
+    monkeypatch.setattr(hall.board, "switch", switch_while_somebody_strikes)
+    both.open({guard.name: guard for guard in hall.guards}, deadline=soon())
+    striking.join()
+    assert lit_at_the_cut == [False]
+    assert lamp.strikes == 0
+
+
+def test_a_lamp_that_is_struck_while_another_on_its_relay_is_looked_at_keeps_its_mains(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hall.close()
+    hall.world.time_s += 100
+    both = Circuit("board 1", 1, ("left", "right"), 3.0, hall.board)
+    look = hall.guards[1].may_open_mains
+
+    def look_while_the_other_is_struck(*, deadline: Deadline) -> bool:
+        striking = threading.Thread(target=hall.guards[0].switch_on, kwargs={"deadline": soon()})
+        striking.start()
+        striking.join()
+        return look(deadline=deadline)
+
+    monkeypatch.setattr(hall.guards[1], "may_open_mains", look_while_the_other_is_struck)
+    with pytest.raises(DeviceRefused) as caught:
+        both.open({guard.name: guard for guard in hall.guards}, deadline=soon())
+    assert caught.value.code == "mains-lamp-hot"
+    assert hall.board.closed[1]
+    assert hall.lamps["left"].lit_at_s is not None
 
 
 def test_after_a_power_cut_lamps_count_as_hot_before_their_mains_are_cut(hall: Hall) -> None:
