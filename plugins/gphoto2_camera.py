@@ -43,7 +43,11 @@ class Gphoto2Camera(WorkerLink[Opened]):
         self._port = port
         self._serial = serial
         self._troubles: list[tuple[str, str]] = []
-        self._capabilities = self._do(device.capabilities, deadline)
+        try:
+            self._capabilities = self._do(device.capabilities, deadline)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def capabilities(self) -> CameraCapabilities:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,14 @@ import pytest
 
 from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
-from hal.errors import PluginError
+from hal.errors import DeviceError, DeviceRefused, PluginError
 from hal.registry import OpenContext
-from hal.values import ExposureSettings
+from hal.values import CameraCapabilities, ExposureSettings
+from plugins import gphoto2_opened
 from plugins import gphoto2_settings as words
 from plugins.gphoto2_camera import DRIVER, Gphoto2Camera, open_camera
+from plugins.gphoto2_opened import Opened
+from tests.waiting import wait_for
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -56,6 +60,32 @@ def test_the_status_tells_battery_and_card(camera: Gphoto2Camera) -> None:
     assert status.battery_percent == 50
     assert (status.free_bytes or 0) > 1 << 28
     assert camera.troubles() == []
+
+
+def test_a_camera_that_could_not_be_opened_leaves_no_thread_behind() -> None:
+    before = threading.active_count()
+    for _ in range(3):
+        with pytest.raises(DeviceError):
+            open_camera({"serial": "of another camera"}, OpenContext(Path()), in_seconds(20))
+    wait_for(lambda: threading.active_count() <= before)
+
+
+def test_a_camera_that_fails_once_it_is_open_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[Opened] = []
+    let_go = Gphoto2Camera.let_go
+
+    def note(camera: Gphoto2Camera, opened: Opened) -> None:
+        closed.append(opened)
+        let_go(camera, opened)
+
+    def refuse(opened: Opened) -> CameraCapabilities:
+        raise DeviceRefused("camera-refused", what="It will not say.", remedy="Ask it again.")
+
+    monkeypatch.setattr(Gphoto2Camera, "let_go", note)
+    monkeypatch.setattr(gphoto2_opened, "capabilities", refuse)
+    with pytest.raises(DeviceRefused):
+        open_camera({}, OpenContext(Path()), in_seconds(20))
+    wait_for(lambda: len(closed) == 1)
 
 
 def test_without_the_wheel_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
