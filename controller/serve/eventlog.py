@@ -210,7 +210,8 @@ class EventLog:
 
 def _is_damage(error: sqlite3.Error) -> bool:
     """Whether the file is at fault, and not a disk without space, or a system without free handles."""
-    return error.sqlite_errorcode & 0xFF in _DAMAGE or error.sqlite_errorcode in _UNREADABLE
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
+    return code & 0xFF in _DAMAGE or code in _UNREADABLE
 
 
 _DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT, sqlite3.SQLITE_ERROR)
