@@ -1,4 +1,4 @@
-"""The kiosk's memory on a disk that takes nothing when the kiosk begins."""
+"""The kiosk's memory on a disk that takes nothing when the kiosk begins, and in a file that is damaged."""
 
 from __future__ import annotations
 
@@ -43,3 +43,21 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
     assert log.done() == {"drift-check 2026-01-01", "drift-check 2026-01-02"}
     log.close()
     assert not list(path.parent.glob("*.damaged-*"))
+
+
+@pytest.mark.parametrize("length", [50, 5000])
+def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length: int) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for _ in range(100):
+        log.tell(Decision("before", "One. " * 50))
+    log.close()
+    path.write_bytes(path.read_bytes()[:length])
+    log = EventLog(path, durable=False)
+    log.tell(Decision("after", "Two."))
+    assert log.problem is None
+    log.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)] == ["after"]
+    log.close()
+    assert len(list(path.parent.glob("*.damaged-*"))) == 1
