@@ -93,7 +93,8 @@ class Wire:
                 view = view[self._socket.send(view) :]
             except BlockingIOError:
                 still_time(deadline)
-                select.select([], [self._socket], [], min(SLICE_S, deadline.left_s()))
+                with contextlib.suppress(ValueError):  # closed meanwhile by another thread: sending tells
+                    select.select([], [self._socket], [], min(SLICE_S, deadline.left_s()))
             except OSError as error:
                 raise camera_lost(error.strerror or str(error)) from error
 
@@ -141,5 +142,8 @@ class Wire:
 
 def readable(wires: Iterable[Wire | None], seconds: float) -> bool:
     """Whether one of the wires has something to read, or ends, within ``seconds``."""
-    open_ones = [wire for wire in wires if wire is not None and wire.fileno() >= 0]
-    return bool(open_ones) and bool(select.select(open_ones, [], [], seconds)[0])
+    open_ones = [number for wire in wires if wire is not None and (number := wire.fileno()) >= 0]
+    try:
+        return bool(open_ones) and bool(select.select(open_ones, [], [], seconds)[0])
+    except OSError:
+        return True  # closed meanwhile by another thread: reading tells

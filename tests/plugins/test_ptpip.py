@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,7 +19,7 @@ from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, Pro
 from hal.transcript import Transcript, Way, parse_transcript
 from plugins.ptp_link import LinkEvent
 from plugins.ptpip import PtpIpLink
-from plugins.ptpip_wire import PtpIpAddress
+from plugins.ptpip_wire import PtpIpAddress, Wire, readable
 from tests.waiting import wait_for
 
 OK = 0x2001
@@ -275,3 +277,30 @@ def test_a_transcript_holds_everything_but_the_pictures(camera: Scripted, tmp_pa
     assert b"".join(entry.data for entry in entries if entry.way is Way.RECEIVED).endswith(response())
     assert not any(b"PICTURE" in entry.data for entry in entries)
     assert any(entry.data == b"700 bytes of data" for entry in entries)
+
+
+def _send(wire: Wire) -> None:
+    wire.send(bytes(30_000_000), in_seconds(30))
+
+
+def _receive(wire: Wire) -> None:
+    wire.fill(memoryview(bytearray(1)), in_seconds(30), lambda deadline: readable([wire], deadline.left_s()))
+
+
+@pytest.mark.parametrize("work", [_send, _receive])
+def test_a_connection_that_another_thread_closes_is_lost_at_whatever_moment(
+    work: Callable[[Wire], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, theirs = socket.socketpair()
+    ours.setblocking(False)
+    wire = Wire(ours)
+    wait = select.select
+
+    def close_and_wait(*arguments: Any) -> Any:
+        """Between what a thread knows of a socket and its wait for it, another may run."""
+        wire.close()
+        return wait(*arguments)
+
+    monkeypatch.setattr(select, "select", close_and_wait)
+    with theirs, pytest.raises(DeviceGone):
+        work(wire)
