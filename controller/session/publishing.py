@@ -28,7 +28,7 @@ from controller.session.live_parts import live_arrays
 from controller.session.progress import Level
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
-from controller.session.shots import Taken, forget_unless_lit, keep_if_lit, take_photograph
+from controller.session.shots import kept_if_lit, take_photograph
 from controller.session.solving import read_solved
 from controller.session.thumbnails import Thumbnails
 from controller.storage import sha256_of, write_atomically
@@ -252,15 +252,10 @@ def photograph_hdr(
     ``white`` is the radiance of the target's white; ``of`` names what is shown, for the journal.
     """
     exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
-    taken: list[Taken] = []
-    try:
+    with kept_if_lit(rig, context) as taken:
         for number, exposure_s in enumerate(exposures_s):
             one = take_photograph(rig, context, f"{name}-{number}", exposure_s, shown_at_s=shown_at_s, of=of)
             taken.append(one)
-    except BaseException:
-        forget_unless_lit(rig, taken)
-        raise
-    keep_if_lit(rig, context, taken)
     merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
     return np.asarray(np.nan_to_num(merged), np.float32)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,7 +29,7 @@ from controller.session.progress import Level
 from controller.session.rig import Rig
 from controller.session.runner import Context
 from controller.storage import write_atomically
-from hal.deadline import Cancelled, in_seconds
+from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
 
 DELAY_FILE, RAISED = "delay.json", "delay-raised.json"
@@ -78,19 +79,14 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, index: str)
     """
     folder = context.folder / "captures"
     use_delay(rig, context.folder)
-    taken: list[Taken] = []
     before: _Before | None = None
     watch = CameraWatch(rig.camera)
-    try:
+    with kept_if_lit(rig, context) as taken:
         for number, planned in enumerate(plan):
             context.advance(number / len(plan), planned.name)
             one, before = _take(rig, context, planned, folder, before)
             taken.append(one)
             watch.look(context)
-    except BaseException:
-        forget_unless_lit(rig, taken)
-        raise
-    keep_if_lit(rig, context, taken)
     path = context.folder / f"{index}.json"
     rows = [
         {"name": t.name, "path": str(t.path.relative_to(context.folder)), "exposure_s": t.exposure_s} for t in taken
@@ -99,40 +95,37 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, index: str)
     return [path, *(t.path for t in taken)]
 
 
-def keep_if_lit(rig: Rig, context: Context, taken: Sequence[Taken]) -> None:
-    """Look at the lamps after photographs were taken; if one is not well, forget them: some may lack its light.
+@contextlib.contextmanager
+def kept_if_lit(rig: Rig, context: Context) -> Iterator[list[Taken]]:
+    """For a row of photographs, added to the list as they are taken. If a lamp is not well at its end, they are
+    forgotten, because some may lack its light: also where the row did not end, which may have been stopped for that.
 
     Raises as ``Rig.check_light``. A run that goes on takes the forgotten ones again.
     """
+    taken: list[Taken] = []
+    try:
+        yield taken
+        _forget_if_dark(rig, taken, context.deadline)
+    except BaseException:
+        # In a time of its own, and in silence: what ended the row is what the caller has to tell.
+        with contextlib.suppress(DeviceError):
+            _forget_if_dark(rig, taken, in_seconds(sum(guard.answer_s for guard in rig.guards)))
+        raise
+
+
+def _forget_if_dark(rig: Rig, taken: list[Taken], deadline: Deadline) -> None:
     if not any(one.fresh for one in taken):
         return
     try:
-        rig.check_light(deadline=context.deadline)
+        rig.check_light(deadline=deadline)
     except Cancelled:
-        forget_unless_lit(rig, taken)
         raise
     except DeviceError:
-        _forget(taken)
+        for one in taken:
+            if one.fresh:
+                one.path.unlink(missing_ok=True)
+        taken.clear()  # looked at
         raise
-
-
-def forget_unless_lit(rig: Rig, taken: Sequence[Taken]) -> None:
-    """As ``keep_if_lit`` for photographs whose row did not end: a lamp that went out may be why it was stopped.
-
-    Has its own time, and raises nothing: what ended the row is what the caller has to tell.
-    """
-    if not any(one.fresh for one in taken):
-        return
-    try:
-        rig.check_light(deadline=in_seconds(sum(guard.answer_s for guard in rig.guards)))
-    except DeviceError:
-        _forget(taken)
-
-
-def _forget(taken: Sequence[Taken]) -> None:
-    for one in taken:
-        if one.fresh:
-            one.path.unlink(missing_ok=True)
 
 
 def use_delay(rig: Rig, folder: Path) -> None:

@@ -27,7 +27,7 @@ from controller.session.modes import DotOptions
 from controller.session.publishing import PHOTO_BRACKET
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
-from controller.session.shots import Developed, keep_if_lit, take_photograph
+from controller.session.shots import Developed, kept_if_lit, take_photograph
 from controller.session.solving import Calibrated, device_frames
 from controller.study.subject import Dots, Shares
 
@@ -53,14 +53,12 @@ class RigLight:
         shown = device_frames(self.calibrated.calibration, frames)
         presented = self.rig.display.show(self.rig.on_outputs(shown), deadline=self.context.deadline.within(20))
         exposures_s = bracket(1 / white, PHOTO_BRACKET, self.rig.acquirer.exposures_s(), self.longest_exposure_s)
-        taken = [
-            take_photograph(
-                self.rig, self.context, f"study-{self.name}-{name}-{number}", exposure_s,
-                shown_at_s=presented.at_s, of={"frames": _digest(shown)},
-            )
-            for number, exposure_s in enumerate(exposures_s)
-        ]  # fmt: skip
-        keep_if_lit(self.rig, self.context, taken)
+        of = {"frames": _digest(shown)}
+        with kept_if_lit(self.rig, self.context) as taken:
+            for number, exposure_s in enumerate(exposures_s):
+                file = f"study-{self.name}-{name}-{number}"
+                one = take_photograph(self.rig, self.context, file, exposure_s, shown_at_s=presented.at_s, of=of)
+                taken.append(one)
         self.used.extend(one.path for one in taken)
         merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
         # Too bright for the shortest exposure is at least its full scale; black would be the one wrong answer.
