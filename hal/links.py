@@ -148,7 +148,7 @@ class TcpLink(BufferedLink):
         for number, place in enumerate(places):
             try:
                 # Of several addresses none may use up the time of the others.
-                return _connected(place, deadline.within(deadline.left_s() / (len(places) - number)))
+                return connected(place, deadline.within(deadline.left_s() / (len(places) - number)))
             except OSError as error:
                 failure = error
         if isinstance(failure, TimeoutError):
@@ -195,8 +195,8 @@ class TcpLink(BufferedLink):
             self._socket.close()
 
 
-def _connected(place: tuple[Any, ...], deadline: Deadline) -> socket.socket:
-    """A connection to what ``getaddrinfo`` found. Raises OSError, TimeoutError at the deadline, Cancelled."""
+def connected(place: tuple[Any, ...], deadline: Deadline) -> socket.socket:
+    """A socket, not blocking, connected to what ``getaddrinfo`` found. Raises OSError (TimeoutError), Cancelled."""
     family, kind, protocol, _, address = place
     connection = socket.socket(family, kind, protocol)
     try:
@@ -207,7 +207,7 @@ def _connected(place: tuple[Any, ...], deadline: Deadline) -> socket.socket:
             while not select.select([], [connection], [], min(SLICE_S, deadline.left_s()))[1]:
                 deadline.sleep(0.0)  # a cancelled call ends soon
                 if deadline.passed:
-                    raise TimeoutError
+                    raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
             failure = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if failure:
             raise OSError(failure, os.strerror(failure))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import os
 import select
 import socket
 from collections.abc import Callable, Iterable
@@ -13,6 +11,7 @@ from typing import Final, Self
 
 from hal.deadline import Deadline
 from hal.errors import PluginError
+from hal.links import connected
 from plugins.ptp_link import camera_lost, camera_off
 
 DEFAULT_PORT: Final = 15740
@@ -65,26 +64,15 @@ class Wire:
     def connect(cls, host: str, port: int, *, deadline: Deadline) -> Self:
         """Open a connection. Raises DeviceGone("camera-off") where nobody listens, at the latest after 5 s."""
         still_time(deadline)
-        where = f"{host}:{port}"
         try:
-            family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            connection = connected(place, deadline.within(_CONNECT_S))
         except OSError as error:
-            raise camera_off(where, error.strerror or str(error)) from error
-        connection = socket.socket(family, kind, protocol)
-        wire = cls(connection)
-        try:
-            connection.setblocking(False)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            failure = connection.connect_ex(place)
-            if failure == errno.EINPROGRESS:
-                failure = wire._connected(deadline.within(_CONNECT_S), deadline)
-            if failure:
-                raise camera_off(where, os.strerror(failure))
-        except BaseException:
-            connection.close()
-            raise
-        return wire
+            if isinstance(error, TimeoutError):
+                still_time(deadline)  # the caller's time may be over, and not ours
+            raise camera_off(f"{host}:{port}", error.strerror or str(error)) from error
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        return cls(connection)
 
     def send(self, data: bytes, deadline: Deadline) -> None:
         view = memoryview(data)
@@ -130,14 +118,6 @@ class Wire:
 
     def fileno(self) -> int:
         return self._socket.fileno()
-
-    def _connected(self, until: Deadline, deadline: Deadline) -> int:
-        """The error number of a connection in progress, 0 once it stands."""
-        while not select.select([], [self._socket], [], min(SLICE_S, until.left_s()))[1]:
-            still_time(deadline)
-            if until.passed:
-                return errno.ETIMEDOUT
-        return self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
 
 
 def readable(wires: Iterable[Wire | None], seconds: float) -> bool:

@@ -28,7 +28,7 @@ from controller.session.live_parts import live_arrays
 from controller.session.progress import Level
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
-from controller.session.shots import kept_if_lit, take_photograph
+from controller.session.shots import Taken, kept_if_lit, take_photograph
 from controller.session.solving import read_solved
 from controller.session.thumbnails import Thumbnails
 from controller.storage import sha256_of, write_atomically
@@ -251,13 +251,21 @@ def photograph_hdr(
 
     ``white`` is the radiance of the target's white; ``of`` names what is shown, for the journal.
     """
+    _, merged = take_hdr(rig, context, name, white, longest_s, shown_at_s=shown_at_s, of=of)
+    return np.asarray(np.nan_to_num(merged), np.float32)
+
+
+def take_hdr(
+    rig: Rig, context: Context, name: str, white: float, longest_s: float, *, shown_at_s: float, of: Mapping[str, str]
+) -> tuple[list[Taken], FloatImage]:
+    """As ``photograph_hdr``: the photographs, and what they tell together, NaN where it is too bright for all."""
     exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
     with kept_if_lit(rig, context) as taken:
         for number, exposure_s in enumerate(exposures_s):
             one = take_photograph(rig, context, f"{name}-{number}", exposure_s, shown_at_s=shown_at_s, of=of)
             taken.append(one)
     merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
-    return np.asarray(np.nan_to_num(merged), np.float32)
+    return taken, merged
 
 
 def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:

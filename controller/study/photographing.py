@@ -15,19 +15,17 @@ from controller.arrays import ByteImage, Float64, FloatImage, load_arrays
 from controller.calibrate.dots import fit_dots
 from controller.calibrate.guess import guess_metapixels, modelled_correspondence, where_missing
 from controller.calibrate.values import PhaseMap
-from controller.capture.brackets import merge_brackets
 from controller.capture.dots import DotPattern, dot_patterns
 from controller.session.calibrating import read_correspondence, read_geometry, read_phase_map
-from controller.session.capturing import bracket
 from controller.session.dot_shots import (
     read_batches,
 )
 from controller.session.dotting import capture_step
 from controller.session.modes import DotOptions
-from controller.session.publishing import PHOTO_BRACKET
+from controller.session.publishing import take_hdr
 from controller.session.rig import Rig
 from controller.session.runner import Context, Step
-from controller.session.shots import Developed, kept_if_lit, take_photograph
+from controller.session.shots import Developed
 from controller.session.solving import Calibrated, device_frames
 from controller.study.subject import Dots, Shares
 
@@ -52,15 +50,11 @@ class RigLight:
     def photograph(self, name: str, frames: Sequence[FloatImage], *, white: float) -> FloatImage:
         shown = device_frames(self.calibrated.calibration, frames)
         presented = self.rig.display.show(self.rig.on_outputs(shown), deadline=self.context.deadline.within(20))
-        exposures_s = bracket(1 / white, PHOTO_BRACKET, self.rig.acquirer.exposures_s(), self.longest_exposure_s)
-        of = {"frames": _digest(shown)}
-        with kept_if_lit(self.rig, self.context) as taken:
-            for number, exposure_s in enumerate(exposures_s):
-                file = f"study-{self.name}-{name}-{number}"
-                one = take_photograph(self.rig, self.context, file, exposure_s, shown_at_s=presented.at_s, of=of)
-                taken.append(one)
+        taken, merged = take_hdr(
+            self.rig, self.context, f"study-{self.name}-{name}", white, self.longest_exposure_s,
+            shown_at_s=presented.at_s, of={"frames": _digest(shown)},
+        )  # fmt: skip
         self.used.extend(one.path for one in taken)
-        merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
         # Too bright for the shortest exposure is at least its full scale; black would be the one wrong answer.
         return np.asarray(np.nan_to_num(merged, nan=1 / min(one.exposure_s for one in taken)), np.float32)
 
