@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from hal.deadline import Deadline
-from hal.errors import DeviceBusy
+from hal.errors import DeviceBusy, DeviceTimeout
 from hal.hid_light import (
     PRODUCT,
     READING_LENGTH,
@@ -48,15 +48,18 @@ class ColorHugLightSensor:
 
     def illuminance_lux(self, *, deadline: Deadline) -> float:
         """See ``hal.interfaces.LightSensor``. Raises DeviceBusy("light-sensor-not-ready") at the deadline."""
-        while (reading := self._link.call(_read, deadline=deadline)).state not in USABLE:
+        refused: DeviceBusy | None = None
+        while True:
+            try:
+                reading = self._link.call(_read, deadline=deadline)
+            except DeviceTimeout as error:
+                raise refused or error from None
+            if reading.state in USABLE:
+                return reading.illuminance_lux
+            refused = _not_ready(reading)
             if deadline.left_s() <= _SETTLE_S:
-                raise DeviceBusy(
-                    "light-sensor-not-ready",
-                    what=f"The light sensor has no reading: {reading.state.name.lower().replace('_', ' ')}.",
-                    remedy="Wait a few seconds; if it stays so, unplug it and plug it in again.",
-                )
+                raise refused
             deadline.sleep(_SETTLE_S)
-        return reading.illuminance_lux
 
     def close(self) -> None:
         self._link.close()
@@ -68,6 +71,14 @@ def _read(sensor: OpenHid) -> LightReading:
     if now.power != wanted.power:  # also after it was plugged in again
         sensor.handle.send_feature_report(wanted.pack())
     return parse_reading(sensor.handle.get_input_report(REPORT, READING_LENGTH))
+
+
+def _not_ready(reading: LightReading) -> DeviceBusy:
+    return DeviceBusy(
+        "light-sensor-not-ready",
+        what=f"The light sensor has no reading: {reading.state.name.lower().replace('_', ' ')}.",
+        remedy="Wait a few seconds; if it stays so, unplug it and plug it in again.",
+    )
 
 
 def open_light_sensor(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> ColorHugLightSensor:

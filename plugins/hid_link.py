@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol
 
 from hal.errors import DeviceGone, DeviceRefused, PluginError
 from hal.ptp import printable
-from plugins.worker_link import WorkerLink
+from plugins.worker_link import NotOpened, WorkerLink
 
 BACKENDS: Final = {"hidraw": "hidraw", "libusb": "hid"}
 """hidapi's modules: ``hidraw`` leaves the kernel's driver in place, ``hid`` goes round it through libusb."""
@@ -98,7 +98,7 @@ class HidLink(WorkerLink[OpenHid]):
 
     def _matching(self) -> list[OpenHid]:
         opened: list[OpenHid] = []
-        refused: DeviceRefused | None = None
+        refused: NotOpened | None = None
         for found in self._listed():
             handle: HidHandle = self._module.device()
             try:
@@ -133,8 +133,8 @@ class HidLink(WorkerLink[OpenHid]):
         ]
         return [one for one in found if self._kind.suits(one)]
 
-    def _not_opened(self, error: Exception) -> DeviceRefused:
-        return DeviceRefused(
+    def _not_opened(self, error: Exception) -> NotOpened:
+        return NotOpened(
             "hid-not-opened",
             what=f"The {self._kind.name} is plugged in, but cannot be opened ({error}).",
             remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and install"

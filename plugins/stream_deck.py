@@ -17,7 +17,7 @@ from hal.errors import DeviceGone, DeviceRefused, PluginError, ProtocolError
 from hal.ptp import printable
 from hal.registry import Driver, OpenContext, setting
 from hal.values import DeviceIdentity, PanelCapabilities
-from plugins.worker_link import WorkerLink
+from plugins.worker_link import NotOpened, WorkerLink
 
 _SLICE_S: Final = 0.1
 _LOOK_S: Final = 5.0
@@ -113,25 +113,25 @@ class StreamDeckPanel(WorkerLink[Any]):
         return deck
 
     def _matching(self) -> list[tuple[Any, str]]:
-        matching = []
+        matching: list[tuple[Any, str]] = []
+        refused: NotOpened | None = None
         for deck in self._manager.enumerate():
             try:
                 deck.open()
                 serial = _text(deck.get_serial_number())
             except TransportError as error:
                 deck.close()
-                if not self._manager.enumerate():
-                    break  # it has just left
-                raise DeviceRefused(
-                    "hid-not-opened",
-                    what=f"The key panel is plugged in, but cannot be opened ({error}).",
-                    remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and"
-                    " install firmware_configs/udev/70-velatura-hid.rules.",
-                ) from error
+                if any(other.id() == deck.id() for other in self._manager.enumerate()):
+                    refused = _not_opened(error)
+                continue  # it has just left, or the one that is wanted may be another
             if deck.is_visual() and self._serial in ("", serial):
                 matching.append((deck, serial))
             else:
                 deck.close()
+        if refused is not None and not (matching and self._serial):
+            for deck, _ in matching:
+                deck.close()
+            raise refused
         return matching
 
     def let_go(self, opened: Any) -> None:
@@ -187,6 +187,15 @@ def _still_open(deck: Any) -> None:
     # The library's reading thread closes a deck that it can't read.
     if not deck.is_open():
         raise TransportError("unplugged")
+
+
+def _not_opened(error: Exception) -> NotOpened:
+    return NotOpened(
+        "hid-not-opened",
+        what=f"The key panel is plugged in, but cannot be opened ({error}).",
+        remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and"
+        " install firmware_configs/udev/70-velatura-hid.rules.",
+    )
 
 
 def _text(told: str) -> str:

@@ -6,6 +6,7 @@ anything is opened anew, so that at most one is ever left behind.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 from abc import ABC, abstractmethod
@@ -13,14 +14,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
-from hal.deadline import Cancelled, Deadline
-from hal.errors import DeviceError, DeviceGone, ProtocolError
+from hal.deadline import Deadline, in_seconds
+from hal.errors import DeviceError, DeviceGone, DeviceRefused, ProtocolError
 
 Opened = TypeVar("Opened")
 Result = TypeVar("Result")
 
 _SLICE_S: Final = 0.05
 _CLOSE_S: Final = 0.7
+_LISTED_S: Final = 2.0
+"""So long a device may be listed that cannot be opened: it has just left, or udev's rules are not yet applied to it."""
 
 
 @dataclass(slots=True)
@@ -63,6 +66,10 @@ class _Worker(Generic[Opened]):
         self.drop()
 
 
+class NotOpened(DeviceRefused):
+    """The device is listed, but cannot be opened."""
+
+
 class WorkerLink(ABC, Generic[Opened]):
     """The way to one device that is opened when needed, and again after it was lost. Callers take turns.
 
@@ -81,7 +88,10 @@ class WorkerLink(ABC, Generic[Opened]):
 
     @abstractmethod
     def find(self) -> Opened:
-        """Find and open the device; on the worker's thread. Raises DeviceError or ``broken``; nothing is open then."""
+        """Find and open the device; on the worker's thread. Raises DeviceError or ``broken``; nothing is open then.
+
+        After ``NotOpened`` it is called again for a while.
+        """
 
     @abstractmethod
     def let_go(self, opened: Opened) -> None:
@@ -99,7 +109,8 @@ class WorkerLink(ABC, Generic[Opened]):
             self._still_time(deadline)
             self._check_open()
             given_up = threading.Event()
-            return self._on_worker(lambda worker: self._try(worker, work, given_up), deadline, given_up)
+            listed = in_seconds(min(_LISTED_S, deadline.left_s() / 2), given_up)
+            return self._on_worker(lambda worker: self._try(worker, work, listed), deadline, given_up)
         finally:
             self._turn.release()
 
@@ -112,22 +123,41 @@ class WorkerLink(ABC, Generic[Opened]):
             worker.end()
             worker.thread.join(_CLOSE_S)
 
-    def _try(self, worker: _Worker[Opened], work: Callable[[Opened], Result], given_up: threading.Event) -> Result:
+    def _try(self, worker: _Worker[Opened], work: Callable[[Opened], Result], listed: Deadline) -> Result:
         for again in (False, True):
             try:
                 if worker.open is None:
-                    worker.open = self.find()
-                if given_up.is_set():  # nobody wants it done any more: a relay must not move minutes later
-                    raise Cancelled
+                    worker.open = self._found(listed)
+                listed.sleep(0.0)  # nobody wants it done any more: a relay must not move minutes later
                 return work(worker.open)
             except self._broken as error:
                 worker.drop()
                 if again:
+                    self._check_there(worker, listed)
                     raise self._failed(error) from error
             except ProtocolError:
                 worker.drop()
                 raise
         raise AssertionError
+
+    def _found(self, listed: Deadline) -> Opened:
+        """``find``, but what cannot be opened is given until ``listed`` to leave the list or to be opened."""
+        while True:
+            try:
+                return self.find()
+            except NotOpened:
+                if listed.passed:
+                    raise
+                listed.sleep(_SLICE_S)
+
+    def _check_there(self, worker: _Worker[Opened], listed: Deadline) -> None:
+        """Raises DeviceGone where the device was pulled while it was used for the second time."""
+        with contextlib.suppress(*self._broken):
+            try:
+                worker.open = self._found(listed)
+            except DeviceError as error:
+                if isinstance(error, DeviceGone):
+                    raise
 
     def _on_worker(
         self, work: Callable[[_Worker[Opened]], Result], deadline: Deadline, given_up: threading.Event

@@ -25,6 +25,7 @@ from __future__ import annotations
 import errno
 import os
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -110,6 +111,7 @@ class UsbBus:
             place.plugged.device.unplugged()
         for file in place.raw_files:
             file.gone = True
+        time.sleep(place.plugged.device.faults.lingers_s)
         self._sys.remove(place.port)
         place.node.remove()
         if place.raw is not None:
@@ -188,7 +190,7 @@ class UsbBus:
 
         def opened() -> OpenFile:
             # While a program has taken the interface from the kernel, there is no hidraw device.
-            if not place.plugged.driver_bound:
+            if not place.plugged.driver_bound or place.plugged.gone:
                 return _NoDevice()
             files.append(HidrawFile(device, node.set_readable))
             return files[-1]

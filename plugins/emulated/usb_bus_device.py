@@ -60,7 +60,8 @@ class UsbFaults:
 
     ``silent``: nothing completes; ``slow_s`` before every transfer completes; ``stalls``, ``drop``, ``cut``,
     ``garble``: that many next control requests are stalled, never complete, or are answered with half of their bytes,
-    or with noise; ``stuck``: the kernel's HID driver hangs, and a program's call in it with it.
+    or with noise; ``stuck``: the kernel's HID driver hangs, and a program's call in it with it;
+    ``lingers_s``: so long it is still listed after its cable was pulled, as on a machine that is busy.
     """
 
     silent: bool = False
@@ -70,6 +71,7 @@ class UsbFaults:
     cut: int = 0
     garble: int = 0
     stuck: bool = False
+    lingers_s: float = 0.0
 
     def take(self, name: str) -> bool:
         """Use up one of a count; False when none is left."""

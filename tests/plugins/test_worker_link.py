@@ -8,7 +8,7 @@ import pytest
 
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceTimeout, ProtocolError
-from plugins.worker_link import WorkerLink
+from plugins.worker_link import NotOpened, WorkerLink
 
 
 class Broken(Exception):
@@ -16,15 +16,22 @@ class Broken(Exception):
 
 
 class Board(WorkerLink[int]):
-    """Opens numbers; ``fails``: so many openings break."""
+    """Opens numbers; ``fails``: so many openings break; ``refuses``: so many are refused."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, refuses: int = 0) -> None:
         super().__init__("board", broken=(Broken,))
         self.opened = 0
         self.let_gone = 0
         self.fails = 0
+        self.refuses = refuses
+        self.gone = False
 
     def find(self) -> int:
+        if self.gone:
+            raise DeviceGone("hid-unplugged", what="It was pulled.", remedy="Plug it in.")
+        if self.refuses:
+            self.refuses -= 1
+            raise NotOpened("hid-not-opened", what="It is not to be opened.", remedy="Unplug it.")
         if self.fails:
             self.fails -= 1
             raise Broken
@@ -82,6 +89,44 @@ def test_a_device_that_breaks_at_each_opening_is_told_in_our_words() -> None:
     with pytest.raises(ProtocolError) as caught:
         board.call(lambda opened: opened, deadline=in_seconds(30))
     assert caught.value.code == "hid-transfer"
+    board.close()
+
+
+def test_a_device_that_is_pulled_while_it_is_used_for_the_second_time_is_gone() -> None:
+    board = Board()
+
+    def pulled(opened: int) -> None:
+        board.gone = board.opened == 2
+        raise Broken
+
+    with pytest.raises(DeviceGone):
+        board.call(pulled, deadline=in_seconds(30))
+    board.gone = False
+    assert board.call(lambda opened: opened, deadline=in_seconds(30)) == 3
+    board.close()
+
+
+def test_a_device_that_breaks_at_each_use_is_told_in_our_words() -> None:
+    board = Board()
+
+    def broken(opened: int) -> None:
+        raise Broken
+
+    with pytest.raises(ProtocolError) as caught:
+        board.call(broken, deadline=in_seconds(30))
+    assert caught.value.code == "hid-transfer"
+    board.close()
+    assert board.let_gone == board.opened
+
+
+def test_a_device_that_cannot_be_opened_yet_is_tried_for_a_while() -> None:
+    board = Board()
+    board.refuses = 3
+    assert board.call(lambda opened: opened, deadline=in_seconds(30)) == 1
+    board.refuses = 1_000_000
+    board.call(lambda opened: None, deadline=in_seconds(30))
+    with pytest.raises(NotOpened):
+        Board(refuses=1_000_000).call(lambda opened: None, deadline=in_seconds(2))
     board.close()
 
 

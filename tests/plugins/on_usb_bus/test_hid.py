@@ -120,11 +120,42 @@ def test_a_sensor_that_is_not_ready_is_busy_until_the_deadline(bus: UsbBusProces
     sensor = ColorHugLightSensor(deadline=in_seconds(20))
     bus.set("light", "state", 5)
     with pytest.raises(DeviceBusy) as caught:
-        sensor.illuminance_lux(deadline=in_seconds(2))
+        sensor.illuminance_lux(deadline=in_seconds(3))
     assert caught.value.code == "light-sensor-not-ready"
     threading.Timer(0.2, bus.set, ["light", "state", 2]).start()
     assert sensor.illuminance_lux(deadline=in_seconds(20)) == pytest.approx(1.0)
     sensor.close()
+
+
+def test_a_sensor_that_is_slow_and_not_ready_is_busy_though_its_last_answer_did_not_come_in_time(
+    bus: UsbBusProcess,
+) -> None:
+    bus.add("light", "light", lux=1.0)
+    sensor = ColorHugLightSensor(deadline=in_seconds(20))
+    bus.set("light", "state", 5)
+    bus.set("light", "faults.slow_s", 1.0)  # so that a reading takes 2 s
+    with pytest.raises(DeviceBusy):
+        sensor.illuminance_lux(deadline=in_seconds(3.6))
+    sensor.close()
+
+
+def asked_until_it_fails(board: RelayBoard) -> None:
+    while True:
+        board.state(1, deadline=in_seconds(20))
+
+
+@BOTH
+def test_a_board_that_was_pulled_and_is_still_listed_is_gone(
+    bus: UsbBusProcess, open_relay: OpenRelay, backend: str
+) -> None:
+    bus.add("relay", "relay", channels=2)
+    board = open_relay(backend=backend)
+    bus.set("relay", "faults.lingers_s", 0.7)
+    pull = threading.Thread(target=bus.unplug, args=["relay"])
+    pull.start()
+    with pytest.raises(DeviceGone):
+        asked_until_it_fails(board)
+    pull.join()
 
 
 @BOTH

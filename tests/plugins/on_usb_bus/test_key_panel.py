@@ -6,6 +6,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -37,9 +38,9 @@ class TestStreamDeck(ButtonPanelConformance):
         return panel
 
 
-def on_key(bus: UsbBusProcess, key: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+def on_key(bus: UsbBusProcess, key: int, name: str = "keys") -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     """What is seen on a key, RGB: the panel turns what it gets by half a turn."""
-    file = np.frombuffer(bytes.fromhex(bus.call("keys", "picture_of", key)), np.uint8)
+    file = np.frombuffer(bytes.fromhex(bus.call(name, "picture_of", key)), np.uint8)
     decoded = cv2.imdecode(file, cv2.IMREAD_COLOR)
     assert decoded is not None
     return np.asarray(decoded[::-1, ::-1, ::-1], np.uint8)
@@ -102,6 +103,27 @@ def test_an_unplugged_panel_is_gone_and_gets_its_pictures_back(bus: UsbBusProces
     assert on_key(bus, 1).mean() == pytest.approx(200, abs=3)
     bus.call("keys", "press", 5)
     assert panel.wait_pressed(deadline=in_seconds(20)) == 5
+
+
+def test_a_panel_that_was_pulled_and_is_still_listed_is_gone(bus: UsbBusProcess, panel: StreamDeckPanel) -> None:
+    bus.set("keys", "faults.lingers_s", 0.7)
+    pull = threading.Thread(target=bus.unplug, args=["keys"])
+    pull.start()
+    with pytest.raises(DeviceGone):
+        panel.wait_pressed(deadline=in_seconds(20))
+    pull.join()
+
+
+def test_a_panel_that_works_is_used_beside_one_that_cannot_be_opened(bus: UsbBusProcess) -> None:
+    bus.add("mine", "keys", serial="KEYS-1")
+    with closing(StreamDeckPanel(deadline=in_seconds(20))):
+        bus.add("other", "keys", serial="KEYS-2")
+        with closing(StreamDeckPanel(serial="KEYS-2", deadline=in_seconds(20))) as other:
+            other.show(0, np.full((72, 72, 3), 100, np.uint8), deadline=in_seconds(20))
+            assert on_key(bus, 0, "other").mean() == pytest.approx(100, abs=3)
+            with pytest.raises(DeviceRefused) as caught:
+                StreamDeckPanel(deadline=in_seconds(20))
+            assert caught.value.code == "hid-not-opened"
 
 
 def test_a_panel_that_leaves_again_while_it_gets_its_pictures_back_is_gone_until_it_stays(
