@@ -62,7 +62,8 @@ def test_it_is_found_by_its_entry_point_and_opens(site: Path) -> None:
 
 
 def test_it_passes_the_conformance_suite_by_its_own_tests(site: Path) -> None:
-    said = run(site, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--import-mode=importlib", "tests")
+    base = f"--basetemp={site.parent / 'pytest'}"
+    said = run(site, "-m", "pytest", "-q", "-p", "no:cacheprovider", base, "--import-mode=importlib", "tests")
     assert "6 passed" in said, said
 
 

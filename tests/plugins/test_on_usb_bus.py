@@ -29,16 +29,22 @@ Outcome = subprocess.CompletedProcess[str]
 
 def _run(name: str) -> Outcome:
     # A unix socket's path is short, and pytest's own folders are not.
-    with tempfile.TemporaryDirectory(prefix="usb", dir="/tmp") as bus:
+    with (
+        tempfile.TemporaryDirectory(prefix="usb", dir="/tmp") as bus,
+        tempfile.TemporaryDirectory(prefix="velatura-") as base,  # pytests that share one clear it up at the same time
+    ):
         return subprocess.run(
-            [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", str(FOLDER / name)],
+            [
+                sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist",
+                f"--basetemp={base}/pytest", str(FOLDER / name),
+            ],
             env={**os.environ, **environment(Path(bus))},
             cwd=ROOT,
             capture_output=True,
             text=True,
             timeout=600,
             check=False,
-        )
+        )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

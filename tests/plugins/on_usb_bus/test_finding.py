@@ -41,7 +41,9 @@ def test_two_boards_with_the_same_numbers_are_told_apart(bus: UsbBusProcess, tmp
 def test_a_camera_is_found_by_its_serial_number_and_nothing_is_sent_to_it(bus: UsbBusProcess, tmp_path: Path) -> None:
     bus.add("camera", "camera")
     (found,) = looked("usb", tmp_path)
-    assert (found.kind, found.driver, found.problems) == ("camera", "ptp", ())
+    assert (found.kind, found.driver) == ("camera", "ptp")
+    # This machine's desktop may run a program that takes cameras.
+    assert {problem.code for problem in found.problems} <= {"camera-may-be-taken"}
     assert found.settings["address"].startswith("usb:")
     assert bus.get("camera", "exposures") == 0
 
