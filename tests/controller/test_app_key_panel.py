@@ -59,19 +59,19 @@ def test_a_pressed_key_reaches_its_command_and_the_panel_is_closed_afterwards(tm
     models, panel, stopped = Models(tmp_path), Panel(), threading.Event()
     (tmp_path / "stage.toml").write_text(STAGE + TABLE)
     checked = check_stage(tmp_path, drivers=drivers(models, panel))
-    with technicians_panel(checked, deadline=in_seconds(5)) as found:
+    with technicians_panel(checked, deadline=in_seconds(60)) as found:
         assert found is panel
         keys = technicians_keys(lambda: None, stopped.set, lambda: None)
         service = KeyService(found, keys, state=lambda: State.PLAYING)
         service.start()
-        assert stopped.wait(5)
+        assert stopped.wait(60)
         service.stop()
     assert not panel.open
 
 
 def test_a_stage_without_keys_has_no_panel(tmp_path: Path) -> None:
     models = Models(tmp_path)
-    with technicians_panel(check_stage(tmp_path, drivers=models.drivers), deadline=in_seconds(5)) as found:
+    with technicians_panel(check_stage(tmp_path, drivers=models.drivers), deadline=in_seconds(60)) as found:
         assert found is None
 
 

@@ -89,7 +89,7 @@ def test_a_port_that_is_taken_is_named_and_a_closed_listener_is_gone(listener: P
         PjLinkListener("127.0.0.1", listener.port)
     listener.close()
     with pytest.raises(DeviceGone):
-        listener.heard(deadline=in_seconds(1))
+        listener.heard(deadline=in_seconds(20))
 
 
 def test_a_projector_that_tells_of_itself_before_it_answers_is_understood(open_pjlink: Any) -> None:

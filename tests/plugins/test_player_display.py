@@ -178,7 +178,7 @@ def test_a_player_that_talks_nonsense_is_an_error_of_ours(
     tmp_path: Path, answer: bytes, error: type[Exception]
 ) -> None:
     with talking(tmp_path / "player.sock", answer), pytest.raises(error):
-        DRIVER.open({}, OpenContext(tmp_path, runtime=tmp_path), in_seconds(3))
+        DRIVER.open({}, OpenContext(tmp_path, runtime=tmp_path), in_seconds(30))
 
 
 class talking:  # noqa: N801

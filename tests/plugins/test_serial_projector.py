@@ -217,7 +217,7 @@ def test_closing_ends_a_call_in_another_thread(open_serial: Any) -> None:
     thread.start()
     time.sleep(0.1)
     pair.driver.close()
-    thread.join(timeout=2)
+    thread.join(timeout=10)
     assert not thread.is_alive()
     assert ended[0].code == "projector-closed"
 

@@ -59,7 +59,7 @@ def test_a_player_that_was_stopped_for_a_while_goes_on_with_whole_pictures(
             time.sleep(0.15)
             before = shown.sequence
             os.kill(player.pid, signal.SIGCONT)
-            ends = time.monotonic() + 5
+            ends = time.monotonic() + 60
             while shown.sequence < before + 8 and time.monotonic() < ends:
                 now = shown.read()
                 assert sum(same(now, one) for one in expected) == 1
@@ -79,7 +79,7 @@ def test_a_player_ends_with_its_x_server_and_starts_on_the_next(tmp_path: Path) 
     settings = PlayerSettings([("P1", WIDTH, HEIGHT)], None, where={"P1": "DUMMY0"})
     with running_server(tmp_path):
         player = start_player(tmp_path, settings)
-    ends = time.monotonic() + 10
+    ends = time.monotonic() + 60
     while player.alive and time.monotonic() < ends:
         time.sleep(0.02)
     assert not player.alive

@@ -14,7 +14,7 @@ def test_every_stopping_signal_sets_the_event_and_the_handlers_come_back() -> No
         with cancelled_by_signals() as cancel:
             assert not cancel.is_set()
             os.kill(os.getpid(), number)
-            assert cancel.wait(5)
+            assert cancel.wait(60)
             os.kill(os.getpid(), number)
             time.sleep(0.01)
         assert {each: signal.getsignal(each) for each in STOPPING} == before
@@ -35,7 +35,7 @@ def test_a_signal_that_was_ignored_stays_ignored() -> None:
 def test_signals_never_meet_a_thread_that_holds_the_events_lock() -> None:
     with cancelled_by_signals() as cancel:
         threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
-        end_s = time.monotonic() + 5
+        end_s = time.monotonic() + 60
         while not cancel.wait(0.00001):  # most of the time inside the event's own code
             assert time.monotonic() < end_s
 
