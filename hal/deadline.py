@@ -5,8 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
+from typing import Final
 
 from hal.errors import DeviceError, DeviceTimeout
+
+SLICE_S: Final = 0.05
+"""Longest single wait, so that a cancelled call ends soon."""
 
 
 class Cancelled(DeviceError):

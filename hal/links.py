@@ -7,19 +7,16 @@ port, ``hal.transcript`` the one that replays a recording.
 from __future__ import annotations
 
 import contextlib
-import errno
-import os
 import select
 import socket
 from abc import ABC, abstractmethod
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
-from hal.deadline import Deadline
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
+from hal.tcp import connected
 from hal.transcript import Transcript
 
-SLICE_S: Final = 0.05
-"""Longest single wait, so that a cancelled call ends soon."""
 _BLOCK: Final = 4096
 _LARGEST_DRAIN: Final = 1 << 20
 
@@ -140,24 +137,16 @@ class TcpLink(BufferedLink):
 
     def _connect(self, host: str, port: int, deadline: Deadline) -> socket.socket:
         self._check(deadline, "was not reached")
-        failure = OSError()
         try:
-            places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        except OSError as error:
-            raise self._lost(error) from error
-        for number, place in enumerate(places):
-            try:
-                # Of several addresses none may use up the time of the others.
-                return connected(place, deadline.within(deadline.left_s() / (len(places) - number)))
-            except OSError as error:
-                failure = error
-        if isinstance(failure, TimeoutError):
+            return connected(host, port, deadline)
+        except TimeoutError as error:
             raise DeviceTimeout(
                 "link-no-connection",
                 what=f"{self.name} did not accept a connection in time.",
                 remedy="Check the network cable and that the device's network is on in standby.",
-            ) from failure
-        raise self._lost(failure) from failure
+            ) from error
+        except OSError as error:
+            raise self._lost(error) from error
 
     def _receive(self, wait_s: float) -> bytes:
         try:
@@ -193,28 +182,6 @@ class TcpLink(BufferedLink):
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._socket.close()
-
-
-def connected(place: tuple[Any, ...], deadline: Deadline) -> socket.socket:
-    """A socket, not blocking, connected to what ``getaddrinfo`` found. Raises OSError (TimeoutError), Cancelled."""
-    family, kind, protocol, _, address = place
-    connection = socket.socket(family, kind, protocol)
-    try:
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        failure = connection.connect_ex(address)
-        if failure == errno.EINPROGRESS:
-            while not select.select([], [connection], [], min(SLICE_S, deadline.left_s()))[1]:
-                deadline.sleep(0.0)  # a cancelled call ends soon
-                if deadline.passed:
-                    raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
-            failure = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        if failure:
-            raise OSError(failure, os.strerror(failure))
-    except BaseException:
-        connection.close()
-        raise
-    return connection
 
 
 def host_and_port(address: str, default_port: int) -> tuple[str, int]:

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final
 
-from hal.deadline import Deadline
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
-from hal.links import SLICE_S
 from hal.pjlink import PORT
 from hal.pjlink_udp import LONGEST_DATAGRAM, SEARCH, Here, Told, parse_datagram
 

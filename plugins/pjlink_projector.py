@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from hal import pjlink
-from hal.deadline import Deadline
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
-from hal.links import SLICE_S, ByteLink, TcpLink, host_and_port
+from hal.links import ByteLink, TcpLink, host_and_port
 from hal.pjlink import Failure
 from hal.profiles import ProjectorProfile
 from hal.registry import Driver, OpenContext, setting

@@ -13,12 +13,12 @@ from collections import deque
 from typing import Final, Self
 
 from hal import ptp_ip
-from hal.deadline import Deadline
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused
 from hal.ptp import broken
 from hal.transcript import Transcript
 from plugins.ptp_link import MOST_IN_MEMORY, LinkEvent, Reply, Sink, camera_lost
-from plugins.ptpip_wire import SLICE_S, PtpIpAddress, Wire, readable, still_time
+from plugins.ptpip_wire import PtpIpAddress, Wire, readable, still_time
 
 _BLOCK: Final = 1 << 20
 _MOST_EVENTS: Final = 10_000

@@ -9,14 +9,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, Self
 
-from hal.deadline import Deadline
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import PluginError
-from hal.links import connected
+from hal.tcp import connected
 from plugins.ptp_link import camera_lost, camera_off
 
 DEFAULT_PORT: Final = 15740
-SLICE_S: Final = 0.05
-"""Longest wait between two looks at the deadline's cancellation."""
 _CONNECT_S: Final = 5.0
 
 
@@ -65,8 +63,7 @@ class Wire:
         """Open a connection. Raises DeviceGone("camera-off") where nobody listens, at the latest after 5 s."""
         still_time(deadline)
         try:
-            place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-            connection = connected(place, deadline.within(_CONNECT_S))
+            connection = connected(host, port, deadline.within(_CONNECT_S))
         except OSError as error:
             if isinstance(error, TimeoutError):
                 still_time(deadline)  # the caller's time may be over, and not ours

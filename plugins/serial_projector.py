@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from hal.deadline import Deadline
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, ProtocolError
-from hal.links import SLICE_S, ByteLink
+from hal.links import ByteLink
 from hal.power_view import PowerView
 from hal.profiles import ProjectorProfile
 from hal.registry import Driver, OpenContext, setting
