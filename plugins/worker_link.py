@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
-from hal.deadline import Deadline, in_seconds
+from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, ProtocolError
 
 Opened = TypeVar("Opened")
@@ -109,8 +109,8 @@ class WorkerLink(ABC, Generic[Opened]):
             self._still_time(deadline)
             self._check_open()
             given_up = threading.Event()
-            listed = in_seconds(min(_LISTED_S, deadline.left_s() / 2), given_up)
-            return self._on_worker(lambda worker: self._try(worker, work, listed), deadline, given_up)
+            theirs = Deadline(deadline.at_s, given_up)
+            return self._on_worker(lambda worker: self._try(worker, work, theirs), deadline, given_up)
         finally:
             self._turn.release()
 
@@ -123,25 +123,26 @@ class WorkerLink(ABC, Generic[Opened]):
             worker.end()
             worker.thread.join(_CLOSE_S)
 
-    def _try(self, worker: _Worker[Opened], work: Callable[[Opened], Result], listed: Deadline) -> Result:
+    def _try(self, worker: _Worker[Opened], work: Callable[[Opened], Result], deadline: Deadline) -> Result:
         for again in (False, True):
             try:
                 if worker.open is None:
-                    worker.open = self._found(listed)
-                listed.sleep(0.0)  # nobody wants it done any more: a relay must not move minutes later
+                    worker.open = self._found(deadline)
+                deadline.sleep(0.0)  # nobody wants it done any more: a relay must not move minutes later
                 return work(worker.open)
             except self._broken as error:
                 worker.drop()
                 if again:
-                    self._check_there(worker, listed)
+                    self._check_there(worker, deadline)
                     raise self._failed(error) from error
             except ProtocolError:
                 worker.drop()
                 raise
         raise AssertionError
 
-    def _found(self, listed: Deadline) -> Opened:
-        """``find``, but what cannot be opened is given until ``listed`` to leave the list or to be opened."""
+    def _found(self, deadline: Deadline) -> Opened:
+        """``find``, but what cannot be opened is given half of the time, at most 2 s, to leave the list or to open."""
+        listed = deadline.within(min(_LISTED_S, deadline.left_s() / 2))
         while True:
             try:
                 return self.find()
@@ -150,11 +151,11 @@ class WorkerLink(ABC, Generic[Opened]):
                     raise
                 listed.sleep(_SLICE_S)
 
-    def _check_there(self, worker: _Worker[Opened], listed: Deadline) -> None:
+    def _check_there(self, worker: _Worker[Opened], deadline: Deadline) -> None:
         """Raises DeviceGone where the device was pulled while it was used for the second time."""
         with contextlib.suppress(*self._broken):
             try:
-                worker.open = self._found(listed)
+                worker.open = self._found(deadline)
             except DeviceError as error:
                 if isinstance(error, DeviceGone):
                     raise
