@@ -260,10 +260,10 @@ def take_hdr(
 ) -> tuple[list[Taken], FloatImage]:
     """As ``photograph_hdr``: the photographs, and what they tell together, NaN where it is too bright for all."""
     exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
-    with kept_if_lit(rig, context) as taken:
+    with kept_if_lit(rig, context) as row:
         for number, exposure_s in enumerate(exposures_s):
-            one = take_photograph(rig, context, f"{name}-{number}", exposure_s, shown_at_s=shown_at_s, of=of)
-            taken.append(one)
+            row.add(take_photograph(rig, context, f"{name}-{number}", exposure_s, shown_at_s=shown_at_s, of=of))
+    taken = row.taken
     merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
     return taken, merged
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,6 +36,8 @@ from hal.errors import DeviceError
 DELAY_FILE, RAISED = "delay.json", "delay-raised.json"
 """What the step ``delay`` measured, and what proved necessary later: that is no artefact of the step."""
 MORE_DELAY_S = 0.1
+LOOK_EVERY_S = 30.0
+"""After so long the lamps are looked at between two photographs: so much work a lamp that dies costs, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,50 +84,70 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, index: str)
     use_delay(rig, context.folder)
     before: _Before | None = None
     watch = CameraWatch(rig.camera)
-    with kept_if_lit(rig, context) as taken:
+    with kept_if_lit(rig, context) as row:
         for number, planned in enumerate(plan):
             context.advance(number / len(plan), planned.name)
             one, before = _take(rig, context, planned, folder, before)
-            taken.append(one)
+            row.add(one)
             watch.look(context)
     path = context.folder / f"{index}.json"
-    rows = [
-        {"name": t.name, "path": str(t.path.relative_to(context.folder)), "exposure_s": t.exposure_s} for t in taken
+    listed = [
+        {"name": one.name, "path": str(one.path.relative_to(context.folder)), "exposure_s": one.exposure_s}
+        for one in row.taken
     ]
-    write_atomically(path, json.dumps(rows, indent=1).encode())
-    return [path, *(t.path for t in taken)]
+    write_atomically(path, json.dumps(listed, indent=1).encode())
+    return [path, *(one.path for one in row.taken)]
+
+
+@dataclass(slots=True)
+class Row:
+    """Photographs that are taken one after the other, and how many of them have all lamps' light for certain."""
+
+    rig: Rig
+    context: Context
+    taken: list[Taken] = field(default_factory=list)
+    _sure: int = 0
+    _looked_at_s: float = field(default_factory=time.monotonic)
+
+    def add(self, one: Taken) -> None:
+        """Raises as ``Rig.check_light``: now and then the lamps are looked at, so that none is missed for long."""
+        self.taken.append(one)
+        if time.monotonic() - self._looked_at_s >= LOOK_EVERY_S:
+            self.look(self.context.deadline)
+
+    def look(self, deadline: Deadline) -> None:
+        """Look at the lamps; if one is not well, forget the photographs since the last look. Raises as it does."""
+        if not any(one.fresh for one in self.taken[self._sure :]):
+            return
+        try:
+            self.rig.check_light(deadline=deadline)
+        except Cancelled:
+            raise
+        except DeviceError:
+            for one in self.taken[self._sure :]:
+                if one.fresh:
+                    one.path.unlink(missing_ok=True)
+            del self.taken[self._sure :]
+            raise
+        self._sure, self._looked_at_s = len(self.taken), time.monotonic()
 
 
 @contextlib.contextmanager
-def kept_if_lit(rig: Rig, context: Context) -> Iterator[list[Taken]]:
-    """For a row of photographs, added to the list as they are taken. If a lamp is not well at its end, they are
-    forgotten, because some may lack its light: also where the row did not end, which may have been stopped for that.
+def kept_if_lit(rig: Rig, context: Context) -> Iterator[Row]:
+    """For a row of photographs, added to it as they are taken. If a lamp is not well at its end, those since it was
+    last looked at are forgotten, because some may lack its light: also where the row did not end, which may have been
+    stopped for that.
 
     Raises as ``Rig.check_light``. A run that goes on takes the forgotten ones again.
     """
-    taken: list[Taken] = []
+    row = Row(rig, context)
     try:
-        yield taken
-        _forget_if_dark(rig, taken, context.deadline)
+        yield row
+        row.look(context.deadline)
     except BaseException:
         # In a time of its own, and in silence: what ended the row is what the caller has to tell.
         with contextlib.suppress(DeviceError):
-            _forget_if_dark(rig, taken, in_seconds(sum(guard.answer_s for guard in rig.guards)))
-        raise
-
-
-def _forget_if_dark(rig: Rig, taken: list[Taken], deadline: Deadline) -> None:
-    if not any(one.fresh for one in taken):
-        return
-    try:
-        rig.check_light(deadline=deadline)
-    except Cancelled:
-        raise
-    except DeviceError:
-        for one in taken:
-            if one.fresh:
-                one.path.unlink(missing_ok=True)
-        taken.clear()  # looked at
+            row.look(in_seconds(sum(guard.answer_s for guard in rig.guards)))
         raise
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from controller.arrays import ByteImage
+from controller.session import shots
 from controller.session.journal import Journal
 from controller.session.progress import Silent
 from controller.session.runner import Context
@@ -96,6 +97,25 @@ def test_photographs_without_a_lamps_light_are_forgotten_but_earlier_ones_are_ke
     light_again(stage)
     take_all(stage.rig, context, plan(), index="greys")
     assert stage.camera.taken == ["grey-0", "grey-1", "grey-2", "grey-1", "grey-2"]
+
+
+def test_a_lamp_that_dies_in_a_long_row_ends_it_and_costs_only_what_was_taken_since_it_was_looked_at(
+    stage: ModelRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shots, "LOOK_EVERY_S", 0.0)
+
+    def advance(fraction: float, note: str) -> None:
+        if note == "grey-2":
+            stage.lamps["right"].go_dark()
+
+    with Journal(tmp_path / "run") as journal:
+        context = Context(journal.folder, journal, in_seconds(60), Silent(), {}, advance)
+        with pytest.raises(DeviceRefused, match="went off"):
+            take_all(stage.rig, context, plan((10, 20, 30, 40, 50)), index="greys")
+        light_again(stage)
+        again = Context(journal.folder, journal, in_seconds(60), Silent(), {}, lambda fraction, note: None)
+        take_all(stage.rig, again, plan((10, 20, 30, 40, 50)), index="greys")
+    assert stage.camera.taken == ["grey-0", "grey-1", "grey-2", "grey-2", "grey-3", "grey-4"]
 
 
 def test_lamps_are_not_asked_when_nothing_was_taken(stage: ModelRig, context: Context) -> None:
