@@ -24,7 +24,7 @@ from hal.registry import OpenContext, load_drivers
 from hal.values import Power
 
 REPOSITORY = Path(__file__).parents[2]
-LONGEST_S = 400.0
+LONGEST_S = 800.0
 """Far beyond what anything here takes, for machines that do much else meanwhile."""
 Record = dict[str, Any]
 
@@ -126,11 +126,11 @@ class Command:
     def interrupt(self) -> Outcome:
         """Ctrl-C, and what comes of it."""
         self.process.send_signal(signal.SIGINT)
-        return self.outcome(timeout_s=60)
+        return self.outcome(timeout_s=180)
 
     def kill(self) -> None:
         self.process.kill()
-        self.outcome(timeout_s=10)
+        self.outcome(timeout_s=60)
 
     def outcome(self, *, timeout_s: float = LONGEST_S) -> Outcome:
         """Wait for the end."""
@@ -163,7 +163,7 @@ class Command:
     def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-            self.outcome(timeout_s=60)
+            self.outcome(timeout_s=180)
 
 
 def velatura(*words: str | Path, timeout_s: float = LONGEST_S) -> Outcome:

@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)"),
 ]
 PASSWORD = "seven tall horses"
-LONG_MS = 400_000
+LONG_MS = 800_000
 """For machines that do much else meanwhile; a calibration of this stage takes half a minute."""
 
 
