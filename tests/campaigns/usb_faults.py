@@ -48,12 +48,25 @@ def tether_faults() -> Iterator[Fault]:
 
 def _wire(name: str) -> Iterator[Fault]:
     for knob in dataclasses.fields(UsbFaults):
+        if knob.name == "lingers_s":  # nothing by itself
+            yield _lingering(name)
+            continue
         for value in values_of(knob):
             blocks = goes_on(value) and not isinstance(value, float) and name in ASKED
             turn, told = _turn(name, f"faults.{knob.name}", value), WORDS[name] if blocks else ""
             words = f"{name} wire" if name == TETHER else name
             # Who was told has noticed.
             yield Fault(f"{words} {knob.name}={value}", turn, mend_usb, goes_on(value) and not blocks, told)
+
+
+def _lingering(name: str) -> Fault:
+    """Its cable is pulled, and the machine is slow to notice."""
+
+    def strike(kiosk: WiredKiosk) -> None:
+        _bus(kiosk).set(name, "faults.lingers_s", SLOW_S)
+        _bus(kiosk).unplug(name)
+
+    return Fault(f"unplug of {name} lingering", strike, mend_usb, True, WORDS.get(name, "camera"))
 
 
 def _wrongs(name: str) -> Iterator[Fault]:
