@@ -108,9 +108,11 @@ class HidLink(WorkerLink[OpenHid]):
                 handle.close()
                 if not any(other.path == found.path for other in self._listed()):
                     continue  # it has just left
-                refused = self._not_opened(error)
+                refused = self.not_opened(error)
                 if self._serial:
                     continue  # the one that is wanted may be another, which works
+                for one in opened:
+                    self.let_go(one)
                 raise refused from error
             except BaseException:
                 handle.close()
@@ -132,14 +134,6 @@ class HidLink(WorkerLink[OpenHid]):
             for path, entry in by_path.items()
         ]
         return [one for one in found if self._kind.suits(one)]
-
-    def _not_opened(self, error: Exception) -> NotOpened:
-        return NotOpened(
-            "hid-not-opened",
-            what=f"The {self._kind.name} is plugged in, but cannot be opened ({error}).",
-            remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and install"
-            " firmware_configs/udev/70-velatura-hid.rules.",
-        )
 
 
 def _name(text: object) -> str:

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, TypeVar
 
-from hal.deadline import Deadline, in_seconds
+from hal.deadline import SLICE_S, Deadline, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.ptp import Answer, Operation
 from hal.ptp_datasets import DeviceInfo
@@ -27,7 +27,6 @@ Result = TypeVar("Result")
 _SESSION: Final = 1
 _ATTEMPTS: Final = 4
 _CLOSE_S: Final = 0.7
-_SLICE_S: Final = 0.05
 _ALIVE_S: Final = 1.0
 
 
@@ -186,7 +185,7 @@ class PtpCamera:
     @contextlib.contextmanager
     def _turn(self, deadline: Deadline) -> Iterator[None]:
         """One caller at a time; another's exposure may take longer than this one has."""
-        while not self._lock.acquire(timeout=min(_SLICE_S, deadline.left_s())):
+        while not self._lock.acquire(timeout=min(SLICE_S, deadline.left_s())):
             _still_time(deadline)
         try:
             yield

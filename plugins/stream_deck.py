@@ -122,7 +122,7 @@ class StreamDeckPanel(WorkerLink[Any]):
             except TransportError as error:
                 deck.close()
                 if any(other.id() == deck.id() for other in self._manager.enumerate()):
-                    refused = _not_opened(error)
+                    refused = self.not_opened(error)
                 continue  # it has just left, or the one that is wanted may be another
             if deck.is_visual() and self._serial in ("", serial):
                 matching.append((deck, serial))
@@ -187,15 +187,6 @@ def _still_open(deck: Any) -> None:
     # The library's reading thread closes a deck that it can't read.
     if not deck.is_open():
         raise TransportError("unplugged")
-
-
-def _not_opened(error: Exception) -> NotOpened:
-    return NotOpened(
-        "hid-not-opened",
-        what=f"The key panel is plugged in, but cannot be opened ({error}).",
-        remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and"
-        " install firmware_configs/udev/70-velatura-hid.rules.",
-    )
 
 
 def _text(told: str) -> str:

@@ -14,13 +14,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
-from hal.deadline import Deadline
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, ProtocolError
 
 Opened = TypeVar("Opened")
 Result = TypeVar("Result")
 
-_SLICE_S: Final = 0.05
 _CLOSE_S: Final = 0.7
 _LISTED_S: Final = 2.0
 """So long a device may be listed that cannot be opened: it has just left, or udev's rules are not yet applied to it."""
@@ -103,7 +102,7 @@ class WorkerLink(ABC, Generic[Opened]):
         Raises what ``find`` and ``work`` raise, DeviceGone for one that was closed, DeviceTimeout, ProtocolError where
         the device is there and fails the transfer, or Cancelled.
         """
-        while not self._turn.acquire(timeout=min(_SLICE_S, deadline.left_s())):
+        while not self._turn.acquire(timeout=min(SLICE_S, deadline.left_s())):
             self._still_time(deadline)
         try:
             self._still_time(deadline)
@@ -149,7 +148,7 @@ class WorkerLink(ABC, Generic[Opened]):
             except NotOpened:
                 if listed.passed:
                     raise
-                listed.sleep(_SLICE_S)
+                listed.sleep(SLICE_S)
 
     def _check_there(self, worker: _Worker[Opened], deadline: Deadline) -> None:
         """Raises DeviceGone where the device was pulled while it was used for the second time."""
@@ -193,7 +192,7 @@ class WorkerLink(ABC, Generic[Opened]):
             raise DeviceGone("hid-closed", what=f"The {self._name} was closed.", remedy=f"Open the {self._name} again.")
 
     def _wait(self, ready: Callable[[float], bool], deadline: Deadline) -> None:
-        while not ready(min(_SLICE_S, deadline.left_s())):
+        while not ready(min(SLICE_S, deadline.left_s())):
             self._still_time(deadline)
 
     def _still_time(self, deadline: Deadline) -> None:
@@ -201,6 +200,15 @@ class WorkerLink(ABC, Generic[Opened]):
             "hid-no-answer",
             what=f"The {self._name} did not answer in time.",
             remedy="Unplug it and plug it in again; use another cable or hub if it happens often.",
+        )
+
+    def not_opened(self, error: Exception) -> NotOpened:
+        """For ``find``: the device is listed, and ``error`` came of opening it."""
+        return NotOpened(
+            "hid-not-opened",
+            what=f"The {self._name} is plugged in, but cannot be opened ({error}).",
+            remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and install"
+            " firmware_configs/udev/70-velatura-hid.rules.",
         )
 
     def _failed(self, error: Exception) -> ProtocolError:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import anyio
-from argon2 import PasswordHasher
 
 from controller.panel.accounts import Accounts
 from controller.panel.broker import BrokerOptions
@@ -47,10 +46,6 @@ class PanelOptions:
     @property
     def tls(self) -> bool:
         return self.tls_certificate is not None
-
-    def accounts(self, hasher: PasswordHasher | None = None) -> Accounts:
-        """The accounts that live in ``folder``. Raises UsageError("accounts-damaged")."""
-        return Accounts(self.folder / "accounts.json", hasher=hasher)
 
 
 @dataclass(slots=True)

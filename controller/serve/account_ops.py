@@ -13,7 +13,7 @@ FOLDER: Final = "kiosk/panel"
 
 
 def stage_accounts(stage: Path) -> Accounts:
-    """As they lie on disk; for whoever knows that no panel holds them. Raises UsageError("accounts-damaged")."""
+    """As they lie on disk; for whoever knows that nobody else holds them. Raises UsageError("accounts-damaged")."""
     (stage / FOLDER).mkdir(mode=0o700, parents=True, exist_ok=True)
     return Accounts(stage / FOLDER / "accounts.json")
 

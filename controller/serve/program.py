@@ -116,7 +116,6 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
         tls_certificate=where.certificate, tls_key=where.key, broker=where.broker,
     )  # fmt: skip
     options = replace(options, hosts=(*options.hosts, where.host, *where.names))
-    options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     accounts = _accounts(kiosk)
     password = accounts.first_start()
     app = make_panel(kiosk, accounts, options)

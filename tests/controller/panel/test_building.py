@@ -17,6 +17,7 @@ import aiomqtt
 import anyio
 import pytest
 
+from controller.panel.accounts import Accounts
 from controller.panel.app import make_panel
 from controller.panel.broker import BrokerOptions
 from controller.panel.building import BuildingControl
@@ -211,7 +212,7 @@ def test_a_broker_that_does_not_confirm_a_state_is_told_it_again_on_a_new_connec
 def test_a_building_hears_that_the_panel_takes_its_leave(tmp_path: Path, port: int) -> None:
     kiosk = MemoryKiosk(tmp_path / "pictures")
     settings = PanelOptions(folder=tmp_path / "panel", port=0, broker=options(tmp_path, port))
-    panel = PanelServer(make_panel(kiosk, settings.accounts(), settings), settings)
+    panel = PanelServer(make_panel(kiosk, Accounts(settings.folder / "accounts.json"), settings), settings)
 
     async def story() -> None:
         async with building(port) as (_, heard):

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from controller.errors import UsageError
-from controller.panel.accounts import Role
+from controller.panel.accounts import Accounts, Role
 from controller.panel.answers import INCOMING, temporary
 from controller.panel.app import make_panel
 from controller.panel.context import PanelOptions
@@ -149,5 +149,5 @@ def test_a_form_upload_leaves_only_our_own_picture(fresh: Served) -> None:
 def test_what_a_killed_service_left_of_an_upload_is_gone_with_the_next_start(tmp_path: Path) -> None:
     options = PanelOptions(tmp_path)
     left = temporary(tmp_path / INCOMING)
-    make_panel(MemoryKiosk(tmp_path / "pictures"), options.accounts(QUICK_HASH), options)
+    make_panel(MemoryKiosk(tmp_path / "pictures"), Accounts(tmp_path / "accounts.json", hasher=QUICK_HASH), options)
     assert not left.exists()
