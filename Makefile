@@ -1,38 +1,76 @@
 # make demo   the whole job on an emulated stage, ending in demo/report.html
-# make test   every test
+# make test   every test; WORKERS=3 chooses how many run side by side
+# make check  lint, types, import contracts, documentation and the fast tests, side by side, in under two minutes
+# make docs   this documentation as a website in build/docs; fails on a broken link
 # make blender   Blender, for targets that it renders
 # make campaign NAME=camera_faults COUNT=10000   a test of hours that has a short version in `make test` (tests/campaigns/)
 # All do their own set-up.
 
 SIZE ?= small
-OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(notdir $(basename $(OBJECT))))
+# The mesh's name without its folder and ending; make's own functions would split it at its spaces.
+empty :=
+OBJECT_NAME = $(notdir $(basename $(subst $(empty) $(empty),_,$(OBJECT))))
+quoted = '$(subst ','\'',$(1))'
+OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))
 SEED ?= 1
 OBJECT ?=
 NAME ?=
 COUNT ?=
-WORKERS ?= 3
+CORES := $(shell nproc 2>/dev/null || echo 2)
+# Many tests wait for devices and programs, so there are more workers than cores.
+WORKERS ?= $(shell expr $(CORES) + 1)
+# Folders of tests that need no other program. `slow` marks those that take seconds.
+FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture config core kiosk/decide plan report solve transport) \
+	tests/plugins/ptp tests/test_architecture.py
+DOCS_PYTHON ?= .venv/bin/python
 
-.PHONY: demo blender test lint bench campaign lock clean
+.PHONY: demo docs blender test test-setup fast check lint style types contracts website bench campaign lock clean
 
 demo:
 	@.ci/setup demo
-	@.venv/bin/velatura demo --size $(SIZE) --out $(OUT) --seed $(SEED) $(if $(OBJECT),--object "$(OBJECT)")
+	@.venv/bin/velatura demo --size $(SIZE) --out $(call quoted,$(OUT)) --seed $(SEED) $(if $(OBJECT),--object $(call quoted,$(OBJECT)))
 
 blender:
 	@.ci/setup-blender
 
-test:
+test: test-setup
+	.venv/bin/python -m pytest --durations=10 -n $(WORKERS) --dist loadfile $(TESTS)
+
+test-setup:
 	@.ci/setup test
 	@.ci/setup-blender
 	@.ci/system-packages
-	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile $(TESTS)
+	@.venv/bin/python -m hal.runtime.kernels compile
+
+check:
+	@.ci/setup test
+	@$(MAKE) --no-print-directory --jobs=$(CORES) --output-sync=target style types contracts website fast
+
+# The parts of `check` have their set-up done.
+fast:
+	@.venv/bin/python -m hal.runtime.kernels compile
+	.venv/bin/python -m pytest -q -m "not slow" -n $(CORES) --dist loadfile $(FAST)
+
+style:
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+
+types:
+	.venv/bin/mypy
+
+contracts:
+	.venv/bin/lint-imports
+
+website:
+	$(DOCS_PYTHON) -m sphinx --jobs auto --quiet --fail-on-warning --keep-going docs build/docs
 
 lint:
 	@.ci/setup test
-	.venv/bin/ruff check .
-	.venv/bin/ruff format --check .
-	.venv/bin/mypy
-	.venv/bin/lint-imports
+	@$(MAKE) --no-print-directory style types contracts
+
+docs:
+	@.ci/setup test
+	@$(MAKE) --no-print-directory website
 
 bench:
 	@.ci/setup test
@@ -47,4 +85,6 @@ lock:
 	.ci/lock
 
 clean:
-	rm -rf .venv .venv-blender build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	@if [ -x .venv/bin/python ]; then python=.venv/bin/python; else python=python3; fi; \
+	  PYTHONDONTWRITEBYTECODE=1 "$$python" -m hal.runtime.caches remove
+	rm -rf .venv .venv-blender build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from hal.runtime.compute import usable_cpus
+
 SIZES: Final = ("small", "medium", "paper")
 
 
@@ -67,7 +69,7 @@ def peak_bytes() -> int:
 def machine() -> dict[str, int]:
     """What the figures were measured on."""
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return {"cores": len(os.sched_getaffinity(0)), "memory_bytes": pages}
+    return {"cores": usable_cpus(), "memory_bytes": pages}
 
 
 def areas() -> list[str]:

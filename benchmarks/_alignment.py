@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller.arrays import Float64
+from controller.core.arrays import Float64
 
 
 def similarity(a: Float64, b: Float64) -> tuple[float, Float64, Float64]:

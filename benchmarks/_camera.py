@@ -10,8 +10,8 @@ from typing import cast
 
 import numpy as np
 
-from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.shot import ShotFiles, ShotSettings
+from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
+from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
 
 
 def main(size: str, flavour: str) -> None:

@@ -20,8 +20,8 @@ from benchmarks import timed
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import ExposureSettings
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.ptp_camera import open_camera
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.ptp.camera import open_camera
 
 EXPOSURE_S = 1 / 30
 REPEATS = 7

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks._synthetic import synthetic_calibration, synthetic_target
-from controller.arrays import ByteImage, FloatImage
-from controller.solve.bounded import solve_bounded
-from controller.solve.dither import to_device
+from controller.core.arrays import ByteImage, FloatImage
+from controller.solve.bounded.solver import solve_bounded
 from controller.solve.feasibility import choose_exposure, target_radiance
-from controller.transport import LightTransport
+from controller.solve.scaling.dither import to_device
+from controller.transport import build_transport
 
 OUTPUTS = ("P1", "P2", "P3")
 MOST_ITERATIONS = 30
@@ -19,8 +19,8 @@ MOST_ITERATIONS = 30
 def compensation_frames(size: str, appearances: int) -> list[dict[str, ByteImage]]:
     """For each appearance its three outputs' device frames, (rows, columns, 3) uint8."""
     calibration = synthetic_calibration(size)
-    transport = LightTransport.build(calibration)
-    shape = transport.shape
+    transport = build_transport(calibration)
+    shape = transport.camera_shape
     found = []
     for number in range(appearances):
         target = _turned(synthetic_target(shape), number)

@@ -9,14 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks._stage import CalibratedStage
 from benchmarks._truth import Truth, developed, footprints, moments, window_around
-from controller.arrays import ByteImage, Float64, FloatImage, Mask, load_arrays
+from controller.artefacts.geometry import read_geometry
+from controller.artefacts.photographs import codes_of
+from controller.artefacts.projectors import Pixels
 from controller.calibrate.values import Calibration, Metapixels, Radiometry
-from controller.calibrate.verify import verify
+from controller.calibrate.verify.grade import verify
 from controller.capture.patterns import device_frame, frame
-from controller.session.calibrating import read_geometry
-from controller.session.shots import read_index
-from controller.session.solving import random_pattern
-from controller.transport import LightTransport
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.steps.appearance.solving import random_pattern
+from controller.transport import build_transport
 
 SPACING_PX = 16
 OFFSETS = ((2, 3), (7, 11), (12, 6), (14, 14))
@@ -46,7 +47,7 @@ def radiometry_errors(truth: Truth, n: int, radiometry: Radiometry) -> dict[str,
 def map_errors(truth: Truth, n: int, run: Path) -> dict[str, float]:
     """Decoded against true projector positions, projector px."""
     name = truth.bench.projectors[n].name
-    measured = load_arrays(run / f"pixels-{name}.npz")["projector_px"].astype(np.float64)
+    measured = Pixels.read(run, name).projector_px.astype(np.float64)
     true = truth.projector_px(n)
     error = np.hypot(*np.moveaxis(measured - true, 2, 0))
     seen = np.isfinite(error)
@@ -97,7 +98,7 @@ def metapixel_errors(truth: Truth, n: int, metapixels: Metapixels) -> dict[str, 
 
 def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibration) -> list[dict[str, float]]:
     """Predicted pictures of each projector against its photograph, and against pictures without noise."""
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     found = []
     for n, part in enumerate(calibration.projectors):
         rows, columns = part.metapixels.valid.shape
@@ -111,8 +112,8 @@ def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibratio
             return developed(truth.light(n, shown), full) * np.float32(unit)
 
         pattern = random_pattern((columns, rows))
-        photograph = read_index(stage.run, f"codes-{part.name}")[f"{part.name}-{pattern.name}"].per_second()
-        predicted = transport.project_one(n, frame(pattern, (columns, rows)))
+        photograph = codes_of(part.name).by_name(stage.run)[pattern.name].per_second()
+        predicted = transport.forward_part(n, frame(pattern, (columns, rows)))
         real = clean(device_frame(pattern, (columns, rows), part.radiometry.response))
         figures = {
             "random photographed": verify(
@@ -124,10 +125,10 @@ def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibratio
         y, x = np.mgrid[0:rows, 0:columns]
         for name, on in (("chequers", (x + y) % 2), ("columns", (x // 2) % 2)):
             light = np.repeat(on.astype(np.float32)[..., None], 3, axis=2)
-            figures[name] = relative(transport.project_one(n, light), clean((light * 255).astype(np.uint8)), lit)
+            figures[name] = relative(transport.forward_part(n, light), clean((light * 255).astype(np.uint8)), lit)
         single = np.zeros((rows, columns, 3), np.uint8)
         single[3::SPACING_PX, 5::SPACING_PX] = 255
-        predicted, real = transport.project_one(n, (single / 255).astype(np.float32)), clean(single)
+        predicted, real = transport.forward_part(n, (single / 255).astype(np.float32)), clean(single)
         figures["column of T"] = relative(predicted, real, lit)
         figures["column of T, one surface"] = relative(predicted, real, lit & truth.one_surface(n, EDGE_PX))
         found.append(figures)

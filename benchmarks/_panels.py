@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
 
-from controller.panel.accounts import Role
-from controller.serve.account_ops import stage_accounts
+from controller.kiosk.store.accounts import Role, stage_accounts
 
 NAME, PASSWORD = "bench", "fifty open windows"
 PARTS = ("/static/style.css", "/static/panel.js", "/static/icon.svg")

@@ -11,12 +11,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.checking import check_stage
-from controller.demo.bench_process import BenchProcess
 from controller.demo.stage import prepare
-from controller.services import calibrate
-from controller.session.journal import Journal
-from controller.session.progress import Silent
+from controller.run.journal import Journal
+from controller.run.progress import Silent
+from controller.run.step_id import StepId
+from controller.services.calibrate import calibrate
+from controller.stage.bench import BenchProcess
+from controller.stage.check import check_stage
+from controller.stage.session import OwnSession
 
 FIRST_SEED = 701
 
@@ -28,7 +30,7 @@ class CalibratedStage:
     folder: Path
     run: Path
     names: tuple[str, ...]
-    seconds: dict[str, float]
+    seconds: dict[StepId, float]
     shots: int
     wall_s: float
 
@@ -47,7 +49,7 @@ def calibrated_stage(size: str, seed: int) -> Iterator[CalibratedStage]:
         cancel = threading.Event()
         began = time.perf_counter()
         with BenchProcess(stage, cancel=cancel):
-            done = calibrate(stage=stage, reporter=Silent(), cancel=cancel)
+            done = calibrate(session=OwnSession(stage), reporter=Silent(), cancel=cancel)
         wall_s = time.perf_counter() - began
         run = Path(str(done["run"]))
         with Journal(run) as journal:

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from controller.arrays import FloatImage, Mask
 from controller.calibrate.values import Calibration, Metapixels, PhaseMap, ProjectorCalibration, Radiometry
+from controller.core.arrays import FloatImage, Mask
 
 PROJECTOR: Final = {"small": (210, 280), "medium": (526, 700), "paper": (1050, 1400)}
 CAMERA: Final = {"small": (520, 776), "medium": (1296, 1944), "paper": (2592, 3888)}

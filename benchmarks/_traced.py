@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks import Timing
-from controller.arrays import FloatImage
-from controller.errors import WorkError
-from controller.solve.bounded import SMOOTHNESS, Problem, first_guess, pose, roughness
-from controller.solve.descent import Watch, descend
-from controller.solve.gradient import weighted_residual
+from controller.core.arrays import FloatImage
+from controller.core.errors import WorkError
+from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.solve.bounded.gradient import weighted_residual
+from controller.solve.bounded.problem import Problem
+from controller.solve.bounded.solver import SMOOTHNESS, build_problem, initial_point, smoothness_term
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes
 
@@ -66,11 +67,11 @@ def traced(
 ) -> Trace:
     """Solve as ``solve_bounded`` does, for so many sweeps, or until the objective is ``enough`` or the time is over."""
     began = time.perf_counter(), time.process_time()
-    problem = pose(transport, target, black, SMOOTHNESS, None)
-    x = first_guess(problem) if start is None else frame_planes(start)
+    problem = build_problem(transport, target, black, SMOOTHNESS, None)
+    x = initial_point(problem) if start is None else frame_planes(start)
     x[problem.majoriser == 0] = 0
     setup = Sweep(time.perf_counter() - began[0], time.process_time() - began[1], np.inf, np.inf)
-    light = np.empty((3, *transport.shape), np.float32)
+    light = np.empty((3, *transport.camera_shape), np.float32)
     found: list[Sweep] = []
     looked = [0.0, 0.0]
 
@@ -88,13 +89,13 @@ def traced(
     def over() -> bool:
         return bool(found) and (found[-1].objective <= enough or time.perf_counter() - began[0] > most_s)
 
-    _descend(problem, x, Watch(0, sweeps, progress=told, cancelled=over, look=look))
+    _descend(problem, x, IterationControl(0, sweeps, progress=told, cancelled=over, on_iterate=look))
     return Trace(setup, found)
 
 
-def _descend(problem: Problem, x: FloatImage, watch: Watch) -> None:
+def _descend(problem: Problem, x: FloatImage, control: IterationControl) -> None:
     try:
-        descend(problem, x, watch)
+        block_coordinate_descent(problem, x, control)
     except WorkError as stopped:
         if stopped.code != "solve-cancelled":
             raise
@@ -102,4 +103,4 @@ def _descend(problem: Problem, x: FloatImage, watch: Watch) -> None:
 
 def _objective(problem: Problem, x: FloatImage, light: FloatImage) -> float:
     problem.transport.forward_planes(x, out=light)
-    return weighted_residual(light, problem.wanted, problem.weights, light) + roughness(problem, x)
+    return weighted_residual(light, problem.target, problem.weights, light) + smoothness_term(problem, x)

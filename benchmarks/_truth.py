@@ -11,13 +11,13 @@ import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
-from controller.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.capture.raw import develop
-from plugins.emulated.objects import StageObject
-from plugins.emulated.rays import SIGMA_STEP_PX, directions, samples_of
-from plugins.emulated.render import Renderer, response
-from plugins.emulated.truth import FOLDER, BenchTruth, read_truth
-from plugins.emulated.world import object_of
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.rays import SIGMA_STEP_PX, directions, samples_of
+from plugins.emulated.optics.render import Renderer, response
+from plugins.emulated.optics.truth import FOLDER, BenchTruth, read_truth
+from plugins.emulated.optics.world import object_of
 
 RGGB = np.array([[0, 1], [1, 2]])
 REACH_SIGMAS = 4.5
@@ -30,8 +30,8 @@ class Truth:
 
     def __init__(self, stage: Path) -> None:
         self.bench: BenchTruth = read_truth(stage)
-        self.thing: StageObject = object_of(stage, self.bench.object)
-        self.samples = samples_of(self.bench, self.thing, stage / FOLDER, lambda share: None)
+        self.stage_object: StageObject = object_of(stage, self.bench.object)
+        self.samples = samples_of(self.bench, self.stage_object, stage / FOLDER, lambda share: None)
         self._renderer = Renderer(self.bench, self.samples)
         width, height = self.bench.camera.lens.size_px
         self.shape = (height, width)
@@ -92,13 +92,13 @@ class Truth:
         y, x = np.mgrid[0:rows, 0:columns].astype(np.float64)
         ray = directions(camera.pose, camera.lens, x.ravel(), y.ravel())
         scene = rtcore_scene.EmbreeScene(robust=True)
-        mesh = TriangleMesh(scene, self.thing.vertices, self.thing.faces)
+        mesh = TriangleMesh(scene, self.stage_object.vertices, self.stage_object.faces)
         origin = np.broadcast_to(np.asarray(camera.pose.position_m, np.float32), ray.shape).copy()
         found = scene.run(origin, ray.astype(np.float32), output=1)
         del mesh
         hit = found["primID"] >= 0
         u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
-        corners = self.thing.vertices[self.thing.faces[found["primID"][hit]]].astype(np.float64)
+        corners = self.stage_object.vertices[self.stage_object.faces[found["primID"][hit]]].astype(np.float64)
         world = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), corners)
         points = np.full((rows * columns, 3), np.nan)
         points[hit] = (world - camera.pose.position_m) @ camera.pose.rotation.T

@@ -14,9 +14,9 @@ import zstandard
 
 from benchmarks import Row, Timing, at_least, at_most, peak_bytes, timed
 from benchmarks._frames import OUTPUTS, compensation_frames
-from controller.arrays import ByteImage
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.core.arrays import ByteImage
 
 APPEARANCES = 2
 GOAL_MS = {1: 14.0, 2: 7.0}

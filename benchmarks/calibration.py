@@ -16,13 +16,16 @@ from benchmarks import Row, at_least, at_most, peak_bytes
 from benchmarks._judge import geometry_errors, map_errors, metapixel_errors, pattern_errors, radiometry_errors
 from benchmarks._stage import FIRST_SEED, CalibratedStage, calibrated_stage, over
 from benchmarks._truth import Truth
-from controller.arrays import FloatImage, load_arrays
-from controller.calibrate.decode import decode
-from controller.calibrate.pixels import fit_metapixels
+from controller.artefacts.calibration import read_calibration, read_captures
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.photographs import Developed
+from controller.artefacts.projectors import Light, Pixels
+from controller.calibrate.correspondence.decode import decode
+from controller.calibrate.metapixels.from_phase import fit_metapixels
 from controller.capture.patterns import plan_patterns
-from controller.errors import VelaturaError
-from controller.session.calibrating import read_calibration, read_captures
-from controller.session.shots import Developed
+from controller.core.arrays import FloatImage
+from controller.core.errors import VelaturaError
+from controller.run.step_id import StepId
 
 STAGES = {"small": 5, "medium": 3, "paper": 1}
 CODES = ("gray-", "phase-", "blur-")
@@ -56,8 +59,8 @@ def _judge(stage: CalibratedStage, found: Found) -> None:
     calibration = read_calibration(stage.run, stage.names)
     truth = Truth(stage.folder)
     found.add({"captures": stage.shots / len(stage.names), "calibration s": stage.wall_s})
-    found.add({"geometry s": stage.seconds["geometry"]})
-    shot_s = [s for name, s in stage.seconds.items() if name.startswith(("light-", "codes-"))]
+    found.add({"geometry s": stage.seconds[StepId(StepKind.GEOMETRY)]})
+    shot_s = [s for step, s in stage.seconds.items() if step.kind in (StepKind.LIGHT, StepKind.CODES)]
     found.add({"shooting s": sum(shot_s) / len(stage.names)})
     found.add(geometry_errors(stage, truth))
     for n, part in enumerate(calibration.projectors):
@@ -71,11 +74,11 @@ def _judge(stage: CalibratedStage, found: Found) -> None:
 
 def _timed(run: Path, name: str) -> dict[str, float]:
     """Seconds of decoding and of the metapixels, compiled by the calibration before; photographs are read meanwhile."""
-    light = load_arrays(run / f"radiometry-{name}.npz")
+    light = Light.read(run, name)
     taken = read_captures(run, name)
-    ready: dict[str, FloatImage] = {"black": light["black"], "white": light["white"] + light["black"]}
+    ready: dict[str, FloatImage] = {"black": light.black, "white": light.white + light.black}
     captures = Developed(taken, ready)
-    rows, columns = load_arrays(run / f"pixels-{name}.npz")["valid"].shape
+    rows, columns = Pixels.read(run, name).valid.shape
     plan = plan_patterns((columns, rows))
     reading = _seconds(lambda: [captures[key] for key in taken if key.startswith(CODES)])
     correspondence = decode(captures, plan)

@@ -16,11 +16,11 @@ import numpy as np
 from benchmarks import Row, at_most, peak_bytes
 from benchmarks._synthetic import CAMERA, PROJECTOR, synthetic_calibration
 from benchmarks.geometry import FIRST_SEED, geometry_seconds
-from controller.arrays import FloatImage
-from controller.calibrate.decode import decode
-from controller.calibrate.pixels import fit_pixels
+from controller.calibrate.correspondence.decode import decode
+from controller.calibrate.metapixels.from_phase import fit_pixels
 from controller.calibrate.values import Correspondence
 from controller.capture.patterns import PatternPlan, frame, plan_patterns
+from controller.core.arrays import FloatImage
 
 NOISE = 0.002
 BLACK = 0.002

@@ -17,9 +17,10 @@ from typing import Any
 
 from benchmarks import Row, at_least, at_most, timed
 from benchmarks._synthetic import CAMERA
-from hal import ptp_ip, ptp_usb
-from hal.ptp import parse_handles
-from plugins.emulated.usb_bus import environment
+from hal.codecs.ptp import ip as ptp_ip
+from hal.codecs.ptp import usb as ptp_usb
+from hal.codecs.ptp.values import parse_handles
+from plugins.emulated.usb.bus import environment
 
 FLAVOURS = ("generic", "eos-new", "eos-old")
 SMALL_FILE = 4096

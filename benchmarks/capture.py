@@ -15,23 +15,24 @@ import rawpy
 
 from benchmarks import Row, Timing, at_most, peak_bytes, timed
 from benchmarks._stage import FIRST_SEED, over, prepared_stage
-from controller.app import run_on_stage
-from controller.arrays import ByteImage
 from controller.capture.acquire import Shot
 from controller.capture.latency import thumbprint
 from controller.capture.raw import read_photograph
-from controller.checking import check_stage
-from controller.demo.bench_process import BenchProcess
-from controller.session.progress import Silent
-from controller.session.rig import Rig
-from controller.session.runner import Context, Step
+from controller.core.arrays import ByteImage
+from controller.rig.rig import Rig
+from controller.run.progress import Silent
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.stage.bench import BenchProcess
+from controller.stage.check import check_stage
+from controller.stage.session import OwnSession
 from hal.deadline import in_seconds
-from plugins.emulated.dng import PictureFacts, dng
-from plugins.emulated.rays import cast
-from plugins.emulated.render import Renderer
-from plugins.emulated.sensor import mosaic
-from plugins.emulated.truth import BenchTruth, read_truth
-from plugins.emulated.world import object_of
+from plugins.emulated.optics.dng import PictureFacts, dng
+from plugins.emulated.optics.rays import cast
+from plugins.emulated.optics.render import Renderer
+from plugins.emulated.optics.sensor import mosaic
+from plugins.emulated.optics.truth import BenchTruth, read_truth
+from plugins.emulated.optics.world import object_of
 
 SHOTS = {"small": 20, "medium": 10, "paper": 6}
 EXPOSURE_S = 1 / 30
@@ -52,9 +53,9 @@ def measure(size: str) -> list[Row]:
 
 
 def _bench(stage: Path, truth: BenchTruth, *, paper: bool) -> list[Row]:
-    thing = object_of(stage, truth.object)
+    stage_object = object_of(stage, truth.object)
     began = time.perf_counter()
-    samples = cast(truth, thing, lambda share: None)
+    samples = cast(truth, stage_object, lambda share: None)
     cast_s = time.perf_counter() - began
     renderer = Renderer(truth, samples)
     frames, rng = _Fresh(truth), np.random.default_rng(0)
@@ -155,9 +156,9 @@ def _chain(stage: Path, shots: int) -> list[Row]:
     began = time.perf_counter()
     with BenchProcess(stage, cancel=cancel):
         started_s = time.perf_counter() - began
-        run_on_stage(
+        OwnSession(stage).run(
             checked,
-            lambda rig, _: [Step("shots", partial(take, rig))],
+            lambda rig, _: [Step(StepId("shots"), partial(take, rig))],
             name="shots",
             reporter=Silent(),
             cancel=cancel,

@@ -22,16 +22,16 @@ from scipy.spatial.transform import Rotation
 from benchmarks import Row, at_least, at_most, peak_bytes
 from benchmarks._alignment import similarity
 from benchmarks._stage import over
-from controller.arrays import Float64
-from controller.calibrate.geometry import reconstruct
-from controller.calibrate.intrinsics import read_intrinsics
-from controller.calibrate.reconstruction import CameraPrior, Reconstruction
+from controller.calibrate.camera.intrinsics import read_intrinsics
+from controller.calibrate.geometry.self_calibration import reconstruct
+from controller.calibrate.geometry.values import CameraPrior, Reconstruction
 from controller.calibrate.values import Correspondence
-from controller.errors import VelaturaError
-from plugins.emulated.objects import StageObject, default_object, load_object
-from plugins.emulated.rays import cast, directions
-from plugins.emulated.staging import device_tables, intrinsics_of, random_truth
-from plugins.emulated.truth import BenchTruth, ObjectTruth
+from controller.core.arrays import Float64
+from controller.core.errors import VelaturaError
+from plugins.emulated.optics.objects import StageObject, default_object, load_object
+from plugins.emulated.optics.rays import cast, directions
+from plugins.emulated.optics.staging import device_tables, intrinsics_of, random_truth
+from plugins.emulated.optics.truth import BenchTruth, ObjectTruth
 
 FIRST_SEED = 900
 STAGES = {"small": 20, "medium": 5, "paper": 1}
@@ -77,15 +77,17 @@ def _posed(
     size: str, seed: int, projectors: int
 ) -> tuple[BenchTruth, StageObject, list[Correspondence], Float64, CameraPrior]:
     """A random stage, what is seen of it, its true points and what is known of the camera."""
-    thing = default_object() if seed % 2 == 0 else _rock(seed)
-    truth = random_truth(size, seed, thing, ObjectTruth("mesh", "object.npz", seed), (1, 2))
+    stage_object = default_object() if seed % 2 == 0 else _rock(seed)
+    truth = random_truth(size, seed, stage_object, ObjectTruth("mesh", "object.npz", seed), (1, 2))
     truth = replace(truth, subsamples=1, projectors=truth.projectors[:projectors])
-    seen, points = _correspondences(truth, thing, seed)
+    seen, points = _correspondences(truth, stage_object, seed)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "camera-intrinsics.toml"
         path.write_text(intrinsics_of(truth))
-        prior = read_intrinsics(path).prior(distance_m=float(device_tables(truth, thing)["camera"]["distance_m"]))
-    return truth, thing, seen, points, prior
+        prior = read_intrinsics(path).prior(
+            distance_m=float(device_tables(truth, stage_object)["camera"]["distance_m"])
+        )
+    return truth, stage_object, seen, points, prior
 
 
 def _one(size: str, seed: int, projectors: int, found: Found) -> None:
@@ -116,11 +118,11 @@ def _rock(seed: int) -> StageObject:
         return load_object(path)
 
 
-def _correspondences(truth: BenchTruth, thing: StageObject, seed: int) -> tuple[list[Correspondence], Float64]:
+def _correspondences(truth: BenchTruth, stage_object: StageObject, seed: int) -> tuple[list[Correspondence], Float64]:
     """What each camera pixel's middle sees of each projector, with noise and outliers; and the points (camera)."""
     rng = np.random.default_rng([seed, 8])
     width, height = truth.camera.lens.size_px
-    samples = cast(truth, thing, lambda share: None)
+    samples = cast(truth, stage_object, lambda share: None)
     out = []
     for n, projector in enumerate(truth.projectors):
         size = np.asarray(projector.lens.size_px)
@@ -134,22 +136,22 @@ def _correspondences(truth: BenchTruth, thing: StageObject, seed: int) -> tuple[
         shaped = px.reshape(height, width, 2).astype(np.float32)
         valid = np.isfinite(shaped[..., 0])
         out.append(Correspondence(shaped, valid.astype(np.float32), valid))
-    return out, _points(truth, thing)
+    return out, _points(truth, stage_object)
 
 
-def _points(truth: BenchTruth, thing: StageObject) -> Float64:
+def _points(truth: BenchTruth, stage_object: StageObject) -> Float64:
     """(rows, columns, 3) in the camera's frame, NaN where the camera sees no object."""
     width, height = truth.camera.lens.size_px
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
     ray = directions(truth.camera.pose, truth.camera.lens, x.ravel(), y.ravel())
     scene = rtcore_scene.EmbreeScene(robust=True)
-    mesh = TriangleMesh(scene, thing.vertices, thing.faces)
+    mesh = TriangleMesh(scene, stage_object.vertices, stage_object.faces)
     origin = np.broadcast_to(np.asarray(truth.camera.pose.position_m, np.float32), ray.shape).copy()
     hits = scene.run(origin, ray.astype(np.float32), output=1)
     del mesh
     hit = hits["primID"] >= 0
     u, v = hits["u"][hit].astype(np.float64), hits["v"][hit].astype(np.float64)
-    corners = thing.vertices[thing.faces[hits["primID"][hit]]].astype(np.float64)
+    corners = stage_object.vertices[stage_object.faces[hits["primID"][hit]]].astype(np.float64)
     points = np.full((height * width, 3), np.nan)
     world = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), corners)
     points[hit] = (world - truth.camera.pose.position_m) @ truth.camera.pose.rotation.T

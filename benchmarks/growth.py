@@ -19,8 +19,8 @@ import numpy as np
 from benchmarks import Row, at_most, peak_bytes
 from benchmarks._synthetic import CAMERA, PROJECTOR, synthetic_calibration
 from controller.solve.appearance import base_image
-from controller.solve.bounded import solve_bounded
-from controller.transport import LightTransport
+from controller.solve.bounded.solver import solve_bounded
+from controller.transport import LightTransport, build_transport
 
 FRACTIONS: Final = {"small": (1 / 64, 1 / 16), "medium": (1 / 16, 1 / 8, 1 / 4), "paper": (1 / 16, 1 / 4, 1 / 2, 1, 2)}
 SWEEPS: Final = 8
@@ -72,7 +72,7 @@ def _solved(fraction: float) -> tuple[LightTransport, list[float]]:
     calibration = synthetic_calibration(
         projector=_sized(PROJECTOR["paper"], fraction), camera=_sized(CAMERA["paper"], fraction)
     )
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     at: list[float] = []
     image = base_image(calibration, "white")
     solve_bounded(

@@ -20,24 +20,24 @@ import numpy.typing as npt
 
 from benchmarks import Row, at_least, at_most
 from benchmarks._synthetic import synthetic_calibration, synthetic_target
-from controller.arrays import ByteImage, FloatImage
 from controller.bundle.live_maps import LiveMaps, compensate
 from controller.calibrate.values import Calibration, Radiometry
+from controller.core.arrays import ByteImage, FloatImage
 from controller.live.sources import LivePicture, LiveSource, VideoSource
+from controller.play.control.launch import PlayerSettings, start_player
 from controller.play.frames import FrameFile, FrameSet, OutputSize
-from controller.play.launch import PlayerSettings, start_player
-from controller.session.live import FrameMaker, run_live
 from controller.solve.appearance import base_image, scale_frames, solve_base
-from controller.solve.dither import to_device, to_light
-from controller.solve.interactive import Interactive
-from controller.solve.scaling import reduced, reduction, scaling_maps
-from controller.solve.targets_files import shipped_photograph
-from controller.solve.targets_values import linear_to_srgb
-from controller.transport import LightTransport
+from controller.solve.scaling.dither import to_device, to_light
+from controller.solve.scaling.interactive import Interactive
+from controller.solve.scaling.stage_maps import reduced, reduction, scaling_maps
+from controller.solve.targets.files import shipped_photograph
+from controller.solve.targets.values import linear_to_srgb
+from controller.steps.appearance.live import FrameMaker, run_live
+from controller.transport import LightTransport, build_transport
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import LiveStatus
-from plugins.player_display import DRIVER, PlayerDisplay
+from plugins.display.player import DRIVER, PlayerDisplay
 
 BRIGHTNESS: Final = 0.25
 """The radiance of white: most of the synthetic target is within reach of it."""
@@ -52,20 +52,20 @@ def measure(size: str) -> list[Row]:
     """A float picture and an sRGB target to frames, their errors, and a stream of both kinds through a player."""
     paper = size == "paper"
     calibration = synthetic_calibration(size)
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     base = solve_base(transport, base_image(calibration, "white"), calibration.black, tolerance=1e-2)
     radiometries = [part.radiometry for part in calibration.projectors]
     maps = scaling_maps(transport, base, calibration.black, radiometries, ["P1", "P2", "P3"])
-    wanted = synthetic_target(transport.shape)
-    small = reduced(wanted, reduction(transport.shape))
+    wanted = synthetic_target(transport.camera_shape)
+    small = reduced(wanted, reduction(transport.camera_shape))
     target = np.asarray(np.rint(255 * linear_to_srgb(small)), np.uint8)
-    scaler = Interactive(maps, transport.shape)
+    scaler = Interactive(maps, transport.camera_shape)
     rows = _speeds(scaler, np.float32(BRIGHTNESS) * wanted, target, paper=paper)
     rows += _errors(scaler, target, paper=paper)
     radiance = np.float32(BRIGHTNESS) * wanted
     exact = scale_frames(transport, base, radiance, calibration.black)
     papers = scaling_maps(transport, base, calibration.black, radiometries, ["P1", "P2", "P3"], spread=1.0)
-    papers_way = Interactive(papers, transport.shape)
+    papers_way = Interactive(papers, transport.camera_shape)
     rows.append(_error_of_maps(papers_way, exact, radiometries, radiance))
     rows.append(_nearer(transport, calibration, {"ours": scaler, "eq. 6": papers_way}))
     with tempfile.TemporaryDirectory(prefix="velatura-bench-") as folder:
@@ -162,7 +162,7 @@ def _error_of_maps(
 
 def _nearer(transport: LightTransport, calibration: Calibration, ways: Mapping[str, Interactive]) -> Row:
     """How far the light of frames is from a photograph, in the model, with means narrower than a pixel's light."""
-    picture = cv2.resize(shipped_photograph(), transport.shape[::-1], interpolation=cv2.INTER_AREA)
+    picture = cv2.resize(shipped_photograph(), transport.camera_shape[::-1], interpolation=cv2.INTER_AREA)
     radiance = np.asarray(picture * np.float32(BRIGHTNESS), np.float32)
     mask = transport.object_mask & (transport.reach() + calibration.black > radiance).all(axis=2)
     rms = {}

@@ -18,23 +18,27 @@ from benchmarks import Row, at_most, peak_bytes
 from benchmarks._judge import metapixel_errors, relative, rms
 from benchmarks._stage import FIRST_SEED, over, prepared_stage
 from benchmarks._truth import Truth, developed
-from controller.arrays import ByteImage, Float64, FloatImage, Mask
-from controller.calibrate.dots import fit_picture
+from controller.artefacts.calibration import read_calibration
+from controller.artefacts.depth_edges import edged
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.photographs import PhotographSet, captured
+from controller.calibrate.metapixels.from_dots import fit_picture
 from controller.calibrate.values import Calibration
 from controller.capture.patterns import device_frame
-from controller.checking import check_stage
-from controller.demo.bench_process import BenchProcess
-from controller.services import calibrate
-from controller.session.calibrating import read_calibration
-from controller.session.edging import edged
-from controller.session.progress import Silent
-from controller.session.solving import random_pattern
-from controller.transport import LightTransport
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.run.progress import Silent
+from controller.services.calibrate import calibrate
+from controller.stage.bench import BenchProcess
+from controller.stage.check import check_stage
+from controller.stage.session import OwnSession
+from controller.steps.appearance.solving import random_pattern
+from controller.transport import LightTransport, build_transport
 
 RUNS: Final = (("auto", None), ("paper", "6"), ("paper", "16"))
 EDGE_PX: Final = 3
 """Camera pixels around an edge or a fold that count as near it."""
 GRID_PX: Final = 12
+DOTS: Final = (StepKind.DOTS, StepKind.EDGE_DOTS)
 PAPER_PX: Final = (1400, 1050)
 CAMERA_PX: Final = (3888, 2592)
 BLURS_PX: Final = {"in focus": 0.47, "blurred 1.2 px": 1.22}
@@ -51,16 +55,16 @@ def measure(size: str) -> list[Row]:
             run = _calibrated(stage, mode, spacing)
             wall_s = time.perf_counter() - began
             calibration = read_calibration(run, names)
-            dots = sum(1 for path in (run / "captures").glob("*dot-*") if path.suffix != ".json") / len(names)
+            dots = sum(captured(run, PhotographSet(kind, name)) for kind in DOTS for name in names) / len(names)
             if mode == "auto":
-                model = LightTransport.build(calibration)
+                model = build_transport(calibration)
                 rows += _judged("fast", truth, calibration, model)
-                rows += _judged("auto", truth, calibration, edged(model, run))
+                rows += _judged("auto", truth, calibration, edged(model, run, names))
                 plain = tuple(dataclasses.replace(part, phase_map=None) for part in calibration.projectors)
                 gaussians = dataclasses.replace(calibration, projectors=plain)
-                rows += _judged("fast, Gaussians", truth, gaussians, LightTransport.build(gaussians))
+                rows += _judged("fast, Gaussians", truth, gaussians, build_transport(gaussians))
             else:
-                rows += _judged(f"dots r = {spacing}", truth, calibration, LightTransport.build(calibration))
+                rows += _judged(f"dots r = {spacing}", truth, calibration, build_transport(calibration))
             label = "auto" if mode == "auto" else f"dots r = {spacing}"
             rows.append(at_most(f"{label}: photographs of dots, a projector", dots, None, unit="", how=""))
             rows.append(at_most(f"{label}: calibration", wall_s, None, unit="s", how="all projectors, lamps included"))
@@ -71,7 +75,12 @@ def _calibrated(stage: Path, mode: str, spacing: str | None) -> Path:
     cancel = threading.Event()
     with BenchProcess(stage, cancel=cancel):
         done = calibrate(
-            stage=stage, reporter=Silent(), cancel=cancel, mode=mode, dot_spacing=spacing, accept_grade=True
+            session=OwnSession(stage),
+            reporter=Silent(),
+            cancel=cancel,
+            mode=mode,
+            dot_spacing=spacing,
+            accept_grade=True,
         )
     return Path(str(done["run"]))
 
@@ -108,7 +117,7 @@ def _predicted(
     found = {}
     for name, shown in (("random pattern", random), ("column of T", grid), ("chequers", chequers)):
         real = developed(truth.light(n, shown), full) * np.float32(unit)
-        seen = transport.project_one(n, _light(shown, response))
+        seen = transport.forward_part(n, _light(shown, response))
         found[name] = relative(seen, real, lit), relative(seen, real, edge)
     return found
 

@@ -19,13 +19,13 @@ import numpy as np
 from benchmarks import Row, at_least, at_most
 from benchmarks._frames import OUTPUTS, compensation_frames
 from benchmarks._watch import digest
-from controller.arrays import ByteImage
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.core.arrays import ByteImage
 from controller.play.cache import CACHE_BYTES
-from controller.play.launch import PlayerProcess, PlayerSettings, start_player
+from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
-from plugins.player_display import DRIVER, PlayerDisplay
+from plugins.display.player import DRIVER, PlayerDisplay
 
 RESIDENT = 3
 """So few are decoded once and stay."""

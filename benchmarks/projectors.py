@@ -8,17 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import Row, Timing, at_most, timed
-from hal import pjlink
+from hal.codecs.projectors import pjlink
+from hal.codecs.projectors.serial_protocol import query_bytes
 from hal.deadline import in_seconds
 from hal.interfaces import Projector
 from hal.registry import OpenContext
-from hal.serial_protocol import query_bytes
-from plugins.emulated.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
-from plugins.emulated.serial_projector import EmulatedSerialProjector
-from plugins.pjlink_projector import open_pjlink_projector
-from plugins.profile_files import load_profile
-from plugins.serial_projector import open_serial_projector
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.projectors.pjlink import open_pjlink_projector
+from plugins.projectors.profile_files import load_profile
+from plugins.projectors.serial import open_serial_projector
 
 TIMING = LampTiming(warm_up_s=0.2, cool_down_s=0.2)
 SERIAL = "optoma-later"

@@ -22,16 +22,19 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from benchmarks import Row, at_least, at_most, timed
 from benchmarks._synthetic import synthetic_calibration
 from benchmarks._traced import traced
-from controller.arrays import FloatImage
-from controller.errors import WorkError
+from controller.core.arrays import FloatImage
+from controller.core.errors import WorkError
 from controller.solve.appearance import base_image
-from controller.solve.bounded import Problem, roughness
-from controller.solve.descent import Watch, descend
-from controller.transport import LightTransport
+from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.solve.bounded.problem import Problem
+from controller.solve.bounded.solver import smoothness_term
+from controller.transport import LightTransport, build_transport
+from controller.transport.camera_box import CameraBox
 
 VARIABLE: Final = "VELATURA_REFERENCE"
 FACTORS: Final = {"small": 0.2, "medium": 0.5, "paper": 1.0}
@@ -95,9 +98,9 @@ def _objective(theirs: dict[str, Any], p: npt.NDArray[np.float32]) -> float:
     return float(squared)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Theirs(LightTransport):
-    """The prototype's T, by its own products; a sheet is its picture (rows, columns, 3)."""
+    """The prototype's T, by its own products; a sensor buffer is its picture (rows, columns, 3), flat."""
 
     theirs: dict[str, Any]
 
@@ -113,72 +116,75 @@ class _Theirs(LightTransport):
         span = self.span(n)
         return tuple(self.theirs[name][span] for name in ("P", "X0", "Y0", "A"))
 
-    def sheet(self) -> FloatImage:
-        return np.zeros((*self.shape, 3), np.float32)
-
-    def add_light(self, n: int, p: FloatImage, sheet: FloatImage) -> None:
+    def accumulate_forward(self, n: int, p: FloatImage, buffer: FloatImage) -> None:
         weights, left, top, amplitude = self._part(n)
         pixels = np.ascontiguousarray(p[:, self.span(n)].T)
-        of = self.theirs
-        of["fwd"](weights, left, top, pixels, amplitude, sheet, of["K"], *self.sizes[n], 1, of["B"])
+        of, picture = self.theirs, buffer.reshape(*self.camera_shape, 3)
+        of["fwd"](weights, left, top, pixels, amplitude, picture, of["K"], *self.sizes[n], 1, of["B"])
 
-    def pull(self, n: int, sheet: FloatImage, out: FloatImage) -> None:
+    def adjoint_of_buffer(self, n: int, buffer: FloatImage, out: FloatImage) -> None:
         weights, left, top, amplitude = self._part(n)
         pixels = np.empty((left.size, 3), np.float32)
-        self.theirs["adj"](weights, left, top, sheet, amplitude, pixels, self.theirs["K"])
+        picture = buffer.reshape(*self.camera_shape, 3)
+        self.theirs["adj"](weights, left, top, picture, amplitude, pixels, self.theirs["K"])
         out[:, self.span(n)] = pixels.T
 
-    def weigh(self, sheet: FloatImage, weights: FloatImage, aim: FloatImage, out: FloatImage) -> None:
-        np.subtract(sheet, aim, out=out)
+    def normal_residual(
+        self, buffer: FloatImage, weights: FloatImage, right_hand_side: FloatImage, out: FloatImage
+    ) -> None:
+        np.subtract(buffer, right_hand_side, out=out)
 
-    def aim(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
-        return picture
+    def right_hand_side(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
+        return picture.reshape(-1)
 
     def forward_planes(
         self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
     ) -> FloatImage:
-        raise TypeError("the prototype's pictures are sheets")
+        raise TypeError("the prototype's pictures are sensor buffers")
 
-    def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
-        raise TypeError("the prototype's pictures are sheets")
+    def adjoint_planes(
+        self, r: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
+    ) -> FloatImage:
+        raise TypeError("the prototype's pictures are sensor buffers")
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
         raise TypeError("the prototype has no means")
 
+    def submatrix(
+        self, box: CameraBox, pixels: npt.NDArray[np.int64], channels: tuple[int, ...]
+    ) -> sp.csr_matrix[np.float64]:
+        raise TypeError("the prototype writes out no equations")
+
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         return {}
-
-    @classmethod
-    def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> _Theirs:
-        raise KeyError("P")
 
 
 def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) -> tuple[int, float, float]:
     """Sweeps until the objective is no higher, their seconds without those of looking, and the objective then."""
     across, down = _smooth(theirs)
     majoriser = 2 * _ties(transport, across, down)
-    ones, sheet, reach = np.ones_like(majoriser), transport.sheet(), transport.sheet()
+    ones, light, reach = np.ones_like(majoriser), transport.sensor_buffer(), transport.sensor_buffer()
     data = np.zeros_like(majoriser)
     for n in range(len(transport.sizes)):
-        sheet[:] = 0
-        transport.add_light(n, ones, sheet)
-        reach += sheet
-        transport.pull(n, sheet, data)
+        light[:] = 0
+        transport.accumulate_forward(n, ones, light)
+        reach += light
+        transport.adjoint_of_buffer(n, light, data)
     majoriser += data
     wanted: FloatImage = theirs["tgt"]
-    problem = Problem(transport, wanted, np.ones(transport.shape, np.float32), across, down, majoriser)
+    problem = Problem(transport, wanted, np.ones(transport.camera_shape, np.float32), across, down, majoriser)
     start = _start(transport, wanted, reach)
-    descend(problem, start.copy(), Watch(0, 1))
+    block_coordinate_descent(problem, start.copy(), IterationControl(0, 1))
     seen: list[tuple[int, float, float]] = []
     state = {"looked_s": 0.0, "began_s": time.perf_counter()}
     start = _start(transport, wanted, reach)
 
     def look(sweep: int, x: FloatImage) -> None:
         arrived_s = time.perf_counter()
-        light = transport.sheet()
+        light = transport.sensor_buffer()
         for n in range(len(transport.sizes)):
-            transport.add_light(n, x, light)
-        found = float(((light - wanted).astype(np.float64) ** 2).sum()) + roughness(problem, x)
+            transport.accumulate_forward(n, x, light)
+        found = float(((light - wanted.reshape(-1)).astype(np.float64) ** 2).sum()) + smoothness_term(problem, x)
         seen.append((sweep, arrived_s - state["began_s"] - state["looked_s"], found))
         state["looked_s"] += time.perf_counter() - arrived_s
 
@@ -186,7 +192,7 @@ def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) 
         return bool(seen) and seen[-1][2] <= objective
 
     with contextlib.suppress(WorkError):
-        descend(problem, start, Watch(0, MOST_SWEEPS, cancelled=enough, look=look))
+        block_coordinate_descent(problem, start, IterationControl(0, MOST_SWEEPS, cancelled=enough, on_iterate=look))
     return seen[-1]
 
 
@@ -194,8 +200,8 @@ def _start(transport: _Theirs, wanted: FloatImage, reach: FloatImage) -> FloatIm
     """All projectors at the same share of their light, as means over their pixels' light."""
     share, whole = np.empty((3, transport.pixels), np.float32), np.empty((3, transport.pixels), np.float32)
     for n in range(len(transport.sizes)):
-        transport.pull(n, wanted, share)
-        transport.pull(n, reach, whole)
+        transport.adjoint_of_buffer(n, wanted.reshape(-1), share)
+        transport.adjoint_of_buffer(n, reach, whole)
     return np.clip(share / np.maximum(whole, np.finfo(np.float32).tiny), 0, 1)
 
 
@@ -212,7 +218,7 @@ def _ties(transport: _Theirs, across: FloatImage, down: FloatImage) -> FloatImag
 def _here(size: str, sweeps: int, prototype_s: float, goal: float | None) -> list[Row]:
     """So many sweeps and the set-up of ours, on the synthetic stage of the same size."""
     calibration = synthetic_calibration(size)
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     image = base_image(calibration, "white")
     traced(transport, image, calibration.black, 1)
     trace = traced(transport, image, calibration.black, 8)

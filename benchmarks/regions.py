@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import os
 import statistics
 import time
 from typing import Final
@@ -19,13 +18,14 @@ import numpy as np
 from benchmarks import Row, Timing, at_least, at_most
 from benchmarks._synthetic import crop_calibration, synthetic_calibration, synthetic_target
 from benchmarks._traced import traced
-from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration
-from controller.solve.bounded import first_guess, pose, solve_bounded
-from controller.solve.box_solvers import BoxProblem, solve_box
+from controller.core.arrays import FloatImage
+from controller.solve.bounded.solver import build_problem, initial_point, solve_bounded
 from controller.solve.feasibility import choose_exposure, target_radiance
-from controller.solve.regions import PHASES, SIZE_PX, Regions, solve_regions
-from controller.transport import LightTransport
+from controller.solve.regions.box_solvers import BoxProblem, solve_box
+from controller.solve.regions.solver import PHASES, SIZE_PX, Regions, solve_regions
+from controller.transport import LightTransport, build_transport
+from hal.runtime.compute import usable_cpus
 
 SAMPLE: Final = 30
 LONG_SWEEPS: Final = 400
@@ -58,12 +58,12 @@ def _unmixed(calibration: Calibration) -> Calibration:
 
 
 def _target(transport: LightTransport, black: FloatImage) -> FloatImage:
-    reflectance = synthetic_target(transport.shape)
+    reflectance = synthetic_target(transport.camera_shape)
     return target_radiance(reflectance, black, choose_exposure(transport, reflectance, black))
 
 
 def _times(calibration: Calibration, kind: str, gap: float, *, paper: bool) -> list[Row]:
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     target = _target(transport, calibration.black)
     traced(transport, target, calibration.black, 1)
     trace = traced(transport, target, calibration.black, LONG_SWEEPS, most_s=MOST_S)
@@ -73,10 +73,10 @@ def _times(calibration: Calibration, kind: str, gap: float, *, paper: bool) -> l
                 how=f"{sweeps} sweeps, set-up included; best of {len(trace.sweeps)}")
         for above, sweeps, at in ((NEAR_BEST, near_sweeps, near), (gap, same_sweeps, same))
     ]  # fmt: skip
-    regions = Regions(pose(transport, target, calibration.black, 0.001, None))
+    regions = Regions(build_problem(transport, target, calibration.black, 0.001, None))
     count = sum(1 for phase in PHASES for _ in regions.of_phase(phase))
     sample, cut_s = _sampled(regions)
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cpus()
     unknowns = statistics.median(problem.start.size for parts in sample for problem in parts)
     rows.append(
         at_most(f"cutting out the equations of a region, {kind}", cut_s, None, unit="s",
@@ -101,7 +101,7 @@ def _times(calibration: Calibration, kind: str, gap: float, *, paper: bool) -> l
 def _sampled(regions: Regions) -> tuple[list[list[BoxProblem]], float]:
     """The problems of random regions of the first phase, which has most unknowns; and the seconds to cut one out."""
     problem = regions.problem
-    x = first_guess(problem)
+    x = initial_point(problem)
     light = problem.transport.forward_planes(x)
     nothing = np.zeros(x.shape[1], np.bool_)
     every = list(regions.of_phase(PHASES[0]))
@@ -137,7 +137,7 @@ def _nearness(calibration: Calibration) -> tuple[list[Row], float]:
     above: dict[int, list[float]] = {size_px: [] for size_px in SIZES_PX}
     differing: dict[int, list[float]] = {size_px: [] for size_px in SIZES_PX}
     for crop in _crops(calibration):
-        transport = LightTransport.build(crop)
+        transport = build_transport(crop)
         target = _target(transport, crop.black)
         exact = solve_regions(transport, target, crop.black, solver=solver, size_px=2 * CROP_PX)
         best = solve_bounded(transport, target, crop.black, tolerance=1e-7, most_iterations=2000)

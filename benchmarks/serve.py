@@ -27,13 +27,13 @@ from benchmarks._stage import FIRST_SEED, prepared_stage
 from controller.bundle.install import install
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.checking import check_stage
-from controller.demo.bench_process import BenchProcess
-from controller.errors import VelaturaError
-from controller.serve.control import ask
-from controller.serve.hours import WEEKDAYS
-from controller.services import KEY_FILE, output_sizes
-from controller.storage import runtime_folder
+from controller.core.errors import VelaturaError
+from controller.core.storage import runtime_folder
+from controller.kiosk.api.control import ask
+from controller.kiosk.decide.hours import WEEKDAYS
+from controller.services.calibrate import KEY_FILE, output_sizes
+from controller.stage.bench import BenchProcess
+from controller.stage.check import check_stage
 from tests.controller.play.wire import Wire
 
 STARTS = 5

@@ -11,15 +11,14 @@ from numba import prange
 from benchmarks import Row, Timing, at_most, peak_bytes, timed
 from benchmarks._synthetic import synthetic_calibration, synthetic_target
 from benchmarks._traced import Sweep, Trace, traced
-from controller.arrays import ByteImage, FloatImage
 from controller.calibrate.values import Calibration
-from controller.compiled import compiled
+from controller.core.arrays import ByteImage, FloatImage
+from controller.core.jit import compiled
 from controller.solve.appearance import Base, base_image, scale_frames, solve_base
-from controller.solve.dither import to_device
 from controller.solve.feasibility import choose_exposure, target_radiance
-from controller.solve.interactive import interactive
-from controller.transport import LightTransport
-from controller.transport.window_transport import WindowTransport
+from controller.solve.scaling.dither import to_device
+from controller.solve.scaling.interactive import interactive
+from controller.transport import LightTransport, build_transport
 
 STREAMED_FLOATS = 1 << 27
 NEAR_BEST = 1e-3
@@ -42,12 +41,12 @@ def measure(size: str) -> list[Row]:
     """Products against bandwidth, time to within 1e-3 of the best objective, memory."""
     calibration = synthetic_calibration(size)
     began = time.perf_counter()
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     build_s = time.perf_counter() - began
     paper = size == "paper"
     rows = [at_most("light transport, build", build_s, None, unit="s", how="once, compiling included")]
     rows += _products(transport, paper=paper)
-    reflectance = synthetic_target(transport.shape)
+    reflectance = synthetic_target(transport.camera_shape)
     exposure = choose_exposure(transport, reflectance, calibration.black)
     target = target_radiance(reflectance, calibration.black, exposure)
     rows += _solve(transport, calibration, target, paper=paper)
@@ -57,7 +56,7 @@ def measure(size: str) -> list[Row]:
 def _products(transport: LightTransport, *, paper: bool) -> list[Row]:
     rng = np.random.default_rng(0)
     p = rng.random((3, transport.pixels), np.float32)
-    light = np.empty((3, *transport.shape), np.float32)
+    light = np.empty((3, *transport.camera_shape), np.float32)
     back = np.empty_like(p)
     stream = np.ones(STREAMED_FLOATS, np.float32)
     read = timed(partial(_read, stream))
@@ -65,9 +64,9 @@ def _products(transport: LightTransport, *, paper: bool) -> list[Row]:
     adjoint = timed(lambda: transport.adjoint_planes(light, out=back))
     again = timed(partial(_read, stream))
     bandwidth = stream.nbytes / min(read.minimum, again.minimum)
-    stored = transport.stored_bytes
+    stored = stored_bytes(transport)
     pair = Timing(*(a + b for a, b in zip(_values(forward), _values(adjoint), strict=True)))
-    samples = int(transport.windows.site.size) if isinstance(transport, WindowTransport) else 0
+    samples = stored_windows(transport)
     return [
         at_most("memory bandwidth, read", bandwidth / 1e9, None, unit="GB/s", how=f"512 MiB, {read} and {again}"),
         at_most("T p", forward.median, None, unit="s", how=str(forward)),
@@ -80,6 +79,19 @@ def _products(transport: LightTransport, *, paper: bool) -> list[Row]:
             how=f"{stored / 1e6:.0f} MB, {stored / max(samples, 1):.1f} bytes a sample and projector; pair {pair}",
         ),
     ]
+
+
+def stored_bytes(transport: LightTransport) -> int:
+    """The size of what a product reads of T."""
+    return sum(
+        array.nbytes for name, array in transport.arrays().items() if name not in ("lit", "per_weight", "per_sum")
+    )
+
+
+def stored_windows(transport: LightTransport) -> int:
+    """How many windows of camera samples T has; 0 where it is made of metapixels."""
+    site = transport.arrays().get("site")
+    return 0 if site is None else int(site.size)
 
 
 def _values(timing: Timing) -> tuple[float, float, float]:

@@ -14,10 +14,9 @@ import numpy as np
 
 from benchmarks import Row, Timing, at_most, timed
 from benchmarks._synthetic import synthetic_calibration
-from benchmarks.solve import STREAMED_FLOATS, _read
-from controller.arrays import FloatImage
-from controller.transport import LightTransport
-from controller.transport.window_transport import WindowTransport
+from benchmarks.solve import STREAMED_FLOATS, _read, stored_bytes, stored_windows
+from controller.core.arrays import FloatImage
+from controller.transport import LightTransport, build_transport
 
 REPEATS = 9
 BYTES_A_WEIGHT = 2
@@ -27,10 +26,8 @@ WEIGHTS = 16
 
 def measure(size: str) -> list[Row]:
     """The stored bytes, then each product by all cores' seconds and by one thread's processor time."""
-    transport = LightTransport.build(synthetic_calibration(size))
-    assert isinstance(transport, WindowTransport)
-    windows = int(transport.windows.site.size)
-    stored = transport.stored_bytes
+    transport = build_transport(synthetic_calibration(size))
+    windows, stored = stored_windows(transport), stored_bytes(transport)
     rows = [
         at_most("stored", stored / 1e6, None, unit="MB", how=f"{windows} windows, {stored / windows:.1f} bytes each")
     ]
@@ -45,23 +42,23 @@ def measure(size: str) -> list[Row]:
 
 
 def _against_a_pass(
-    transport: WindowTransport, clock: Callable[..., Timing], what: str, goal: float | None
+    transport: LightTransport, clock: Callable[..., Timing], what: str, goal: float | None
 ) -> list[Row]:
     rng = np.random.default_rng(0)
     p = rng.random((3, transport.pixels), np.float32)
-    light = np.zeros((3, *transport.shape), np.float32)
+    light = np.zeros((3, *transport.camera_shape), np.float32)
     back, stream = np.zeros_like(p), np.ones(STREAMED_FLOATS, np.float32)
-    sheet = transport.sheet()
-    aim, residual = np.zeros_like(sheet), np.empty_like(sheet)
-    weights = np.ones(transport.shape, np.float32)
+    buffer = transport.sensor_buffer()
+    right_hand_side, residual = np.zeros_like(buffer), np.empty_like(buffer)
+    weights = np.ones(transport.camera_shape, np.float32)
     read = clock(partial(_read, stream), repeats=REPEATS)
     forward = clock(lambda: transport.forward_planes(p, out=light), repeats=REPEATS)
     adjoint = clock(lambda: transport.adjoint_planes(light, out=back), repeats=REPEATS)
-    sweep = clock(lambda: _sweep(transport, p, weights, aim, sheet, residual, back), repeats=REPEATS)
+    sweep = clock(lambda: _sweep(transport, p, weights, right_hand_side, buffer, residual, back), repeats=REPEATS)
     again = clock(partial(_read, stream), repeats=REPEATS)
     bandwidth = stream.nbytes / min(read.minimum, again.minimum)
-    one_pass = transport.stored_bytes / bandwidth
-    plain = BYTES_A_WEIGHT * WEIGHTS * transport.windows.site.size / bandwidth
+    one_pass = stored_bytes(transport) / bandwidth
+    plain = BYTES_A_WEIGHT * WEIGHTS * stored_windows(transport) / bandwidth
     pair = forward.minimum + adjoint.minimum
     return [
         at_most(f"one pass, {what}", one_pass, None, unit="s", how=f"{bandwidth / 1e9:.1f} GB/s, {read} and {again}"),
@@ -86,18 +83,18 @@ def _against_a_pass(
 
 
 def _sweep(
-    transport: WindowTransport,
+    transport: LightTransport,
     p: FloatImage,
     weights: FloatImage,
-    aim: FloatImage,
-    sheet: FloatImage,
+    right_hand_side: FloatImage,
+    buffer: FloatImage,
     residual: FloatImage,
     back: FloatImage,
 ) -> None:
     for n in range(len(transport.sizes)):
-        transport.weigh(sheet, weights, aim, residual)
-        transport.pull(n, residual, back)
-        transport.add_light(n, p, sheet)
+        transport.normal_residual(buffer, weights, right_hand_side, residual)
+        transport.adjoint_of_buffer(n, residual, back)
+        transport.accumulate_forward(n, p, buffer)
 
 
 def _processor_time(work: Callable[[], object], *, repeats: int) -> Timing:

@@ -19,11 +19,11 @@ import numpy as np
 from benchmarks import Row, at_least, at_most
 from benchmarks._frames import OUTPUTS, compensation_frames
 from benchmarks.player import keep_compiled, more_than_kept, private_bytes, processor_s, starting
-from controller.arrays import ByteImage
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.play.launch import PlayerProcess, PlayerSettings, start_player
+from controller.core.arrays import ByteImage
+from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
+from tests.controller.play.display.xorg import CONNECTORS, MODES, running_server
 from tests.controller.play.wire import Wire
-from tests.controller.play.xorg import CONNECTORS, MODES, running_server
 
 MINUTES = 0.5
 GOAL_MINUTES = 10.0

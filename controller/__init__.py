@@ -1,1 +1,3 @@
-"""Velatura's controller. Kept empty of imports: the player must start without loading the rest."""
+"""Velatura's controller; `__main__` is the command line. Kept free of imports: the player must start without
+loading the rest.
+"""

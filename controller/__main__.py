@@ -5,36 +5,50 @@ Heavy imports happen inside the commands, so that ``velatura --help`` answers at
 
 from __future__ import annotations
 
-import errno
 import os
 import platform
 import sys
-import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
+from controller.cli.plain_install import run_without_commands
+from controller.core.extras import EXTRA_OF, extra_missing
 
-from controller import console
-from controller.commands import accounts as account_commands
-from controller.commands import bundle as bundle_commands
-from controller.commands import camera as camera_commands
-from controller.commands import kiosk as kiosk_commands
-from controller.commands import serve as serve_commands
-from controller.commands.doctor import doctor
-from controller.commands.drift import drift
-from controller.commands.export import export
-from controller.commands.keys import keys
-from controller.commands.live import live
-from controller.commands.photograph import photograph
-from controller.commands.plan import plan
-from controller.commands.report import report
-from controller.commands.running import Json, StageFolder, group, projector_names, work
-from controller.commands.study import study
-from controller.errors import UsageError, VelaturaError
+try:
+    import typer
+except ModuleNotFoundError as missing:  # a plain installation, which has the player alone
+    if missing.name not in EXTRA_OF:
+        raise
+    sys.exit(run_without_commands(sys.argv[1:], missing.name))
+
+from controller.cli import console, derived
+from controller.cli.commands import accounts as account_commands
+from controller.cli.commands import bundle as bundle_commands
+from controller.cli.commands import camera as camera_commands
+from controller.cli.commands import kiosk as kiosk_commands
+from controller.cli.commands import serve as serve_commands
+from controller.cli.commands.doctor import doctor
+from controller.cli.commands.drift import drift
+from controller.cli.commands.export import export
+from controller.cli.commands.keys import keys
+from controller.cli.commands.live import live
+from controller.cli.commands.photograph import photograph
+from controller.cli.commands.plan import plan
+from controller.cli.commands.report import report
+from controller.cli.commands.study import study
+from controller.cli.running import Json, StageFolder, group, projector_names, work
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.files import file_error
+from hal.runtime.caches import prepare_libraries, state_folder, temporary_folder
+
+if TYPE_CHECKING:
+    from controller.run.progress import Reporter
+    from hal.errors import DeviceError
 
 __all__ = ["COMMANDS", "GROUPS", "Json", "StageFolder", "application", "main", "run", "work"]
 
@@ -51,8 +65,8 @@ def states(
     mermaid: Annotated[bool, typer.Option("--mermaid", help="Print the diagram in Mermaid's language.")] = False,
 ) -> None:
     """Show the states of a stage and what leads from one to the next."""
-    from controller.session.machine import TRANSITIONS
-    from controller.session.machine import mermaid as diagram
+    from controller.run.state_machine import TRANSITIONS
+    from controller.run.state_machine import mermaid as diagram
 
     lines = (f"{before.value:12} {event.value:14} -> {after.value}" for (before, event), after in TRANSITIONS.items())
     console.show_result(diagram() if mermaid else "\n".join(lines), as_json=False)
@@ -69,16 +83,22 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Do the whole job on an emulated stage, from cold lamps to a report."""
-    work(
-        "controller.demo.job:demo", as_json=as_json,
-        size=size, object_file=object, out=out, seed=seed, prepare_only=prepare_only,
-    )  # fmt: skip
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.demo.job import demo
+
+        return demo(
+            size=size, object_file=object, out=out, seed=seed, prepare_only=prepare_only,
+            reporter=reporter, cancel=cancel,
+        )  # fmt: skip
+
+    work(do, as_json=as_json)
 
 
 def emulate(
     stage: StageFolder,
     scenario: Annotated[
-        Path | None, typer.Option(help="A script of faults (docs/drivers.md) that the devices play.")
+        Path | None, typer.Option(help="A script of faults (docs/how-to/emulated-devices.md) that the devices play.")
     ] = None,
     until_input_ends: Annotated[
         bool, typer.Option("--until-input-ends", help="End, too, when standard input is closed.")
@@ -86,7 +106,7 @@ def emulate(
     as_json: Json = False,
 ) -> int:
     """Serve the emulated devices of a stage, and print the address of each, until Ctrl-C."""
-    from controller.demo.bench_process import bench_of, terminated_when_input_ends
+    from controller.stage.bench import bench_of, terminated_when_input_ends
 
     if not stage.is_dir():
         raise UsageError(
@@ -118,16 +138,23 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Photograph patterns and calibrate the stage; goes on with an unfinished calibration."""
-    if quick or projector is not None:
-        work(
-            "controller.drift_services:recalibrate", as_json=as_json,
-            stage=stage, accept_grade=accept_grade, projector=projector,
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.services.calibrate import calibrate
+        from controller.services.recalibrate import recalibrate
+        from controller.stage.session import OwnSession
+
+        session = OwnSession(stage)
+        if quick or projector is not None:
+            return recalibrate(
+                session=session, accept_grade=accept_grade, projector=projector, reporter=reporter, cancel=cancel
+            )
+        return calibrate(
+            session=session, mode=mode, dot_spacing=dot_spacing, accept_grade=accept_grade,
+            reporter=reporter, cancel=cancel,
         )  # fmt: skip
-        return
-    work(
-        "controller.services:calibrate", as_json=as_json,
-        stage=stage, mode=mode, dot_spacing=dot_spacing, accept_grade=accept_grade,
-    )  # fmt: skip
+
+    work(do, as_json=as_json)
 
 
 def appearance(
@@ -152,11 +179,17 @@ def appearance(
     as_json: Json = False,
 ) -> None:
     """Solve appearances on the last calibration and publish them in a signed bundle."""
-    work(
-        "controller.services:make_appearances", as_json=as_json,
-        stage=stage, names=tuple(names or ()), scenes=tuple(blender or ()), accept_grade=accept_grade, base=base,
-        scheduler=scheduler, quick=quick,
-    )  # fmt: skip
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.services.calibrate import make_appearances
+        from controller.stage.session import OwnSession
+
+        return make_appearances(
+            session=OwnSession(stage), names=tuple(names or ()), scenes=tuple(blender or ()),
+            accept_grade=accept_grade, base=base, scheduler=scheduler, quick=quick, reporter=reporter, cancel=cancel,
+        )  # fmt: skip
+
+    work(do, as_json=as_json)
 
 
 def play(
@@ -171,10 +204,17 @@ def play(
     as_json: Json = False,
 ) -> None:
     """Light the projectors and show appearances of the installed bundle."""
-    work(
-        "controller.play_services:play", as_json=as_json,
-        stage=stage, names=tuple(names or ()), sequence=sequence, seconds=seconds or None, fade_s=fade, repeat=repeat,
-    )  # fmt: skip
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.services.play import play
+        from controller.stage.session import OwnSession
+
+        return play(
+            session=OwnSession(stage), names=tuple(names or ()), sequence=sequence, seconds=seconds or None,
+            fade_s=fade, repeat=repeat, reporter=reporter, cancel=cancel,
+        )  # fmt: skip
+
+    work(do, as_json=as_json)
 
 
 COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
@@ -195,6 +235,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     states,
     *serve_commands.COMMANDS,
     *kiosk_commands.COMMANDS,
+    *derived.commands(),
 )
 """Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
 
@@ -217,6 +258,8 @@ def application() -> typer.Typer:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 the work failed, 2 wrong use, 3 a device failed, 130 stopped."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    console.prepare_streams()
+    prepare_libraries()
     sys.exit(run(given))
 
 
@@ -229,43 +272,67 @@ def run(arguments: Sequence[str]) -> int:
     except SystemExit as exiting:  # by the command-line library, when the reader of our output went away
         return exiting.code if isinstance(exiting.code, int) else FAILED
     except BaseException as error:  # noqa: BLE001 - the last boundary: nobody above could show it
-        return _shown(error, as_json=as_json)
+        return _told(error, as_json=as_json)
     return outcome if isinstance(outcome, int) else DONE
 
 
-def _shown(error: BaseException, *, as_json: bool) -> int:
-    """Show ``error`` as two sentences and return the exit code."""
+def _told(error: BaseException, *, as_json: bool) -> int:
+    """Show ``error`` as two sentences and return the exit code; where the output is lost, say that instead."""
+    if isinstance(error, typer.Exit):
+        return error.exit_code
+    if isinstance(error, OSError) and console.output_lost():
+        return FAILED
+    try:
+        shown = _explained(error)
+        if shown is None:
+            return _crashed(error, as_json=as_json)
+        console.show_error(shown.code, shown.what, shown.remedy, as_json=as_json)
+    except OSError:
+        if not console.output_lost():
+            raise
+    else:
+        return shown.exit_code
+    return FAILED
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    code: str
+    what: str
+    remedy: str
+    exit_code: int
+
+
+def _explained(error: BaseException) -> _Shown | None:
+    """What to tell of ``error``; None for one that should never happen."""
     from hal.deadline import Cancelled
     from hal.errors import DeviceError
 
-    if isinstance(error, typer.Exit):
-        return error.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort | Cancelled) or getattr(error, "code", None) == "cancelled":
-        console.show_error(
-            "cancelled", "The work was stopped on request.", "The same command goes on from here.", as_json=as_json
-        )
-        return STOPPED
-    if isinstance(error, VelaturaError | DeviceError):
-        console.show_error(error.code, error.what, error.remedy, as_json=as_json)
-        return error.exit_code if isinstance(error, VelaturaError) else DEVICE_FAILED
+        return _Shown("cancelled", "The work was stopped on request.", "The same command goes on from here.", STOPPED)
     if isinstance(error, typer.TyperException):
-        return _wrong_use(error, as_json=as_json)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        name = error.filename or "the stage's folder"
-        console.show_error(
-            "no-space", f"There was no space left to write {name}.", "Free some space and start again.", as_json=as_json
-        )
-        return FAILED
-    return _crashed(error, as_json=as_json)
+        message = error.format_message()
+        sentence = message if message.endswith((".", "?")) else f"{message}."
+        return _Shown("wrong-use", sentence, "`velatura --help` shows the commands and their options.", WRONG_USE)
+    known = _as_velatura_error(error)
+    if isinstance(known, DeviceError):
+        return _Shown(known.code, known.what, known.remedy, DEVICE_FAILED)
+    return None if known is None else _Shown(known.code, known.what, known.remedy, known.exit_code)
 
 
-def _wrong_use(error: typer.TyperException, *, as_json: bool) -> int:
-    message = error.format_message()
-    sentence = message if message.endswith((".", "?")) else f"{message}."
-    console.show_error(
-        "wrong-use", sentence, "`velatura --help` shows the commands and their options.", as_json=as_json
-    )
-    return WRONG_USE
+def _as_velatura_error(error: BaseException) -> VelaturaError | DeviceError | None:
+    from hal.errors import DeviceError
+
+    if isinstance(error, VelaturaError | DeviceError):
+        return error
+    if isinstance(error, ModuleNotFoundError):
+        return extra_missing(error.name or "")
+    if isinstance(error, OSError):
+        return file_error(error)
+    if isinstance(error, MemoryError):
+        return WorkError("no-memory", what="The memory of this machine did not suffice.",
+                         remedy="End other programs, or give a smaller stage, picture or mesh.")  # fmt: skip
+    return None
 
 
 def _crashed(error: BaseException, *, as_json: bool) -> int:
@@ -278,8 +345,7 @@ def _crashed(error: BaseException, *, as_json: bool) -> int:
         ]
     )
     name = f"crash-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
-    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    path = _kept(report, name, Path(state) / "velatura")
+    path = _kept(report, name)
     console.show_error(
         "crash",
         f"Velatura met an error that it does not know ({type(error).__name__}).",
@@ -289,15 +355,16 @@ def _crashed(error: BaseException, *, as_json: bool) -> int:
     return FAILED
 
 
-def _kept(report: str, name: str, folder: Path) -> Path | None:
-    for place in (folder, Path(tempfile.gettempdir())):
+def _kept(report: str, name: str) -> Path | None:
+    for folder in (state_folder, temporary_folder):
         try:
+            place = folder()
             place.mkdir(parents=True, exist_ok=True)
             path = place / name
             # Only a new file, and only for this user: the folder may be shared with others.
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
                 file.write(report)
-        except OSError:
+        except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
             continue
         return path
     return None

@@ -1,1 +1,3 @@
-"""What a device is: interfaces, values, errors, registry, byte links, protocol codecs, conformance suite."""
+"""What a device is: `interfaces`, `values`, `errors`, `registry`, byte links, protocol codecs (`codecs`), and
+the tests for drivers (`conformance`).
+"""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -56,6 +58,20 @@ class Deadline:
             time.sleep(wait_s)
         elif self.cancel.wait(wait_s):
             raise Cancelled
+
+
+@contextlib.contextmanager
+def turn(lock: threading.Lock | threading.RLock, deadline: Deadline, check: Callable[[], object]) -> Iterator[None]:
+    """One caller at a time has ``lock``. ``check`` is called while others have it.
+
+    It raises Cancelled, and what says that ``deadline`` has passed (``Deadline.check``).
+    """
+    while not lock.acquire(timeout=min(SLICE_S, deadline.left_s())):
+        check()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def in_seconds(seconds: float, cancel: threading.Event | None = None) -> Deadline:

@@ -50,3 +50,7 @@ class ProtocolError(DeviceError):
 
 class PluginError(DeviceError):
     """A driver could not be found, loaded or configured."""
+
+
+class DriverFault(DeviceError):
+    """A driver broke its promise: it raised what is no ``DeviceError``, or returned a wrong object."""

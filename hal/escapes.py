@@ -7,6 +7,7 @@ byte is ``\xNN``.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Final
 
 from hal.errors import ProtocolError
@@ -31,3 +32,16 @@ def unescaped(text: str) -> bytes:
             remedy="Record it again; its format is described in hal/transcript.py.",
         )
     return _ESCAPE.sub(lambda m: bytes.fromhex(m[1].decode()) if m[1] else _LONG[m[2]], data)
+
+
+def toml_value(value: object) -> str:
+    """A value of a TOML file as an error repeats it: not as Python writes it, and text in single quotes."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f"'{value}'"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    return str(value)

@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from hal.deadline import Deadline
+from hal.driver_calls import Caller
 from hal.errors import DeviceError
 
 GROUP: Final = "velatura.finders"
@@ -88,6 +89,12 @@ class Finder:
 
     bus: str
     find: Callable[[Wanted, Deadline], Sequence[Found]]
+
+
+def search_bus(finder: Finder, wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    """What ``finder`` finds. Raises as ``Finder.find``, and DriverFault for all else that it raises or returns."""
+    caller = Caller(f"What looks for devices on {finder.bus}")
+    return cast("Sequence[Found]", caller.call("find", finder.find, Sequence[Found], wanted, deadline))
 
 
 def load_finders(found: Iterable[EntryPoint] | None = None) -> tuple[tuple[Finder, ...], tuple[Problem, ...]]:

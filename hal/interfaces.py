@@ -64,6 +64,14 @@ class Projector(Device, Protocol):
 
 
 @runtime_checkable
+class WatchedProjector(Projector, Protocol):
+    """A projector whose driver tells what it could not understand."""
+
+    def troubles(self) -> list[tuple[str, str]]:
+        """What was odd since the last call, each thing once: (stable code, one sentence). Nothing of it stops work."""
+
+
+@runtime_checkable
 class Camera(Device, Protocol):
     """A still camera that can be triggered and read out over a cable."""
 

@@ -7,15 +7,24 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from hal.annotations import mismatch
 from hal.deadline import Deadline
+from hal.driver_calls import Caller
 from hal.errors import PluginError
+from hal.escapes import toml_value
 
 GROUP = "velatura.devices"
 BENCH = "-bench"
 """How the names of entry points end that offer a bench."""
 KINDS = ("projector", "camera", "display", "power_switch", "light_sensor", "button_panel", "bench")
+
+
+_KIND_WORDS: Final[Mapping[type, str]] = {
+    str: "text in quotes", int: "a whole number", float: "a number", bool: "true or false", list: "a list",
+    dict: "a table",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +60,18 @@ class Driver:
 
 @dataclass(frozen=True, slots=True)
 class BrokenPlugin:
-    """An entry point that could not be used: its name and value, its distribution, and why."""
+    """An entry point that could not be used: its name and value, its distribution, why, and what to do.
+
+    ``claims``: the kind and name that two plugins claim, of which therefore neither is used; None for another reason.
+    ``missing``: the Python module that was not found, if that is why.
+    """
 
     entry_point: str
     distribution: str
     reason: str
+    remedy: str = "Reinstall that distribution."
+    claims: tuple[str, str] | None = None
+    missing: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +82,21 @@ class Drivers:
     broken: tuple[BrokenPlugin, ...] = ()
 
     def get(self, kind: str, name: str) -> Driver:
-        """The driver ``name`` of ``kind``; PluginError("driver-unknown") says which there are."""
+        """The driver ``name`` of ``kind``.
+
+        Raises PluginError("driver-unknown"), which says which there are, and PluginError("driver-twice") where two
+        plugins claim this kind and name: neither may win by chance.
+        """
         for driver in self.list:
             if (driver.kind, driver.name) == (kind, name):
                 return driver
+        if claimed := [plugin for plugin in self.broken if plugin.claims == (kind, name)]:
+            raise PluginError(
+                "driver-twice",
+                what=f"The {kind.replace('_', ' ')} driver {name!r} comes from more than one plugin: "
+                f"{', '.join(f'{plugin.distribution} ({plugin.entry_point})' for plugin in claimed)}.",
+                remedy=claimed[0].remedy,
+            )
         names = sorted(driver.name for driver in self.list if driver.kind == kind)
         broken = f" These plugins could not be loaded: {self._broken_sentence()}." if self.broken else ""
         raise PluginError(
@@ -77,6 +104,10 @@ class Drivers:
             what=f"There is no {kind.replace('_', ' ')} driver {name!r}.{broken}",
             remedy=f"Use one of these: {', '.join(names)}." if names else f"Install a plugin that has a {kind} driver.",
         )
+
+    def missing_for(self, name: str) -> str:
+        """The Python module whose absence keeps the driver ``name`` from being loaded; "" if it is not that."""
+        return next((plugin.missing for plugin in self.broken if plugin.entry_point.startswith(name)), "")
 
     def _broken_sentence(self) -> str:
         return "; ".join(f"{plugin.entry_point} of {plugin.distribution} ({plugin.reason})" for plugin in self.broken)
@@ -88,10 +119,10 @@ def load_drivers(found: Iterable[EntryPoint] | None = None, *, benches: bool = T
     ``benches`` False: not those whose name ends in ``-bench``. A bench is asked for by name and never stands in
     stage.toml, and its optics take longer to load than everything that a stage needs.
 
-    A plugin that cannot be imported, or is not a ``Driver``, is reported in ``broken`` and stops no other.
-    Raises PluginError("driver-twice") when two plugins claim one kind and name: neither may win by chance.
+    A plugin that cannot be imported, or is not a ``Driver``, is reported in ``broken`` and stops no other; so are all
+    plugins that claim a kind and name which another claims too.
     """
-    drivers: dict[tuple[str, str], tuple[Driver, str]] = {}
+    claims: dict[tuple[str, str], list[tuple[Driver, BrokenPlugin]]] = {}
     broken: list[BrokenPlugin] = []
     for entry in _distinct(entry_points(group=GROUP) if found is None else found):
         if not benches and entry.name.endswith(BENCH):
@@ -99,20 +130,19 @@ def load_drivers(found: Iterable[EntryPoint] | None = None, *, benches: bool = T
         where = f"{entry.name} = {entry.value}"
         owner = entry.dist.name if entry.dist is not None else "an unnamed distribution"
         loaded = _load(entry)
+        if isinstance(loaded, ModuleNotFoundError):
+            broken.append(BrokenPlugin(where, owner, f"ModuleNotFoundError: {loaded}", missing=loaded.name or ""))
+            continue
         if isinstance(loaded, str):
             broken.append(BrokenPlugin(where, owner, loaded))
             continue
         key = (loaded.kind, loaded.name)
-        if key in drivers:
-            raise PluginError(
-                "driver-twice",
-                what=f"The {loaded.kind} driver {loaded.name!r} comes from two plugins: {drivers[key][1]} and {owner}"
-                f" ({where}).",
-                remedy="Uninstall one of the two.",
-            )
-        drivers[key] = (loaded, f"{owner} ({where})")
-    ordered = sorted(drivers)
-    return Drivers(tuple(drivers[key][0] for key in ordered), tuple(broken))
+        reason = f"another plugin has a {loaded.kind.replace('_', ' ')} driver {loaded.name!r} too"
+        twice = BrokenPlugin(where, owner, reason, "Uninstall all but one of them.", key)
+        claims.setdefault(key, []).append((loaded, twice))
+    usable = [plugins[0][0] for _, plugins in sorted(claims.items()) if len(plugins) == 1]
+    broken += [twice for _, plugins in sorted(claims.items()) if len(plugins) > 1 for _, twice in plugins]
+    return Drivers(tuple(usable), tuple(broken))
 
 
 def _distinct(found: Iterable[EntryPoint]) -> Iterable[EntryPoint]:
@@ -124,20 +154,27 @@ def _distinct(found: Iterable[EntryPoint]) -> Iterable[EntryPoint]:
     return sorted(seen.values(), key=lambda entry: (entry.name, entry.value))
 
 
-def _load(entry: EntryPoint) -> Driver | str:
+def _load(entry: EntryPoint) -> Driver | ModuleNotFoundError | str:
     """The driver, or the reason why there is none."""
     try:
         driver = entry.load()
+    except ModuleNotFoundError as error:
+        return error
     except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything, and must not stop the others
         return f"{type(error).__name__}: {error}"
+    return _problem_of(driver) or driver
+
+
+def _problem_of(driver: Any) -> str:
+    """Why what an entry point names cannot be used; empty if it can."""
     if not isinstance(driver, Driver):
         return f"it names a {type(driver).__name__}, not a hal.registry.Driver"
     if driver.kind not in KINDS:
         return f"its kind {driver.kind!r} is not one of {', '.join(KINDS)}"
+    if problem := mismatch(driver, Driver):
+        return f"its Driver is wrong: {problem}"
     unexplained = [key for key in driver.required if key not in driver.settings]
-    if unexplained:
-        return f"it requires {', '.join(unexplained)} without explaining it in settings"
-    return driver
+    return f"it requires {', '.join(unexplained)} without explaining it in settings" if unexplained else ""
 
 
 def check_settings(driver: Driver, settings: Mapping[str, Any]) -> None:
@@ -164,10 +201,29 @@ def check_settings(driver: Driver, settings: Mapping[str, Any]) -> None:
             )
 
 
-def open_device(driver: Driver, settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> Any:
-    """Check ``settings``, then open the device."""
+def check_device(driver: Driver, settings: Mapping[str, Any], context: OpenContext, *, name: str = "") -> None:
+    """Check ``settings`` as ``check_settings``, then by the driver's own ``check``. Raises as ``open_device``."""
     check_settings(driver, settings)
-    return driver.open(settings, context, deadline)
+    if driver.check is not None:
+        _caller(driver, name).call("check", driver.check, None, settings, context)
+
+
+def open_device(
+    driver: Driver, settings: Mapping[str, Any], context: OpenContext, deadline: Deadline, *, name: str = ""
+) -> Any:
+    """Check ``settings``, then open the device. ``name``: how the stage calls it, for messages.
+
+    What the device raises or returns later is checked too (see ``hal.driver_calls``). Raises PluginError for the
+    settings, the driver's own DeviceError, and DriverFault("driver-fault") for anything else that it raises or returns.
+    """
+    check_settings(driver, settings)
+    caller = _caller(driver, name)
+    return caller.device(driver.kind, caller.call("open", driver.open, Any, settings, context, deadline))
+
+
+def _caller(driver: Driver, name: str) -> Caller:
+    device = f"{driver.kind.replace('_', ' ')} {name}" if name else f"the {driver.kind.replace('_', ' ')}"
+    return Caller(f"The driver {driver.name!r} of {device}")
 
 
 def setting(settings: Mapping[str, Any], key: str, kind: type | tuple[type, ...], default: Any = None) -> Any:
@@ -177,7 +233,7 @@ def setting(settings: Mapping[str, Any], key: str, kind: type | tuple[type, ...]
         kinds = kind if isinstance(kind, tuple) else (kind,)
         raise PluginError(
             "setting-wrong",
-            what=f"The setting {key!r} is {value!r}, which is not {' or '.join(k.__name__ for k in kinds)}.",
+            what=f"The setting '{key}' is {toml_value(value)}, not {' or '.join(_KIND_WORDS[k] for k in kinds)}.",
             remedy=f"Correct {key} in stage.toml.",
         )
     return value

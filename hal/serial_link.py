@@ -13,6 +13,7 @@ import serial
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
 from hal.links import BufferedLink, taken
+from hal.pty_links import leads_to_its_owner
 from hal.transcript import Transcript
 
 # After a hang-up pyserial raises SerialException (an OSError) from read and write, termios.error from flushes, and
@@ -37,6 +38,8 @@ class SerialLink(BufferedLink):
     def __init__(self, port: Path, *, baud: int, deadline: Deadline, transcript: Transcript | None = None) -> None:
         super().__init__(str(port), transcript)
         self._check(deadline, "was not opened")
+        if not leads_to_its_owner(port):
+            raise self._not_opened(None)
         try:
             self._serial = serial.Serial(str(port), baudrate=baud, timeout=0, write_timeout=0, exclusive=True)
         except _LOST as error:
@@ -69,7 +72,7 @@ class SerialLink(BufferedLink):
             remedy="Plug the adapter back in; the port is found again by its name.",
         )
 
-    def _not_opened(self, error: BaseException) -> DeviceError:
+    def _not_opened(self, error: BaseException | None) -> DeviceError:
         number = getattr(error, "errno", None)
         if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY) or "exclusively lock" in str(error):
             return taken(self.name)

@@ -1,1 +1,3 @@
-"""Real devices, one file a family; plugins.emulated holds the same devices as emulators, and the bench."""
+"""Drivers for real devices, one package per family; `plugins.emulated` has the same devices as emulators, with
+the bench.
+"""

@@ -12,9 +12,10 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
-from hal.deadline import SLICE_S, Deadline
+from hal.deadline import SLICE_S, Deadline, turn
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, ProtocolError
 
 Opened = TypeVar("Opened")
@@ -102,16 +103,12 @@ class WorkerLink(ABC, Generic[Opened]):
         Raises what ``find`` and ``work`` raise, DeviceGone for one that was closed, DeviceTimeout, ProtocolError where
         the device is there and fails the transfer, or Cancelled.
         """
-        while not self._turn.acquire(timeout=min(SLICE_S, deadline.left_s())):
-            self._still_time(deadline)
-        try:
+        with turn(self._turn, deadline, partial(self._still_time, deadline)):
             self._still_time(deadline)
             self._check_open()
             given_up = threading.Event()
             theirs = Deadline(deadline.at_s, given_up)
             return self._on_worker(lambda worker: self._try(worker, work, theirs), deadline, given_up)
-        finally:
-            self._turn.release()
 
     def close(self) -> None:
         """Close the device; a call that hangs is left behind after 0.7 s."""

@@ -1,52 +1,74 @@
-"""How tests are spread over workers: by file, long files first, files that share a costly fixture on one worker."""
+"""How tests are spread over workers: by file, long files first, users of the finished demo when it is there."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 from xdist.scheduler import LoadFileScheduling
 
-TOGETHER: Final = {
-    "tests/end_to_end/test_demo.py": "the finished demo",
-    "tests/end_to_end/test_live.py": "the finished demo",
-    "tests/end_to_end/test_on_a_cluster.py": "the finished demo",
-    "tests/end_to_end/test_photograph.py": "the finished demo",
-    "tests/end_to_end/test_takeover.py": "the finished demo",
-    "tests/end_to_end/test_targets.py": "the finished demo",
-}
-"""A fixture of the session is made once a worker, and the finished demo takes minutes."""
+MAKES_THE_DEMO: Final = "tests/end_to_end/test_demo.py"
+"""Its first test makes it, for all workers."""
+NEEDS_THE_DEMO: Final = (
+    "tests/end_to_end/test_on_a_cluster.py",
+    "tests/end_to_end/test_takeover.py",
+    "tests/end_to_end/test_live.py",
+    "tests/end_to_end/test_photograph.py",
+    "tests/end_to_end/test_targets.py",
+    "tests/end_to_end/test_kiosk_targets.py",
+)
+"""Meanwhile their workers would only wait: they have other tests first, and these at once when it is there."""
 LONGEST_FIRST: Final = (
-    "the finished demo",
+    MAKES_THE_DEMO,
+    "tests/end_to_end/test_going_on.py",
     "tests/plugins/test_on_usb_bus.py",
     "tests/controller/panel/test_in_browser.py",
-    "tests/end_to_end/test_going_on.py",
-    "tests/plugins/test_gphoto2_peer.py",
+    "tests/plugins/emulated/cameras/test_gphoto2_peer.py",
     "tests/plugins/finding/test_serial_ports.py",
     "tests/end_to_end/test_drift.py",
     "tests/end_to_end/test_technician.py",
     "tests/campaigns/test_kills.py",
     "tests/campaigns/test_serve_wires.py",
     "tests/end_to_end/test_usb_camera.py",
+    "tests/controller/calibrate/geometry/test_self_calibration.py",
+    "tests/controller/calibrate/geometry/test_self_calibration_failures.py",
     "tests/controller/calibrate/test_chain.py",
-    "tests/controller/solve/test_regions.py",
+    "tests/controller/solve/regions/test_solver.py",
     "tests/end_to_end/test_refusing_devices.py",
     "tests/controller/cluster/test_cluster.py",
     "tests/end_to_end/test_killed_demo.py",
     "tests/controller/study/test_beyond.py",
 )
-"""What would keep one worker busy for a minute after the other has ended, were it to come last. While the demo compiles
-every kernel (a minute and a half, kept on disk), the others have tests that need none: they would compile them, too."""
+"""What would keep one worker busy for a minute after the others have ended, were it to come last."""
+
+
+LONG: Final = (*NEEDS_THE_DEMO, *LONGEST_FIRST)
 
 
 class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
-    """xdist's scheduling by file, with these two additions."""
+    """xdist's scheduling by file, in this order, and no worker keeps a second long file while others could take it."""
 
-    def _split_scope(self, nodeid: str) -> str:
-        file = nodeid.split("::", 1)[0]
-        return TOGETHER.get(file, file)
+    _demo_is_made = False
 
-    def _assign_work_unit(self, node: object) -> None:
-        for scope in reversed(LONGEST_FIRST):
-            if scope in self.workqueue:
-                self.workqueue.move_to_end(scope, last=False)
+    def mark_test_complete(self, node: Any, item_index: int, duration: float = 0) -> None:
+        self._demo_is_made |= self._split_scope(self.registered_collections[node][item_index]) == MAKES_THE_DEMO
+        super().mark_test_complete(node, item_index, duration)
+
+    def _reschedule(self, node: Any) -> None:
+        # A worker runs a test when it knows the next one. xdist would give it files until it knows three.
+        if not node.shutting_down and self.workqueue and self._pending_of(self.assigned_work[node]) >= 2:
+            return
+        super()._reschedule(node)
+
+    def _assign_work_unit(self, node: Any) -> None:
+        unfinished = [file for file, tests in self.assigned_work[node].items() if not all(tests.values())]
+        busy = any(file in LONG for file in unfinished)
+        self.workqueue.move_to_end(min(self.workqueue, key=lambda file: self._rank(file, busy=busy)), last=False)
         super()._assign_work_unit(node)
+
+    def _rank(self, file: str, *, busy: bool) -> int:
+        """The file of the lowest rank is the next; for a worker that is ``busy`` with a long one, a short one."""
+        waiting = file in NEEDS_THE_DEMO and not self._demo_is_made and self._will_be_made()
+        return LONG.index(file) + (2 * len(LONG) if busy or waiting else 0) if file in LONG else len(LONG)
+
+    def _will_be_made(self) -> bool:
+        return any(test.startswith(MAKES_THE_DEMO) for test in self.collection)

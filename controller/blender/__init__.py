@@ -1,1 +1,1 @@
-"""Targets that Blender renders: the reconstructed object in another material, another light, another shape."""
+"""Target pictures rendered by Blender in a process of its own. Entry: `job.write_job`, `run.render`."""

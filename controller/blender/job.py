@@ -14,25 +14,25 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from controller.arrays import FloatImage, Mask, save_arrays
-from controller.calibrate.blender import TO_BLENDER, margin_px, places_in_rendering
-from controller.calibrate.surface import grid_mesh
+from controller.calibrate.mesh.blender import TO_BLENDER, margin_px, places_in_rendering
+from controller.calibrate.mesh.grid_mesh import grid_mesh
 from controller.calibrate.values import Geometry, Pinhole
-from controller.errors import WorkError
-from controller.solve.relight import smooth_normals
-from controller.solve.targets_values import Target
-from controller.storage import write_atomically
+from controller.core.arrays import FloatImage, Mask, save_arrays
+from controller.core.errors import WorkError
+from controller.core.storage import write_atomically
+from controller.solve.targets.relight import smooth_normals
+from controller.solve.targets.values import Target
 
 BUILTIN: Final = ("marble", "gold", "glazed", "lowered-head")
 """The scenes of ``scenes.py``."""
 MOST_VERTICES: Final = 400_000
 THICKNESS: Final = 0.2
-"""Of the object behind what the camera sees, as a share of its size: light that goes in must not come out there."""
+"""Of the object behind the visible surface, as a share of its size: light that enters must not leave there."""
 FURTHEST_FILL_PX: Final = 8.0
-"""Seams between parts at different depths are filled from as far away."""
+"""Seams between parts at different depths are filled from this far away."""
 BRIGHTEST_PERCENT: Final = 97.0
 SMOOTHING_PX: Final = 2.0
-"""Standard deviation of the smoothing of the normals, whose noise would glitter in a glaze."""
+"""Standard deviation of the smoothing of the normals; their noise would glitter in a glaze."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +72,8 @@ def write_job(
     if len(mesh.triangles) == 0:
         raise WorkError(
             "target-no-geometry",
-            what="Too little of the object's shape is known to render it.",
-            remedy="Calibrate again with better overlap of the projectors, or give a finished picture as the target.",
+            what="Too little of the object's shape is known for a rendering.",
+            remedy="Calibrate again with better overlap of the projectors, or use a finished picture as the target.",
         )
     rows, columns = mask.shape
     column, row = np.round(mesh.camera_px).astype(int).T

@@ -1,4 +1,4 @@
-"""Finds a Blender, has it render a job, and tells how far it is. Blender runs as a process of its own: its libraries
+"""Finds a Blender, has it render a job, and reports its progress. Blender runs as a process of its own: its libraries
 do not mix with ours, a scene that brings it down brings nothing else down, and it can be stopped at any moment."""
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
-from controller.errors import UsageError, WorkError
+from controller.core.errors import UsageError, WorkError
 
 VARIABLE: Final = "VELATURA_BLENDER"
 ENVIRONMENT: Final = ".venv-blender"
-"""Beside the environment that Velatura runs in; ``make blender`` makes it."""
+"""Beside the environment in which Velatura runs; ``make blender`` creates it."""
 _WORKER: Final = Path(__file__).with_name("worker.py")
 _SAMPLE: Final = re.compile(r"Sample (\d+)/(\d+)")
 _TOLD_LINES: Final = 6
@@ -54,7 +54,7 @@ def find_blender() -> Blender:
             raise UsageError(
                 "blender-missing",
                 what=f"{VARIABLE} names {named}, which is not a program.",
-                remedy="Let it name Blender, or a Python with the bpy module, or unset it.",
+                remedy="Set it to Blender, or to a Python with the bpy module, or unset it.",
             )
         return Blender.at(Path(found))
     beside = Path(sys.prefix).parent / ENVIRONMENT / "bin" / "python"
@@ -65,8 +65,8 @@ def find_blender() -> Blender:
         return Blender.at(Path(installed))
     raise UsageError(
         "blender-missing",
-        what="Blender was not found, and this target is rendered by it.",
-        remedy=f"Type `make blender`, or install Blender 4.5 and let {VARIABLE} name it.",
+        what="Blender was not found, but this target needs it.",
+        remedy=f"Run `make blender`, or install Blender 4.5 and set {VARIABLE} to its path.",
     )
 
 
@@ -79,9 +79,9 @@ def render(blender: Blender, folder: Path, advance: Callable[[float, str], None]
     picture = folder / "picture.exr"
     picture.unlink(missing_ok=True)
     log = folder / "blender.log"
-    with log.open("wb") as told, _running([*blender.command, str(folder)]) as process:
+    with log.open("wb") as log_file, _running([*blender.command, str(folder)]) as process:
         assert process.stdout is not None
-        watch = _Watch(process.stdout, told)
+        watch = _Watch(process.stdout, log_file)
         while watch.reading(_POLL_S):
             advance(watch.share, watch.note)
         code = process.wait()
@@ -89,7 +89,7 @@ def render(blender: Blender, folder: Path, advance: Callable[[float, str], None]
         raise WorkError(
             "blender-failed",
             what=f"Blender did not render the target: {watch.last_words() or f'it ended with code {code}'}.",
-            remedy=f"Open the scene in Blender and mend it there; all that Blender said is in {log}.",
+            remedy=f"Open the scene in Blender and correct it there; Blender's full log is {log}.",
         )
     return picture
 
@@ -144,7 +144,7 @@ class _Watch:
         return self._thread.is_alive()
 
     def last_words(self) -> str:
-        """The last error, or the last thing said."""
+        """The last error, or the last line of output."""
         errors = [line for line in self._lines if "rror" in line]
         words = (errors or self._lines)[-1:]
         return " ".join(words)[:300].rstrip(".")

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from scenes import BUILTIN, COLOURS  # type: ignore[import-not-found]
 
 PLACEHOLDER = "velatura"
-"""An object of this name in a scene of the user's gets the reconstructed shape, and keeps its material."""
+"""An object of this name in a user's scene gets the reconstructed shape and keeps its material."""
 SENSOR_MM = 36.0
 
 

@@ -1,1 +1,1 @@
-"""Bundles: what a kiosk plays; format, writer, reader, signing, install."""
+"""Bundles, the files that a kiosk plays: `format`, `writer`, `reader`, `signing`, `install`, `export`."""

@@ -6,16 +6,16 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final
 
-from controller.bundle.format import Appearance, Index, Live, OutputLayout
+from controller.bundle.format import BundledAppearance, Index, LiveSection, OutputLayout
 from controller.bundle.reader import Bundle
 
 _LAST_SECOND: Final = 253_402_300_799
-"""The end of the year 9999; a bundle may say more, the calendar does not."""
+"""The end of the year 9999; a bundle may contain a later time, but the calendar does not."""
 _HEADS: Final = ("stage", "calibration", "created_unix_s", "revision")
 
 
 def describe(bundle: Bundle) -> dict[str, Any]:
-    """What ``velatura bundle inspect --json`` prints (docs/bundle-format.md, "The commands")."""
+    """What ``velatura bundle inspect --json`` prints (docs/reference/bundle-format.md, "The commands")."""
     index = bundle.index
     raw = sum(3 * output.width_px * output.height_px for output in index.outputs) * len(index.appearances)
     return {
@@ -34,7 +34,7 @@ def describe(bundle: Bundle) -> dict[str, Any]:
     }
 
 
-def _live(live: Live) -> dict[str, Any]:
+def _live(live: LiveSection) -> dict[str, Any]:
     return {"target_px": list(live.target_px), "bytes": sum(array.blob.length for array in live.arrays.values())}
 
 
@@ -42,7 +42,7 @@ def _output(output: OutputLayout) -> dict[str, Any]:
     return {"name": output.name, "width_px": output.width_px, "height_px": output.height_px}
 
 
-def _appearance(appearance: Appearance) -> dict[str, Any]:
+def _appearance(appearance: BundledAppearance) -> dict[str, Any]:
     return {
         "name": appearance.name,
         "bytes": sum(blob.length for blobs in appearance.stripes.values() for blob in blobs),
@@ -64,7 +64,7 @@ def as_text(found: Mapping[str, Any]) -> str:
         f"stage        {found['stage']}",
         f"calibration  {found['calibration']}",
         f"revision     {found['revision']}, made {found['created']}",
-        f"signed by    {found['signed_by'] or 'nobody: anyone may have made it'}",
+        f"signed by    {found['signed_by'] or 'not signed; its origin is unknown'}",
         f"size         {found['bytes']} bytes, {found['ratio']:.1f} x smaller than raw",
         f"outputs      {outputs}",
         f"appearances  {len(found['appearances'])}",
@@ -114,7 +114,7 @@ def _appearance_differences(one: Index, other: Index) -> dict[str, list[Any]]:
     }
 
 
-def _parts(before: Appearance, after: Appearance) -> dict[str, Any]:
+def _parts(before: BundledAppearance, after: BundledAppearance) -> dict[str, Any]:
     outputs = [*before.stripes, *(name for name in after.stripes if name not in before.stripes)]
     thumbnails = [None if one.thumbnail is None else one.thumbnail.sha256 for one in (before, after)]
     return {
@@ -124,14 +124,14 @@ def _parts(before: Appearance, after: Appearance) -> dict[str, Any]:
     }
 
 
-def _hashes(appearance: Appearance, output: str) -> list[bytes]:
+def _hashes(appearance: BundledAppearance, output: str) -> list[bytes]:
     return [blob.sha256 for blob in appearance.stripes.get(output, ())]
 
 
 def differences_as_text(found: Mapping[str, Any]) -> str:
     """What ``differences`` returned, in lines: - for what only the first has, + for the second, ~ for both."""
     if found["same"]:
-        return "The bundles hold the same."
+        return "The bundles have the same content."
     lines = []
     for key, (one, other) in found["changed"].items():
         if key in ("schedule", "live"):

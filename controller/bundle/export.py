@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from controller.bundle.describe import describe
 from controller.bundle.reader import Bundle
-from controller.errors import BundleError, UsageError
-from controller.storage import sync_folder, write_atomically
+from controller.core.errors import BundleError, UsageError
+from controller.core.storage import sync_folder, write_atomically
 
 INDEX: Final = "index.json"
 
@@ -34,8 +34,8 @@ def export_pictures(bundle: Bundle, folder: Path, advance: Callable[[float], Non
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(
             "folder-not-empty",
-            what=f"{folder} is there already and holds something.",
-            remedy="Give a folder that is empty or not yet there; nothing was overwritten.",
+            what=f"{folder} already exists and is not empty.",
+            remedy="Give an empty or new folder; nothing was overwritten.",
         )
     bundle.verify()
     folder = folder.resolve()
@@ -80,6 +80,6 @@ def png(image: npt.NDArray[np.uint8]) -> bytes:
         raise BundleError(
             "picture-not-encodable",
             what=f"A frame of {image.shape[1]}x{image.shape[0]} pixels could not be written as PNG.",
-            remedy="Read the bundle with the program in docs/bundle-format.md instead.",
+            remedy="Read the bundle with the program in docs/reference/bundle-format.md instead.",
         )
     return data.tobytes()

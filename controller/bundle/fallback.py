@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from controller.bundle.install import CURRENT, STARTS, current, previous, switch_back
-from controller.errors import VelaturaError
-from controller.storage import write_atomically
+from controller.core.errors import VelaturaError
+from controller.core.storage import write_atomically
 
 MOST_FAILED_STARTS: Final = 3
 _LARGEST_BYTES: Final = 4096
@@ -66,7 +66,7 @@ class CountedStart:
         earlier = previous(folder)
         failing = now is None or starts.failed >= MOST_FAILED_STARTS
         if failing and earlier is not None and earlier.name not in (name, starts.given_up):
-            why = f"{starts.failed} starts with the bundle {name} showed no picture" if name else "The bundle is gone"
+            why = f"The bundle {name} showed no picture in {starts.failed} starts" if name else "The bundle is missing"
             tell(f"{why}; {earlier.name} plays again.")
             now, starts = earlier, Starts(earlier.name, 0, name or None)
         self.file = folder / CURRENT if now is None else now
@@ -102,4 +102,4 @@ class CountedStart:
         try:
             write()
         except (VelaturaError, OSError) as error:
-            self._tell(f"The count of starts could not be kept: {error}")
+            self._tell(f"The count of starts could not be saved: {error}")

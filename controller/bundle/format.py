@@ -1,4 +1,4 @@
-"""What a bundle is made of: constants, limits, header and the values of the index (docs/bundle-format.md). No I/O.
+"""Constants, limits, header and index values of a bundle (docs/reference/bundle-format.md). No I/O.
 
 A bundle is one file: header, stripes of compressed pixels, JSON index, signature block. Everything that is read from
 it is checked against the limits below before anything of that size is allocated.
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from controller.errors import BundleError
+from controller.core.errors import BundleError
 
 MAGIC: Final = b"VELBUNDL"
 VERSION: Final = 2
@@ -21,7 +21,8 @@ HEADER: Final = struct.Struct("<8sIIQQQ32s56x")
 HEADER_BYTES: Final = HEADER.size
 FIRST_BLOB: Final = 4096
 ALIGNMENTS: Final = {1: 4096, 2: 64}
-"""Of blobs, by format version. 4 KiB cost a bundle 1 to 15 % of its size, and nothing reads whole pages of it."""
+"""Alignment of blobs by format version. 4 KiB cost a bundle 1 to 15 % of its size, and nothing reads whole pages of
+it."""
 ALIGNMENT: Final = ALIGNMENTS[VERSION]
 STRIPES_PER_IMAGE: Final = 6
 
@@ -81,7 +82,7 @@ class OutputLayout:
 
 
 @dataclass(frozen=True, slots=True)
-class Appearance:
+class BundledAppearance:
     """One appearance: the stripes of each output's image from top to bottom, a PNG thumbnail, free metadata (JSON)."""
 
     name: str
@@ -91,7 +92,7 @@ class Appearance:
 
 
 @dataclass(frozen=True, slots=True)
-class Hint:
+class PlaylistEntry:
     """One entry of the playlist that a bundle suggests; whoever plays it may do otherwise."""
 
     appearance: str
@@ -114,8 +115,8 @@ class LiveArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Live:
-    """What the live mode needs (docs/bundle-format.md, "Live section"); ``target_px`` is (width, height)."""
+class LiveSection:
+    """What the live mode needs (docs/reference/bundle-format.md, "Live section"); ``target_px`` is (width, height)."""
 
     target_px: tuple[int, int]
     arrays: Mapping[str, LiveArray]
@@ -135,9 +136,9 @@ class Index:
     created_unix_s: int
     revision: int
     outputs: tuple[OutputLayout, ...]
-    appearances: tuple[Appearance, ...]
-    schedule: tuple[Hint, ...] = ()
-    live: Live | None = None
+    appearances: tuple[BundledAppearance, ...]
+    schedule: tuple[PlaylistEntry, ...] = ()
+    live: LiveSection | None = None
 
     def output(self, name: str) -> OutputLayout:
         """The output of this name. Raises BundleError("bundle-no-output")."""
@@ -150,7 +151,7 @@ class Index:
             remedy="Publish a bundle for this stage's outputs.",
         )
 
-    def appearance(self, name: str) -> Appearance:
+    def appearance(self, name: str) -> BundledAppearance:
         """The appearance of this name. Raises BundleError("bundle-no-appearance")."""
         for appearance in self.appearances:
             if appearance.name == name:
@@ -210,11 +211,11 @@ def parse_header(data: bytes, *, file_size: int, trailer_bytes: int) -> Header:
     if flags or data[:HEADER_BYTES] != pack_header(header):
         raise damaged("reserved bytes of the header are not zero")
     if size != file_size:
-        raise damaged(f"it has {file_size} bytes, and its header says {size}")
+        raise damaged(f"the file has {file_size} bytes, but its header says {size}")
     if not 2 <= length <= MAX_INDEX_BYTES:
         raise damaged(f"its index of {length} bytes is outside 2 to {MAX_INDEX_BYTES}")
     if offset < HEADER_BYTES or offset + length + trailer_bytes != size:
-        raise damaged("its index does not lie at its end")
+        raise damaged("its index is not at its end")
     return header
 
 

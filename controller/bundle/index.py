@@ -25,18 +25,18 @@ from controller.bundle.format import (
     MAX_SIDE_PX,
     MAX_THUMBNAIL_BYTES,
     VERSION,
-    Appearance,
     Blob,
-    Hint,
+    BundledAppearance,
     Index,
-    Live,
     LiveArray,
+    LiveSection,
     OutputLayout,
+    PlaylistEntry,
     compressed_bound,
     damaged,
     valid_name,
 )
-from controller.errors import BundleError
+from controller.core.errors import BundleError
 
 
 def encode_index(index: Index) -> bytes:
@@ -71,13 +71,13 @@ def encode_index(index: Index) -> bytes:
     except (TypeError, ValueError, RecursionError) as error:
         raise BundleError(
             "bundle-metadata",
-            what=f"An appearance's metadata can not be written as JSON ({error}).",
+            what=f"An appearance's metadata can't be written as JSON ({error}).",
             remedy="Give only texts, finite numbers, true, false, lists and tables.",
         ) from error
     return data
 
 
-def _live_document(live: Live) -> dict[str, Any]:
+def _live_document(live: LiveSection) -> dict[str, Any]:
     arrays = {
         name: {"dtype": array.dtype, "shape": list(array.shape), "blob": _packed(array.blob)}
         for name, array in live.arrays.items()
@@ -136,7 +136,7 @@ def parse_index(data: bytes, *, data_end: int, version: int = VERSION) -> Index:
 def _table(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) != len(pairs):
-        raise ValueError("a key stands twice")
+        raise ValueError("a key occurs twice")
     return table
 
 
@@ -178,13 +178,13 @@ def _output(value: Any) -> OutputLayout:
     return OutputLayout(_name(table["name"], MAX_OUTPUT_NAME_BYTES), width, height, rows)
 
 
-def _appearance(value: Any, outputs: tuple[OutputLayout, ...], area: _Area) -> Appearance:
+def _appearance(value: Any, outputs: tuple[OutputLayout, ...], area: _Area) -> BundledAppearance:
     table = _fields(value, {"name", "stripes", "thumbnail", "metadata"})
     stripes = _fields(table["stripes"], {output.name for output in outputs})
     if not isinstance(table["metadata"], dict):
         raise damaged("the metadata of an appearance is not a table")
     thumbnail = table["thumbnail"]
-    return Appearance(
+    return BundledAppearance(
         name=_name(table["name"]),
         stripes={o.name: _stripes(stripes[o.name], o, area) for o in outputs},
         thumbnail=None if thumbnail is None else _blob(thumbnail, MAX_THUMBNAIL_BYTES, area),
@@ -192,30 +192,30 @@ def _appearance(value: Any, outputs: tuple[OutputLayout, ...], area: _Area) -> A
     )
 
 
-def _schedule(value: Any, names: set[str]) -> tuple[Hint, ...]:
+def _schedule(value: Any, names: set[str]) -> tuple[PlaylistEntry, ...]:
     hints = []
     for item in _list(value, "the schedule", 0, MAX_APPEARANCES):
         name, duration, fade = _list(item, "an entry of the schedule", 3, 3)
         if not isinstance(name, str) or name not in names:
-            raise damaged("its schedule names an appearance that it does not hold")
+            raise damaged("its schedule names an appearance that it does not contain")
         duration = _whole(duration, "a duration", 1, MAX_DURATION_MS)
-        hints.append(Hint(name, duration, _whole(fade, "a fade", 0, duration)))
+        hints.append(PlaylistEntry(name, duration, _whole(fade, "a fade", 0, duration)))
     return tuple(hints)
 
 
-def _live(value: Any, area: _Area) -> Live:
+def _live(value: Any, area: _Area) -> LiveSection:
     table = _fields(value, {"target_px", "arrays"})
     width, height = (_whole(side, "target_px", 1, MAX_SIDE_PX) for side in _list(table["target_px"], "target_px", 2, 2))
     arrays = table["arrays"]
     if not isinstance(arrays, dict) or len(arrays) > MAX_LIVE_ARRAYS:
         raise damaged(f"the arrays of its live section are not a table of at most {MAX_LIVE_ARRAYS}")
-    return Live((width, height), {_name(name): _live_array(arrays[name], area) for name in sorted(arrays)})
+    return LiveSection((width, height), {_name(name): _live_array(arrays[name], area) for name in sorted(arrays)})
 
 
 def _live_array(value: Any, area: _Area) -> LiveArray:
     table = _fields(value, {"dtype", "shape", "blob"})
     if table["dtype"] not in LIVE_TYPES:
-        raise damaged("an array of its live section has an element type that there is not")
+        raise damaged("an array of its live section has an unknown element type")
     sides = _list(table["shape"], "a shape", 1, 4)
     shape = tuple(_whole(side, "a side of an array", 1, MAX_SIDE_PX) for side in sides)
     raw_bytes = int(table["dtype"][1]) * math.prod(shape)

@@ -15,13 +15,13 @@ from typing import Final
 from controller.bundle.format import Index
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
-from controller.errors import BundleError
-from controller.storage import exclusive, sha256_of, stream_atomically, sync_folder
+from controller.core.errors import BundleError
+from controller.core.storage import exclusive, sha256_of, stream_atomically, sync_folder
 
 CURRENT: Final = "current"
 PREVIOUS: Final = "previous"
 STARTS: Final = "starts.json"
-"""How often the player was started with the current bundle in vain (``fallback``)."""
+"""How often the player was started with the current bundle without showing a picture (``fallback``)."""
 _INCOMING: Final = ".incoming.vel"
 _LOCK: Final = ".install.lock"
 _INSTALLED: Final = re.compile(r"[0-9a-f]{64}\.vel")
@@ -97,7 +97,7 @@ def switch_back(folder: Path, *, away_from: Path | None = None) -> Path:
 def _no_previous() -> BundleError:
     return BundleError(
         "bundle-no-previous",
-        what="There is no earlier bundle to go back to.",
+        what="There is no earlier bundle.",
         remedy="Install a bundle with 'velatura bundle install'.",
     )
 
@@ -139,7 +139,7 @@ def _copy(source: Path, target: Path) -> None:
     except OSError as error:
         raise BundleError(
             "bundle-unreadable",
-            what=f"The bundle {source} can not be read: {error.strerror}.",
+            what=f"The bundle {source} can't be read: {error.strerror}.",
             remedy="Check the path and the file's permissions.",
         ) from error
 
@@ -149,7 +149,7 @@ def _refuse_older(index: Index, folder: Path, trust: Trust) -> None:
     if index.revision < least:
         raise BundleError(
             "bundle-older",
-            what=f"The bundle has revision {index.revision}, and revision {least} is installed.",
+            what=f"The bundle has revision {index.revision}, but revision {least} is installed.",
             remedy="Publish it again with a higher revision, or use 'velatura bundle rollback'.",
         )
 

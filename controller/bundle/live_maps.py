@@ -1,7 +1,8 @@
 """Base times scale (paper eqs 4-6): what is kept of a stage for it, and the frames of a target computed from that.
 
-This is the definition (docs/bundle-format.md, "Live section"). ``compensate`` is the reference in numpy; what makes
-frames at speed is held against it: ``solve.interactive`` on the processor, ``play.live_gl`` in shaders.
+This is the definition (docs/reference/bundle-format.md, "Live section"). ``compensate`` is the reference in numpy; what
+makes
+frames at speed is held against it: ``solve.scaling.interactive`` on the processor, ``play.live.gl`` in shaders.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Bytes = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveOutput:
+class OutputMaps:
     """One output's maps.
 
     ``base`` (rows, columns, 3) uint16 over ``base_range``; ``centre`` (rows, columns, 2) uint16; ``shape``
@@ -69,7 +70,7 @@ class LiveMaps:
     present: Bytes
     unit: float
     noise: Float
-    outputs: tuple[LiveOutput, ...]
+    outputs: tuple[OutputMaps, ...]
 
     @classmethod
     def read(cls, bundle: Bundle) -> Self:
@@ -96,14 +97,14 @@ class LiveMaps:
         return whole | {"unit": np.array([self.unit], np.float32), "noise": self.noise} | parts
 
 
-def _output(bundle: Bundle, name: str, size_px: tuple[int, int]) -> LiveOutput:
+def _output(bundle: Bundle, name: str, size_px: tuple[int, int]) -> OutputMaps:
     def array(key: str, shape: tuple[int, ...], dtype: str) -> npt.NDArray[Any]:
         return _shaped(bundle.live_array(f"{name}.{key}"), shape, dtype, key)
 
     columns, rows = size_px
     low, high = map(float, array("range", (2,), "f4"))
     down, along = (int(value) % TILE for value in array("dither", (2,), "u2"))
-    return LiveOutput(
+    return OutputMaps(
         name, array("base", (rows, columns, 3), "u2"), (low, high), array("centre", (rows, columns, 2), "u2"),
         array("shape", (rows, columns, 3), "u1"), array("unmix", (3, 3), "f4"), array("response", (3, 256), "f4"),
         (down, along),
@@ -114,7 +115,7 @@ def _shaped(values: npt.NDArray[Any], shape: tuple[int, ...], dtype: str, name: 
     if values.shape != shape or values.dtype != np.dtype(f"<{dtype}"):
         raise damaged(f"the array {name} of its live section is {values.dtype} {values.shape}, not {dtype} {shape}")
     if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise damaged(f"the array {name} of its live section has values that are no numbers")
+        raise damaged(f"the array {name} of its live section has values that are not numbers")
     return values
 
 
@@ -156,13 +157,13 @@ def compensate_light(maps: LiveMaps, light: Float) -> tuple[Bytes, ...]:
     return tuple(_frame(maps, output, scale) for output in maps.outputs)
 
 
-def base_light(output: LiveOutput) -> Float:
+def base_light(output: OutputMaps) -> Float:
     """M p_b, (rows, columns, 3)."""
     low, high = (np.float32(value) for value in output.base_range)
     return np.asarray(low + output.base.astype(np.float32) / FULL * (high - low), np.float32)
 
 
-def _frame(maps: LiveMaps, output: LiveOutput, scale: Float) -> Bytes:
+def _frame(maps: LiveMaps, output: OutputMaps, scale: Float) -> Bytes:
     frame: Bytes = np.empty(output.base.shape, np.uint8)
     means = _means(maps, output, scale) * base_light(output)
     rows, columns = frame.shape[:2]
@@ -176,7 +177,7 @@ def _frame(maps: LiveMaps, output: LiveOutput, scale: Float) -> Bytes:
     return frame
 
 
-def thresholds(noise: Float, output: LiveOutput, channel: int) -> Float:
+def thresholds(noise: Float, output: OutputMaps, channel: int) -> Float:
     """(64, 64): the dither's tile as a channel of an output reads it from its upper left corner on."""
     down, along = output.dither
     # Channels read the tile at different places, or colours would speckle together as grey does.
@@ -192,7 +193,7 @@ def device_level(light: Float, response: Float) -> Float:
     return np.asarray(below + part, np.float32)
 
 
-def _means(maps: LiveMaps, output: LiveOutput, scale: Float) -> Float:
+def _means(maps: LiveMaps, output: OutputMaps, scale: Float) -> Float:
     """P_s: (rows, columns, 3), the mean of C_s under each pixel's Gaussian where there is base light."""
     width, height = maps.target_px
     present = maps.present.astype(np.float32) / np.float32(255)

@@ -24,7 +24,7 @@ from controller.bundle import format as fmt
 from controller.bundle.format import damaged
 from controller.bundle.index import parse_index
 from controller.bundle.signing import BLOCK_BYTES, Trust, check_signature, sign
-from controller.errors import BundleError
+from controller.core.errors import BundleError
 
 _MAX_WINDOW_BYTES: Final = 2**23
 
@@ -51,7 +51,7 @@ class Bundle:
         end = header.index_offset + header.index_length
         index_bytes, block = data[header.index_offset : end], data[end : end + BLOCK_BYTES]
         if hashlib.sha256(index_bytes).digest() != header.index_sha256:
-            raise damaged("its index does not have the hash that its header says")
+            raise damaged("its index does not match the hash in its header")
         self.signed_by = check_signature(
             start, index_bytes, block, trusted=trusted, allow_unsigned=allow_unsigned, revoked=revoked
         )
@@ -59,7 +59,7 @@ class Bundle:
         self.version = header.version
         self.identity = header.index_sha256.hex()
         self._data_end = header.index_offset
-        # One unpacker a thread: made anew for each stripe, their buffers leave gaps, and memory grows by and by.
+        # One unpacker a thread: created for each stripe, their buffers leave gaps, and memory use grows slowly.
         self._thread = threading.local()
 
     @property
@@ -91,7 +91,7 @@ class Bundle:
         except OSError as error:
             raise BundleError(
                 "bundle-unreadable",
-                what=f"The bundle {path} can not be read: {error.strerror}.",
+                what=f"The bundle {path} can't be read: {error.strerror}.",
                 remedy="Check the path and the file's permissions.",
             ) from error
         except ValueError as error:
@@ -120,7 +120,7 @@ class Bundle:
         position = fmt.HEADER_BYTES
         for blob in sorted(self._blobs(), key=lambda blob: blob.offset):
             if hashlib.sha256(self._view(blob)).digest() != blob.sha256:
-                raise damaged(f"the bytes from {blob.offset} do not have their hash")
+                raise damaged(f"the bytes from {blob.offset} do not match their hash")
             self._check_gap(position, blob.offset)
             position = max(position, blob.offset + blob.length)
         self._check_gap(position, self._data_end)
@@ -133,7 +133,7 @@ class Bundle:
 
     def _check_gap(self, start: int, end: int) -> None:
         if end - start >= fmt.FIRST_BLOB or self._data[start:end].strip(b"\0"):
-            raise damaged(f"there is something between its parts, at {start}")
+            raise damaged(f"there are bytes between its parts, at {start}")
 
     def _blobs(self) -> list[fmt.Blob]:
         found = []
@@ -154,7 +154,7 @@ class Bundle:
             return None
         data = bytes(self._view(blob))
         if hashlib.sha256(data).digest() != blob.sha256 or not fmt.is_png(data):
-            raise damaged(f"the thumbnail of {appearance!r} does not have its hash")
+            raise damaged(f"the thumbnail of {appearance!r} does not match its hash")
         return data
 
     def live_array(self, name: str) -> npt.NDArray[Any]:
@@ -166,7 +166,7 @@ class Bundle:
         if found is None:
             raise BundleError(
                 "bundle-not-live",
-                what=f"The bundle holds no {name!r} for the live mode.",
+                what=f"The bundle contains no {name!r} for the live mode.",
                 remedy="Build it again on the stage with 'velatura bundle build --live'.",
             )
         values = np.empty(found.shape, f"<{found.dtype}")
@@ -217,14 +217,14 @@ class Bundle:
         """Decompress a blob into ``rows``; its frame must hold exactly that many bytes."""
         view = self._view(blob)
         if xxhash.xxh3_64_intdigest(view) != blob.xxh3:
-            raise damaged(f"the stripe at {blob.offset} does not have its checksum")
+            raise damaged(f"the stripe at {blob.offset} does not match its checksum")
         try:
             if zstandard.frame_content_size(view) != rows.nbytes:
-                raise damaged(f"the stripe at {blob.offset} does not hold the pixels of its rows")
+                raise damaged(f"the stripe at {blob.offset} does not have the pixels of its rows")
             with self._unpacker().stream_reader(view, read_size=len(view)) as stream:
                 filled = stream.readinto(rows.data.cast("B"))
         except zstandard.ZstdError as error:
-            raise damaged(f"the stripe at {blob.offset} can not be decompressed") from error
+            raise damaged(f"the stripe at {blob.offset} can't be decompressed") from error
         if filled != rows.nbytes:
             raise damaged(f"the stripe at {blob.offset} ends too early")
 

@@ -1,4 +1,4 @@
-"""Ed25519 signatures over a bundle's header and index, and the key files (docs/bundle-format.md, "Signature").
+"""Ed25519 signatures over a bundle's header and index; key files (docs/reference/bundle-format.md, "Signature").
 
 The index holds the SHA-256 of every stripe, so what is signed fixes every pixel.
 """
@@ -6,6 +6,7 @@ The index holds the SHA-256 of every stripe, so what is signed fixes every pixel
 from __future__ import annotations
 
 import os
+import stat
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ from nacl.exceptions import BadSignatureError, CryptoError
 from nacl.signing import SigningKey, VerifyKey
 
 from controller.bundle.format import damaged
-from controller.errors import BundleError, UsageError
-from controller.storage import sync_folder, write_atomically
+from controller.core.errors import BundleError, UsageError
+from controller.core.storage import sync_folder, write_atomically
 
 BLOCK: Final = struct.Struct("<8s32s64s24x")
 BLOCK_BYTES: Final = BLOCK.size
@@ -32,29 +33,29 @@ _KEY_FILE_BYTES: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Which bundles may be used: signed by one of ``keys``, or, if so said, not signed at all; never by ``revoked``."""
+    """Which bundles may be used: signed by one of ``keys``, or unsigned if allowed; never signed by ``revoked``."""
 
     keys: tuple[bytes, ...] = ()
     allow_unsigned: bool = False
     revoked: tuple[bytes, ...] = ()
 
 
-ANYONE: Final = Trust(allow_unsigned=True)
-"""To look into a bundle of whatever origin: a signature must fit its content, whoever signed."""
+ANY_SIGNER: Final = Trust(allow_unsigned=True)
+"""For inspecting any bundle: a signature must match its content, whoever signed."""
 
 
-def unproven(signed_by: bytes | None, trust: Trust) -> BundleError | None:
-    """What people must be told of a bundle that may be used only because unsigned ones may; None if all is well.
+def unsigned_warning(signed_by: bytes | None, trust: Trust) -> BundleError | None:
+    """The warning for a bundle that is usable only because unsigned ones are allowed; None if it is trusted.
 
     Not to be raised: the bundle plays.
     """
     if signed_by is not None and signed_by in trust.keys:
         return None
-    how = "carries no signature" if signed_by is None else "is signed by a key that the stage does not list"
+    how = "has no signature" if signed_by is None else "is signed by a key that stage.toml does not list"
     return BundleError(
         "bundle-unproven",
-        what=f"The bundle {how}: anyone may have made it, and it plays because the stage allows unsigned bundles.",
-        remedy="Make a key with `velatura keys STAGE`, publish again, and take allow_unsigned out of stage.toml.",
+        what=f"The bundle {how}. Its origin is unknown; it plays because the stage allows unsigned bundles.",
+        remedy="Make a key with `velatura keys STAGE`, publish again, and remove allow_unsigned from stage.toml.",
     )
 
 
@@ -66,8 +67,8 @@ def generate_key(path: Path) -> bytes:
     if path.exists():
         raise UsageError(
             "key-exists",
-            what=f"There is a key in {path} already.",
-            remedy="Give another name, or remove the old key if no kiosk trusts it any more.",
+            what=f"There is already a key in {path}.",
+            remedy="Use another name, or remove the old key if no kiosk trusts it any more.",
         )
     key = SigningKey.generate()
     public = bytes(key.verify_key)
@@ -88,8 +89,8 @@ def load_signing_key(path: Path) -> SigningKey:
     if path.stat().st_mode & 0o077:
         raise UsageError(
             "key-open-to-others",
-            what=f"Others may read the secret key {path}.",
-            remedy=f"Type 'chmod 600 {path}', and make a new key if someone may have copied it.",
+            what=f"Other users of this computer can read the secret key {path}.",
+            remedy=f"Run 'chmod 600 {path}', and make a new key if someone may have copied it.",
         )
     return SigningKey(data)
 
@@ -101,13 +102,16 @@ def load_public_key(path: Path) -> bytes:
 
 def _key_bytes(path: Path, prefix: str) -> bytes:
     try:
-        with path.open("rb") as file:
+        # Not blocking: opening a pipe would otherwise wait for its other end.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ValueError("it is not a file")
             text = file.read(_KEY_FILE_BYTES).decode("ascii").strip()
         if not text.startswith(prefix):
             raise ValueError(f"it does not begin with '{prefix.strip()}'")
         data = bytes.fromhex(text.removeprefix(prefix))
         if len(data) != _KEY_BYTES:
-            raise ValueError("it does not hold 32 bytes")
+            raise ValueError("it does not have 32 bytes")
     except (OSError, ValueError) as error:
         reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
         raise UsageError(
@@ -146,30 +150,31 @@ def check_signature(
             return None
         raise BundleError(
             "bundle-unsigned",
-            what="The bundle carries no signature, so anyone may have made it.",
+            what="The bundle has no signature, so its origin is unknown.",
             remedy="Sign it with 'velatura bundle sign', or allow unsigned bundles in stage.toml on a test stage.",
         )
     magic, public, signature = BLOCK.unpack(block)
     if magic != _MAGIC or block != BLOCK.pack(magic, public, signature):
-        raise damaged("its signature block is not one")
+        raise damaged("its signature block is not valid")
     if public in revoked:
         raise BundleError(
             "bundle-revoked",
             what=f"The bundle is signed with the key {public.hex()[:16]}…, which this stage has revoked.",
-            remedy="Build it again where a key is that the stage trusts, or sign it with 'velatura bundle sign'.",
+            remedy="Build it again with a key that the stage trusts, or sign it with 'velatura bundle sign'.",
         )
     if public not in trusted and (trusted or not allow_unsigned):
         raise BundleError(
             "bundle-untrusted",
             what=f"The bundle is signed with the key {public.hex()[:16]}…, which this stage does not trust.",
-            remedy="Add that public key to the stage's trusted keys if it is yours; otherwise do not use the bundle.",
+            remedy="If the key is yours, add its public key to the stage's trusted keys; otherwise do not use the "
+            "bundle.",
         )
     try:
         VerifyKey(public).verify(_CONTEXT + header + index, signature)
     except (BadSignatureError, CryptoError, ValueError) as error:
         raise BundleError(
             "bundle-signature-wrong",
-            what="The bundle's signature does not fit its content: it was changed after signing.",
+            what="The bundle's signature does not match its content: it was changed after signing.",
             remedy="Copy or publish the bundle again; nothing of this one was used.",
         ) from error
     return bytes(public)

@@ -17,15 +17,15 @@ from nacl.signing import SigningKey
 from controller.bundle import format as fmt
 from controller.bundle.index import encode_index, parse_index
 from controller.bundle.reader import Bundle
-from controller.bundle.signing import ANYONE, BLOCK_BYTES, UNSIGNED_BLOCK, sign
-from controller.errors import BundleError
-from controller.storage import stream_atomically
+from controller.bundle.signing import ANY_SIGNER, BLOCK_BYTES, UNSIGNED_BLOCK, sign
+from controller.core.errors import BundleError
+from controller.core.storage import stream_atomically
 
 STRIPE_PARAMETERS: Final = zstandard.ZstdCompressionParameters(
     strategy=zstandard.STRATEGY_LAZY2, window_log=20, hash_log=18, chain_log=18, search_log=5, min_match=6,
     target_length=32, write_content_size=True, write_checksum=False,
 )  # fmt: skip
-"""Five times the work of level 1, once; then 6 % smaller and unpacked a quarter quicker (docs/bundle-format.md)."""
+"""Five times the work of level 1, once; then 6 % smaller, a quarter quicker (docs/reference/bundle-format.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def write_bundle(
     appearances: Iterable[NewAppearance],
     key: SigningKey | None = None,
     revision: int = 0,
-    schedule: Sequence[fmt.Hint] = (),
+    schedule: Sequence[fmt.PlaylistEntry] = (),
     live: NewLive | None = None,
 ) -> fmt.Index:
     """Write a bundle atomically and return its index.
@@ -73,7 +73,7 @@ def write_bundle(
     outputs : (name, width_px, height_px) of each output, in stage order
     appearances : taken one at a time, so that a long list need not be in memory at once
     schedule : the playlist that the bundle suggests
-    key : signs the bundle; None leaves it unsigned, and players refuse it unless told otherwise
+    key : signs the bundle; None leaves it unsigned, and players refuse it unless they allow unsigned bundles
 
     Raises BundleError for frames that do not fit the outputs and for names, thumbnails or metadata that the format
     does not allow; WorkError("no-space") when the disk is full. ``path`` is then as it was.
@@ -98,7 +98,7 @@ def sign_bundle(path: Path, key: SigningKey) -> bytes:
 
     Raises BundleError as ``Bundle.open`` and ``Bundle.verify``: what is damaged or forged is not signed.
     """
-    with Bundle.open_trusted(path, ANYONE) as bundle:
+    with Bundle.open_trusted(path, ANY_SIGNER) as bundle:
         bundle.verify()
         stream_atomically(path, lambda file: bundle.write_signed(file, key))
     return bytes(key.verify_key)
@@ -112,8 +112,8 @@ def _finish(file: BinaryIO, index: fmt.Index, key: SigningKey | None) -> None:
     except BundleError as error:
         raise BundleError(
             "bundle-not-writable",
-            what=error.what.replace("The bundle is damaged", "The bundle can not be written"),
-            remedy="Change the name or size that is not allowed; docs/bundle-format.md lists the limits.",
+            what=error.what.replace("The bundle can't be written", "The bundle is damaged"),
+            remedy="Change the name or size that is not allowed; docs/reference/bundle-format.md lists the limits.",
         ) from error
     size = end + len(data) + BLOCK_BYTES
     header = fmt.pack_header(fmt.Header(end, len(data), size, hashlib.sha256(data).digest()))
@@ -123,16 +123,18 @@ def _finish(file: BinaryIO, index: fmt.Index, key: SigningKey | None) -> None:
     file.write(header)
 
 
-def _write_appearance(file: BinaryIO, layouts: Sequence[fmt.OutputLayout], appearance: NewAppearance) -> fmt.Appearance:
+def _write_appearance(
+    file: BinaryIO, layouts: Sequence[fmt.OutputLayout], appearance: NewAppearance
+) -> fmt.BundledAppearance:
     if set(appearance.frames) != {layout.name for layout in layouts}:
-        raise _unfit(appearance, "has not exactly one frame for each output")
+        raise _unfit(appearance, "does not have exactly one frame for each output")
     stripes = {}
     for layout in layouts:
         frame = appearance.frames[layout.name]
         if frame.dtype != np.uint8 or frame.shape != (layout.height_px, layout.width_px, 3):
             raise _unfit(
                 appearance,
-                f"has a frame of shape {frame.shape}, dtype {frame.dtype} for {layout.name}, which takes "
+                f"has a frame of shape {frame.shape}, dtype {frame.dtype} for {layout.name}, which needs "
                 f"({layout.height_px}, {layout.width_px}, 3), uint8",
             )
         stripes[layout.name] = tuple(_write_blob(file, data) for data in compress_image(frame, layout))
@@ -140,7 +142,7 @@ def _write_appearance(file: BinaryIO, layouts: Sequence[fmt.OutputLayout], appea
     if thumbnail is not None and (not fmt.is_png(thumbnail) or len(thumbnail) > fmt.MAX_THUMBNAIL_BYTES):
         raise _unfit(appearance, f"has a thumbnail that is not a PNG file of at most {fmt.MAX_THUMBNAIL_BYTES} bytes")
     blob = None if thumbnail is None else _write_blob(file, thumbnail)
-    return fmt.Appearance(appearance.name, stripes, blob, dict(appearance.metadata))
+    return fmt.BundledAppearance(appearance.name, stripes, blob, dict(appearance.metadata))
 
 
 def _unfit(appearance: NewAppearance, detail: str) -> BundleError:
@@ -161,7 +163,7 @@ def compress_image(frame: npt.NDArray[np.uint8], layout: fmt.OutputLayout) -> It
         yield packer.compress(delta.tobytes())
 
 
-def _write_live(file: BinaryIO, live: NewLive) -> fmt.Live:
+def _write_live(file: BinaryIO, live: NewLive) -> fmt.LiveSection:
     arrays = {}
     for name, values in sorted(live.arrays.items()):
         dtype = values.dtype.str.lstrip("<|")
@@ -172,7 +174,7 @@ def _write_live(file: BinaryIO, live: NewLive) -> fmt.Live:
                 remedy=f"Give one of {', '.join(fmt.LIVE_TYPES)}, little-endian.",
             )
         arrays[name] = fmt.LiveArray(dtype, values.shape, _write_blob(file, _compressed_array(values)))
-    return fmt.Live(live.target_px, arrays)
+    return fmt.LiveSection(live.target_px, arrays)
 
 
 def _compressed_array(values: npt.NDArray[Any]) -> bytes:

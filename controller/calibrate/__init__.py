@@ -1,1 +1,3 @@
-"""From captures to the light transport's parts: decode, radiometry, geometry, metapixels."""
+"""From photographs to a calibration; takes arrays, returns arrays. One package per stage of the work; `values`
+holds what they share.
+"""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask
 
 
 @dataclass(frozen=True, slots=True)

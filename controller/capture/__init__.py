@@ -1,1 +1,3 @@
-"""Patterns, exposure brackets, acquisition and the store of captures."""
+"""Patterns, exposure brackets and RAW development: `patterns.plan_patterns`, `acquire`,
+`brackets.merge_brackets`, `raw`.
+"""

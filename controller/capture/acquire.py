@@ -7,18 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.arrays import ByteImage
-from controller.errors import WorkError
+from controller.core.arrays import ByteImage
+from controller.core.errors import WorkError
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.interfaces import Camera, Display
 from hal.values import CapturedFile, ExposureSettings, FileKind
 
 TRANSFER_MARGIN_S = 20.0
-"""Longest that a camera may take beyond the exposure itself: mirror, write-out and transfer."""
+"""Longest time that a camera may need beyond the exposure itself: mirror, write-out and transfer."""
 
 DISK_CODES = ("no-space", "cannot-write")
-"""What a camera's driver raises when this computer's disk fails."""
+"""Error codes of a camera driver when this computer's disk fails."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Acquirer:
 
     Parameters
     ----------
-    settle_s : seconds between the display's word that frames are presented and the release of the shutter, at least.
+    settle_s : least seconds between the display's report that frames are presented and the release of the shutter.
         Where the delay of the stage has been measured (``set_delay``), the longer of the two is waited, so that no
         photograph shows the pattern before
     """
@@ -58,7 +58,7 @@ class Acquirer:
 
     @property
     def protected(self) -> bool:
-        """Whether the stage's delay is known; until then nobody can tell a late picture from a short wait."""
+        """Whether the stage's delay is known; until then a late picture and a short wait look the same."""
         return self._delay_s is not None
 
     def set_delay(self, delay_s: float) -> None:
@@ -119,15 +119,12 @@ class Acquirer:
         if not files:
             raise WorkError(
                 "camera-no-file",
-                what=f"The camera took picture {name} and sent no file.",
-                remedy="Check its memory card and its image quality setting (RAW), then go on with the same command.",
+                what=f"The camera took picture {name} but sent no file.",
+                remedy="Check its memory card and its image quality setting (RAW), then run the same command again to "
+                "continue.",
             )
         raw = [file for file in files if file.kind is FileKind.RAW]
         return (raw or files)[0], confirmed.exposure_s
-
-    def forget_settings(self) -> None:
-        """After a reconnect: set the camera again before the next shot."""
-        self._confirmed = None
 
     def _set(self, exposure_s: float, deadline: Deadline) -> ExposureSettings:
         if self._confirmed is None or self._confirmed[0] != exposure_s:

@@ -8,41 +8,41 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.arrays import FloatImage, Mask
 from controller.capture.profile import CameraNoise
-from controller.errors import UsageError
+from controller.core.arrays import FloatImage, Mask
+from controller.core.errors import UsageError
 
 __all__ = [
     "BracketChoice",
     "CameraNoise",
     "ExposureChoice",
-    "Merged",
+    "MergedBracket",
     "choose_brackets",
     "choose_exposure",
-    "least_level",
     "merge_brackets",
+    "minimum_level",
 ]
 
 TARGET = 0.75
-"""Of full scale, for the brightest lit pixels of a pattern: bright enough, and room for the lamp's flicker."""
+"""Of full scale, for the brightest lit pixels of a pattern: bright enough, with room for the lamp's flicker."""
 BRIGHT_PERCENTILE = 99.5
 LIT_SHARE = 0.05
 TOO_DARK = 0.1
-"""Below it a percentile says more of the noise than of the light."""
+"""Below this level a percentile is dominated by noise."""
 BRACKET_CEILING = 0.8
 DARK_SHARE = 0.01
-"""Of the brightest: what is darker than this is hardly lit, and its noise hardly matters."""
+"""Of the brightest: darker pixels are hardly lit, and their noise hardly matters."""
 DARK_PERCENTILE = 2
 RELATIVE_NOISE = 0.02
-"""Of one sample; a metapixel is a mean of many."""
+"""Of one sample; a metapixel is a mean of many samples."""
 BEFORE_CLIPPING = 0.9
-"""Of full scale: up to here a longer exposure is surely not clipped."""
+"""Of full scale: up to this level a longer exposure is surely not clipped."""
 FEWEST_WHITES = 2
-"""One exposure alone would tell neither the camera's noise nor whether it is linear."""
+"""One exposure alone would show neither the camera's noise nor whether it is linear."""
 
 
 @dataclass(frozen=True, slots=True)
-class Merged:
+class MergedBracket:
     """``radiance`` (rows, columns, 3) float32 full-scale value per second, NaN where no exposure measured it.
 
     ``sigma`` (rows, columns, 3) float32: its standard deviation by the noise model.
@@ -54,7 +54,7 @@ class Merged:
 
 def merge_brackets(
     images: Sequence[FloatImage], exposures_s: Sequence[float], *, noise: CameraNoise | None = None
-) -> Merged:
+) -> MergedBracket:
     """Merge exposures of one still scene, each weighted by the inverse of its variance.
 
     The variance is taken from a first estimate of the radiance and not from each value itself: a value that noise
@@ -71,8 +71,8 @@ def merge_brackets(
     if not images or len(images) != len(exposures_s) or len({image.shape for image in images}) != 1:
         raise UsageError(
             "bracket-mismatch",
-            what="The photographs of a bracket differ in size or number from their exposures.",
-            remedy="Give one exposure time for each photograph, all of one size.",
+            what="The photographs of a bracket differ in size, or their number differs from the number of exposures.",
+            remedy="Give one exposure time for each photograph, and use photographs of one size.",
         )
     if min(exposures_s) <= 0:
         raise UsageError(
@@ -82,7 +82,7 @@ def merge_brackets(
     radiance, weight = _weighted(images, exposures_s, np.maximum(np.nan_to_num(estimate), 0), noise)
     with np.errstate(divide="ignore"):
         sigma = np.where(weight > 0, 1 / np.sqrt(weight), np.nan)
-    return Merged(radiance, sigma.astype(np.float32))
+    return MergedBracket(radiance, sigma.astype(np.float32))
 
 
 def _weighted(
@@ -147,7 +147,7 @@ class BracketChoice:
     settled: bool
 
 
-def least_level(noise: CameraNoise, relative: float = RELATIVE_NOISE) -> float:
+def minimum_level(noise: CameraNoise, relative: float = RELATIVE_NOISE) -> float:
     """The full-scale value from which noise is below ``relative`` of it: (relative v)^2 = shot v + read^2."""
     root = math.sqrt(noise.shot**2 + 4 * relative**2 * noise.read**2)
     return (noise.shot + root) / (2 * relative**2)
@@ -165,8 +165,8 @@ def choose_brackets(
     """As few exposures as measure the brightest lit pixels unsaturated and the darkest well above noise; two at least.
 
     The bright end is measured in ``image``, which is as in ``choose_exposure``. The dark end is the 2nd percentile of
-    the pixels above 1 % of the brightest (of those in ``lit``): the longest exposure brings it to ``least_level``.
-    Neighbours are as far apart as they may be: what is just clipped in one has to be at ``least_level`` in the one
+    the pixels above 1 % of the brightest (of those in ``lit``): the longest exposure brings it to ``minimum_level``.
+    Neighbours are as far apart as they may be: what is just clipped in one has to be at ``minimum_level`` in the one
     before. With a 12-bit camera that is a factor of ten, and two exposures span almost two decades of light.
     """
     noise = noise or CameraNoise()
@@ -174,7 +174,7 @@ def choose_brackets(
     if not first.settled:
         return BracketChoice((first.exposure_s,), False)
     exposures = _ascending(available_s)
-    level = min(least_level(noise), BRACKET_CEILING / 2)
+    level = min(minimum_level(noise), BRACKET_CEILING / 2)
     dark = _darkest(image, lit)
     needed = level * exposure_s / max(dark, 1e-5) / first.exposure_s
     step = BEFORE_CLIPPING / level
@@ -200,8 +200,8 @@ def _ascending(available_s: Sequence[float]) -> list[float]:
     if not exposures:
         raise UsageError(
             "no-exposures",
-            what="The camera offers no exposure times to choose from.",
-            remedy="Set the camera to manual exposure, and connect it again.",
+            what="The camera reports no exposure times.",
+            remedy="Set the camera to manual exposure and connect it again.",
         )
     return exposures
 

@@ -1,4 +1,4 @@
-"""Bilinear interpolation of a Bayer mosaic: exact, parallel, and told as data to whoever models it.
+"""Bilinear interpolation of a Bayer mosaic: exact, parallel, and available as data for models of it.
 
 A colour missing at a pixel is the mean of its samples among the eight neighbours (the cross for green, the line or the
 diagonals for red and blue); the colour that was measured there is kept. At the image's edge the mean is over the
@@ -17,12 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import Float64, FloatImage, Mask
-from controller.compiled import compiled
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.jit import compiled
+from hal.runtime.compute import usable_cpus
 
 GREEN = 1
 WORTH_THREADS = 1 << 20
-"""Samples; below, a single thread is done before others have begun."""
+"""Samples; with fewer, one thread finishes before others have started."""
 STRIP_ROWS = 128
 NEVER = 1 << 20
 """A clipping limit above every 16-bit sample."""
@@ -107,7 +108,7 @@ def _pool(process: int) -> ThreadPoolExecutor:
     The threads of a parallel loop wait for each other by spinning, which on a busy machine costs more than the work,
     and such a loop can't be entered from two threads at once.
     """
-    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), thread_name_prefix="demosaic")
+    return ThreadPoolExecutor(usable_cpus(), thread_name_prefix="demosaic")
 
 
 def _limit(clip: float) -> int:

@@ -12,12 +12,12 @@ from typing import Final
 
 import numpy as np
 
-from controller.arrays import ByteImage
-from controller.errors import UsageError
+from controller.core.arrays import ByteImage
+from controller.core.errors import UsageError
 
 PAPER_SPACING_PX: Final = 16
 SIGMAS_APART: Final = 6.5
-"""Dots this many standard deviations apart do not disturb each other's fit: they meet at 3.25."""
+"""Dots this many standard deviations apart do not disturb each other's fit: their Gaussians meet at 3.25."""
 LEAST_SPACING_PX: Final = 4
 
 
@@ -42,8 +42,8 @@ def dot_patterns(size_px: tuple[int, int], r: int = PAPER_SPACING_PX) -> tuple[D
     if r < 1 or min(size_px) < 1:
         raise UsageError(
             "dot-spacing-wrong",
-            what=f"Dots {r} pixels apart on a projector of {width}x{height} are not possible.",
-            remedy=f"Choose a spacing of at least {LEAST_SPACING_PX} pixels; {PAPER_SPACING_PX} suits every focus.",
+            what=f"Dots {r} pixels apart do not fit on a projector of {width}x{height}.",
+            remedy=f"Choose a spacing of at least {LEAST_SPACING_PX} pixels; {PAPER_SPACING_PX} works for every focus.",
         )
     return tuple(
         DotPattern(f"dot-{column:02d}-{row:02d}", column, row, r)
@@ -73,7 +73,7 @@ def dot_spacing(largest_sigma_px: float) -> int:
     if not 0 <= largest_sigma_px < math.inf:
         raise UsageError(
             "dot-blur-unknown",
-            what=f"A blur of {largest_sigma_px} projector pixels gives no spacing of dots.",
-            remedy=f"Measure the blur first, or take the paper's spacing of {PAPER_SPACING_PX}.",
+            what=f"No dot spacing follows from a blur of {largest_sigma_px} projector pixels.",
+            remedy=f"Measure the blur first, or use the spacing of {PAPER_SPACING_PX} pixels.",
         )
     return max(LEAST_SPACING_PX, math.ceil(SIGMAS_APART * largest_sigma_px))

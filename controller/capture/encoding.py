@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from controller.arrays import ByteImage, Float64, FloatImage
-from controller.compiled import compiled
-from controller.errors import UsageError
+from controller.core.arrays import ByteImage, Float64, FloatImage
+from controller.core.errors import UsageError
+from controller.core.jit import compiled
 
 
 def encode_frame(linear: FloatImage, response: Float64, *, dither: bool = True) -> ByteImage:
@@ -25,7 +25,7 @@ def encode_frame(linear: FloatImage, response: Float64, *, dither: bool = True) 
     if linear.ndim != 3 or linear.shape[2] != 3:
         raise UsageError(
             "frame-shape-wrong",
-            what=f"A frame must be (rows, columns, 3); this one is {linear.shape}.",
+            what=f"A frame must have the shape (rows, columns, 3), but this one has {linear.shape}.",
             remedy="Give one linear RGB image of the projector's size.",
         )
     table = checked_response(response)
@@ -40,7 +40,7 @@ def checked_response(response: Float64) -> FloatImage:
     if table.shape != (3, 256) or not np.all(np.isfinite(table)) or np.any(np.diff(table, axis=1) < 0):
         raise UsageError(
             "response-not-rising",
-            what="The projector's response table is not 3 rows of 256 rising values.",
+            what="The projector's response table must have 3 rows of 256 rising values.",
             remedy="Measure the projector's response again.",
         )
     return table

@@ -1,6 +1,6 @@
 """How long a picture takes from the computer to the camera, and whether a photograph shows the picture before.
 
-Projectors show a frame one to eight frames after they got it, cameras open their shutter a while after they are told;
+Projectors show a frame one to eight frames after they got it, cameras open their shutter a while after the command;
 only the sum matters, and it is measured as a whole: by photographing a change ever later after it was shown.
 """
 
@@ -14,25 +14,25 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import ByteImage, FloatImage
 from controller.capture.profile import CameraNoise
 from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic
-from controller.errors import CalibrationError
+from controller.core.arrays import ByteImage, FloatImage
+from controller.core.errors import CalibrationError
 
 LONGEST_S = 1.5
-"""No display is later than this; pictures that must be there for certain are given this time."""
+"""No display is slower than this; pictures that must be visible are given this time."""
 FIRST_DELAY_S = 0.04
 RESOLUTION_S = 0.025
 MARGIN_S = 0.035
-"""Two frames: a picture may just have missed one, at the display and at the projector."""
+"""Two frames: a picture may just have missed one at the display and one at the projector."""
 WHOLE_SHARE = 0.96
-"""A picture is there when all but a few blocks show this much of the change; lamps flicker by less."""
+"""A picture is complete when all but a few blocks show this much of the change; lamps flicker by less."""
 NEARLY_SHARE = 0.9
-"""Where the best blocks show this much, what they lack is a lamp's flicker, or less than the margin."""
+"""Where the best blocks show this much, the rest is a lamp's flicker, or less than the margin."""
 BLOCK_PX = 16
 LIT_SHARE = 0.1
 WORST_BLOCKS = 3.0
-"""Per cent of the blocks that may be below: something moved, a reflection."""
+"""Per cent of the blocks that may be below, because something moved or reflects."""
 LEAST_CONTRAST = 0.01
 CONFIRMATIONS = 4
 SPARSE = 8
@@ -58,16 +58,16 @@ class Latency:
         return self.delay_s + MARGIN_S
 
 
-Look = Callable[[bool, float], FloatImage]
-"""(white or black, delay in seconds): show it after the other was there for certain, photograph it that much later."""
+CaptureFlat = Callable[[bool, float], FloatImage]
+"""(white or black, delay in seconds): show it after the other one was surely visible, photograph it that much later."""
 
 
-def measure_latency(look: Look) -> Latency:
+def measure_latency(look: CaptureFlat) -> Latency:
     """Find the delay from which photographs show the new picture whole, changing to white and to black in turn.
 
     Parameters
     ----------
-    look : takes a photograph, see ``Look``; (rows, columns) or (rows, columns, 3) in linear light, NaN where saturated
+    look : see ``CaptureFlat``; (rows, columns) or (rows, columns, 3) in linear light, NaN where saturated
 
     Raises CalibrationError("picture-not-seen") when white and black do not differ even after ``LONGEST_S``.
     """
@@ -78,8 +78,8 @@ def measure_latency(look: Look) -> Latency:
         raise CalibrationError(
             "picture-not-seen",
             what=f"The camera sees no difference between white and black {LONGEST_S:g} s after they are shown.",
-            remedy="Check that the camera looks at the object, that the outputs are connected to the projectors, and "
-            "that no projector is frozen, blanked or showing another input.",
+            remedy="Check that the camera sees the object and that the outputs are connected to the projectors. No "
+            "projector may be frozen, blanked or on another input.",
         )
     tries: list[tuple[float, float]] = []
 
@@ -181,7 +181,7 @@ def same_picture(one: Thumbprint, other: Thumbprint, *, noise: CameraNoise | Non
         variance += (np.float32(noise.shot) * light + np.float32(noise.read**2)) * full**2
     level = np.maximum(np.maximum(one.samples, other.samples), 0)
     allowed = DIFFERENT_SIGMAS * np.sqrt(variance) + np.float32(DIFFERENT_SHARE) * level
-    # A sample that is clipped in one alone differs; clipped in both it tells nothing.
+    # A sample that is clipped in one alone differs; clipped in both it gives no information.
     clipped_in_one = (one.samples >= ceiling) != (other.samples >= ceiling)
     far = np.abs(one.samples - other.samples) > np.maximum(allowed, np.float32(DIFFERENT_SHARE * ceiling) / 4)
     different = np.count_nonzero(far & (below | clipped_in_one))

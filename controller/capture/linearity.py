@@ -1,4 +1,4 @@
-"""What a RAW camera's numbers are worth: black level, true exposure ratios, limit of linearity, bad samples."""
+"""Checks of a RAW camera: black level, true exposure ratios, limit of linearity, bad samples."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import Float64, Mask
 from controller.capture.demosaic import SensorLevels
+from controller.core.arrays import Float64, Mask
 
 WELL_LIT = (0.2, 0.7)
 """Shares of full scale between which a ratio of exposures is taken: above noise, below every limit."""
@@ -20,34 +20,34 @@ FEWEST = 200
 FEWEST_IN_BIN = 40
 GLARING, GLARE_PX = 0.8, 5
 BENDS_FROM = 0.4
-"""Of full scale: no sensor bends below; what deviates there moved or flickered."""
+"""Of full scale: no sensor becomes nonlinear below this; a deviation there means that something moved or flickered."""
 FEWEST_BENT = 2
 TOLERANCE = 0.01
 """A level counts as linear while the median of its samples is within 1 % of what the shorter exposure predicts."""
 PILED = 1.15
-"""Samples that should exceed full scale by this are saturated for certain; what they show is the ceiling."""
+"""Samples whose prediction exceeds full scale by this factor are surely saturated; they show the ceiling."""
 HOT_SIGMAS = 12.0
-WRONGLY_TOLD = 0.015
-"""Spread of an exposure series' corrections from which the camera's exposure times are corrected."""
+SMALLEST_CORRECTION = 0.015
+"""Spread of the corrections of an exposure series from which the camera's exposure times are corrected."""
 WORST_BLACK_STEPS = 64.0
-"""A black level farther from the file's word than this is no camera's; the light in between was not still."""
+"""A black level farther from the file's value than this is not the camera's; the light changed in between."""
 
 Samples = npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)
-class Exposed:
-    """Raw ``samples`` (rows, columns) uint16 of a picture, and the ``exposure_s`` that the camera told."""
+class RawExposure:
+    """Raw ``samples`` (rows, columns) uint16 of a picture, and the ``exposure_s`` that the camera reported."""
 
     samples: Samples
     exposure_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class Linearity:
+class SensorLinearity:
     """How a bracket series fits a linear camera.
 
-    ``ratios`` measured exposure of each photograph relative to the first; ``nominal`` as the camera told them
+    ``ratios`` measured exposure of each photograph relative to the first; ``nominal`` as the camera reported them
     ``clip`` (2, 2) raw value from which a site is saturated or no longer linear, inf where no sample came near
     ``worst`` largest relative deviation from linearity at the levels below ``clip``
     """
@@ -58,36 +58,36 @@ class Linearity:
     worst: float
 
 
-def check_series(series: Sequence[Exposed], levels: SensorLevels) -> Linearity:
+def check_series(series: Sequence[RawExposure], levels: SensorLevels) -> SensorLinearity:
     """Compare the photographs of one still picture, exposure by exposure.
 
     Each longer exposure should be the next shorter one times one ratio at every level. The ratio is measured where
     both are well exposed; the level from which the longer falls behind is the sensor's limit. Two equal exposures
-    tell nothing.
+    give no information.
 
     Parameters
     ----------
-    series : of one picture, in any order; ``levels`` as the files tell them (``clip`` is not used)
+    series : of one picture, in any order; ``levels`` as the files state them (``clip`` is not used)
     """
     ordered = sorted(series, key=lambda one: one.exposure_s)
     ratios, nominal = [1.0], [1.0]
     limits: list[Float64] = []
     worst = 0.0
     for shorter, longer in itertools.pairwise(ordered):
-        told = longer.exposure_s / shorter.exposure_s
+        reported = longer.exposure_s / shorter.exposure_s
         ratio = exposure_ratio(shorter, longer, levels)
         ratios.append(ratios[-1] * ratio)
-        nominal.append(nominal[-1] * told)
-        if told <= 1:
+        nominal.append(nominal[-1] * reported)
+        if reported <= 1:
             continue
         limit, deviation = _limits(shorter, longer, levels, ratio)
         limits.append(limit)
         worst = max(worst, deviation)
-    return Linearity(tuple(ratios), tuple(nominal), common_limit(limits), worst)
+    return SensorLinearity(tuple(ratios), tuple(nominal), common_limit(limits), worst)
 
 
 def common_limit(limits: Sequence[Float64]) -> Float64:
-    """(2, 2) limit of each site from several findings, inf where none found one.
+    """(2, 2) limit of each site from several measurements, inf where none found one.
 
     The highest: a sensor's limit is the same every time, and what something else made look like one is lower.
     """
@@ -96,9 +96,9 @@ def common_limit(limits: Sequence[Float64]) -> Float64:
     return np.where(np.isfinite(highest), highest, np.inf)
 
 
-def exposure_ratio(shorter: Exposed, longer: Exposed, levels: SensorLevels) -> float:
-    """Light of ``longer`` over that of ``shorter``, measured; as told where no sample is well exposed in both."""
-    told = longer.exposure_s / shorter.exposure_s
+def exposure_ratio(shorter: RawExposure, longer: RawExposure, levels: SensorLevels) -> float:
+    """Light of ``longer`` over that of ``shorter``, measured; as reported where no sample is well exposed in both."""
+    reported = longer.exposure_s / shorter.exposure_s
     tops, bottoms = 0.0, 0.0
     for row, column in np.ndindex(2, 2):
         x, y = (_site(one, levels, row, column) for one in (shorter, longer))
@@ -112,44 +112,44 @@ def exposure_ratio(shorter: Exposed, longer: Exposed, levels: SensorLevels) -> f
         near = off < max(3 * 1.4826 * float(np.median(off)), TOLERANCE)
         tops += float(y[good][near].sum(dtype=np.float64))
         bottoms += float(x[good][near].sum(dtype=np.float64))
-    return tops / bottoms if bottoms > 0 else told
+    return tops / bottoms if bottoms > 0 else reported
 
 
-def _site(one: Exposed, levels: SensorLevels, row: int, column: int) -> npt.NDArray[np.float32]:
+def _site(one: RawExposure, levels: SensorLevels, row: int, column: int) -> npt.NDArray[np.float32]:
     black, white = levels.black[row, column], levels.white[row, column]
     site = one.samples[row::2, column::2].astype(np.float32)
     return np.asarray((site - np.float32(black)) / np.float32(white - black))
 
 
 def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Float64:
-    """(n, 2) exposures as told and as they truly are, in seconds, for those that are told noticeably wrong.
+    """(n, 2) reported and true exposures in seconds, for those that are reported noticeably wrong.
 
-    Cameras round: one that tells 1/30 s opens for 1/32 s. Each series says how its exposures relate; together they are
-    solved for the corrections that are smallest on the whole, since no photograph tells absolute time.
+    Cameras round: one that reports 1/30 s opens for 1/32 s. Each series gives the ratios of its exposures; together
+    they are solved for the corrections that are smallest on the whole, since no photograph shows absolute time.
 
     Parameters
     ----------
-    measured : for each series its exposures as told, rising, and their measured ratios to the first
+    measured : for each series its reported exposures, rising, and their measured ratios to the first
     """
-    told = sorted({value for exposures, _ in measured for value in exposures})
-    if len(told) < 2:
+    reported = sorted({value for exposures, _ in measured for value in exposures})
+    if len(reported) < 2:
         return np.empty((0, 2))
     rows, wanted = [], []
     for exposures, ratios in measured:
         for (a, b), (x, y) in zip(itertools.pairwise(exposures), itertools.pairwise(ratios), strict=True):
-            row = np.zeros(len(told))
-            row[told.index(b)] += 1
-            row[told.index(a)] -= 1
+            row = np.zeros(len(reported))
+            row[reported.index(b)] += 1
+            row[reported.index(a)] -= 1
             rows.append(row)
             wanted.append(np.log(y / x) - np.log(b / a))
     correction = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
-    # Below this it may as well be the lamp, and the camera's word stands.
-    if np.ptp(correction) < WRONGLY_TOLD:
+    # Smaller differences can come from the lamp, so the reported exposures are kept.
+    if np.ptp(correction) < SMALLEST_CORRECTION:
         return np.empty((0, 2))
-    return np.stack((np.array(told), np.array(told) * np.exp(correction)), axis=1)
+    return np.stack((np.array(reported), np.array(reported) * np.exp(correction)), axis=1)
 
 
-def _limits(shorter: Exposed, longer: Exposed, levels: SensorLevels, ratio: float) -> tuple[Float64, float]:
+def _limits(shorter: RawExposure, longer: RawExposure, levels: SensorLevels, ratio: float) -> tuple[Float64, float]:
     limits, worst = np.full((2, 2), np.inf), 0.0
     for row, column in np.ndindex(2, 2):
         x, y = (_site(one, levels, row, column) for one in (shorter, longer))
@@ -205,8 +205,8 @@ def _deviations(
     return found
 
 
-def black_offset(series: Sequence[Exposed], levels: SensorLevels) -> Float64:
-    """(2, 2) raw steps by which the black level lies above the file's word: a line through the exposures at 0 s.
+def black_offset(series: Sequence[RawExposure], levels: SensorLevels) -> Float64:
+    """(2, 2) raw steps by which the black level lies above the file's value: a line through the exposures at 0 s.
 
     ``series``: a dark picture at two exposures or more. Without two different ones, and where the result is no
     camera's, zeros: the file is then believed.
@@ -229,7 +229,7 @@ def black_offset(series: Sequence[Exposed], levels: SensorLevels) -> Float64:
     return offset if np.abs(offset).max() <= WORST_BLACK_STEPS else np.zeros((2, 2))
 
 
-def find_hot(series: Sequence[Exposed], levels: SensorLevels) -> npt.NDArray[np.int64]:
+def find_hot(series: Sequence[RawExposure], levels: SensorLevels) -> npt.NDArray[np.int64]:
     """(n, 2) column and row of samples that stand far out of their neighbours in every one of the dark photographs.
 
     Compared with the median of the eight nearest samples of the same site, in units of the photograph's own spread.
@@ -237,12 +237,12 @@ def find_hot(series: Sequence[Exposed], levels: SensorLevels) -> npt.NDArray[np.
     """
     if not series:
         return np.empty((0, 2), np.int64)
-    hot = np.logical_and.reduce([_standing_out(one.samples, levels) for one in series])
+    hot = np.logical_and.reduce([_outliers(one.samples, levels) for one in series])
     rows, columns = np.nonzero(hot)
     return np.stack((columns, rows), axis=1).astype(np.int64)
 
 
-def _standing_out(samples: Samples, levels: SensorLevels) -> npt.NDArray[np.bool_]:
+def _outliers(samples: Samples, levels: SensorLevels) -> npt.NDArray[np.bool_]:
     """Above the brightest of the eight neighbours of its own site, and above their median by many deviations."""
     found = np.zeros(samples.shape, np.bool_)
     ring = np.ones((3, 3), np.uint8)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.arrays import Float64, FloatImage
 from controller.capture.profile import CameraNoise
+from controller.core.arrays import Float64, FloatImage
 
 __all__ = ["CameraNoise", "NoiseReport", "measure_noise"]
 
@@ -16,13 +16,13 @@ BLOCK = 8
 """Samples of one site along a block's side: small enough for one ratio, large enough for a variance."""
 FEWEST_BLOCKS = 60
 MOST_BLOCKS = 8000
-"""Of one site of one pair: more only cost memory."""
+"""Of one site of one pair: more blocks only cost memory."""
 ROUNDS = 12
 OUTLIER = 4.0
-"""Standard deviations of a block's variance: beyond it something moved, or an edge did not fit."""
+"""Standard deviations of a block's variance: beyond this, something moved or an edge did not fit."""
 SMALLEST = 1e-12
 DARK_SHARE = 1e-4
-"""Below this mean a block has no ratio of its own: both are black."""
+"""Below this mean a block has no ratio: both photographs are black."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def measure_noise(pairs: Sequence[tuple[FloatImage, FloatImage]]) -> NoiseReport
 
     Returns
     -------
-    None where there are too few whole blocks, or nothing but darkness, to tell shot from read noise
+    None where there are too few whole blocks, or nothing but darkness, to separate shot noise from read noise
     """
     found = [_blocks(first[r::2, c::2], second[r::2, c::2]) for first, second in pairs for r, c in np.ndindex(2, 2)]
     rows = np.concatenate(found) if found else np.empty((0, 3))

@@ -3,7 +3,7 @@
 Everything is a pure function of the projector's size. Cells and phases fit together so that no camera pixel is
 ambiguous: the Gray code counts cells of half the coarse phase's period, so a pixel whose cell is read one off, which
 happens only at the border of two cells, still lies 6 px inside the period it is given. The coarse phase in turn only
-chooses among the fringes of the fine sinusoids, which tell the position and, by the contrast they lose, the blur.
+chooses among the fringes of the fine sinusoids, which give the position and, by the contrast they lose, the blur.
 """
 
 from __future__ import annotations
@@ -16,37 +16,37 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from controller.arrays import ByteImage, FloatImage
 from controller.capture.encoding import encode_frame
-from controller.errors import UsageError
+from controller.core.arrays import ByteImage, FloatImage
+from controller.core.errors import UsageError
 
 __all__ = [
     "BLUR_FREQUENCIES",
     "CELL_PX",
-    "MOSAICS",
     "PERIOD_PX",
+    "TILE_PATTERNS",
     "Pattern",
     "PatternKind",
     "PatternPlan",
     "device_frame",
     "encode_frame",
     "frame",
-    "mosaic_levels",
     "plan_patterns",
+    "tile_levels",
 ]
 
 CELL_PX = 12
-"""Seven bits tell 1536 px: both sides of 1400x1050 take seven."""
+"""Seven bits encode 1536 px: both sides of 1400x1050 take seven."""
 PERIOD_PX = 24
 PHASE_STEPS = 3
 BLUR_STEPS = 3
 BLUR_FREQUENCIES = {"x": (1 / 5, 0.0), "y": (0.0, 1 / 5), "d": (1 / 7, 1 / 7)}
 """Cycles per projector pixel of the three fine sinusoids: position within their fringe, and blur."""
-MOSAICS = 2
+TILE_PATTERNS = 2
 FEW_CELLS = 1000
-"""With fewer Gray cells on the whole frame, one mosaic more is shown."""
+"""With fewer Gray cells on the whole frame, one more set of colour tiles is shown."""
 MOST_TILES = 4000
-"""With more Gray cells than this, a mosaic's tiles are 2x2 of them: wider, so that defocus takes less of each."""
+"""With more Gray cells than this, a colour tile covers 2x2 of them: wider, so that defocus affects less of each."""
 
 
 class PatternKind(enum.Enum):
@@ -54,7 +54,7 @@ class PatternKind(enum.Enum):
 
     FLAT = "flat"
     GRAY = "gray"
-    MOSAIC = "mosaic"
+    COLOUR_TILES = "mosaic"
     SINUSOID = "sinusoid"
     RANDOM = "random"
 
@@ -126,14 +126,14 @@ def plan_patterns(size_px: tuple[int, int], *, random_patterns: int = 1) -> Patt
         raise UsageError(
             "projector-too-small",
             what=f"A projector of {width}x{height} pixels is too small to be calibrated.",
-            remedy=f"Give its true size in stage.toml; at least {2 * CELL_PX} pixels a side are needed.",
+            remedy=f"Give its true size in stage.toml; each side needs at least {2 * CELL_PX} pixels.",
         )
     patterns = [
         Pattern("black", PatternKind.FLAT, colour=(0.0, 0.0, 0.0)),
         Pattern("white", PatternKind.FLAT),
         *_gray_bits("x", 0, width),
         *_gray_bits("y", 1, height),
-        *_mosaics(size_px),
+        *_tile_patterns(size_px),
         *_steps("phase-x", (1 / PERIOD_PX, 0.0), PHASE_STEPS),
         *_steps("phase-y", (0.0, 1 / PERIOD_PX), PHASE_STEPS),
     ]
@@ -143,11 +143,11 @@ def plan_patterns(size_px: tuple[int, int], *, random_patterns: int = 1) -> Patt
     return PatternPlan(size_px, tuple(patterns))
 
 
-def _mosaics(size_px: tuple[int, int]) -> list[Pattern]:
+def _tile_patterns(size_px: tuple[int, int]) -> list[Pattern]:
     across, down = cells_of_frame(size_px)
-    number = MOSAICS + (across * down < FEW_CELLS)
+    number = TILE_PATTERNS + (across * down < FEW_CELLS)
     tile_cells = 2 if across * down > MOST_TILES else 1
-    return [Pattern(f"mosaic-{n}", PatternKind.MOSAIC, tile_cells=tile_cells, seed=n) for n in range(number)]
+    return [Pattern(f"mosaic-{n}", PatternKind.COLOUR_TILES, tile_cells=tile_cells, seed=n) for n in range(number)]
 
 
 def cells_of_frame(size_px: tuple[int, int]) -> tuple[int, int]:
@@ -155,11 +155,11 @@ def cells_of_frame(size_px: tuple[int, int]) -> tuple[int, int]:
     return math.ceil(size_px[0] / CELL_PX), math.ceil(size_px[1] / CELL_PX)
 
 
-def mosaic_levels(pattern: Pattern, size_px: tuple[int, int]) -> ByteImage:
-    """(cells down, cells across, 3) uint8: the device values of a MOSAIC in each Gray cell.
+def tile_levels(pattern: Pattern, size_px: tuple[int, int]) -> ByteImage:
+    """(cells down, cells across, 3) uint8: the device values of COLOUR_TILES in each Gray cell.
 
-    In each channel every level comes equally often (0 and 255 a little more), in an order of its own: no channel
-    tells of another, and the mosaic's mean light is the same wherever one looks.
+    In each channel every level comes equally often (0 and 255 a little more), in its own order: the channels
+    are independent, and the mean light of the tiles is the same everywhere.
     """
     across, down = cells_of_frame(size_px)
     side = pattern.tile_cells
@@ -190,7 +190,7 @@ def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
     -------
     float32 in [0, 1], (rows, columns) where the pattern is grey, (rows, columns, 3) where it is coloured
 
-    Raises UsageError("mosaic-has-no-light") for a MOSAIC, whose light is what is to be measured.
+    Raises UsageError("mosaic-has-no-light") for COLOUR_TILES, whose light is what is to be measured.
     """
     width, height = size_px
     x, y = np.arange(width, dtype=np.float64)[None, :], np.arange(height, dtype=np.float64)[:, None]
@@ -206,7 +206,7 @@ def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
             return (0.5 + 0.5 * np.cos(angle)).astype(np.float32)
         case PatternKind.RANDOM:
             return _random_image(pattern.seed, size_px)
-        case PatternKind.MOSAIC:
+        case PatternKind.COLOUR_TILES:
             raise UsageError(
                 "mosaic-has-no-light",
                 what=f"Pattern {pattern.name} is given in device values; its light is not known.",
@@ -224,8 +224,8 @@ def device_frame(
     ``response`` (3, 256) is needed only where ``pattern.needs_response``; without it UsageError("response-missing").
     """
     width, height = size_px
-    if pattern.kind is PatternKind.MOSAIC:
-        cells = mosaic_levels(pattern, size_px)
+    if pattern.kind is PatternKind.COLOUR_TILES:
+        cells = tile_levels(pattern, size_px)
         return np.repeat(np.repeat(cells, CELL_PX, axis=0), CELL_PX, axis=1)[:height, :width].copy()
     light = frame(pattern, size_px)
     if light.ndim == 2:
@@ -236,7 +236,7 @@ def device_frame(
         raise UsageError(
             "response-missing",
             what=f"Pattern {pattern.name} can't be shown before the projector's response is measured.",
-            remedy="Capture the mosaics first.",
+            remedy="Capture the colour tiles first.",
         )
     return encode_frame(np.ascontiguousarray(light), response)
 

@@ -1,4 +1,4 @@
-"""What was measured of the camera itself during a run, and how it is kept beside the photographs."""
+"""Properties of the camera measured during a run, and their file beside the photographs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import Float64, load_arrays, save_arrays
+from controller.core.arrays import Float64, load_arrays, save_arrays
 
 FILE_NAME = "camera.npz"
 SAME_EXPOSURE = 1e-6
@@ -30,7 +30,7 @@ def _nothing_added() -> Float64:
     return np.zeros((2, 2))
 
 
-def _as_told() -> Float64:
+def _no_corrections() -> Float64:
     return np.empty((0, 2))
 
 
@@ -40,12 +40,12 @@ def _none_bad() -> npt.NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class CameraProfile:
-    """Measured properties of the camera; the defaults leave to each file what it says of itself.
+    """Measured properties of the camera; with the defaults, the values of each file are used.
 
     ``noise`` of one raw sample (JPEG: of one value in linear light)
-    ``black_offset`` (2, 2) raw steps by which each site's black level lies above the file's word
+    ``black_offset`` (2, 2) raw steps by which each site's black level lies above the file's value
     ``clip`` (2, 2) raw value from which a site saturates or is no longer linear, inf where none was found
-    ``exposures`` (n, 2) exposures in seconds as told and as they truly are; those that are not listed are as told
+    ``exposures`` (n, 2) reported and true exposures in seconds; those that are not listed are true as reported
     ``bad_px`` (n, 2) column and row of samples that do not measure light
     ``response`` (3, 256) linear light of a JPEG value, 1 at 255; None for a camera that delivers RAW
     """
@@ -54,15 +54,15 @@ class CameraProfile:
     black_offset: Float64 = field(default_factory=_nothing_added)
     clip: Float64 = field(default_factory=_nothing_clips)
     bad_px: npt.NDArray[np.int64] = field(default_factory=_none_bad)
-    exposures: Float64 = field(default_factory=_as_told)
+    exposures: Float64 = field(default_factory=_no_corrections)
     response: Float64 | None = None
 
-    def true_exposure(self, told_s: float) -> float:
-        """Seconds for which the shutter really opens when the camera tells ``told_s``."""
-        for told, true in self.exposures:
-            if abs(told / told_s - 1) < SAME_EXPOSURE:
+    def true_exposure(self, reported_s: float) -> float:
+        """Seconds for which the shutter really opens when the camera reports ``reported_s``."""
+        for reported, true in self.exposures:
+            if abs(reported / reported_s - 1) < SAME_EXPOSURE:
                 return float(true)
-        return told_s
+        return reported_s
 
     def save(self, folder: Path) -> Path:
         """Write ``camera.npz`` into a run's folder."""

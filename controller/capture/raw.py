@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import Float64, FloatImage, Mask
 from controller.capture.demosaic import SensorLevels, demosaic, fill_bad
 from controller.capture.profile import CameraProfile
-from controller.errors import UsageError, WorkError
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.errors import UsageError, WorkError
+from controller.core.files import check_pixels, require_regular
 
 SATURATED_SHARE = 0.985
-"""Of full scale: sensors bend shortly before they clip."""
+"""Of full scale: sensors become nonlinear shortly before they clip."""
 JPEG_SATURATED = 254
 SINGULAR = 1e-6
 SRGB_TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
@@ -37,7 +38,7 @@ class Photograph:
 
     ``image`` (rows, columns, 3) float32 camera RGB, 0 at the black level, 1 at full scale; noise may go below 0
     ``saturated`` (rows, columns) bool: some sample that this pixel is made of was clipped
-    ``camera_to_xyz`` (3, 3) linear camera RGB to CIE XYZ as the file tells it, None where it does not
+    ``camera_to_xyz`` (3, 3) linear camera RGB to CIE XYZ as the file states it, None where it does not
     ``colours`` (2, 2) the Bayer pattern it was interpolated from (0 red, 1 green, 2 blue; see ``bayer_kernels``), None
     for a JPEG, whose interpolation is the camera's secret
     """
@@ -114,7 +115,9 @@ def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosai
     import rawpy
 
     try:
+        require_regular(path)
         with rawpy.imread(str(path)) as raw:
+            check_pixels(path, (raw.sizes.raw_width, raw.sizes.raw_height))
             mosaic = raw.raw_image_visible.copy()
             colours = _colour_of_sites(raw, path)
             black, white = _levels(raw)
@@ -130,9 +133,10 @@ def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosai
 
 
 def _unreadable(path: Path, reason: object) -> WorkError:
+    words = reason.strerror if isinstance(reason, OSError) and reason.strerror else reason
     return WorkError(
         "photograph-unreadable",
-        what=f"The photograph {path.name} can't be read ({reason}).",
+        what=f"The photograph {path.name} can't be read ({words}).",
         remedy="Take it again; if this happens often, check the camera's card and cable.",
     )
 
@@ -146,7 +150,7 @@ def _colour_of_sites(raw: Any, path: Path) -> npt.NDArray[np.int64]:
     if names != "BGGR":
         raise UsageError(
             "raw-not-bayer",
-            what=f"{path.name} comes from a sensor without a Bayer pattern.",
+            what=f"The sensor of {path.name} has no Bayer pattern.",
             remedy="Use a camera with a Bayer sensor, or JPEG.",
         )
     return np.array([["RGB".index(letters[index]) for index in row] for row in sites[:2, :2]], np.int64)
@@ -163,7 +167,7 @@ def _levels(raw: Any) -> tuple[Float64, Float64]:
 
 
 def _camera_to_xyz(raw: Any) -> Float64 | None:
-    """From LibRaw's XYZ-to-camera matrix where it knows the camera, else from what a DNG says of itself.
+    """From LibRaw's XYZ-to-camera matrix where it knows the camera, else from the DNG's own matrix.
 
     LibRaw keeps a DNG's matrix only as balanced camera RGB to sRGB, with the daylight balance beside it.
     """
@@ -199,7 +203,7 @@ def read_jpeg_values(path: Path) -> npt.NDArray[np.uint8]:
         raise _unreadable(path, error) from error
     decoded = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if decoded is None:
-        raise _unreadable(path, "it is not a whole JPEG")
+        raise _unreadable(path, "the JPEG file is not complete")
     return np.asarray(decoded, np.uint8)
 
 

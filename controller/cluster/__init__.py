@@ -1,1 +1,1 @@
-"""Work spread over machines by Dask distributed (docs/facade.md)."""
+"""Work on many machines with Dask distributed (docs/how-to/cluster.md). Entry: `connect`, `appearances`."""

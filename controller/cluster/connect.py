@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final, Generic, TypeVar
 
 from controller.cluster.tasks import Outcome, code_digest
-from controller.errors import UsageError, WorkError
+from controller.core.errors import UsageError, WorkError
+from controller.core.extras import extra_missing
 
 Value = TypeVar("Value")
 CONNECT_S: Final = 10.0
@@ -77,7 +78,7 @@ class Cluster:
                 raise WorkError(
                     "no-workers",
                     what=f"The scheduler at {self._address} has had no worker for {WORKERS_S:g} seconds.",
-                    remedy="Start workers there (docs/facade.md), or solve without --scheduler.",
+                    remedy="Start workers there (docs/how-to/cluster.md), or solve without --scheduler.",
                 )
             time.sleep(POLL_S)
 
@@ -139,7 +140,7 @@ class Task(Generic[Value]):
         raise WorkError(
             "workers-lost",
             what=f"{TRIES} workers went away, one after the other, over the same piece of work.",
-            remedy="Look whether they run out of memory; a worker needs what docs/facade.md says. Then start again.",
+            remedy="Check their memory; docs/how-to/cluster.md says what a worker needs. Then start again.",
         )
 
     def cancel(self) -> None:
@@ -161,17 +162,13 @@ def _lost() -> tuple[type[BaseException], ...]:
 def connected(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Cluster]:
     """A connection to the scheduler at ``address``, such as tcp://host:8786 or tls://host:8786.
 
-    Raises UsageError "cluster-missing" (the package distributed is not installed), "scheduler-address" or
+    Raises UsageError "extra-missing" (the package distributed is not installed), "scheduler-address" or
     "workers-differ"; WorkError "scheduler-unreachable" or "no-workers".
     """
     try:
         from distributed import Client
-    except ImportError as error:
-        raise UsageError(
-            "cluster-missing",
-            what=f"The package distributed is not installed ({error}).",
-            remedy="Install Velatura with its extra `cluster`, or solve without --scheduler.",
-        ) from error
+    except ModuleNotFoundError as error:
+        raise extra_missing(error.name or "") or error from error
     if not address.startswith(("tcp://", "tls://")):
         raise UsageError(
             "scheduler-address",

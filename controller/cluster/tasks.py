@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Generic, TypeVar
@@ -16,19 +16,18 @@ from typing import Final, Generic, TypeVar
 import numpy as np
 import xxhash
 
-from controller.arrays import Float64, FloatImage
-from controller.errors import VelaturaError
+from controller.core.arrays import FloatImage
+from controller.core.errors import VelaturaError
 from controller.solve.appearance import Base, prepare_base
-from controller.solve.bounded import Solution
-from controller.solve.box_solvers import BoxProblem, BoxSolver
-from controller.solve.drive import Drive
-from controller.solve.request import Answer, SolveOptions, answer
-from controller.solve.targets_values import Target
+from controller.solve.bounded.solver import Solution
+from controller.solve.drive_levels import DriveLevels
+from controller.solve.request import AppearanceResult, SolveOptions, solve_appearance
+from controller.solve.targets.values import Target
 from controller.transport import LightTransport
 
 Value = TypeVar("Value")
 _RUNNING: Final = threading.Lock()
-_CODE: Final = ("arrays.py", "compiled.py", "solve", "transport")
+_CODE: Final = ("core/arrays.py", "core/jit.py", "solve", "transport")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,26 +82,21 @@ def _told(work: Callable[[], Value]) -> Outcome[Value]:
         return Outcome(None, (type(error), error.code, error.what, error.remedy))
 
 
-_kept: dict[str, tuple[Base, Drive]] = {}
+_kept: dict[str, tuple[Base, DriveLevels]] = {}
 
 
-def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions) -> Outcome[Answer]:
-    """An appearance, as ``solve.request.answer`` makes it; ``key`` names the stage's contents."""
+def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions) -> Outcome[AppearanceResult]:
+    """An appearance, as ``solve.request.solve_appearance`` makes it; ``key`` names the stage's contents."""
 
-    def work() -> Answer:
+    def work() -> AppearanceResult:
         if key not in _kept:
             _kept.clear()  # a stage fills a worker's memory: not two of them
             base = prepare_base(stage.transport, stage.image, stage.black, stage.solution)
-            _kept[key] = base, Drive(stage.transport)
+            _kept[key] = base, DriveLevels(stage.transport)
         base, drive = _kept[key]
-        return answer(stage.transport, base, stage.black, asked, options, drive=drive)
+        return solve_appearance(stage.transport, base, stage.black, asked, options, drive=drive)
 
     return _told(work)
-
-
-def solve_there(solve: BoxSolver, problems: Sequence[BoxProblem]) -> Outcome[list[Float64]]:
-    """Some regions, solved one after the other."""
-    return _told(lambda: [solve(problem) for problem in problems])
 
 
 def code_digest() -> str:

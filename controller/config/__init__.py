@@ -5,7 +5,7 @@ from controller.config.models import (
     AppearanceTable,
     CameraTable,
     DisplayTable,
-    OpenTable,
+    OpenConfigTable,
     ProjectorTable,
     StageTables,
 )
@@ -15,7 +15,7 @@ __all__ = [
     "AppearanceTable",
     "CameraTable",
     "DisplayTable",
-    "OpenTable",
+    "OpenConfigTable",
     "ProjectorTable",
     "Stage",
     "StageTables",

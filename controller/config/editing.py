@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
+
+import tomlkit
+import tomlkit.container
+import tomlkit.exceptions
+import tomlkit.items
 
 from controller.config.lines import KeyLines, KeyPath
 from controller.config.loader import parse_stage
 from controller.config.models import StageTables
 from controller.config.problems import Place
 from controller.config.writer import toml_text
-from controller.errors import UsageError
-from controller.storage import write_atomically
-
-_PAIR: Final = re.compile(r"""^(\s*[A-Za-z0-9_-]+\s*=\s*)("[^"]*"|'[^']*'|[^"'#\[\]{}]*?)(\s*(?:#.*)?)$""")
+from controller.core.errors import UsageError
+from controller.core.files import read_text
+from controller.core.storage import write_atomically
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class KeyChange:
     """``key`` = ``value`` in the table at ``path``, e.g. ``("projectors", 0)``: changed, or added."""
 
     path: KeyPath
@@ -29,10 +32,10 @@ class Change:
     value: str | int | float | bool
 
 
-def edited(text: str, changes: Sequence[Change] = (), tables: Mapping[str, Any] | None = None) -> str:
+def edited(text: str, changes: Sequence[KeyChange] = (), tables: Mapping[str, Any] | None = None) -> str:
     """The text with the changes, and with further top-level ``tables`` after its end.
 
-    Raises UsageError("stage-not-editable") where a value stands so that no line of its own can be replaced.
+    Raises UsageError("stage-not-editable") where the text would not hold the change and all else as it was.
     """
     for change in changes:
         text = _changed(text, change)
@@ -43,7 +46,7 @@ def edited(text: str, changes: Sequence[Change] = (), tables: Mapping[str, Any] 
 
 def rewrite_stage(
     file: Path,
-    changes: Sequence[Change] = (),
+    changes: Sequence[KeyChange] = (),
     tables: Mapping[str, Any] | None = None,
     *,
     check: Callable[[StageTables], None] = lambda tables: None,
@@ -52,40 +55,57 @@ def rewrite_stage(
 
     Raises UsageError as ``load_stage`` for what would be wrong with it (nothing is written then), and WorkError.
     """
-    text = edited(file.read_text(encoding="utf-8"), changes, tables)
+    text = edited(read_text(file), changes, tables)
     check(parse_stage(tomllib.loads(text), Place(file.name, KeyLines(text))))
     write_atomically(file, text.encode())
 
 
-def _changed(text: str, change: Change) -> str:
-    content: Any = tomllib.loads(text)
-    for part in change.path:
-        content = content[part]
-    lines = text.split("\n")
-    pair = toml_text({change.key: change.value}).strip()
-    where = KeyLines(text)
-    if change.key not in content:
-        at = where.line(change.path)
-        if not lines[at - 1].lstrip().startswith("["):
-            raise _not_editable(at, pair)
-        return "\n".join([*lines[:at], pair, *lines[at:]])
-    at = where.line((*change.path, change.key))
-    match = _PAIR.match(lines[at - 1])
-    if match is None:
-        raise _not_editable(at, pair)
-    lines[at - 1] = match[1] + pair.partition("=")[2].strip() + match[3]
-    changed = "\n".join(lines)
-    content = tomllib.loads(changed)
-    for part in change.path:
-        content = content[part]
-    if content.get(change.key) != change.value:
-        raise _not_editable(at, pair)
+def _changed(text: str, change: KeyChange) -> str:
+    wanted: Any = tomllib.loads(text)
+    _table_at(wanted, change.path)[change.key] = change.value
+    try:
+        document = tomlkit.parse(text)
+        _assign(_table_at(document, change.path), change.key, change.value, "\r\n" if "\r\n" in text else "\n")
+        changed = tomlkit.dumps(document)
+        safe = bool(tomllib.loads(changed) == wanted)
+    # What tomlkit can't read or place, and what it would write wrongly, is left to a person.
+    except (tomlkit.exceptions.TOMLKitError, tomllib.TOMLDecodeError, LookupError, TypeError):
+        safe = False
+    if not safe:
+        raise _not_editable(KeyLines(text).line((*change.path, change.key)), toml_text({change.key: change.value}))
     return changed
 
 
+def _table_at(content: Any, path: KeyPath) -> Any:
+    for part in path:
+        content = content[part]
+    return content
+
+
+def _assign(table: Any, key: str, value: str | int | float | bool, end: str) -> None:
+    """Change a key, or add it after the table's last own one: before comments and tables that follow."""
+    container = table.value if isinstance(table, tomlkit.items.Table) else table
+    if key in table or not isinstance(container, tomlkit.container.Container):
+        table[key] = value
+        return
+    added = tomlkit.item(value)
+    added.trivia.trail = end
+    own = [n for n, (name, item) in enumerate(container.body) if name is not None and not _is_table(item)]
+    first = own[-1] + 1 if own else 0
+    after = container.body[first:]
+    del container.body[first:]
+    table[key] = added
+    container.body.extend(after)
+
+
+def _is_table(item: Any) -> bool:
+    return isinstance(item, tomlkit.items.Table | tomlkit.items.AoT)
+
+
 def _not_editable(line: int, pair: str) -> UsageError:
+    pair = pair.strip()
     return UsageError(
         "stage-not-editable",
-        what=f"stage.toml, line {line}, is written so that only a person can change it safely.",
-        remedy=f"Write {pair} there.",
+        what=f"stage.toml, line {line}, has a form that Velatura can't change safely.",
+        remedy=f"Edit the file and write {pair} there.",
     )

@@ -13,13 +13,14 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from controller.config.lines import KeyLines, KeyPath
-from controller.config.models import OpenTable, StageTables, Table
+from controller.config.models import ConfigTable, OpenConfigTable, StageTables
 from controller.config.problems import Place
-from controller.errors import UsageError
-from controller.text import printable
+from controller.core.errors import UsageError
+from controller.core.files import UnfitFile, read_bytes
+from controller.core.text import printable
 from hal.registry import Driver
 
-Tables = TypeVar("Tables", bound=Table)
+Tables = TypeVar("Tables", bound=ConfigTable)
 LARGEST_BYTES: Final = 1 << 20
 FILE: Final = "stage.toml"
 
@@ -81,7 +82,7 @@ def parse_tables(model: type[Tables], content: Mapping[str, Any], place: Place) 
     return tables
 
 
-def check_driver_settings(table: OpenTable, driver: Driver) -> dict[str, Any]:
+def check_driver_settings(table: OpenConfigTable, driver: Driver) -> dict[str, Any]:
     """The settings with which to open ``driver``, checked against what it understands.
 
     Raises UsageError("stage-key-unknown") or UsageError("stage-key-missing") with the line.
@@ -90,26 +91,26 @@ def check_driver_settings(table: OpenTable, driver: Driver) -> dict[str, Any]:
 
 
 _EXAMPLES: Final = {
-    "stage": "Give the stage's folder, which holds stage.toml; `velatura demo --prepare-only` writes an example.",
-    "plan": "Give a file that says what is to be planned; `velatura plan --example` writes one.",
+    "stage": "Give the stage's folder, which contains stage.toml; `velatura demo --prepare-only` writes an example.",
+    "plan": "Give a file that describes the plan; `velatura plan --example` writes one.",
 }
 
 
 def _text(file: Path, kind: str) -> str:
     try:
-        data = file.read_bytes() if file.stat().st_size <= LARGEST_BYTES else None
+        data = read_bytes(file, LARGEST_BYTES)
     except FileNotFoundError as error:
         raise UsageError(
             f"{kind}-missing",
             what=f"There is no {file}.",
             remedy=_EXAMPLES[kind],
         ) from error
+    except UnfitFile as error:
+        raise _unreadable(file, f"can't be read: {error.strerror}", "Give a text file.", kind) from error
     except OSError as error:
         raise _unreadable(file, f"can't be read: {error.strerror}", "Check the file's permissions.", kind) from error
-    if data is None:
-        raise _unreadable(file, f"is larger than {LARGEST_BYTES} bytes", "Is it the right file?", kind)
     try:
-        return data.decode()
+        return data.decode("utf-8-sig")  # some editors on Windows put a byte order mark before the text
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise _unreadable(file, f"is not UTF-8 text (line {line})", "Save it as text in UTF-8.", kind) from error
@@ -126,8 +127,9 @@ def _syntax(file: Path, error: Exception, kind: str) -> UsageError:
     problem = message[: where.start()] if where else message
     return UsageError(
         f"{kind}-syntax",
-        what=f"{file.name}{line}: this is not TOML: {problem}.",
-        remedy='Mend the line; text needs quotes (name = "left"), and tables brackets ([camera], [[projectors]]).',
+        what=f"{file.name}{line} is not valid TOML: {problem}.",
+        remedy='Correct the line; text needs quotes (name = "left"), and tables need brackets ([camera], '
+        "[[projectors]]).",
     )
 
 
@@ -147,7 +149,7 @@ _PROBLEMS: Final = {
     "finite_number": "is not a finite number",
     "bool_type": "is neither true nor false",
     "string_type": "is not text in quotes",
-    "string_pattern_mismatch": "is not of the allowed form",
+    "string_pattern_mismatch": "does not have the allowed form",
     "string_too_short": "is too short",
     "string_too_long": "is too long",
     "tuple_type": "is not a list",
@@ -164,7 +166,7 @@ _PROBLEMS: Final = {
 def _problem(detail: ErrorDetails, place: Place, root: type[BaseModel]) -> UsageError:
     path: KeyPath = tuple(detail["loc"])
     model, depth = _model_at(path, root)
-    # A position in a list of values (trusted_keys, from_px) is told by the name of the list.
+    # A position in a list of values (trusted_keys, from_px) is reported by the name of the list.
     table, key = place.at(*path[:depth]), str(path[depth]) if depth < len(path) else str(path[-1])
     field = model.model_fields.get(key)
     allowed = (field.description if field is not None else None) or "left out"
@@ -208,15 +210,15 @@ def _inner_model(model: type[BaseModel], key: str) -> type[BaseModel] | None:
     return next((kind for kind in arguments if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
 
 
-def _tables(table: Table, path: KeyPath) -> Iterator[tuple[KeyPath, Table]]:
+def _tables(table: ConfigTable, path: KeyPath) -> Iterator[tuple[KeyPath, ConfigTable]]:
     yield path, table
     for key in type(table).model_fields:
         value = getattr(table, key)
-        if isinstance(value, Table):
+        if isinstance(value, ConfigTable):
             yield from _tables(value, (*path, key))
         elif isinstance(value, tuple):
             for position, item in enumerate(value):
-                if isinstance(item, Table):
+                if isinstance(item, ConfigTable):
                     yield from _tables(item, (*path, key, position))
 
 
@@ -243,7 +245,7 @@ def _check_agreement(tables: StageTables) -> None:
 
 
 def _check_mains(tables: StageTables) -> None:
-    """Relays feed projectors that there are, each through one relay at most: else nobody knows what cuts what."""
+    """Relays feed existing projectors, each through one relay at most."""
     names = [projector.name for projector in tables.projectors]
     fed: set[str] = set()
     for board in tables.relays:
@@ -251,16 +253,16 @@ def _check_mains(tables: StageTables) -> None:
         for mains in board.mains:
             for name in mains.feeds:
                 if name not in names or name in fed:
-                    problem = "is fed by another relay too" if name in fed else "is not a projector of this stage"
+                    problem = "is fed by another relay" if name in fed else "is not a projector of this stage"
                     raise mains.place.wrong_value("feeds", name, problem, f"one of {', '.join(names)}, each once")
                 fed.add(name)
 
 
-def _all_different(tables: tuple[Table, ...], key: str) -> None:
+def _all_different(tables: tuple[ConfigTable, ...], key: str) -> None:
     lines: dict[str, int] = {}
     for table in tables:
         value = getattr(table, key)
         if value in lines:
             allowed = (type(table).model_fields[key].description or "") + ", not used twice"
-            raise table.place.wrong_value(key, value, f"is taken already in line {lines[value]}", allowed)
+            raise table.place.wrong_value(key, value, f"is already used in line {lines[value]}", allowed)
         lines[value] = table.place.line(key)

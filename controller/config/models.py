@@ -16,7 +16,7 @@ Positive = Annotated[float, Field(gt=0)]
 Size = Annotated[int, Field(ge=1, le=16_384)]
 
 
-class Table(BaseModel):
+class ConfigTable(BaseModel):
     """A table of stage.toml; knows where it stands in the file."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
@@ -34,7 +34,7 @@ class Table(BaseModel):
         return self
 
 
-class OpenTable(Table):
+class OpenConfigTable(ConfigTable):
     """A table with further keys that only somebody else understands: a driver, or a kind of appearance."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow", allow_inf_nan=False)
@@ -55,83 +55,84 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
-class StageTable(Table):
+class StageTable(ConfigTable):
     name: Name = Field(description="the stage's name, 1 to 64 printable characters")
 
 
-class ProjectorTable(OpenTable):
+class ProjectorTable(OpenConfigTable):
     name: Name = Field(description="a name for people, different for every projector, 1 to 64 printable characters")
     output: Name = Field(description="the name of the display output that feeds this projector")
     driver: Name = Field(description='the name of a projector driver, e.g. "serial"')
 
 
-class CameraTable(OpenTable):
+class CameraTable(OpenConfigTable):
     driver: Name = Field(description='the name of a camera driver, e.g. "ptp"')
     iso: int = Field(ge=25, le=819_200, description="the camera's sensitivity, a whole number from 25 to 819200")
     aperture_f: Annotated[float, Field(ge=0.5, le=128)] | None = Field(
-        default=None, description="the f-number from 0.5 to 128; left out: as the lens is set"
+        default=None, description="the f-number from 0.5 to 128; if omitted: the current setting of the lens"
     )
     intrinsics: str | None = Field(
         default=None,
         min_length=1,
-        description="a file that `velatura camera calibrate` wrote, relative to the stage's folder; it takes the"
-        " place of focal_length_px",
+        description="a file that `velatura camera calibrate` wrote, relative to the stage's folder; it replaces "
+        "focal_length_px",
     )
     focal_length_px: Positive | None = Field(
         default=None,
-        description="the focal length in pixels of the camera's full image, a number above 0 (from the lens and"
-        " sensor); may be left out where intrinsics stands",
+        description="the focal length in pixels of the camera's full image, a number above 0 (from the lens and "
+        "sensor); not needed with intrinsics",
     )
     focal_length_rel_sigma: float = Field(
-        default=0.02, gt=0, le=1, description="how far focal_length_px may be off as a share of it, above 0, at most 1"
+        default=0.02, gt=0, le=1, description="relative standard uncertainty of focal_length_px, above 0, at most 1"
     )
     distance_m: Positive | None = Field(
         default=None,
-        description="metres from the front of the camera's lens to the nearest visible point of the object, above 0;"
-        " left out: not measured",
+        description="metres from the front of the camera's lens to the nearest visible point of the object, above 0; "
+        "if omitted: not measured",
     )
     distance_rel_sigma: float = Field(
-        default=0.01, gt=0, le=1, description="how far distance_m may be off as a share of it, above 0, at most 1"
+        default=0.01, gt=0, le=1, description="relative standard uncertainty of distance_m, above 0, at most 1"
     )
 
 
-class OutputTable(Table):
+class OutputTable(ConfigTable):
     name: Name = Field(description="the output's name, different for every output, 1 to 64 printable characters")
     width_px: Size = Field(description="the output's width in pixels, a whole number from 1 to 16384")
     height_px: Size = Field(description="the output's height in pixels, a whole number from 1 to 16384")
     where: str | None = Field(
         default=None,
         pattern=r"^[^\s=](.*[^\s])?$",
-        description='the connector ("HDMI-1") or the serial number of its display; left out: the name is one of these',
+        description='the connector ("HDMI-1") or the serial number of its display; if omitted: the name is one of '
+        "these",
     )
 
 
-class DisplayTable(OpenTable):
+class DisplayTable(OpenConfigTable):
     driver: Name = Field(description='the name of a display driver, e.g. "player"')
     frames: str | None = Field(
-        default=None, min_length=1, description="the file of a memory output; left out: windows on real outputs"
+        default=None, min_length=1, description="the file of a memory output; if omitted: windows on real outputs"
     )
     outputs: Annotated[tuple[OutputTable, ...], Field(strict=False)] = Field(
         default=(), description="a list of [[display.outputs]] tables with name, width_px and height_px"
     )
 
 
-class DistanceTable(Table):
+class DistanceTable(ConfigTable):
     """Two points of the object in the camera's image, and how far they are apart."""
 
     from_px: Annotated[tuple[float, float], Field(strict=False)] = Field(description="[x, y] in camera pixels")
     to_px: Annotated[tuple[float, float], Field(strict=False)] = Field(description="[x, y] in camera pixels")
     distance_m: Positive = Field(description="metres between the two points, above 0")
-    sigma_m: Positive = Field(default=0.001, description="how far distance_m may be off in metres, above 0")
+    sigma_m: Positive = Field(default=0.001, description="standard uncertainty of distance_m in metres, above 0")
 
 
-class ObjectTable(Table):
+class ObjectTable(ConfigTable):
     distances: Annotated[tuple[DistanceTable, ...], Field(strict=False)] = Field(
         default=(), description="a list of [[object.distances]] tables with from_px, to_px and distance_m"
     )
 
 
-class CaptureTable(Table):
+class CaptureTable(ConfigTable):
     settle_s: float = Field(
         default=0.15, ge=0, le=10, description="seconds from a frame's presentation to the shutter, 0 to 10"
     )
@@ -140,112 +141,120 @@ class CaptureTable(Table):
     )
 
 
-class CalibrationTable(Table):
+class CalibrationTable(ConfigTable):
     worst_grade: float = Field(
         default=8.0,
         gt=0,
         le=1000,
-        description="the largest error of a prediction, in per cent, with which a calibration may be published, "
-        "above 0, at most 1000",
+        description="the largest prediction error, in per cent, at which a calibration may be published, above 0, at "
+        "most 1000",
     )
     photograph_at_night: bool = Field(
         default=False,
-        description="true or false: whether the kiosk photographs what the appearances achieve after a nightly "
-        "recalibration",
+        description="true or false: whether the kiosk photographs the appearances after a nightly recalibration",
     )
 
 
-class SolveTable(Table):
+class SolveTable(ConfigTable):
     exposure_share: float = Field(
         default=0.9, gt=0, le=1, description="the share of the reachable light that targets may use, above 0, at most 1"
     )
     smoothness: float = Field(
-        default=0.001, ge=0, le=100, description="the weight of equal neighbours in a compensation image, 0 to 100"
+        default=0.001,
+        ge=0,
+        le=100,
+        description="the weight of smoothness in a compensation image (equal neighbours), 0 to 100",
     )
     mode: Literal["auto", "full", "scale"] = Field(
         default="auto",
-        description='"full" (a solve for every appearance), "scale" (base image x scale image), or "auto" (full where '
-        "the target has finer detail than scaling can show)",
+        description='"full" (a solve for every appearance), "scale" (base image x scale image), or "auto" (full '
+        "where the target has finer detail than scaling can show)",
     )
     base: Literal["minimum", "white", "high-pass"] = Field(
         default="white",
-        description='the base image: "minimum" (at each pixel the darkest white image), "white" (even light), or '
+        description='the base image: "minimum" (the darkest white image at each pixel), "white" (even light), or '
         '"high-pass" (the fine detail of each target, with a solve for each)',
     )
     adapt: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="how much targets are bent into reach where light is lacking, keeping local contrast, 0 (cut off) "
-        "to 1",
+        description="how much a target is adapted to the available light to keep its local contrast, from 0 (too "
+        "bright parts are clipped) to 1",
     )
 
 
-class MainsTable(Table):
+class MainsTable(ConfigTable):
     """One relay of a board, and whose mains go through it."""
 
     channel: int = Field(ge=1, le=64, description="the relay's number on its board, from 1")
     feeds: Annotated[tuple[Name, ...], Field(strict=False, min_length=1, max_length=32)] = Field(
-        description="a list of names of the projectors whose mains go through this relay"
+        description="a list of names of the projectors that get their mains through this relay"
     )
 
 
-class RelaysTable(OpenTable):
+class RelaysTable(OpenConfigTable):
     name: Name = Field(description="a name for people, different for every relay board, 1 to 64 printable characters")
     driver: Name = Field(description='the name of a power_switch driver, e.g. "usb-relay"')
     boot_s: Annotated[float, Field(ge=0, le=600)] = Field(
-        default=10.0, description="seconds from mains on until a projector can be spoken to, 0 to 600"
+        default=10.0, description="seconds from mains on until a projector accepts commands, 0 to 600"
     )
     mains: Annotated[tuple[MainsTable, ...], Field(strict=False, min_length=1, max_length=64)] = Field(
         description="a list of [[relays.mains]] tables with channel and feeds"
     )
 
 
-class LightSensorTable(OpenTable):
+class LightSensorTable(OpenConfigTable):
     driver: Name = Field(description='the name of a light_sensor driver, e.g. "colorhug-als"')
     most_lux: float = Field(
         default=5.0, gt=0, le=100_000, description="lux at the object above which calibration is refused, above 0"
     )
 
 
-class KeyPanelTable(OpenTable):
+class KeyPanelTable(OpenConfigTable):
     driver: Name = Field(description='the name of a button_panel driver, e.g. "stream-deck"')
 
 
-class HoursTable(Table):
-    """Opening hours of a weekday or a date; see ``controller.serve.hours`` for what they mean together."""
+class HoursTable(ConfigTable):
+    """Opening hours of a weekday or a date; see ``controller.kiosk.decide.hours`` for what they mean together."""
 
     day: str = Field(description='"mon" to "sun", or a date such as "2026-12-24", which takes precedence')
-    opens: str = Field(default="", description='the local time "HH:MM"; left out, with closes: closed all day')
+    opens: str = Field(
+        default="", description='the local time "HH:MM"; if omitted together with closes: closed all day'
+    )
     closes: str = Field(default="", description='the local time "HH:MM"; at or before opens: on the next day')
-    appearance: str = Field(default="", description="the appearance to play; left out: what was played last")
+    appearance: str = Field(
+        default="", description="the appearance to play; if omitted: the appearance that played last"
+    )
 
 
-class ScheduleTable(Table):
+class ScheduleTable(ConfigTable):
     time_zone: str = Field(default="UTC", description='a name of the IANA database, e.g. "Europe/Vienna"')
     drift_check: str = Field(
-        default="", description='the local time "HH:MM" of the nightly drift check; left out: none'
+        default="", description='the local time "HH:MM" of the nightly drift check; if omitted: no check'
     )
     without_time: Literal["open", "closed"] = Field(
-        default="closed", description='"open" or "closed": what the stage is while nobody knows the time'
+        default="closed", description='"open" or "closed": the state of the stage while the system time is unknown'
     )
     hours: Annotated[tuple[HoursTable, ...], Field(strict=False)] = Field(
         default=(), description="a list of [[schedule.hours]] tables with day, opens and closes; none: always open"
     )
 
 
-class SafetyTable(Table):
+class SafetyTable(ConfigTable):
     power_up_s: Seconds = Field(
-        default=1800.0, description="seconds that lamps may take until they are steady, 0 to 86400"
+        default=1800.0, description="the longest time in seconds until the lamps are steady, 0 to 86400"
     )
-    power_down_s: Seconds = Field(default=60.0, description="seconds that switching the lamps off may take, 0 to 86400")
-    warm_up_s: Seconds = Field(default=0.0, description="seconds from strike to light, if longer than the driver says")
+    power_down_s: Seconds = Field(
+        default=60.0, description="the longest time in seconds for switching the lamps off, 0 to 86400"
+    )
+    warm_up_s: Seconds = Field(default=0.0, description="seconds from strike to light, if longer than in the driver")
     stable_s: Seconds = Field(
-        default=0.0, description="seconds from strike to steady light, if longer than the driver says"
+        default=0.0, description="seconds from strike to steady light, if longer than in the driver"
     )
-    cool_down_s: Seconds = Field(default=0.0, description="seconds of cooling, if longer than the driver says")
+    cool_down_s: Seconds = Field(default=0.0, description="seconds of cooling, if longer than in the driver")
     minimum_off_s: Seconds = Field(
-        default=0.0, description="seconds from off to the next strike, if longer than the driver says"
+        default=0.0, description="seconds from off to the next strike, if longer than in the driver"
     )
 
     def at_least(self) -> LampRules:
@@ -253,9 +262,9 @@ class SafetyTable(Table):
         return LampRules(self.warm_up_s, self.stable_s, self.cool_down_s, self.minimum_off_s)
 
 
-class BundleTable(Table):
+class BundleTable(ConfigTable):
     allow_unsigned: bool = Field(
-        default=False, description="true or false: whether a bundle without signature may play"
+        default=False, description="true or false: whether a bundle without a signature may play"
     )
     trusted_keys: Annotated[tuple[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")], ...], Field(strict=False)] = Field(
         default=(), description="a list of public keys, each 64 hexadecimal digits in lower case"
@@ -265,7 +274,7 @@ class BundleTable(Table):
     )
 
 
-class AppearanceTable(OpenTable):
+class AppearanceTable(OpenConfigTable):
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
         description="a name of 1 to 64 letters, digits, - and _, different for every appearance",
@@ -277,7 +286,8 @@ class AppearanceTable(OpenTable):
     )
     fade_s: float | None = Field(
         default=None, ge=0, le=600,
-        description="seconds of shown_s in which it comes in there, 0 (at once) to 600; left out: 1, at most shown_s",
+        description="seconds of cross-fade at its start, part of shown_s, 0 (none) to 600; if omitted: 1, at most "
+"shown_s",
     )  # fmt: skip
 
     @property
@@ -289,12 +299,12 @@ class AppearanceTable(OpenTable):
         return round(1000 * self.shown_s), round(1000 * fade_s)
 
 
-class StageTables(Table):
+class StageTables(ConfigTable):
     """The whole of stage.toml."""
 
     stage: StageTable = Field(description="the table [stage] with the stage's name")
     projectors: Annotated[tuple[ProjectorTable, ...], Field(strict=False, min_length=1, max_length=32)] = Field(
-        description="1 to 32 tables [[projectors]], one a projector"
+        description="1 to 32 tables [[projectors]], one for each projector"
     )
     camera: CameraTable = Field(description="the table [camera]")
     display: DisplayTable = Field(description="the table [display]")
@@ -303,7 +313,7 @@ class StageTables(Table):
     calibration: CalibrationTable = Field(default_factory=CalibrationTable, description="the table [calibration]")
     solve: SolveTable = Field(default_factory=SolveTable, description="the table [solve]")
     relays: Annotated[tuple[RelaysTable, ...], Field(strict=False, max_length=16)] = Field(
-        default=(), description="a list of [[relays]] tables, one a relay board"
+        default=(), description="a list of [[relays]] tables, one for each relay board"
     )
     light_sensor: LightSensorTable | None = Field(default=None, description="the table [light_sensor]")
     key_panel: KeyPanelTable | None = Field(default=None, description="the table [key_panel]")

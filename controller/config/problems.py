@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from controller.config.lines import KeyLines, KeyPath
-from controller.errors import UsageError
-from controller.text import printable
+from controller.core.errors import UsageError
+from controller.core.text import printable
+from hal.escapes import toml_value
 
 LONGEST_SHOWN = 40
 """Characters of a wrong value that an error repeats."""
@@ -87,5 +88,5 @@ def table_name(path: KeyPath) -> str:
 
 def shown(value: Any) -> str:
     """A value as an error repeats it: short, and without control characters."""
-    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    text = toml_value(value)
     return printable(text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 1] + "…")

@@ -1,18 +1,18 @@
-"""Writing TOML: as much of it as stage.toml uses."""
+"""Writing TOML in the layout of stage.toml; tomlkit spells the values."""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any, Final
 
+import tomlkit
+
 from controller.config.models import StageTables
-from controller.storage import write_atomically
+from controller.core.storage import write_atomically
 
 _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
-_ESCAPES: Final = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 _HEADING: Final = """\
 # A Velatura stage: the devices, the object and the options that a technician knows.
 # Relative paths start at this file's folder. Every command checks it first, and names the line of a mistake.
@@ -68,39 +68,16 @@ def _is_list(value: Any) -> bool:
 
 
 def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else _string(key)
+    # tomlkit writes letters of any language bare, which TOML 1.0 does not allow
+    return key if _BARE.fullmatch(key) else tomlkit.item(key).as_string()
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        text = "true" if value else "false"
-    elif isinstance(value, int):
-        text = str(int(value))
-    elif isinstance(value, float):
-        text = _float(float(value))
-    elif isinstance(value, str | PurePath):
-        text = _string(str(value))
-    elif isinstance(value, Mapping):
+    if isinstance(value, Mapping):
         pairs = (f"{_key(key)} = {_value(item)}" for key, item in value.items() if item is not None)
-        text = "{" + ", ".join(pairs) + "}"
-    elif _is_list(value):
-        text = "[" + ", ".join(map(_value, value)) + "]"
-    else:
-        raise TypeError(f"TOML has no {type(value).__name__}")
-    return text
-
-
-def _float(value: float) -> str:
-    if not math.isfinite(value):
-        return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
-    text = repr(value)
-    return text if "." in text or "e" in text else f"{text}.0"
-
-
-def _string(text: str) -> str:
-    escaped = (_ESCAPES.get(character) or _plain(character) for character in text)
-    return '"' + "".join(escaped) + '"'
-
-
-def _plain(character: str) -> str:
-    return f"\\u{ord(character):04x}" if ord(character) < 0x20 or ord(character) == 0x7F else character
+        return "{" + ", ".join(pairs) + "}"
+    if _is_list(value):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, bool | int | float | str | PurePath):
+        return tomlkit.item(str(value) if isinstance(value, PurePath) else value).as_string()
+    raise TypeError(f"TOML has no {type(value).__name__}")

@@ -1,1 +1,1 @@
-"""The whole job on an emulated stage, as a kiosk would do it, ending in a report."""
+"""The whole job on an emulated stage, ending in a report. Entry: `job.demo`, `stage`."""

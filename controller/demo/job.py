@@ -8,23 +8,34 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from controller.app import marker, run_on_stage
-from controller.arrays import save_arrays
-from controller.checking import Checked, check_stage
-from controller.demo.bench_process import BenchProcess
-from controller.demo.report import write_demo_report
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.kinds import StepKind, of_projectors
+from controller.artefacts.published import write_photograph
+from controller.artefacts.solved import read_solved
 from controller.demo.stage import prepare
-from controller.services import calibrating, output_sizes, signing_key, worst_grade
-from controller.session import costs
-from controller.session.grading import gate_step
-from controller.session.machine import Event
-from controller.session.progress import Reporter
-from controller.session.publishing import photograph_hdr, photograph_step, photographs_s, playback_step, publish_step
-from controller.session.rig import Rig
-from controller.session.runner import Context, Step
-from controller.session.solving import Calibrated, SolveOptions, device_frames, read_solved, solve_steps
-from controller.session.wishes import wishes_of
+from controller.report.demo import write_demo_report
+from controller.rig.rig import Rig
+from controller.run.progress import Reporter
+from controller.run.runner import Context, Step
+from controller.run.state_machine import Event
+from controller.run.step_id import StepId
+from controller.services.calibrate import calibrating, output_sizes, signing_key, worst_grade
 from controller.solve.traditional import traditional_compensation
+from controller.stage.bench import BenchProcess
+from controller.stage.check import Checked, check_stage
+from controller.stage.run import marker
+from controller.stage.session import OwnSession
+from controller.steps import costs
+from controller.steps.appearance.publishing import (
+    photograph_hdr,
+    photograph_step,
+    photographs_s,
+    playback_step,
+    publish_step,
+)
+from controller.steps.appearance.requests import wishes_of
+from controller.steps.appearance.solving import SolveOptions, device_frames, solve_steps
+from controller.steps.calibrate.grade import gate_step
 
 PLAYBACK_S = 4.0
 
@@ -48,9 +59,8 @@ def demo(
     if prepare_only:
         return {"stage": str(stage)}
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
-    run = run_on_stage(
-        checked, partial(demo_steps, checked=checked), name="demo", reporter=reporter, cancel=cancel, around=bench
-    )
+    session = OwnSession(stage, around=bench)
+    run = session.run(checked, partial(demo_steps, checked=checked), name="demo", reporter=reporter, cancel=cancel)
     reporter.say("Writing the report.")
     html, machine = write_demo_report(out.resolve(), run, checked)
     return {"report": str(html), "figures": str(machine), "stage": str(stage)}
@@ -64,13 +74,13 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     names = [wish.name for wish in wishes]
     table = stage.tables.solve
     options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
-    after = [name for projector in checked.names for name in (f"radiometry-{projector}", f"pixels-{projector}")]
+    after = [StepId(StepKind.GEOMETRY), *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS)]
     longest_s = stage.tables.capture.longest_exposure_s
     return [
         *calibrating(rig, run, checked=checked, calibrated=calibrated),
         gate_step(worst_grade(checked), accepted=False),
         marker("solving", "Solving", enter=Event.SOLVE),
-        *solve_steps(calibrated, wishes, options, [*after, "geometry"], costs.scale(p.size_px for p in rig.projectors)),
+        *solve_steps(calibrated, wishes, options, after, costs.scale(p.size_px for p in rig.projectors)),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
         publish_step(
@@ -93,9 +103,9 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
 def _traditional_step(rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float) -> Step:
     """What the targets look like when one projector makes them by division at each pixel, to compare with."""
     return Step(
-        "traditional",
+        StepId(StepKind.TRADITIONAL),
         partial(_traditional, rig, calibrated, tuple(names), longest_s),
-        after=tuple(f"appearance-{name}" for name in names),
+        after=tuple(StepId(StepKind.APPEARANCE, item=name) for name in names),
         title="Photographing the traditional way for comparison",
         weight=photographs_s(rig, names),
     )
@@ -115,10 +125,8 @@ def _traditional(
         )
         shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
         picture = photograph_hdr(
-            rig, context, f"traditional-{name}", solved.exposure, longest_s,
+            rig, context, StepKind.TRADITIONAL, name, solved.exposure, longest_s,
             shown_at_s=shown.at_s, of={"appearance": name, "projector": str(best)},
         )  # fmt: skip
-        path = context.folder / f"traditional-{name}.npz"
-        save_arrays(path, {"photograph": picture})
-        paths.append(path)
+        paths.append(write_photograph(context.folder, StepKind.TRADITIONAL, name, picture))
     return paths

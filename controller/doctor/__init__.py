@@ -1,1 +1,3 @@
-"""`velatura doctor`: what is there, what is wrong with it, and what to do (docs/doctor.md)."""
+"""`velatura doctor`: what is connected, what is wrong with it, what to do (docs/how-to/doctor.md). Entry: `examine`,
+`outputs`.
+"""

@@ -10,18 +10,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from controller.app import LOCK
-from controller.checking import Checked, check_stage
 from controller.config.loader import FILE
+from controller.core.errors import UsageError
+from controller.core.storage import exclusive
 from controller.doctor.trying import Trying, devices_of
 from controller.doctor.values import Examination, Finding
 from controller.doctor.writing import write
-from controller.errors import UsageError
-from controller.session.progress import Reporter
-from controller.storage import exclusive
-from hal.deadline import Deadline, in_seconds
+from controller.run.progress import Reporter
+from controller.stage.check import Checked, check_stage
+from controller.stage.run import LOCK
+from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
-from hal.finding import Finder, Found, Known, Problem, Wanted, load_finders
+from hal.finding import Finder, Found, Known, Problem, Wanted, load_finders, search_bus
 from hal.registry import Drivers, load_drivers
 
 LONGEST_S: Final = 300.0
@@ -56,7 +56,7 @@ def examine(
         if checked is not None:
             seen = _tried(checked, seen, deadline, reporter)
     if write_it:
-        if wrong:
+        if wrong and checked is None:
             raise UsageError(wrong[0].problem.code, what=wrong[0].problem.what, remedy=wrong[0].problem.remedy)
         seen = replace(seen, written=write(folder, None if checked is None else checked.stage, seen))
     return seen
@@ -69,9 +69,10 @@ def _checked(folder: Path, tools: Tools) -> tuple[Checked | None, list[Finding]]
             raise UsageError("stage-missing", what=f"There is no folder {folder}.", remedy="Make it, or give another.")
         return None, []
     try:
-        return check_stage(folder, drivers=tools.drivers), []
+        checked = check_stage(folder, drivers=tools.drivers)
     except (UsageError, DeviceError) as error:
         return None, [Finding(FILE, Problem(error.code, error.what, error.remedy))]
+    return checked, [Finding(FILE, Problem.of(fault)) for fault in checked.faults]
 
 
 def _known(checked: Checked | None) -> tuple[Known, ...]:
@@ -91,9 +92,11 @@ def _search(
     found: list[Found] = []
     reporter.say(f"Looking at {', '.join(finder.bus for finder in finders)}.")
     with ThreadPoolExecutor(max(1, len(finders)), thread_name_prefix="doctor") as pool:
-        for finder, search in [(one, pool.submit(one.find, wanted, deadline)) for one in finders]:
+        for finder, search in [(one, pool.submit(search_bus, one, wanted, deadline)) for one in finders]:
             try:
                 found += search.result()
+            except Cancelled:
+                raise
             except DeviceError as error:
                 problems.append(Finding(finder.bus, Problem.of(error)))
     return found, problems
@@ -118,7 +121,7 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
         problems += _unplugged_outputs(found, outputs)
     for plugin in (tools.drivers or load_drivers()).broken:
         what = f"The plugin {plugin.entry_point} of {plugin.distribution} can't be used: {plugin.reason}."
-        problems.append(Finding("", Problem("plugin-broken", what, "Reinstall that distribution.")))
+        problems.append(Finding("", Problem("plugin-broken", what, plugin.remedy)))
     return Examination(tuple(found), (), tuple(problems), tuple(new))
 
 
@@ -128,7 +131,7 @@ def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
         if one.kind == "power_switch":
             remedy = (
                 "Add it by hand, because only you know what each relay feeds: [[relays]] with driver, serial and "
-                "[[relays.mains]] (docs/drivers.md)."
+                "[[relays.mains]] (docs/how-to/relays-sensor-keys.md)."
             )
         elif one.kind == "camera" and "camera" in kinds:
             remedy = f"If it is the one to use, write address = {one.settings.get('address', '')!r} into [camera]."

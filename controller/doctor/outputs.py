@@ -8,7 +8,6 @@ for this, under the lamp rules, and switched off afterwards.
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,21 +16,22 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from controller.app import LOCK
-from controller.arrays import ByteImage
 from controller.capture.acquire import Shot
 from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic
-from controller.checking import Checked, check_stage
+from controller.core.arrays import ByteImage
+from controller.core.storage import exclusive
 from controller.doctor.values import Examination, Finding
-from controller.opening import opened
-from controller.session.lighting import lit
-from controller.session.machine import Machine
-from controller.session.power import light
-from controller.session.progress import Level, Reporter
-from controller.session.rig import Rig, RigProjector
-from controller.storage import exclusive
+from controller.rig.lamp_session import lit
+from controller.rig.power import light
+from controller.rig.rig import Rig, RigProjector
+from controller.run.progress import Level, Reporter
+from controller.run.state_machine import Machine
+from controller.stage.check import Checked, check_stage
+from controller.stage.open import opened
+from controller.stage.run import LOCK
 from hal.deadline import Deadline, in_seconds
 from hal.finding import Problem
+from hal.runtime.caches import temporary
 from hal.values import Presented
 
 LONGEST_S: Final = 3600.0
@@ -79,8 +79,8 @@ def examine_outputs(
             tell=lambda sentence: reporter.say(sentence, Level.WARNING),
         )
         show_numbers(rig, reporter, deadline)
-        with tempfile.TemporaryDirectory(prefix="velatura-doctor-") as folder:
-            shown = who_shows_what(rig, Path(folder), deadline=deadline)
+        with temporary() as folder:
+            shown = who_shows_what(rig, folder, deadline=deadline)
     findings = judge(rig.projectors, shown)
     return replace(seen, findings=(*seen.findings, *findings))
 

@@ -7,14 +7,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from controller.checking import Checked
 from controller.doctor.values import Finding, Tried
-from controller.session.lamp_faults import fatal_faults, faulty
+from controller.rig.lamp_faults import fatal_faults, faulty
+from controller.stage.check import Checked
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.finding import Problem
-from hal.interfaces import ButtonPanel, Camera, LightSensor, PowerSwitch, Projector
-from hal.registry import Driver, OpenContext
+from hal.interfaces import ButtonPanel, Camera, LightSensor, PowerSwitch, Projector, WatchedProjector
+from hal.registry import Driver, OpenContext, open_device
 from hal.values import Power
 
 OPEN_S = 15.0
@@ -28,6 +28,11 @@ class Device:
     kind: str
     driver: Driver
     settings: Mapping[str, Any]
+
+    @property
+    def title(self) -> str:
+        """Its name in stage.toml, or "" where a stage has one such device at most, which needs none."""
+        return self.name if self.kind in ("projector", "power_switch") else ""
 
     @property
     def place(self) -> str:
@@ -78,7 +83,8 @@ class Trying:
 
     def _asked(self, device: Device) -> str:
         context = OpenContext(stage=self._checked.stage.folder)
-        opened = device.driver.open(device.settings, context, self._deadline.within(OPEN_S))
+        until = self._deadline.within(OPEN_S)
+        opened = open_device(device.driver, device.settings, context, until, name=device.title)
         with contextlib.closing(opened):
             identity = opened.identity(deadline=self._deadline.within(OPEN_S))
             says = f"{identity.maker} {identity.model}" + (f", number {identity.serial}" if identity.serial else "")
@@ -107,7 +113,8 @@ class Trying:
         hours = "" if status.lamp_hours is None else f", {status.lamp_hours} lamp hours"
         warned = f", {', '.join(status.faults)}" if status.faults else ""
         by_hand = "" if can.power else ", to be switched by hand"
-        return f"{status.power.value}{hours}{warned}{by_hand}"
+        notes = projector.troubles() if isinstance(projector, WatchedProjector) else []
+        return " ".join([f"{status.power.value}{hours}{warned}{by_hand}", *(f"({note})" for _, note in notes)])
 
     def _relays(self, name: str, board: PowerSwitch) -> str:
         until = self._deadline.within(OPEN_S)

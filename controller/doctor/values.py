@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from controller.text import printable
+from controller.core.text import printable
 from hal.finding import Found, Problem
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.config import Stage, StageTables, write_stage
-from controller.config.editing import Change, rewrite_stage
+from controller.config.editing import KeyChange, rewrite_stage
+from controller.core.errors import UsageError
 from controller.doctor.values import Examination
-from controller.errors import UsageError
 from hal.finding import Found
 
 CORRECTIONS: Final = ("serial-wrong-baud", "serial-other-profile")
@@ -24,7 +24,7 @@ FIRST_ISO: Final = 100
 class Plan:
     """What would be written: changes of keys, further tables, and both in words."""
 
-    changes: list[Change] = field(default_factory=list)
+    changes: list[KeyChange] = field(default_factory=list)
     tables: dict[str, Any] = field(default_factory=dict)
     words: list[str] = field(default_factory=list)
 
@@ -72,7 +72,7 @@ def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str
         raise UsageError(
             "doctor-not-enough",
             what=f"A stage needs {', '.join(missing)} more than was found, so no stage.toml was written.",
-            remedy="Plug in and switch on what is missing, or write stage.toml by hand (docs/architecture.md).",
+            remedy="Plug in and switch on what is missing, or write stage.toml by hand (docs/reference/stage-toml.md).",
         )
     content: dict[str, Any] = {
         "stage": {"name": folder.resolve().name},
@@ -116,7 +116,7 @@ def _correct(stage: Stage, found: Sequence[Found], plan: Plan) -> None:
                 continue
             wanted = {key: value for key, value in one.settings.items() if written.get(key) != value}
             for key, value in wanted.items():
-                plan.changes.append(Change(("projectors", position), key, value))
+                plan.changes.append(KeyChange(("projectors", position), key, value))
                 plan.words.append(f"{key} = {value!r} for projector {projector.name}")
 
 

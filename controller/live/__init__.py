@@ -1,1 +1,1 @@
-"""A stream of targets turned into compensation images as they come (docs/live.md)."""
+"""A stream of target pictures, as files or frames (docs/how-to/live-targets.md). Entry: `sources`."""

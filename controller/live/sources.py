@@ -13,14 +13,15 @@ from typing import Final, Protocol
 import cv2
 import numpy as np
 
-from controller.arrays import ByteImage
-from controller.errors import UsageError
-from controller.solve.targets_files import check_picture, read_picture
-from controller.solve.targets_values import linear_to_srgb
+from controller.core.arrays import ByteImage
+from controller.core.errors import UsageError
+from controller.core.files import UnfitFile, check_pixels, read_picture_bytes
+from controller.solve.targets.files import check_picture, read_picture
+from controller.solve.targets.values import linear_to_srgb
 
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".exr")
 SETTLED_S: Final = 0.2
-"""A picture that can't be read and is older than this is damaged, not half written."""
+"""A picture that can't be read and is older than this is damaged, not still being written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +51,19 @@ class VideoSource:
     def __init__(self, path: Path, *, loop: bool) -> None:
         """Raises UsageError("live-source-unreadable")."""
         self._path, self._loop = path, loop
-        # What is wrong with a file is told in our words; its decoder would write its own to the terminal.
+        # Errors of a file are reported in our words; its decoder would write its own to the terminal.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         self._capture = cv2.VideoCapture(str(path))
         rate = float(self._capture.get(cv2.CAP_PROP_FPS)) if self._capture.isOpened() else 0.0
         if not rate > 0:
             self._capture.release()
-            raise unreadable(path, "it is no video that OpenCV can decode")
+            raise unreadable(path, "it is not a video that OpenCV can decode")
+        size = (int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        try:
+            check_pixels(path, size)
+        except UnfitFile as error:
+            self._capture.release()
+            raise unreadable(path, error.reason) from error
         self.rate_hz = rate
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         # the last frame is shown however late it is; some files don't tell how many they have
@@ -143,7 +150,7 @@ class FolderSource:
         try:
             pixels = _as_srgb(newest)
         except UsageError:
-            # half written: it is asked again, unless nobody has written to it for a while
+            # half written: it is read again, unless it has not changed for a while
             if self._clock() - mark[1] / 1e9 > SETTLED_S:
                 self._last = mark
                 raise
@@ -167,7 +174,7 @@ def open_source(path: Path, *, loop: bool, rate_hz: float) -> LiveSource:
     if path.is_dir():
         return FolderSource(path, loop=loop, rate_hz=rate_hz)
     if not path.is_file():
-        raise unreadable(path, "it is not there")
+        raise unreadable(path, "it does not exist")
     return VideoSource(path, loop=loop)
 
 
@@ -192,11 +199,18 @@ def unreadable(path: Path, why: str) -> UsageError:
 
 def _as_srgb(path: Path) -> ByteImage:
     if path.suffix.lower() != ".exr":
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        data_ends = path.read_bytes()[-4096:]
-        if image is None or not (b"IEND" in data_ends or b"\xff\xd9" in data_ends):
+        try:
+            data = read_picture_bytes(path)
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise unreadable(path, str(error.strerror)) from error
+        except cv2.error:
+            image = None
+        if image is None or not (b"IEND" in data[-4096:] or b"\xff\xd9" in data[-4096:]):
             read_picture(path)  # tells what is wrong with it
-            raise unreadable(path, "a picture in it could not be decoded")
+            raise unreadable(path, "one of its pictures could not be decoded")
         return np.ascontiguousarray(image[..., ::-1])
     light = read_picture(path)[..., :3]
     check_picture(path, light, (light.shape[1], light.shape[0]))

@@ -1,1 +1,3 @@
-"""The technician's web panel and the API: what a person sees of a kiosk and may ask of it (docs/panel.md)."""
+"""The technician's web panel and the HTTP API; web only, everything else is asked of `controller.kiosk`. Entry:
+`app`, `server`.
+"""

@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -13,10 +14,10 @@ from urllib.parse import quote
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 
-from controller.errors import UsageError, VelaturaError, WorkError
-from controller.panel.context import Panel, Values
-from controller.panel.fields import Field, parse
-from controller.panel.operation import BytesAnswer, FileAnswer, Operation
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.kiosk.operations.fields import Field, parse
+from controller.kiosk.operations.operation import Answer, Operation, Values
+from controller.panel.context import Panel
 from hal.errors import DeviceError
 
 FAILURES: Final = (VelaturaError, DeviceError)
@@ -48,23 +49,62 @@ def failure(error: Failure) -> Response:
 
 
 async def run(panel: Panel, operation: Operation, values: Values) -> Any:
-    """Run an operation in a thread. Raises what it raises."""
-    return await panel.ask(lambda: operation.run(panel, values))
+    """Do an operation in a thread, with the files of uploaded targets for their keys. Raises what it raises."""
+    targets = [field.name for field in operation.fields if field.kind == "target"]
+
+    def do() -> Any:
+        files = {name: panel.targets.path(values[name]) for name in targets}
+        return operation.of(panel.holders[operation.holder], values | files)
+
+    return await panel.ask(do)
 
 
-def response(answer: object) -> Response:
-    if isinstance(answer, BytesAnswer):
-        return Response(answer.content, media_type=answer.media_type)
-    if isinstance(answer, FileAnswer):
-        headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(answer.download)}"}
-        return FileResponse(answer.path, media_type=answer.media_type, headers=headers if answer.download else None)
-    return JSONResponse(answer)
+def response(operation: Operation, answer: Any, values: Values) -> Response:
+    """Raises UsageError("picture-unknown") where there is no picture."""
+    kind = operation.answer
+    if kind is Answer.NOTHING:
+        return JSONResponse({"done": True})
+    if kind is Answer.TEXT:
+        return JSONResponse({"text": answer})
+    if kind is Answer.VALUE:
+        return JSONResponse(plain(answer))
+    if kind is Answer.JPEG:
+        if answer is None:
+            raise UsageError(
+                "picture-unknown",
+                what="The camera shows no picture now.",
+                remedy="Look at the camera's line on the first page.",
+            )
+        return Response(answer, media_type=kind.media)
+    if kind is Answer.PICTURE:
+        return _picture(answer)
+    download = answer.name if kind is Answer.FILE else "-".join([operation.name, *map(str, values.values())]) + ".html"
+    headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(download)}"}
+    return FileResponse(answer, media_type=kind.media, headers=headers)
+
+
+def _picture(path: Path | None) -> Response:
+    types = {".png": "image/png", ".jpg": "image/jpeg"}
+    if path is None or path.suffix not in types or not path.is_file():
+        raise UsageError("picture-unknown", what="There is no such picture.", remedy="Load the page again.")
+    return FileResponse(path, media_type=types[path.suffix])
+
+
+def plain(value: Any) -> Any:
+    """Values as JSON has them; paths are left out: they mean nothing outside this machine."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {key: plain(inner) for key, inner in asdict(value).items() if not isinstance(inner, Path)}
+    if isinstance(value, dict):
+        return {str(key): plain(inner) for key, inner in value.items() if not isinstance(inner, Path)}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    return value
 
 
 def scalar_values(operation: Operation, request: Request) -> Values:
     """The values in the path and after the question mark. Raises UsageError."""
-    path = [field for field in operation.fields if field.where == "path"]
-    query = [field for field in operation.fields if field.where == "query"]
+    path = [field for field in operation.fields if operation.where(field) == "path"]
+    query = [field for field in operation.fields if operation.where(field) == "query"]
     sent = request.query_params
     if len(sent.multi_items()) != len(sent):
         raise UsageError("field-wrong", what="A field was sent twice.", remedy="Send each field once.")
@@ -73,7 +113,7 @@ def scalar_values(operation: Operation, request: Request) -> Values:
 
 async def json_values(operation: Operation, request: Request) -> Values:
     """The values of a JSON body. Raises UsageError("body-wrong") and as ``parse``."""
-    fields = [field for field in operation.fields if field.where == "body"]
+    fields = [field for field in operation.fields if operation.where(field) == "body"]
     body = await request.body()
     if not fields and not body:
         return {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -12,14 +12,14 @@ from prometheus_client.registry import Collector
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
+from controller.kiosk.operations.fields import object_schema
+from controller.kiosk.operations.operation import Answer, Operation
+from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.roles import Role
 from controller.panel import answers
-from controller.panel.accounts import Role
+from controller.panel.auth.identity import Endpoint, Entry, Visitor
 from controller.panel.context import Panel
-from controller.panel.fields import object_schema
-from controller.panel.operation import Operation
-from controller.panel.operations import OPERATIONS
-from controller.panel.visitors import Endpoint, Entry, Visitor
-from controller.session.machine import State
+from controller.run.state_machine import State
 
 PREFIX: Final = "/api/v1"
 _ERROR: Final = {"$ref": "#/components/responses/Error"}
@@ -27,8 +27,8 @@ _ERROR: Final = {"$ref": "#/components/responses/Error"}
 
 def entries(panel: Panel) -> list[Entry]:
     """All routes for machines."""
-    table = [Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op)) for op in OPERATIONS]
-    table.append(Entry("GET", PREFIX + "/openapi.json", "token", Role.VIEWER, _document))
+    table = [Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op)) for op in panel.operations]
+    table.append(Entry("GET", PREFIX + "/openapi.json", "token", Role.VIEWER, _document(panel.operations)))
     table.append(Entry("GET", "/metrics", "token", Role.VIEWER, _metrics(panel)))
     return table
 
@@ -54,7 +54,7 @@ def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
                 values[operation.upload.name] = uploaded
             elif operation.changes:
                 values |= await answers.json_values(operation, request)
-            return answers.response(await answers.run(panel, operation, values))
+            return answers.response(operation, await answers.run(panel, operation, values), values)
         except answers.FAILURES as error:
             return answers.failure(error)
         finally:
@@ -64,14 +64,17 @@ def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
     return answer
 
 
-async def _document(_: Request, __: Visitor) -> Response:
-    return JSONResponse(document())
+def _document(operations: Sequence[Operation]) -> Endpoint:
+    async def answer(_: Request, __: Visitor) -> Response:
+        return JSONResponse(document(operations))
+
+    return answer
 
 
-def document() -> dict[str, Any]:
+def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
     """The OpenAPI 3.1 document, made from the same table as the routes."""
     paths: dict[str, dict[str, Any]] = {}
-    for operation in OPERATIONS:
+    for operation in operations:
         paths.setdefault(operation.path, {})[operation.method.lower()] = _described(operation)
     error = object_schema(()) | {
         "properties": {key: {"type": "string"} for key in ("code", "what", "remedy")},
@@ -101,8 +104,8 @@ def document() -> dict[str, Any]:
 
 
 def _described(operation: Operation) -> dict[str, Any]:
-    content: dict[str, Any] = {operation.media: {"schema": {}}}
-    if operation.media == "image/png":
+    content: dict[str, Any] = {operation.answer.media: {"schema": {}}}
+    if operation.answer is Answer.PICTURE:
         content["image/jpeg"] = {}
     described: dict[str, Any] = {
         "operationId": operation.name,
@@ -114,13 +117,14 @@ def _described(operation: Operation) -> dict[str, Any]:
             "413": {"$ref": "#/components/responses/Plain"},
         },
     }
-    scalars = [field for field in operation.fields if field.where != "body"]
+    placed = [(field, operation.where(field)) for field in operation.fields]
+    scalars = [(field, where) for field, where in placed if where != "body"]
     if scalars:
         described["parameters"] = [
-            {"name": f.name, "in": f.where, "required": f.required or f.where == "path", "schema": f.schema()}
-            for f in scalars
+            {"name": f.name, "in": where, "required": f.required or where == "path", "schema": f.schema()}
+            for f, where in scalars
         ]
-    body = [field for field in operation.fields if field.where == "body"]
+    body = [field for field, where in placed if where == "body"]
     if operation.upload is not None:
         described["requestBody"] = {"required": True, "content": {"application/octet-stream": {}}}
     elif body:

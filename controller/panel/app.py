@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import mimetypes
 import shutil
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from importlib import resources
 from typing import Final
 
@@ -17,27 +17,31 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
 
+from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.operation import Operation
+from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.store.accounts import Accounts
 from controller.panel import answers, api
-from controller.panel.accounts import Accounts
 from controller.panel.answers import FAILURES
-from controller.panel.building import BuildingControl
+from controller.panel.auth.http_guard import BodyTooLarge, Guard
+from controller.panel.auth.identity import Endpoint, Entry, Visitor, guarded
+from controller.panel.auth.routes import Entrance
+from controller.panel.auth.sessions import Sessions
 from controller.panel.context import Panel, PanelOptions
-from controller.panel.drawing import Drawing
-from controller.panel.entrance import Entrance
-from controller.panel.forms import Forms
-from controller.panel.guard import BodyTooLarge, Guard
-from controller.panel.kiosk import Kiosk
 from controller.panel.live import Hub
-from controller.panel.pages import Pages
-from controller.panel.sessions import Sessions
-from controller.panel.setup import Setup
+from controller.panel.mqtt.bridge import BuildingControl
+from controller.panel.pages.drawing import Drawing
+from controller.panel.pages.forms import Forms
+from controller.panel.pages.routes import Pages
+from controller.panel.pages.setup import Setup
 from controller.panel.uploads import Targets
-from controller.panel.visitors import Endpoint, Entry, Visitor, guarded
 
 STATIC: Final = ("style.css", "panel.js", "icon.svg")
 
 
-def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starlette:
+def make_panel(
+    kiosk: Kiosk, accounts: Accounts, options: PanelOptions, operations: Sequence[Operation] = OPERATIONS
+) -> Starlette:
     """The panel of ``kiosk``, ready to be served.
 
     ``accounts.first_start()`` belongs to the caller, who shows the one-time password where technicians look. The
@@ -59,8 +63,9 @@ def make_panel(kiosk: Kiosk, accounts: Accounts, options: PanelOptions) -> Starl
         accounts=accounts,
         options=options,
         sessions=Sessions(options.folder / "sessions.json"),
-        targets=Targets(options.folder / "targets", options.uploads),
+        targets=Targets(options.folder / "targets", options.uploads, fitted=kiosk.fitted),
         hub=Hub(draw, frames_per_s=options.frames_per_s, most=options.most_open_panels),
+        operations=operations,
     )
     with contextlib.suppress(*FAILURES):
         drawing.use_zone(kiosk.schedule().time_zone)
@@ -111,7 +116,9 @@ def _lifespan(panel: Panel) -> Callable[[Starlette], contextlib.AbstractAsyncCon
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(panel.hub.run)
                 if panel.options.broker is not None:
-                    tasks.start_soon(BuildingControl(panel.kiosk, panel.options.broker).run)
+                    tasks.start_soon(
+                        BuildingControl(panel.kiosk, panel.options.broker, operations=panel.operations).run
+                    )
                 yield
                 tasks.cancel_scope.cancel()
         finally:

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import anyio
 
-from controller.panel.accounts import Accounts
-from controller.panel.broker import BrokerOptions
-from controller.panel.kiosk import Kiosk
+from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.accounts import AccountActions
+from controller.kiosk.operations.operation import Operation
+from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.store.accounts import Accounts
+from controller.panel.auth.sessions import LoginLimit, Sessions
 from controller.panel.live import Hub
-from controller.panel.sessions import LoginLimit, Sessions
+from controller.panel.mqtt.options import BrokerOptions
 from controller.panel.uploads import Targets, UploadLimits
 
 T = TypeVar("T")
-Values = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,7 @@ class Panel:
     sessions: Sessions
     targets: Targets
     hub: Hub
+    operations: Sequence[Operation] = OPERATIONS
     by_address: LoginLimit = field(default_factory=LoginLimit)
     # Wide, so that nobody can lock a technician out by typing wrong passwords elsewhere.
     by_account: LoginLimit = field(default_factory=lambda: LoginLimit(burst=50))
@@ -67,6 +70,12 @@ class Panel:
     costly: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
     working: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(16))
     form_key: bytes = field(default_factory=lambda: secrets.token_bytes(32))
+
+    @property
+    def holders(self) -> dict[str, Any]:
+        """Who does the operations."""
+        accounts = AccountActions(lambda: self.accounts, self.sessions.end_all, self.costly)
+        return {"kiosk": self.kiosk, "accounts": accounts, "targets": self.targets}
 
     async def ask(self, question: Callable[[], T]) -> T:
         """The kiosk's answer, got in a thread: it is not asynchronous."""

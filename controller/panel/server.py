@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import ipaddress
+import socket
 import ssl
 import threading
 import time
@@ -11,7 +13,7 @@ import time
 import uvicorn
 from starlette.applications import Starlette
 
-from controller.errors import UsageError, WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.panel.context import PanelOptions
 
 START_S = 10.0
@@ -50,16 +52,16 @@ class PanelServer:
             self._server.run()
 
     def start(self) -> str:
-        """Begin to serve; return the address. Raises WorkError("panel-not-started") when the port is taken."""
+        """Begin to serve; return the address.
+
+        Raises WorkError("panel-port-taken") when another program listens there, and ("panel-not-started").
+        """
+        check_port(self._options.host, self._options.port)
         self._thread.start()
         until_s = time.monotonic() + START_S
         while not self._server.started:
             if not self._thread.is_alive() or time.monotonic() > until_s:
-                raise WorkError(
-                    "panel-not-started",
-                    what=f"The panel could not listen on {self._options.host}, port {self._options.port}.",
-                    remedy="Another program may use the port: choose another one in stage.toml.",
-                )
+                raise _not_started(self._options.host, self._options.port)
             time.sleep(0.005)
         port = self._server.servers[0].sockets[0].getsockname()[1]
         return f"{'https' if self._options.tls else 'http'}://{self._options.host}:{port}/"
@@ -83,3 +85,29 @@ def check_exposure(options: PanelOptions) -> None:
             what=f"The panel would be reachable at {options.host} without TLS.",
             remedy="Give it a certificate and a key, or let it listen on 127.0.0.1 and use a tunnel.",
         )
+
+
+def check_port(host: str, port: int) -> None:
+    """Raises WorkError("panel-port-taken" or "panel-not-started") where nothing can listen; uvicorn only logs why."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(family) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind((host, port))
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise WorkError(
+                "panel-port-taken",
+                what=f"Another program listens on port {port} of {host}, so the panel can't.",
+                remedy=f"End it, or give another port: --panel {host}:{port % 65535 + 1}.",
+            ) from error
+        raise _not_started(host, port, error.strerror) from error
+
+
+def _not_started(host: str, port: int, why: str | None = None) -> WorkError:
+    detail = f": {why}" if why else ""
+    return WorkError(
+        "panel-not-started",
+        what=f"The panel could not listen on {host}, port {port}{detail}.",
+        remedy="Give an address of this machine and a port from 1024: --panel HOST:PORT.",
+    )

@@ -7,15 +7,18 @@ import secrets
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
-from controller.errors import UsageError
+from controller.core.errors import UsageError
+from controller.core.storage import write_atomically
+from controller.kiosk.operations.table import TARGET_KEY
+from controller.kiosk.values import Fit
 from controller.panel import decoder
-from controller.storage import write_atomically
 
-KEY: Final = r"^[0-9a-f]{24}$"
+Fitted = Callable[[Path, Fit], bytes]
+"""The PNG of a file as one of the camera's view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +75,15 @@ def _refused() -> UsageError:
 class Targets:
     """Uploaded targets, as our own PNG files in ``folder``; the newest ``most`` are kept."""
 
-    def __init__(self, folder: Path, limits: UploadLimits, *, most: int = 20) -> None:
-        self._folder, self._limits, self._most = folder, limits, most
+    def __init__(
+        self,
+        folder: Path,
+        limits: UploadLimits,
+        *,
+        most: int = 20,
+        fitted: Fitted = lambda file, fit: file.read_bytes(),
+    ) -> None:
+        self._folder, self._limits, self._most, self._fitted = folder, limits, most, fitted
         # One at a time: the limits hold for all uploads together.
         self._one = threading.Lock()
 
@@ -81,12 +91,17 @@ class Targets:
     def limits(self) -> UploadLimits:
         return self._limits
 
-    def add(self, uploaded: Path) -> str:
-        """Decode ``uploaded`` and return the key of the target made from it. Raises as ``decode_picture``."""
+    def add(self, uploaded: Path, fit: Fit = "fit") -> str:
+        """Decode ``uploaded``, fit it to the camera's view, and return the key of the target made from it.
+
+        Raises as ``decode_picture``.
+        """
         with self._one:
             png = decode_picture(uploaded, self._limits)
             key = secrets.token_hex(12)
-            write_atomically(self._folder / f"{key}.png", png, mode=0o600)
+            file = self._folder / f"{key}.png"
+            write_atomically(file, png, mode=0o600)
+            write_atomically(file, self._fitted(file, fit), mode=0o600)
             kept = sorted(self._folder.glob("*.png"), key=lambda file: file.stat().st_mtime, reverse=True)
             for old in kept[self._most :]:
                 old.unlink(missing_ok=True)
@@ -95,6 +110,6 @@ class Targets:
     def path(self, key: str) -> Path:
         """Raises UsageError("target-unknown")."""
         file = self._folder / f"{key}.png"
-        if not re.fullmatch(KEY, key) or not file.is_file():
+        if not re.fullmatch(TARGET_KEY, key) or not file.is_file():
             raise UsageError("target-unknown", what="This target is not there any more.", remedy="Upload it again.")
         return file

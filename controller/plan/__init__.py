@@ -1,1 +1,3 @@
-"""Where to put projectors, before there is anything to measure: predicted resolution, light and focus on a mesh."""
+"""Where to put projectors before anything is measured: predicted resolution, light and focus on a mesh. Entry:
+`search`, `optics`.
+"""

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from controller.arrays import Float64
+from controller.core.arrays import Float64
 from controller.plan.optics import best_focus
 from controller.plan.values import Placement, ProjectorModel, Spot, Surface
 

@@ -8,11 +8,11 @@ from typing import Any, Final, ParamSpec
 
 import numpy as np
 
-from controller.arrays import ByteImage, Float64
+from controller.core.arrays import ByteImage, Float64
+from controller.core.plotting import figure_of, picture_of
 from controller.plan.values import Placement, Surface
-from controller.plotting import figure_of, picture_of
 
-Asked = ParamSpec("Asked")
+Arguments = ParamSpec("Arguments")
 BACK, INK, DIM, LINE = "#17181b", "#e8e6e1", "#9b9890", "#34363b"
 COLOURS: Final = ("#f0a35e", "#6db3f2", "#7fc98b", "#d58ad8", "#e5d36b", "#f0876b", "#8fd6d0", "#b5a7f0")
 DPI: Final = 150
@@ -22,11 +22,11 @@ STYLE: Final[Any] = {
 }  # fmt: skip
 
 
-def _in_style(draw: Callable[Asked, ByteImage]) -> Callable[Asked, ByteImage]:
+def _in_style(draw: Callable[Arguments, ByteImage]) -> Callable[Arguments, ByteImage]:
     """The whole drawing in our colours; matplotlib is imported by the first."""
 
     @functools.wraps(draw)
-    def drawn(*args: Asked.args, **kwargs: Asked.kwargs) -> ByteImage:
+    def drawn(*args: Arguments.args, **kwargs: Arguments.kwargs) -> ByteImage:
         import matplotlib as mpl
 
         with mpl.rc_context(STYLE):

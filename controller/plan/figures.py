@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import Float64, Mask
+from controller.core.arrays import Float64, Mask
 from controller.plan.search import Chosen
-from controller.plan.values import Goal, Lit, Placement, Surface
+from controller.plan.values import Illumination, Placement, PlanGoal, Surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Together:
     count: npt.NDArray[np.int64]
 
 
-def together(lit: Sequence[Lit], useful: Mask) -> Together:
+def together(lit: Sequence[Illumination], useful: Mask) -> Together:
     """``useful`` (projectors, N) bool: where each of ``lit`` is of use."""
     return Together(
         np.where(useful, [one.lux for one in lit], 0.0).sum(axis=0),
@@ -36,7 +36,7 @@ def together(lit: Sequence[Lit], useful: Mask) -> Together:
     )
 
 
-def figures_of(best: Chosen, surface: Surface, goal: Goal) -> dict[str, Any]:
+def figures_of(best: Chosen, surface: Surface, goal: PlanGoal) -> dict[str, Any]:
     """Placements in words of a stand and a lens, and what the seen surface gets of each and of all."""
     weight = surface.area_m2 / surface.area_m2.sum()
     found = together([one.lit for one in best.candidates], np.stack([one.useful for one in best.candidates]))
@@ -73,7 +73,7 @@ def _placed(placement: Placement) -> dict[str, Any]:
     }
 
 
-def _alone(useful: Mask, lit: Lit, weight: Float64) -> dict[str, Any]:
+def _alone(useful: Mask, lit: Illumination, weight: Float64) -> dict[str, Any]:
     """What one projector does where it is of use."""
     share = float(weight @ useful)
     inside = np.where(useful, weight, 0.0)

@@ -12,8 +12,8 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from controller.arrays import Float64, Mask
-from controller.plan.values import Lit, Placement, Surface
+from controller.core.arrays import Float64, Mask
+from controller.plan.values import Illumination, Placement, Surface
 
 FWHM: Final = 2.0 * np.sqrt(2.0 * np.log(2.0))
 PIXEL_VARIANCE_PX2: Final = 1.0 / 12.0
@@ -30,7 +30,7 @@ class Shadows(Protocol):
         """(N,) whether something lies between ``from_m`` (3,) and each of ``points_m`` (N, 3)."""
 
 
-def lit_by(placement: Placement, surface: Surface, shadows: Shadows) -> Lit:
+def lit_by(placement: Placement, surface: Surface, shadows: Shadows) -> Illumination:
     """What ``placement`` does at each point of ``surface``."""
     at_px, local = pixels_of(placement, surface.points_m)
     depth = np.maximum(local[:, 2], NEAREST_M)
@@ -44,7 +44,7 @@ def lit_by(placement: Placement, surface: Surface, shadows: Shadows) -> Lit:
     with np.errstate(divide="ignore"):
         pixel_mm = np.where(reached[:, None], 1e3 / np.stack((coarse, fine), axis=1), np.inf)
     flux = placement.model.lumens / float(size[0] * size[1])
-    return Lit(
+    return Illumination(
         reached=reached,
         cosine=np.where(reached, cosine, 0.0),
         lux=np.where(reached, flux * fine * coarse, 0.0),

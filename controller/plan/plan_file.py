@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from controller.config.loader import parse_tables, read_toml
-from controller.config.models import Name, Positive, Size, Table
-from controller.plan.values import Goal, ProjectorModel, Spot
+from controller.config.models import ConfigTable, Name, Positive, Size
+from controller.plan.values import PlanGoal, ProjectorModel, Spot
 
 Metres3 = Annotated[tuple[float, float, float], Field(strict=False)]
 Two = Annotated[tuple[float, float], Field(strict=False)]
@@ -19,89 +19,102 @@ MOST_SPOTS: Final = 5000
 _AXIS: Final = 'one of "+x", "-x", "+y", "-y", "+z", "-z"'
 
 
-class ObjectTable(Table):
+class TargetObjectTable(ConfigTable):
     mesh: str = Field(min_length=1, description="a mesh file (.obj, .ply, .glb ...), relative to this file")
     height_m: Positive | None = Field(
-        default=None, description="the object's height in metres, above 0; left out: the mesh is in metres"
+        default=None, description="the object's height in metres, above 0; if omitted: the mesh is in metres"
     )
     up: Axis = Field(default="+y", description=f"the mesh's axis that points up, {_AXIS}")
     front: Axis = Field(default="+z", description=f"the mesh's axis that points towards the audience, {_AXIS}")
 
 
-class AudienceTable(Table):
+class AudienceTable(ConfigTable):
     positions_m: Annotated[tuple[Metres3, ...], Field(strict=False, min_length=1, max_length=64)] = Field(
-        description="a list of [x, y, z] in metres from which people look: x right, y down, z away from the audience"
+        description="a list of the audience's positions [x, y, z] in metres: x right, y down, z away from the audience"
     )
 
 
-class ProjectorsTable(Table):
+class ProjectorsTable(ConfigTable):
     name: Name = Field(description="the model's name, 1 to 64 printable characters")
-    count: int = Field(default=1, ge=1, le=64, description="how many of them there are, from 1 to 64")
+    count: int = Field(default=1, ge=1, le=64, description="how many projectors of this model there are, from 1 to 64")
     width_px: Size = Field(description="the picture's width in pixels, a whole number from 1 to 16384")
     height_px: Size = Field(description="the picture's height in pixels, a whole number from 1 to 16384")
     lumens: Positive = Field(description="the light of a white picture in lumens, above 0")
-    throw_ratio: Two = Field(description="distance by picture width, [shortest, longest], as the data sheet has them")
+    throw_ratio: Two = Field(
+        description="throw ratio (distance by picture width), [shortest, longest], from the data sheet"
+    )
     lens_shift: Two = Field(
         default=(0.0, 0.0),
-        description="how far the picture's middle lies from the lens' axis, [right, up], in picture widths and heights;"
-        " a table projector has about [0, 0.55]",
+        description="offset of the picture's centre from the optical axis, [right, up], in picture widths and "
+        "heights; a table projector has about [0, 0.55]",
     )
     pupil_mm: float = Field(
-        default=25.0, ge=0, le=1000, description="the lens' focal length by its f-number in millimetres, 0 to 1000"
+        default=25.0,
+        ge=0,
+        le=1000,
+        description="the diameter of the lens pupil (focal length by f-number) in millimetres, 0 to 1000",
     )
     sharpest_px: float = Field(
         default=0.35, ge=0, le=10, description="a pixel's blur in focus, standard deviation in pixels, 0 to 10"
     )
 
 
-class PlacesTable(Table):
+class PlacesTable(ConfigTable):
     name: Name = Field(description="the place's name, different for every place")
     position_m: Metres3 = Field(
-        description="[x, y, z] of the lens in metres from the object's middle: x right, y down, z to the back"
+        description="[x, y, z] of the lens in metres from the object's centre: x right, y down, z to the back"
     )
 
 
-class ShellTable(Table):
+class ShellTable(ConfigTable):
     """Places on a part of a sphere round the object."""
 
-    distance_m: Two = Field(description="[nearest, farthest] in metres from the object's middle")
+    distance_m: Two = Field(description="[nearest, farthest] in metres from the object's centre")
     right_degrees: Two = Field(description="[from, to], degrees to the audience's right, -180 to 180")
     above_degrees: Two = Field(description="[from, to], degrees above the object, -89 to 89")
-    step_degrees: float = Field(default=10.0, ge=0.5, le=90, description="degrees from place to place, 0.5 to 90")
-    step_m: Positive = Field(default=0.25, description="metres from distance to distance, above 0")
+    step_degrees: float = Field(default=10.0, ge=0.5, le=90, description="degrees between positions, 0.5 to 90")
+    step_m: Positive = Field(default=0.25, description="metres between distances, above 0")
 
 
-class GoalTable(Table):
-    lux: Positive = Field(default=400.0, description="light wanted on the surface from all projectors, in lux, above 0")
-    detail_mm: Positive = Field(default=1.0, description="width of the smallest detail wanted in millimetres, above 0")
-    overlap: int = Field(default=2, ge=1, le=16, description="projectors wanted at each point, from 1 to 16")
+class GoalTable(ConfigTable):
+    lux: Positive = Field(
+        default=400.0, description="required light on the surface from all projectors, in lux, above 0"
+    )
+    detail_mm: Positive = Field(
+        default=1.0, description="width of the smallest required detail in millimetres, above 0"
+    )
+    overlap: int = Field(
+        default=2, ge=1, le=16, description="required number of projectors at each point, from 1 to 16"
+    )
     steepest_degrees: float = Field(
         default=75.0,
         ge=10,
         le=89,
-        description="light that meets the surface flatter than this does not count, 10 to 89",
+        description="the smallest angle between light and surface that counts, in degrees, 10 to 89",
     )
     fill: float = Field(
-        default=0.9, gt=0, le=1, description="the share of a picture that the object is to take, above 0, at most 1"
+        default=0.9, gt=0, le=1, description="the share of a picture that the object should fill, above 0, at most 1"
     )
     body_m: float = Field(default=0.25, ge=0, le=10, description="a projector's radius in metres, 0 to 10")
-    apart_m: float = Field(default=0.5, ge=0, le=100, description="least metres from lens to lens, 0 to 100")
+    apart_m: float = Field(
+        default=0.5, ge=0, le=100, description="the smallest distance between lenses in metres, 0 to 100"
+    )
     points: int = Field(
-        default=4000, ge=100, le=200_000, description="points that stand for the surface, 100 to 200000"
+        default=4000, ge=100, le=200_000, description="number of sample points on the surface, 100 to 200000"
     )
 
 
-class PlanTables(Table):
-    object: ObjectTable = Field(description="the table [object] with mesh")
+class PlanTables(ConfigTable):
+    object: TargetObjectTable = Field(description="the table [object] with mesh")
     audience: AudienceTable = Field(description="the table [audience] with positions_m")
     projectors: Annotated[tuple[ProjectorsTable, ...], Field(strict=False, min_length=1, max_length=16)] = Field(
-        description="a list of [[projectors]] tables, one a model"
+        description="a list of [[projectors]] tables, one for each model"
     )
     places: Annotated[tuple[PlacesTable, ...], Field(strict=False, max_length=MOST_SPOTS)] = Field(
         default=(), description="a list of [[places]] tables with name and position_m"
     )
-    shell: ShellTable | None = Field(default=None, description="the table [shell], or left out")
-    goal: GoalTable = Field(default=GoalTable(), description="the table [goal], or left out")
+    shell: ShellTable | None = Field(default=None, description="the table [shell]; optional")
+    goal: GoalTable = Field(default=GoalTable(), description="the table [goal]; optional")
 
     def models(self) -> list[ProjectorModel]:
         """One for each projector that there is, the brightest model first."""
@@ -120,9 +133,9 @@ class PlanTables(Table):
         named = [Spot(table.name, table.position_m) for table in self.places]
         return named + ([] if self.shell is None else _on_shell(self.shell))
 
-    def aims(self) -> Goal:
+    def aims(self) -> PlanGoal:
         table = self.goal
-        return Goal(
+        return PlanGoal(
             table.lux, table.detail_mm, table.overlap, table.steepest_degrees, table.fill, table.body_m, table.apart_m
         )
 
@@ -144,7 +157,7 @@ def read_plan(file: Path) -> PlanTables:
     return tables
 
 
-def _rising(table: Table, key: str, *, low: float, high: float) -> None:
+def _rising(table: ConfigTable, key: str, *, low: float, high: float) -> None:
     first, last = getattr(table, key)
     if not low <= first <= last <= high:
         allowed = f"two numbers from {low:g} to {high:g}, the smaller first"
@@ -155,14 +168,14 @@ def _check_places(tables: PlanTables) -> None:
     names: set[str] = set()
     for table in tables.places:
         if table.name in names:
-            raise table.place.wrong_value("name", table.name, "is taken already", "different for every place")
+            raise table.place.wrong_value("name", table.name, "is taken already", "is used twice")
         names.add(table.name)
     if not tables.places and tables.shell is None:
         raise tables.place.missing("places", "[[places]] with name and position_m, or a table [shell]")
     if tables.shell is not None and len(tables.spots()) > MOST_SPOTS:
-        allowed = f"large enough for at most {MOST_SPOTS} places"
+        allowed = f"large enough for at most {MOST_SPOTS} positions"
         raise tables.shell.place.wrong_value(
-            "step_degrees", tables.shell.step_degrees, "makes too many places", allowed
+            "step_degrees", tables.shell.step_degrees, "gives too many positions", allowed
         )
 
 

@@ -15,18 +15,18 @@ from typing import Final
 
 import numpy as np
 
-from controller.arrays import Float64, Mask
-from controller.errors import UsageError, WorkError
+from controller.core.arrays import Float64, Mask
+from controller.core.errors import UsageError, WorkError
 from controller.plan.aim import aimed
 from controller.plan.optics import Shadows, lit_by
-from controller.plan.values import Goal, Lit, Placement, ProjectorModel, Spot, Surface
+from controller.plan.values import Illumination, Placement, PlanGoal, ProjectorModel, Spot, Surface
 
 MOST_EXCHANGES: Final = 50
 STARTS: Final = 4
 LEAST_GAIN: Final = 1e-6
 LINES: Final = 200
-"""Lines of sight on which is tried whether a projector's body stands in them."""
-Told = Callable[[float, str], None]
+"""Lines of sight on which the search tests whether a projector's body blocks the view."""
+ProgressCallback = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Candidate:
     """A projector at a place, and what it does. ``useful`` (N,) bool: reached, and not too steep."""
 
     placement: Placement
-    lit: Lit
+    lit: Illumination
     useful: Mask
 
 
@@ -52,14 +52,14 @@ class Chosen:
 class Measure:
     """Arrays (candidates, N) from which any set of candidates is judged by sums and minima."""
 
-    goal: Goal
+    goal: PlanGoal
     weight: Float64
     detail_mm: Float64
     lux: Float64
     count: Float64
 
     @classmethod
-    def of(cls, candidates: Sequence[Candidate], surface: Surface, goal: Goal) -> Measure:
+    def of(cls, candidates: Sequence[Candidate], surface: Surface, goal: PlanGoal) -> Measure:
         useful = np.stack([one.useful for one in candidates])
         return cls(
             goal,
@@ -90,10 +90,10 @@ def candidates_of(
     spots: Sequence[Spot],
     surface: Surface,
     shadows: Shadows,
-    goal: Goal,
+    goal: PlanGoal,
     audience_m: Float64,
     *,
-    tell: Told = lambda share, text: None,
+    tell: ProgressCallback = lambda share, text: None,
     cancel: threading.Event | None = None,
 ) -> list[list[Candidate]]:
     """For each model, it at every spot where it can stand and reaches the object at all.
@@ -118,8 +118,8 @@ def candidates_of(
         if not found:
             raise UsageError(
                 "plan-no-place",
-                what=f"No place is fit for {model.name}: from each, it reaches nothing or hides the object.",
-                remedy="Give more places, farther to the side of the audience, or a smaller [goal] body_m.",
+                what=f"No position is possible for {model.name}: from each, it reaches nothing or hides the object.",
+                remedy="Add positions farther to the side of the audience, or use a smaller [goal] body_m.",
             )
     return [known[model] for model in models]
 
@@ -127,9 +127,9 @@ def candidates_of(
 def chosen(
     by_model: Sequence[Sequence[Candidate]],
     surface: Surface,
-    goal: Goal,
+    goal: PlanGoal,
     *,
-    tell: Told = lambda share, text: None,
+    tell: ProgressCallback = lambda share, text: None,
     cancel: threading.Event | None = None,
 ) -> Chosen:
     """One place for every model, best together. The same arguments give the same plan.
@@ -159,8 +159,8 @@ def chosen(
     if best is None:
         raise UsageError(
             "plan-too-crowded",
-            what="The projectors can't all stand: their places are too near to each other or in each other's light.",
-            remedy="Give more places, or a smaller [goal] apart_m or body_m.",
+            what="There is no room for all projectors: they stand too near each other or in each other's light.",
+            remedy="Add positions, or use a smaller [goal] apart_m or body_m.",
         )
     at_points = measure.at_points(best[1])[0]
     return Chosen(tuple(flat[index] for index in best[1]), best[0], at_points, tried)
@@ -206,7 +206,7 @@ def _exchanged(
 class _Fits:
     """Whether candidates can stand beside each other; what was found is kept."""
 
-    def __init__(self, candidates: Sequence[Candidate], surface: Surface, goal: Goal) -> None:
+    def __init__(self, candidates: Sequence[Candidate], surface: Surface, goal: PlanGoal) -> None:
         self._candidates, self._surface, self._goal = candidates, surface, goal
         self._known: dict[tuple[int, int], bool] = {}
 
@@ -239,4 +239,4 @@ def in_the_way(body_m: Float64, from_m: Float64, surface: Surface, radius_m: flo
 def check(cancel: threading.Event | None) -> None:
     """Raises WorkError("cancelled") once ``cancel`` is set."""
     if cancel is not None and cancel.is_set():
-        raise WorkError("cancelled", what="The work was stopped on request.", remedy="The same command begins again.")
+        raise WorkError("cancelled", what="The planning was stopped.", remedy="Run the same command to start again.")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.arrays import Float64, Mask
+from controller.core.arrays import Float64, Mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +87,10 @@ class Surface:
 
 
 @dataclass(frozen=True, slots=True)
-class Lit:
+class Illumination:
     """What one projector does at each of N surface points.
 
-    ``reached`` (N,) bool: in its picture, facing it, in nobody's shadow. Of the rest, zero or infinite:
+    ``reached`` (N,) bool: in its picture, facing it, not in any shadow. Of the rest, zero or infinite:
     ``cosine`` (N,): of the angle between its light and the normal; 1 - cosine is lost by grazing
     ``lux`` (N,): of a white picture, before the surface's albedo
     ``blur_px`` (N,): standard deviation in projector pixels, focus included
@@ -106,13 +106,13 @@ class Lit:
     detail_mm: Float64
 
     def useful(self, steepest_degrees: float) -> Mask:
-        """(N,) bool: reached, and no farther than ``steepest_degrees`` from the normal (``Goal``)."""
+        """(N,) bool: reached, and no farther than ``steepest_degrees`` from the normal (``PlanGoal``)."""
         near: Mask = self.cosine >= np.cos(np.deg2rad(steepest_degrees))
         return self.reached & near
 
 
 @dataclass(frozen=True, slots=True)
-class Goal:
+class PlanGoal:
     """What the plan is for: ``lux`` in all and ``detail_mm`` wanted, light from ``overlap`` projectors at each point.
 
     Light that meets the surface farther from the normal than ``steepest_degrees`` counts for nothing: metapixels are

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.arrays import Float64, Mask
-from controller.plan.thing import AFTER_M, Thing
+from controller.core.arrays import Float64, Mask
+from controller.plan.target_object import AFTER_M, TargetObject
 from controller.plan.values import Surface
 
 MARGIN = 1.06
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class AudienceView:
     """A picture of the object: ``mask`` (rows, columns) bool, and a surface of one point a pixel of the mask."""
 
     mask: Mask
@@ -27,13 +27,13 @@ class View:
         return picture
 
 
-def seen_from(thing: Thing, eye_m: Float64, *, rows: int) -> View:
+def seen_from(target_object: TargetObject, eye_m: Float64, *, rows: int) -> AudienceView:
     """The object from ``eye_m`` (3,), upright, ``rows`` pixels high and as wide as it needs."""
     ahead = -eye_m / np.linalg.norm(eye_m)
     right = np.cross((0.0, 1.0, 0.0) if abs(ahead[1]) < 0.999 else (0.0, 0.0, -1.0), ahead)
     right /= np.linalg.norm(right)
     down = np.cross(ahead, right)
-    local = (thing.vertices_m[np.unique(thing.faces)] - eye_m) @ np.stack((right, down, ahead)).T
+    local = (target_object.vertices_m[np.unique(target_object.faces)] - eye_m) @ np.stack((right, down, ahead)).T
     flat = local[:, :2] / np.maximum(local[:, 2:], 1e-6)
     low, high = flat.min(axis=0), flat.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * MARGIN * np.maximum(high - low, 1e-9)
@@ -42,8 +42,8 @@ def seen_from(thing: Thing, eye_m: Float64, *, rows: int) -> View:
     across, along = middle[0] + x.ravel() * half[0], middle[1] + y.ravel() * half[1]
     ray = across[:, None] * right + along[:, None] * down + ahead
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    distance, normals = thing.hit(eye_m, ray)
+    distance, normals = target_object.hit(eye_m, ray)
     hit = distance < AFTER_M
     normals = normals[hit] * -np.sign(np.sum(normals[hit] * ray[hit], axis=1))[:, None]
     points = eye_m + distance[hit, None] * ray[hit]
-    return View(hit.reshape(rows, columns), Surface(points, normals, np.ones(len(points))))
+    return AudienceView(hit.reshape(rows, columns), Surface(points, normals, np.ones(len(points))))

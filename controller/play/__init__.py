@@ -1,1 +1,3 @@
-"""The player: a process of its own that shows patterns and appearances."""
+"""The player: a process of its own that shows patterns and appearances (`python -m controller.play`). It needs
+little more than NumPy and pyglet.
+"""

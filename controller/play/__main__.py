@@ -1,4 +1,4 @@
-"""``python -m controller.play``: starts the player (docs/player-protocol.md says what it then understands)."""
+"""``python -m controller.play``: starts the player (its protocol: docs/reference/player-protocol.md)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from pathlib import Path
 from controller.bundle.fallback import CountedStart
 from controller.bundle.install import CURRENT
 from controller.bundle.signing import Trust, load_public_key
-from controller.errors import UsageError, VelaturaError
-from controller.play.commands import Commands
+from controller.core.errors import UsageError, VelaturaError
+from controller.play.control.commands import Commands
+from controller.play.control.notify import tell
+from controller.play.control.protocol import MAX_RATE_HZ, Suggested
+from controller.play.control.resume import SUFFIX, SavedRequest
+from controller.play.control.server import Server
+from controller.play.display.outputs import MemoryOutput, Output
 from controller.play.frames import FrameFile, OutputSize, parse_outputs, parse_where
 from controller.play.loop import Player
-from controller.play.notify import tell
-from controller.play.outputs import MemoryOutput, Output
-from controller.play.protocol import MAX_RATE_HZ, Suggested
-from controller.play.resume import SUFFIX, Kept
-from controller.play.server import Server
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the player until it is told to quit; the exit code is 0, 1 (failed) or 2 (wrong use)."""
+    """Run the player until it gets a quit request; the exit code is 0, 1 (failed) or 2 (wrong use)."""
     options = _parser().parse_args(arguments)
     try:
         return _run(options)
@@ -40,17 +40,23 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--socket", type=Path, required=True, help="unix socket to serve; made with mode 0600")
     parser.add_argument("--outputs", required=True, help="NAME:WIDTHxHEIGHT of each output, with commas between")
     where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--frames", type=Path, help="show in this file (machines without projectors)")
+    where.add_argument("--frames", type=Path, help="file for the shown frames (machines without projectors)")
     where.add_argument("--windows", action="store_true", help="show in one window over all outputs")
     parser.add_argument("--where", action="append", default=[], metavar="NAME=OUTPUT",
                         help="connector or display serial number of an output, if that is not its name")  # fmt: skip
-    parser.add_argument("--bundle", type=Path, help="bundle to have ready; a stage's bundles/current falls back")
+    parser.add_argument("--bundle", type=Path, help="bundle to load; in a stage, bundles/current is the fallback")
     parser.add_argument("--trusted", type=Path, action="append", default=[], help="public key file; may be repeated")
-    parser.add_argument("--revoked", type=Path, action="append", default=[], help="key file never to be trusted")
-    parser.add_argument("--allow-unsigned", action="store_true", help="play bundles without a signature, too")
-    parser.add_argument("--resume", action="store_true", help="go on with what was playing when it was ended or killed")
     parser.add_argument(
-        "--suggested", action="store_true", help="begin with the bundle's playlist, or as --resume says"
+        "--revoked", type=Path, action="append", default=[], help="public key that must not be trusted any more"
+    )
+    parser.add_argument("--allow-unsigned", action="store_true", help="also play bundles without a signature")
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="file with the last request; the player resumes it after a crash or restart",
+    )
+    parser.add_argument(
+        "--suggested", action="store_true", help="start with the bundle's playlist, or as --resume says"
     )
     parser.add_argument("--rate", type=float, default=60.0, help="pictures change at multiples of 1/RATE seconds")
     return parser
@@ -61,7 +67,7 @@ def _run(options: argparse.Namespace) -> int:
     if not 1 <= options.rate <= MAX_RATE_HZ:
         raise UsageError(
             "rate-wrong",
-            what=f"A rate of {options.rate:g} pictures a second can not be played.",
+            what=f"A rate of {options.rate:g} pictures a second is not possible.",
             remedy=f"Give a rate from 1 to {MAX_RATE_HZ:g}.",
         )
     keys, revoked = (tuple(map(load_public_key, paths)) for paths in (options.trusted, options.revoked))
@@ -83,7 +89,7 @@ def _run(options: argparse.Namespace) -> int:
         broken = _end_on_signals(player)
         playing = options.socket.with_name(options.socket.name + SUFFIX) if options.resume else None
         first = Suggested(repeat=0) if options.suggested else None
-        commands = Commands(player, server, inbox, Kept(playing), first=first)
+        commands = Commands(player, server, inbox, SavedRequest(playing), first=first)
         player.run(commands.serve, first=commands.resume)
         if start is not None and not broken.is_set() and not player.skipped:
             start.ended()
@@ -99,14 +105,14 @@ def _counted_start(bundle: Path | None) -> CountedStart | None:
 
 def _open_output(options: argparse.Namespace, sizes: tuple[OutputSize, ...]) -> Output:
     if options.windows:
-        from controller.play.windows import WindowOutput
+        from controller.play.display.window import WindowOutput
 
         return WindowOutput(sizes, parse_where(options.where, sizes))
     return MemoryOutput(options.frames, sizes)
 
 
 def _end_on_signals(player: Player) -> threading.Event:
-    """SIGTERM, SIGINT and a broken thread end the loop; the event tells the last case from the others."""
+    """SIGTERM, SIGINT and a broken thread end the loop; the event is set only in the last case."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: player.end())
     broken = threading.Event()

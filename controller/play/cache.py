@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
 from controller.bundle.reader import Bundle
-from controller.errors import BundleError, VelaturaError
+from controller.core.errors import BundleError, VelaturaError
 from controller.play.frames import FrameSet, OutputSize
 
 CACHE_BYTES: Final = 64 * 1024 * 1024
@@ -26,8 +26,8 @@ def check_fits(bundle: Bundle, outputs: Sequence[OutputSize]) -> None:
     if made_for != ours:
         raise BundleError(
             "bundle-outputs-differ",
-            what=f"The bundle was made for the outputs {made_for}; this player has {ours}.",
-            remedy="Calibrate and publish again with these outputs, or set the outputs as they were.",
+            what=f"The bundle was made for the outputs {made_for}, but this player has {ours}.",
+            remedy="Calibrate and publish again with these outputs, or restore the earlier outputs.",
         )
 
 
@@ -133,7 +133,7 @@ class DecodedAhead:
             return name, frames
 
     def _free_set(self) -> FrameSet:
-        """A set to decode into: a new one while there is room, else the one longest unused that nobody needs."""
+        """A set to decode into: a new one while there is room, else the least recently used one that is not needed."""
         if len(self._decoded) + len(self._decoding) >= self._capacity:
             for name, frames in self._decoded.items():
                 if name not in self._pinned and not any(frames is held for held in self._held):

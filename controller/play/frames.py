@@ -1,4 +1,4 @@
-"""Sets of frames, and the mapped file in which they pass between processes (docs/player-protocol.md, "Frame file").
+"""Sets of frames, and the mapped file that passes them on (docs/reference/player-protocol.md, "Frame file").
 
 The same layout serves the inbox (the controller writes, the player reads) and the memory output (the player writes,
 whoever emulates the projectors reads).
@@ -21,8 +21,8 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from controller.errors import UsageError, WorkError
-from controller.storage import stream_atomically
+from controller.core.errors import UsageError, WorkError
+from controller.core.storage import stream_atomically
 
 MAGIC: Final = b"VELFRAME"
 VERSION: Final = 1
@@ -58,7 +58,7 @@ def parse_outputs(text: str) -> tuple[OutputSize, ...]:
             raise _outputs_wrong(f"{part!r} is not NAME:WIDTHxHEIGHT")
         outputs.append(OutputSize(found[1], int(found[2]), int(found[3])))
     if len({output.name for output in outputs}) != len(outputs) or len(outputs) > MAX_OUTPUTS:
-        raise _outputs_wrong(f"there are more than {MAX_OUTPUTS}, or two have one name")
+        raise _outputs_wrong(f"there are more than {MAX_OUTPUTS}, or two have the same name")
     if any(not 1 <= side <= MAX_SIDE_PX for output in outputs for side in output.shape[:2]):
         raise _outputs_wrong(f"a side is not 1 to {MAX_SIDE_PX} pixels")
     return tuple(outputs)
@@ -76,8 +76,8 @@ def parse_where(texts: Sequence[str], outputs: Sequence[OutputSize]) -> dict[str
 def _outputs_wrong(detail: str) -> UsageError:
     return UsageError(
         "outputs-wrong",
-        what=f"The list of outputs can not be used: {detail}.",
-        remedy="Give it as P1:1400x1050,P2:1400x1050 with each name once.",
+        what=f"The list of outputs is not valid: {detail}.",
+        remedy="Write it as P1:1400x1050,P2:1400x1050 with each name once.",
     )
 
 
@@ -125,7 +125,7 @@ class FrameFile:
         head, offsets = layout_bytes(outputs)
         size = offsets[-1] + outputs[-1].width_px * outputs[-1].height_px * 3
         if not _has_layout(path, head, size):
-            _refuse_taken(path)
+            _refuse_in_use(path)
             stream_atomically(path, lambda file: _fill(file.fileno(), head, size), mode=0o600)
         self._file = path.open("r+b")
         try:
@@ -171,7 +171,7 @@ class FrameFile:
             raise WorkError(
                 "frames-changing",
                 what="The frames changed while they were being read.",
-                remedy="Write all frames first, make the sequence number even, and then ask for them to be shown.",
+                remedy="Write all frames first, make the sequence number even, and then request them.",
             )
         return before
 
@@ -187,11 +187,11 @@ def _in_use(path: Path) -> UsageError:
     return UsageError(
         "frames-in-use",
         what=f"Another player writes to {path}.",
-        remedy="Stop it first, or give this one another file.",
+        remedy="Stop it first, or give this player another file.",
     )
 
 
-def _refuse_taken(path: Path) -> None:
+def _refuse_in_use(path: Path) -> None:
     """Raise UsageError("frames-in-use") rather than put another file in the place of one that somebody writes to."""
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         try:

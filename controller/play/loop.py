@@ -9,22 +9,22 @@ from typing import Any, Final
 
 from controller.bundle.live_maps import LiveMaps
 from controller.bundle.reader import Bundle
-from controller.bundle.signing import Trust, unproven
-from controller.errors import BundleError, UsageError
-from controller.play import protocol
+from controller.bundle.signing import Trust, unsigned_warning
+from controller.core.errors import BundleError, UsageError
 from controller.play.cache import DecodedAhead, check_fits
-from controller.play.coming import Coming, Told
+from controller.play.control import protocol
+from controller.play.control.notify import Notifier, tell
+from controller.play.display.outputs import Output
 from controller.play.frames import FrameSet, OutputSize
-from controller.play.live import LiveStream, open_live
-from controller.play.notify import Notifier, tell
-from controller.play.outputs import Output
+from controller.play.live.stream import LiveStream, open_live
 from controller.play.pacing import Grid
+from controller.play.pending_presentation import PendingPresentation, ResultCallback
 from controller.play.playlist import Playlist
 from controller.play.presenting import Presenter
 
 _IDLE_S: Final = 0.1
 _STATM: Final = Path("/proc/self/statm")
-"""Made once: each Path interns its parts, and the table of interned strings grows after ten thousand of them."""
+"""Created once: each Path interns its parts, and the table of interned strings grows after ten thousand of them."""
 _DECODE_WAIT_S: Final = 0.02
 _LIVE_WAIT_S: Final = 0.004
 
@@ -55,7 +55,7 @@ class Player:
         self._presenter = Presenter(output, sizes, rate_hz)
         self._black = self._presenter.shown
         self._decoded: DecodedAhead | None = None
-        self._coming: Coming | None = None
+        self._coming: PendingPresentation | None = None
         self._playlist: Playlist | None = None
         self._live: LiveStream | None = None
         self._warning: BundleError | None = None
@@ -88,17 +88,19 @@ class Player:
         """Show black and end soon; a signal handler may call it."""
         self._ending = True
 
-    def stop(self, told: Told | None, *, fade_s: float = 0.0) -> None:
+    def stop(self, on_result: ResultCallback | None, *, fade_s: float = 0.0) -> None:
         """Show black."""
-        self.show(self._black, told, showing="black", fade_s=fade_s)
+        self.show(self._black, on_result, showing="black", fade_s=fade_s)
 
-    def show(self, frames: FrameSet, told: Told | None, *, showing: str = "pattern", fade_s: float = 0.0) -> None:
+    def show(
+        self, frames: FrameSet, on_result: ResultCallback | None, *, showing: str = "pattern", fade_s: float = 0.0
+    ) -> None:
         """Show these frames; they must not change while they are the ``shown`` ones, or will be."""
         self.withdraw()
-        self._coming = Coming(showing, None, frames, self._presenter.soon(), told, fade_s)
+        self._coming = PendingPresentation(showing, None, frames, self._presenter.soon(), on_result, fade_s)
 
-    def play(self, playlist: Playlist, told: Told, *, rate_hz: float | None = None) -> None:
-        """Play appearances in turn; ``told`` hears of the first. ``rate_hz``: the grid meanwhile.
+    def play(self, playlist: Playlist, on_result: ResultCallback, *, rate_hz: float | None = None) -> None:
+        """Play appearances in turn; ``on_result`` is called for the first. ``rate_hz``: the grid meanwhile.
 
         Raises BundleError if there is no bundle or it has not all of them; then nothing changes.
         """
@@ -109,7 +111,7 @@ class Player:
         self._presenter.begin_sequence(rate_hz or self.rate_hz)
         self._playlist = playlist
         playlist.look_ahead = decoded.look_ahead
-        self._make_coming(self._presenter.soon(), told)
+        self._make_coming(self._presenter.soon(), on_result)
 
     def live(self, path: Path, white: float | None) -> dict[str, Any]:
         """Show what is written to a frame file as it comes: finished frames, or with ``white`` targets.
@@ -124,7 +126,7 @@ class Player:
         return {"by": stream.by}
 
     def withdraw(self) -> None:
-        """Present nothing more, keep the picture; whoever waits for a presentation is told."""
+        """Present nothing more, keep the picture; pending requests get an error."""
         live, self._live = self._live, None
         coming, self._coming, self._playlist = self._coming, None, None
         if live is not None:
@@ -133,12 +135,13 @@ class Player:
         if coming is not None:
             self._presenter.freeze(coming)
             self._hold_shown()
-        if coming is not None and coming.told is not None:
-            coming.told(
+        if coming is not None and coming.on_result is not None:
+            coming.on_result(
                 UsageError(
                     "superseded",
                     what="Another request came before this one was presented.",
-                    remedy="Wait for the answer before asking for the next picture; let only one program ask.",
+                    remedy="Wait for the answer before you request the next picture, and let only one program send "
+                    "requests.",
                 )
             )
 
@@ -155,7 +158,7 @@ class Player:
                 self.withdraw()
             self._decoded.close()
         self._decoded = DecodedAhead(bundle, self.sizes, self._wake)
-        self._warning = unproven(bundle.signed_by, self._trust)
+        self._warning = unsigned_warning(bundle.signed_by, self._trust)
         if self._warning is not None:
             tell(f"WARNING: {self._warning.what} {self._warning.remedy}")
 
@@ -191,7 +194,7 @@ class Player:
         return None if self._decoded is None else self._decoded.bundle.identity
 
     def status(self) -> dict[str, Any]:
-        """What the status request answers (docs/player-protocol.md)."""
+        """What the status request answers (docs/reference/player-protocol.md)."""
         presenter = self._presenter
         signed_by = None if self._decoded is None else self._decoded.bundle.signed_by
         pages = int(_STATM.read_text(encoding="ascii").split()[1])
@@ -212,7 +215,7 @@ class Player:
             "interval_longest_s": presenter.intervals.percentile(100),
             "bundle": self.bundle_identity,
             "signed_by": None if signed_by is None else signed_by.hex(),
-            "warning": None if self._warning is None else protocol.told(self._warning),
+            "warning": None if self._warning is None else protocol.error_fields(self._warning),
             "rss_bytes": pages * os.sysconf("SC_PAGESIZE"),
         }
 
@@ -246,12 +249,12 @@ class Player:
             return False
         return coming.frames is not None
 
-    def _skip(self, coming: Coming, error: BundleError) -> None:
+    def _skip(self, coming: PendingPresentation, error: BundleError) -> None:
         """An appearance can't be decoded: say so, keep the picture, and go on with the next of a sequence."""
         self._skipped += 1
         self._coming = None
-        if coming.told is not None:
-            coming.told(error)
+        if coming.on_result is not None:
+            coming.on_result(error)
         if self._playlist is not None and self._playlist.has_others(coming.appearance):
             self._go_on(coming.tick + self._presenter.grid.ticks(self._playlist.seconds))
         else:
@@ -268,7 +271,7 @@ class Player:
         if whole:
             self._presented(coming)
 
-    def _presented(self, coming: Coming) -> None:
+    def _presented(self, coming: PendingPresentation) -> None:
         self._coming = None
         self._hold_shown()
         if self._live is not None:
@@ -278,8 +281,8 @@ class Player:
             self._on_appearance = None
         if self._playlist is not None:
             self._go_on(coming.first_tick + self._presenter.grid.ticks(self._playlist.seconds))
-        if coming.told is not None:
-            coming.told(self._presenter.last)
+        if coming.on_result is not None:
+            coming.on_result(self._presenter.last)
 
     def _hold_shown(self) -> None:
         if self._decoded is not None:
@@ -293,9 +296,9 @@ class Player:
             return
         self._make_coming(tick, None)
 
-    def _make_coming(self, tick: int, told: Told | None) -> None:
+    def _make_coming(self, tick: int, on_result: ResultCallback | None) -> None:
         assert self._decoded is not None
         assert self._playlist is not None
         self._decoded.want(self._playlist.upcoming)
         name, fade_s = self._playlist.appearance, self._playlist.fade_s
-        self._coming = Coming("appearance", name, None, tick, told, fade_s, paced=True)
+        self._coming = PendingPresentation("appearance", name, None, tick, on_result, fade_s, paced=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 _SHORTEST_S: Final = 1e-5
 _CLASS: Final = 5e-4
-"""Logarithm of how much longer the intervals of a class are than those of the class before."""
+"""Logarithm of the ratio between the intervals of neighbouring classes."""
 _CLASSES: Final = 58_000
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from itertools import islice
 from typing import Self
 
-from controller.bundle.format import Hint
-from controller.errors import BundleError
+from controller.bundle.format import PlaylistEntry
+from controller.core.errors import BundleError
 
 
 class Playlist:
@@ -20,13 +20,13 @@ class Playlist:
         self.look_ahead = 2
 
     @classmethod
-    def suggested(cls, hints: Sequence[Hint], repeat: int) -> Self:
+    def suggested(cls, hints: Sequence[PlaylistEntry], repeat: int) -> Self:
         """What a bundle suggests. Raises BundleError("bundle-no-schedule") if that is nothing."""
         if not hints:
             raise BundleError(
                 "bundle-no-schedule",
-                what="The bundle suggests no playlist.",
-                remedy="Say what is to be played, or publish it again.",
+                what="The bundle contains no playlist.",
+                remedy="Name the appearances to play, or publish the bundle again with a playlist.",
             )
         return cls([(hint.appearance, hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints], repeat)
 

@@ -1,1 +1,3 @@
-"""What was measured, for people (report.html) and for machines (report.json)."""
+"""What was measured, for people (report.html) and for machines (report.json): `calibration`, `comparison`,
+`demo`.
+"""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,17 +11,28 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import ByteImage, FloatImage, load_arrays
+from controller.artefacts.calibration import read_calibration
+from controller.artefacts.geometry import read_geometry_figures, read_points_m
+from controller.artefacts.grade import (
+    BEFORE,
+    PICTURE,
+    RESOLUTION,
+    graded,
+    is_graded,
+    passes,
+    read_error_maps,
+    read_grade_figures,
+)
+from controller.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.bundle.export import png
 from controller.calibrate.values import Calibration
-from controller.errors import UsageError
+from controller.core.arrays import ByteImage, FloatImage
+from controller.core.errors import UsageError
+from controller.core.storage import write_atomically
 from controller.report import plots
-from controller.report.page import Goal, Page, Picture, Table, write_report
+from controller.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.report.pictures import Crop, crop_around, fitted, to_screen
-from controller.session.calibrating import read_calibration
-from controller.session.grades import FILE, PICTURE, graded, passes
-from controller.session.journal import Journal
-from controller.storage import write_atomically
+from controller.run.journal import Journal
 
 COMPARED: Final = 3
 SHOWN_RUNS: Final = 12
@@ -30,7 +40,7 @@ LONGEST_PX: Final = 960
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class StageDescription:
     """What stage.toml says: the stage's name, its projectors in order, and the largest error in per cent."""
 
     stage: str
@@ -38,23 +48,23 @@ class Asked:
     worst_grade: float
 
 
-def write_calibration_report(run: Path, asked: Asked, out: Path | None = None) -> Path:
+def write_calibration_report(run: Path, asked: StageDescription, out: Path | None = None) -> Path:
     """Write the report of the graded calibration in ``run`` into ``out`` (else the run's folder); the page's path.
 
     Leaves before.png and resolution.png in the run's folder, for the panel. Raises UsageError("run-not-graded").
     """
-    if not (run / FILE).exists():
+    if not is_graded(run):
         raise UsageError("run-not-graded", what=f"{run.name} has no grade, so there is nothing to report.",
-                         remedy="Give the folder of a calibration that has come to its end.")  # fmt: skip
+                         remedy="Give the folder of a finished calibration.")  # fmt: skip
     calibration = read_calibration(run, asked.projectors)
     crop = crop_around(calibration.object_mask)
     earlier = [one for one in graded_runs(run.parent) if one.name < run.name][-SHOWN_RUNS + 1 :]
     figures = figures_of(run, asked.projectors)
     last = [figures_of(one, asked.projectors) for one in earlier[-COMPARED:]]
     before, resolution = _white(calibration, crop), resolution_px(calibration)
-    _keep(run / "before.png", before)
-    fine = plots.field(_cut(resolution, crop), "camera pixels, the smaller the finer", least=0)
-    _keep(run / "resolution.png", fine)
+    _keep(run / BEFORE, before)
+    fine = plots.field(_cut(resolution, crop), "camera pixels, smaller is finer", least=0)
+    _keep(run / RESOLUTION, fine)
     page = Page(
         title=f"{asked.stage}: calibration {run.name}",
         summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work.",
@@ -62,8 +72,8 @@ def write_calibration_report(run: Path, asked: Asked, out: Path | None = None) -
         rows=(),
         tables=(_compared(run, figures, earlier[-COMPARED:], last),),
         galleries=(
-            ("Maps", "Cut to the object; dark where nothing is known.",
-             (Picture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
+            ("Maps", "Cropped to the object; dark where nothing is known.",
+             (ReportPicture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
             *_blamed(run, figures),
             ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures)),
         ),
@@ -75,29 +85,25 @@ def write_calibration_report(run: Path, asked: Asked, out: Path | None = None) -
 
 def graded_runs(runs: Path) -> list[Path]:
     """Every run with a grade, oldest first."""
-    return sorted(run for run in runs.glob("*") if (run / FILE).exists() and (run / Journal.FILE).exists())
+    return sorted(run for run in runs.glob("*") if is_graded(run) and (run / Journal.FILE).exists())
 
 
 def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
-    """What report.json holds of a calibration; docs/report.md says what each is."""
-
-    def read(name: str) -> Any:
-        path = run / name
-        return json.loads(path.read_text()) if path.exists() else {}
+    """What report.json holds of a calibration; docs/reference/report.md says what each is."""
 
     with Journal(run) as journal:
         steps, shots = journal.steps(), journal.shot_count()
-    geometry = read("geometry.json")
-    pixels = {name: read(f"pixels-{name}.json") for name in projectors}
+    geometry = read_geometry_figures(run)
+    pixels = {name: PixelFigures.read(run, name) for name in projectors}
     return {
         "run": run.name,
         "photographs": shots,
         "seconds": sum(steps.values()),
         "geometry": {key: geometry.get(key) for key in ("reprojection_rms_px", "shape_rel_sigma", "inlier_share")},
-        "metapixels": {name: row.get("fitted") for name, row in pixels.items()},
-        "radiometry": {name: read(f"radiometry-{name}.json") for name in projectors},
-        "verification": read(FILE),
-        "steps": steps,
+        "metapixels": {name: None if one is None else one.fitted for name, one in pixels.items()},
+        "radiometry": {name: read_radiometry_figures(run, name) for name in projectors},
+        "verification": read_grade_figures(run),
+        "steps": {str(step): seconds for step, seconds in steps.items()},
     }
 
 
@@ -146,11 +152,11 @@ def _goals(run: Path, figures: Mapping[str, Any], limit: float) -> tuple[Goal, .
         Goal("Grade", grade, note="of the worst projector"),
         Goal("Largest error of a prediction", f"{100 * worst:.2f} %", f"at most {limit:g} %", passes(run, limit)),
         Goal("Geometry", "unknown" if rms is None else f"{rms:.3f} px", note="rms of reprojection, projector pixels"),
-        Goal("Metapixels", f"{sum(count or 0 for count in fitted_count):,}", note="with place and size"),
+        Goal("Metapixels", f"{sum(count or 0 for count in fitted_count):,}", note="with position and size"),
     )
 
 
-def _compared(run: Path, now: Mapping[str, Any], runs: Sequence[Path], last: Sequence[Mapping[str, Any]]) -> Table:
+def _compared(run: Path, now: Mapping[str, Any], runs: Sequence[Path], last: Sequence[Mapping[str, Any]]) -> PageTable:
     """This calibration beside the last ones, newest first."""
     both = [now, *reversed(last)]
 
@@ -170,30 +176,32 @@ def _compared(run: Path, now: Mapping[str, Any], runs: Sequence[Path], last: Seq
     rows.append(row("photographs", lambda one: one["photographs"], "{}"))
     rows.append(row("work", lambda one: one["seconds"], "{:.0f} s"))
     header = ("", f"{run.name} (this one)", *(one.name for one in reversed(runs)))
-    title = "Beside the last ones" if runs else "This is the first calibration"
-    return Table(title, header, tuple(rows))
+    title = "Compared with the last calibrations" if runs else "This is the first calibration"
+    return PageTable(title, header, tuple(rows))
 
 
 def _percent(row: Mapping[str, Any] | None) -> float | None:
     return None if row is None else 100 * float(row["relative_rms"])
 
 
-def _maps(run: Path, calibration: Calibration, crop: Crop, fine: ByteImage) -> tuple[Picture, ...]:
-    errors = load_arrays(run / "verification.npz")
+def _maps(run: Path, calibration: Calibration, crop: Crop, fine: ByteImage) -> tuple[ReportPicture, ...]:
+    errors = read_error_maps(run)
     mask = calibration.object_mask
     lit = sum((np.asarray(part.white.mean(axis=2) > 0.02 * np.nanmax(part.white)) for part in calibration.projectors),
               start=np.zeros(mask.shape, int))  # fmt: skip
     light = sum((part.white.mean(axis=2) for part in calibration.projectors), start=np.zeros(mask.shape))
     usual = float(np.median(light[mask])) if mask.any() else 1.0
-    found = [Picture("Resolution", fine, "the finest metapixel around", large=True)]
-    found.append(Picture("Coverage", _map(lit, mask, crop, "projectors", least=0, most=len(calibration.projectors))))
+    found = [ReportPicture("Resolution", fine, "the finest metapixel nearby", large=True)]
+    found.append(
+        ReportPicture("Coverage", _map(lit, mask, crop, "projectors", least=0, most=len(calibration.projectors)))
+    )
     relative = 100 * light / max(usual, 1e-12)
-    found.append(Picture("Light", _map(relative, mask, crop, "% of the usual", least=0, most=250)))
-    depth = load_arrays(run / "geometry.npz")["points_m"][..., 2]
-    found.append(Picture("Depth", _map(depth, mask, crop, "metres from the camera")))
+    found.append(ReportPicture("Light", _map(relative, mask, crop, "% of the usual", least=0, most=250)))
+    depth = read_points_m(run)[..., 2]
+    found.append(ReportPicture("Depth", _map(depth, mask, crop, "metres from the camera")))
     found += [
-        Picture(f"Error of {part.name}",
-                _map(100 * errors[part.name], mask, crop, "% of the light around", least=0, most=15))
+        ReportPicture(f"Error of {part.name}",
+                _map(100 * errors[part.name].error, mask, crop, "% of the light nearby", least=0, most=15))
         for part in calibration.projectors
     ]  # fmt: skip
     return tuple(found)
@@ -203,21 +211,23 @@ def _map(values: Any, mask: Any, crop: Crop, label: str, **limits: float) -> Byt
     return plots.field(_cut(np.where(mask, values, np.nan).astype(np.float32), crop), label, **limits)
 
 
-def _blamed(run: Path, figures: Mapping[str, Any]) -> tuple[tuple[str, str, tuple[Picture, ...]], ...]:
+def _blamed(run: Path, figures: Mapping[str, Any]) -> tuple[tuple[str, str, tuple[ReportPicture, ...]], ...]:
     whole = cv2.imread(str(run / PICTURE))
     if whole is None:
         return ()
     panels = np.split(np.asarray(whole[..., ::-1], np.uint8), len(figures["verification"]), axis=0)
     pictures = tuple(
-        Picture(name, np.ascontiguousarray(panel), " ".join(why["sentence"] for why in row.get("reasons", [])[:3]))
+        ReportPicture(
+            name, np.ascontiguousarray(panel), " ".join(why["sentence"] for why in row.get("reasons", [])[:3])
+        )
         for (name, row), panel in zip(figures["verification"].items(), panels, strict=True)
     )
-    return (("Where it is not good, and why", "Grey is fine.", pictures),)
+    return (("Where the error is large, and why", "Grey is good.", pictures),)
 
 
 def _plots(
     run: Path, calibration: Calibration, earlier: Sequence[Path], limit: float, figures: Mapping[str, Any]
-) -> tuple[Picture, ...]:
+) -> tuple[ReportPicture, ...]:
     runs = [*earlier, run]
     grades = [graded(one) or {} for one in runs]
     names = [part.name for part in calibration.projectors]
@@ -228,11 +238,13 @@ def _plots(
         for name, row in figures["verification"].items()
     }
     return (
-        Picture("Error over the calibrations", plots.history(errors, [one.name for one in runs], limit), large=True),
-        Picture("Response", plots.responses({p.name: p.radiometry.response for p in calibration.projectors})),
-        Picture("Sizes of metapixels", plots.sizes(widths), large=True),
-        Picture("Reasons for what is left", plots.reasons(why)),
+        ReportPicture(
+            "Error over the calibrations", plots.history(errors, [one.name for one in runs], limit), large=True
+        ),
+        ReportPicture("Response", plots.responses({p.name: p.radiometry.response for p in calibration.projectors})),
+        ReportPicture("Sizes of metapixels", plots.sizes(widths), large=True),
+        ReportPicture("Reasons for the remaining error", plots.reasons(why)),
     )
 
 
-__all__ = ["Asked", "figures_of", "graded_runs", "resolution_px", "size_px", "write_calibration_report"]
+__all__ = ["StageDescription", "figures_of", "graded_runs", "resolution_px", "size_px", "write_calibration_report"]

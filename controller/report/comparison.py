@@ -12,17 +12,20 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from controller.arrays import ByteImage, load_arrays
-from controller.errors import UsageError
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.comparison import Compared, all_compared, compared_in, picture_path, read_images
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.solved import read_solved
+from controller.core.arrays import ByteImage
+from controller.core.errors import UsageError
+from controller.core.storage import write_atomically
 from controller.report import plots
-from controller.report.page import Goal, Page, Picture, Row, Table, write_report
+from controller.report.page import Goal, Page, PageTable, PictureRow, ReportPicture, write_report
 from controller.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
-from controller.session.compared import Compared, all_compared, compared_in, picture_path
-from controller.session.comparing import compared_mask
-from controller.session.journal import Journal
-from controller.session.runner import Context, Step
-from controller.session.solving import Calibrated, read_solved
-from controller.storage import write_atomically
+from controller.run.journal import Journal
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps.appearance.compare import compared_mask
 
 COMPARED: Final = 3
 SHOWN_RUNS: Final = 12
@@ -34,7 +37,7 @@ _SHOWN: Final = (
     ("target", "Target", ""),
     ("achieved", "Achieved", "photograph"),
     ("error", "Error", "CIEDE2000"),
-    ("resolution", "Resolution", "violet: none of the target's edges are there; yellow: all; grey: it has too few"),
+    ("resolution", "Resolution", "violet: none of the target's edges are present; yellow: all; grey: too few edges"),
 )
 _FIGURES: Final[tuple[tuple[str, Callable[[Compared], float], str], ...]] = (
     ("median CIEDE2000", lambda one: one.delta_e00_median, "{:.2f}"),
@@ -45,12 +48,12 @@ _FIGURES: Final[tuple[tuple[str, Callable[[Compared], float], str], ...]] = (
 
 
 def picture_steps(calibrated: Calibrated, names: Sequence[str]) -> list[Step]:
-    """After ``session.comparing.compare_steps``: the pictures of each appearance, for report and panel."""
+    """After ``steps.appearance.compare.compare_steps``: the pictures of each appearance, for report and panel."""
     return [
         Step(
-            f"pictures-{name}",
+            StepId(StepKind.PICTURES, item=name),
             partial(_draw, calibrated, name),
-            after=(f"compare-{name}",),
+            after=(StepId(StepKind.COMPARE, item=name),),
             title=f"Drawing the maps of {name}",
             weight=0.3,
         )
@@ -61,7 +64,7 @@ def picture_steps(calibrated: Calibrated, names: Sequence[str]) -> list[Step]:
 def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]:
     calibration = calibrated.calibration
     solved = read_solved(calibrated.folder, name, calibrated.projectors)
-    arrays = load_arrays(context.folder / f"compared-{name}.npz")
+    images = read_images(context.folder, name)
     (one,) = (one for one in compared_in(context.folder) if one.name == name)
     on_object, mask = calibration.object_mask, compared_mask(calibrated, solved)
     crop = crop_around(on_object)
@@ -72,9 +75,9 @@ def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]
     drawn = {
         "before": to_screen(lit, to_xyz, white=white),
         "target": to_screen(target, to_xyz, white=solved.exposure),
-        "achieved": to_screen(arrays["photograph"], to_xyz, white=solved.exposure),
-        "error": error_picture(arrays["error"].astype(np.float32), mask),
-        "resolution": sharpness_picture(arrays["resolution"], one.window_px, on_object.shape, mask),
+        "achieved": to_screen(images.photograph, to_xyz, white=solved.exposure),
+        "error": error_picture(images.error.astype(np.float32), mask),
+        "resolution": sharpness_picture(images.resolution, one.window_px, on_object.shape, mask),
     }
     paths = []
     for kind, whole in drawn.items():
@@ -115,7 +118,8 @@ def _figures(run: Path, found: Sequence[Compared]) -> dict[str, Any]:
     with Journal(run) as journal:
         steps, shots = journal.steps(), journal.shot_count()
     return {"run": run.name, "photographs": shots, "seconds": sum(steps.values()),
-            "appearances": [asdict(one) for one in found], "steps": steps}  # fmt: skip
+            "appearances": [asdict(one) for one in found],
+            "steps": {str(step): seconds for step, seconds in steps.items()}}  # fmt: skip
 
 
 def _day(name: str) -> str:
@@ -131,7 +135,7 @@ def _goals(found: Sequence[Compared], before: Sequence[dict[str, Compared]]) -> 
     return (
         Goal("Worst median colour difference", f"{worst.delta_e00_median:.2f}", f"at most {GOAL_DELTA_E:g}",
              worst.delta_e00_median <= GOAL_DELTA_E, worst.title),
-        Goal("Since the last time", *_change(found, before)),
+        Goal("Change since the last run", *_change(found, before)),
         Goal("Least sharpness", f"{blurred.sharpness_lambda:.2f}", note=f"share of edges in common, {blurred.title}"),
     )  # fmt: skip
 
@@ -144,12 +148,12 @@ def _change(found: Sequence[Compared], before: Sequence[dict[str, Compared]]) ->
         if last is not None:
             changes.append((one.delta_e00_median - last.delta_e00_median, one.title))
     if not changes:
-        return "nothing to compare", "", None, "it is the first time"
+        return "nothing to compare", "", None, "first run"
     change, title = max(changes, key=lambda each: abs(each[0]))
     return f"{change:+.2f}", "", None, f"median colour difference, {title}"
 
 
-def _row(run: Path, one: Compared) -> Row:
+def _row(run: Path, one: Compared) -> PictureRow:
     known = [(label, form.format(value(one))) for label, value, form in _FIGURES]
     if one.reachable_share is not None:
         known.append(("within reach", f"{100 * one.reachable_share:.1f} % of the object"))
@@ -159,8 +163,8 @@ def _row(run: Path, one: Compared) -> Row:
         path = picture_path(run, one.name, kind)
         image = cv2.imread(str(path)) if path.exists() else None
         if image is not None:
-            pictures.append(Picture(caption, _rgb(image), note))
-    return Row(one.title, tuple(known), tuple(pictures))
+            pictures.append(ReportPicture(caption, _rgb(image), note))
+    return PictureRow(one.title, tuple(known), tuple(pictures))
 
 
 def _rgb(image: Any) -> ByteImage:
@@ -169,7 +173,7 @@ def _rgb(image: Any) -> ByteImage:
 
 def _beside(
     name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]]
-) -> Table:
+) -> PageTable:
     """This run beside the last ones, newest first."""
     runs = [*reversed(before)]
     rows = [
@@ -177,8 +181,8 @@ def _beside(
         for one in found
     ]
     header = ("", f"{name} (this one)", *(folder.name for folder in reversed(earlier)))
-    said = "beside the last ones" if earlier else "the first ones"
-    return Table(f"Colour difference, median and 95 %, and sharpness: {said}", header, tuple(rows))
+    comparison = "compared with earlier runs" if earlier else "first run"
+    return PageTable(f"Colour difference, median and 95 %, and sharpness: {comparison}", header, tuple(rows))
 
 
 def _short(one: Compared) -> str:
@@ -187,7 +191,7 @@ def _short(one: Compared) -> str:
 
 def _course(
     name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]]
-) -> tuple[tuple[str, str, tuple[Picture, ...]], ...]:
+) -> tuple[tuple[str, str, tuple[ReportPicture, ...]], ...]:
     if not earlier:
         return ()
     held = [*before, {one.name: one for one in found}]
@@ -196,4 +200,4 @@ def _course(
     runs = [*(folder.name for folder in earlier), name]
     label = "median colour difference, CIEDE2000"
     drawn = plots.history(medians, runs, GOAL_DELTA_E, label=label, unit="")
-    return (("How it went", "", (Picture("Colour difference over the runs", drawn, large=True),)),)
+    return (("How it went", "", (ReportPicture("History", drawn, large=True),)),)

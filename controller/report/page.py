@@ -12,13 +12,14 @@ from typing import Any
 
 import jinja2
 
-from controller.arrays import ByteImage
+from controller.artefacts.names import REPORT_FIGURES, REPORT_PAGE
+from controller.core.arrays import ByteImage
+from controller.core.storage import write_atomically
 from controller.report.pictures import ERROR_SCALE_DELTA_E, data_uri, scale_bar
-from controller.storage import write_atomically
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ReportPicture:
     """``large``: it holds small text, and wants more than a column of a strip."""
 
     caption: str
@@ -28,12 +29,12 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class PictureRow:
     """One appearance on the page: a title, its figures in words, and its pictures from left to right."""
 
     title: str
     figures: tuple[tuple[str, str], ...]
-    pictures: tuple[Picture, ...]
+    pictures: tuple[ReportPicture, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class Goal:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class PageTable:
     """Figures side by side: ``header`` and every row have one more column than what is compared."""
 
     title: str
@@ -61,11 +62,11 @@ class Page:
     title: str
     summary: str
     goals: tuple[Goal, ...]
-    rows: tuple[Row, ...]
-    galleries: tuple[tuple[str, str, tuple[Picture, ...]], ...] = ()
+    rows: tuple[PictureRow, ...]
+    galleries: tuple[tuple[str, str, tuple[ReportPicture, ...]], ...] = ()
     steps: tuple[tuple[str, float], ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
-    tables: tuple[Table, ...] = ()
+    tables: tuple[PageTable, ...] = ()
 
 
 def render(page: Page) -> str:
@@ -82,11 +83,11 @@ def render(page: Page) -> str:
 
 
 def write_report(folder: Path, page: Page, figures: Mapping[str, Any]) -> tuple[Path, Path]:
-    """Write ``report.html`` and ``report.json`` (keys: docs/report.md) into ``folder``; return both paths.
+    """Write ``report.html`` and ``report.json`` (keys: docs/reference/report.md) into ``folder``; return both paths.
 
     A figure that is no finite number becomes null: what could not be measured must not cost what could.
     """
-    html, machine = folder / "report.html", folder / "report.json"
+    html, machine = folder / REPORT_PAGE, folder / REPORT_FIGURES
     write_atomically(machine, (json.dumps(_finite(figures), indent=2, allow_nan=False) + "\n").encode())
     write_atomically(html, render(page).encode())
     return html, machine

@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 
 XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 """IEC 61966-2-1, linear part."""
 
 ERROR_SCALE_DELTA_E = 12.0
-"""The colour difference at which an error map is at its brightest; the same in every report, so that two compare."""
+"""The colour difference of the brightest colour in an error map; the same in every report, so that they can be
+compared."""
 
 OUTSIDE = (38, 40, 44)
 """The grey of maps where nothing is known."""

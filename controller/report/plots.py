@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from cycler import cycler
 
-from controller.arrays import ByteImage, Float64, FloatImage
-from controller.plotting import figure_of, picture_of
+from controller.core.arrays import ByteImage, Float64, FloatImage
+from controller.core.plotting import figure_of, picture_of
 
 WIDE_IN, HIGH_IN, DPI = 7.2, 4.2, 100
 BACK, INK, DIM = "#1f2125", "#e8e6e1", "#9b9890"
 COLOURS: Final = ("#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#d55e00", "#0072b2")
-"""Apart for those who see few colours, too (Okabe and Ito)."""
+"""Also distinguishable for colour-blind readers (Okabe and Ito)."""
 STYLE: Final[Any] = {
     "figure.facecolor": BACK, "axes.facecolor": BACK, "savefig.facecolor": BACK, "axes.edgecolor": DIM,
     "axes.labelcolor": INK, "text.color": INK, "xtick.color": DIM, "ytick.color": DIM, "grid.color": "#34363b",

@@ -18,9 +18,9 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.arrays import FloatImage, Mask
-from controller.errors import UsageError
-from controller.solve.drive import Drive
+from controller.core.arrays import FloatImage, Mask
+from controller.core.errors import UsageError
+from controller.solve.drive_levels import DriveLevels
 from controller.solve.feasibility import Feasibility, feasibility
 from controller.transport import LightTransport
 
@@ -64,7 +64,7 @@ def adapt(
     *,
     strength: float = 1.0,
     given_up: float = 0.0,
-    drive: Drive | None = None,
+    drive: DriveLevels | None = None,
 ) -> Adapted:
     """Bend ``wanted`` into reach.
 
@@ -77,7 +77,7 @@ def adapt(
     Raises UsageError "image-wrong-size", "target-not-finite" or "adapt-strength".
     """
     _check_strength(strength, given_up)
-    drive = Drive(transport) if drive is None else drive
+    drive = DriveLevels(transport) if drive is None else drive
     before = feasibility(transport, wanted, black, drive=drive)
     target, gain = _bent(wanted, black, drive, strength, given_up)
     return Adapted(target, gain, before, feasibility(transport, target, black, drive=drive))
@@ -90,14 +90,14 @@ def adapt_gently(
     *,
     white: float,
     most: float = 1.0,
-    drive: Drive | None = None,
+    drive: DriveLevels | None = None,
 ) -> tuple[Adapted, float, float]:
     """The adaptation that keeps most contrast, of a few up to strength ``most``; and the contrast cut off and adapted.
 
     A few highlights lose little when they are cut off, and to dim their surroundings for them would lose more: they are
     given up, or nothing is adapted at all. ``white`` as in ``contrast_kept``; errors as ``adapt``.
     """
-    drive = Drive(transport) if drive is None else drive
+    drive = DriveLevels(transport) if drive is None else drive
     before = feasibility(transport, wanted, black, drive=drive)
     reach = black + transport.reach()
     kept: list[tuple[float, FloatImage, FloatImage]] = []
@@ -121,7 +121,7 @@ def _check_strength(strength: float, given_up: float) -> None:
 
 
 def _bent(
-    wanted: FloatImage, black: FloatImage, drive: Drive, strength: float, given_up: float
+    wanted: FloatImage, black: FloatImage, drive: DriveLevels, strength: float, given_up: float
 ) -> tuple[FloatImage, FloatImage]:
     """The bent target (rows, columns, 3) and the gain (rows, columns); arguments as ``adapt``."""
     lifted = _above_black(np.maximum(wanted, 0), black, strength)

@@ -14,10 +14,10 @@ from typing import Final, Literal
 import cv2
 import numpy as np
 
-from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration
-from controller.solve.bounded import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
-from controller.solve.gradient import scale_base
+from controller.core.arrays import FloatImage
+from controller.solve.bounded.gradient import scale_base
+from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
 
@@ -197,7 +197,7 @@ def make_appearance(
 ) -> Appearance:
     """Frames for a target radiance: by base and scale, by a full solve, or by what the target needs.
 
-    A full solve starts from the target alone (``guess``), which takes fewer sweeps than base x scale (decision 25).
+    A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 25).
     """
     check_target(transport, target)
     detail = fine_detail(transport, base, target, black)

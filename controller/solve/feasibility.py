@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.arrays import FloatImage, Mask
-from controller.errors import UsageError, WorkError
-from controller.solve.bounded import check_target
-from controller.solve.drive import Drive
+from controller.core.arrays import FloatImage, Mask
+from controller.core.errors import UsageError, WorkError
+from controller.solve.bounded.solver import check_target
+from controller.solve.drive_levels import DriveLevels
 from controller.transport import LightTransport
 
 
@@ -35,14 +35,14 @@ def feasibility(
     black: FloatImage,
     *,
     margin: float = 2e-3,
-    drive: Drive | None = None,
+    drive: DriveLevels | None = None,
 ) -> Feasibility:
     """Compare ``target`` (rows, columns, 3), linear radiance, with what the projectors can make.
 
     ``margin``: so much drive beyond [0, 1] is forgiven; ``drive`` of this transport, where already known.
     """
     check_target(transport, target)
-    drive = Drive(transport) if drive is None else drive
+    drive = DriveLevels(transport) if drive is None else drive
     needed = drive.of(target - black)
     bright, dark = np.maximum(needed - 1, 0), np.maximum(-needed, 0)
     mask = drive.mask
@@ -57,7 +57,7 @@ def choose_exposure(
     black: FloatImage,
     *,
     share: float = 0.95,
-    drive: Drive | None = None,
+    drive: DriveLevels | None = None,
 ) -> float:
     """The largest exposure at which ``share`` of the object's pixels can be made as bright as exposure x target.
 
@@ -73,7 +73,7 @@ def choose_exposure(
             what=f"A share of {share} reachable pixels was asked for.",
             remedy="Ask for a share above 0 and up to 1, for example 0.95.",
         )
-    drive = Drive(transport) if drive is None else drive
+    drive = DriveLevels(transport) if drive is None else drive
     mask = drive.mask
     per_exposure, at_none = drive.of(target)[mask].astype(np.float64), drive.of(-black)[mask].astype(np.float64)
     possible = np.isfinite(per_exposure).all(axis=1) & np.isfinite(at_none).all(axis=1)

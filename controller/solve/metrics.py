@@ -10,13 +10,17 @@ import numpy as np
 import numpy.typing as npt
 from skimage.color import deltaE_ciede2000
 
-from controller.arrays import Float64, FloatImage, Mask
-from controller.errors import UsageError
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.errors import UsageError
 
 BAND_PIXELS: Final = 1 << 18
 """Pixels compared at a time, so that memory stays bounded at any size."""
 STRONG: Final = 0.9
-"""Canny's high threshold is this quantile of the target's gradient; the low one is ``WEAK`` of it."""
+STRONGEST: Final = 0.99
+SHARE_OF_STRONGEST: Final = 0.5
+"""Canny's high threshold is the ``STRONG`` quantile of the target's gradient, and at most this share of the
+``STRONGEST`` one: where a dense pattern's edges are all equally strong, the quantile would lie at their own strength,
+and a result with a tenth less contrast would have hardly an edge. The low threshold is ``WEAK`` of the high one."""
 WEAK: Final = 0.4
 EDGE_SIGMA_PX: Final = 1.4
 GRADIENT_SCALE: Final = 2000.0
@@ -120,7 +124,8 @@ def _both_edges(achieved: FloatImage, target: FloatImage, white: float, mask: Ma
     """Edges (rows, columns) of both pictures inside the mask, by Canny."""
     gradients = [_gradient(image, white) for image in (achieved, target)]
     strength = np.hypot(*(part.astype(np.float32) for part in gradients[1]))[mask]
-    threshold = max(float(np.quantile(strength, STRONG)) if strength.size else 0.0, FAINTEST_EDGE)
+    strong, strongest = np.quantile(strength, (STRONG, STRONGEST)) if strength.size else (0.0, 0.0)
+    threshold = max(float(min(strong, SHARE_OF_STRONGEST * strongest)), FAINTEST_EDGE)
     ours, theirs = (
         (cv2.Canny(dx, dy, WEAK * threshold, threshold, L2gradient=True) > 0) & mask for dx, dy in gradients
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from controller.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask
 from controller.solve.adapt import adapt_gently
 from controller.solve.appearance import (
     FINE_DETAIL,
@@ -23,13 +23,15 @@ from controller.solve.appearance import (
     make_appearance,
     solve_base,
 )
-from controller.solve.drive import Drive
+from controller.solve.bounded.weights import appearance_weights
+from controller.solve.drive_levels import DriveLevels
 from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
-from controller.solve.targets_values import Target
-from controller.solve.weights import appearance_weights
+from controller.solve.targets.values import Target
 from controller.transport import LightTransport
 
-GO_FULL = 'The target has finer detail than one projector can scale; mode "full" or base "high-pass" would keep it.'
+ADVICE_FULL_SOLVE = (
+    'The target has finer detail than one projector can scale; mode "full" or base "high-pass" would keep it.'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +60,8 @@ class SolveOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What an appearance came to.
+class AppearanceResult:
+    """A solved appearance.
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
     ``target`` (rows, columns, 3) float32: radiance aimed at
@@ -74,31 +76,31 @@ class Answer:
     figures: dict[str, float | int | str | None] = field(default_factory=dict)
 
 
-def answer(
+def solve_appearance(
     transport: LightTransport,
     base: Base,
     black: FloatImage,
-    asked: Target,
+    requested: Target,
     options: SolveOptions,
     *,
-    drive: Drive | None = None,
+    drive: DriveLevels | None = None,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
-) -> Answer:
-    """Make an appearance of the picture ``asked`` for, reflectance-like, as seen from the camera.
+) -> AppearanceResult:
+    """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
 
     Raises what ``choose_exposure`` and ``solve_bounded`` raise.
     """
-    drive = Drive(transport) if drive is None else drive
-    picture = asked.image
+    drive = DriveLevels(transport) if drive is None else drive
+    picture = requested.image
     exposure = choose_exposure(transport, picture, black, share=options.share, drive=drive)
     wanted = np.float32(exposure) * picture
     possible = feasibility(transport, wanted, black, drive=drive)
-    told: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
+    figures: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
     if options.adapt > 0:
         adapted, cut_off, kept = adapt_gently(transport, wanted, black, white=exposure, most=options.adapt, drive=drive)
         wanted, possible = adapted.target, adapted.after
-        told |= {"contrast_kept_cut_off": cut_off, "contrast_kept": kept, "adapted_share": possible.share}
+        figures |= {"contrast_kept_cut_off": cut_off, "contrast_kept": kept, "adapted_share": possible.share}
     target = target_radiance(wanted, black, 1.0)
     began_s = time.perf_counter()
     if options.base == "high-pass":
@@ -117,12 +119,12 @@ def answer(
         progress=progress,
         cancelled=cancelled,
     )
-    told |= {
+    figures |= {
         "mode": made.mode,
         "seconds": time.perf_counter() - began_s,
         "fine_detail": made.fine_detail,
-        "advice": GO_FULL if made.mode == "scale" and made.fine_detail >= FINE_DETAIL else None,
+        "advice": ADVICE_FULL_SOLVE if made.mode == "scale" and made.fine_detail >= FINE_DETAIL else None,
         "iterations": 0 if made.solution is None else made.solution.iterations,
         "kkt": None if made.solution is None else made.solution.kkt,
     }
-    return Answer(made.frames, wanted, possible.reachable & asked.mask, told)
+    return AppearanceResult(made.frames, wanted, possible.reachable & requested.mask, figures)

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration
-from controller.errors import UsageError
+from controller.core.arrays import FloatImage
+from controller.core.errors import UsageError
 
 
 def traditional_compensation(calibration: Calibration, target: FloatImage, n: int) -> list[FloatImage]:

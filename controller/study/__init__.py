@@ -1,1 +1,3 @@
-"""The paper's experiments, done again on a calibrated stage with photographs alone."""
+"""The paper's experiments, repeated on a calibrated stage with photographs. Entry: `catalogue`; `values` says
+what an experiment is.
+"""

@@ -1,25 +1,26 @@
-"""Every experiment, in the order of the index."""
+"""Every experiment, in the order of the index, and every stage that experiments work on."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
-from controller.errors import UsageError
-from controller.study.ablation import ABLATION
-from controller.study.adaptation import ADAPTATION
-from controller.study.appearances import APPEARANCES
-from controller.study.drifting import DRIFTING
-from controller.study.earlier import EARLIER
-from controller.study.effort import EFFORT
-from controller.study.frequency import FREQUENCY
-from controller.study.live import LIVE
-from controller.study.placement import PLACEMENT
-from controller.study.regions import REGIONS
-from controller.study.residual import RESIDUAL, RESIDUAL_SIX
-from controller.study.robustness import ROBUSTNESS
-from controller.study.sharpness import SHARPNESS
-from controller.study.times import TIMES
+from controller.core.errors import UsageError
+from controller.study.experiments.ablation import ABLATION
+from controller.study.experiments.adaptation import ADAPTATION
+from controller.study.experiments.appearances.experiment import APPEARANCES
+from controller.study.experiments.drift import DRIFTING
+from controller.study.experiments.earlier import EARLIER
+from controller.study.experiments.effort import EFFORT
+from controller.study.experiments.frequency import FREQUENCY
+from controller.study.experiments.live import LIVE
+from controller.study.experiments.placement.experiment import PLACEMENT, planned_object
+from controller.study.experiments.regions import REGIONS
+from controller.study.experiments.residual import RESIDUAL, RESIDUAL_SIX
+from controller.study.experiments.robustness import ROBUSTNESS
+from controller.study.experiments.sharpness import SHARPNESS
+from controller.study.experiments.times.experiment import TIMES
+from controller.study.lab.scenes import Scene, curved_object
 from controller.study.values import Experiment
 
 EXPERIMENTS: Final[tuple[Experiment, ...]] = (
@@ -39,6 +40,16 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     ADAPTATION,
     LIVE,
 )
+
+_ALL: Final = (
+    Scene("painted", "a painted vase and bust, three projectors"),
+    Scene("curved", "a pale curved shell, three projectors", curved_object),
+    Scene("curved-six", "a pale curved shell, six projectors", curved_object, {"projectors": 6}),
+    Scene(
+        "planned", "the shell, three projectors where they were planned", planned_object, {"stands": "../stands.toml"}
+    ),
+)
+SCENES: Final[Mapping[str, Scene]] = {scene.name: scene for scene in _ALL}
 
 
 def chosen(names: Sequence[str]) -> list[Experiment]:

@@ -1,4 +1,4 @@
-"""What an experiment is, and what it comes to."""
+"""An experiment and its result."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.arrays import ByteImage
-from controller.storage import sha256_of
-from controller.study.subject import Subject
+from controller.core.arrays import ByteImage
+from controller.core.storage import sha256_of
+from controller.study.lab.subject import Subject
 
 Cell = str | int | float | bool | None
 
@@ -18,7 +18,7 @@ Cell = str | int | float | bool | None
 class Criterion:
     """What is asked, in words and figures, what was reached, and whether that is enough.
 
-    ``reason``: why a missed one is missed, as far as it was found; ``holds`` None where nothing can be told
+    ``reason``: why it is missed, as far as known; ``holds`` None where it is not known
     """
 
     asked: str
@@ -28,7 +28,7 @@ class Criterion:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class ResultTable:
     """A small table: ``name`` (of its file), ``title``, one name a column, and rows of as many cells."""
 
     name: str
@@ -52,13 +52,13 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What an experiment came to.
+    """The result of an experiment.
 
-    ``text``: what of the page's paragraph depends on the run; the paragraph itself is in ``words``
+    ``text``: the part of the page's text that depends on the run; the rest is in ``words``
     """
 
     criteria: tuple[Criterion, ...]
-    tables: tuple[Table, ...]
+    tables: tuple[ResultTable, ...]
     figures: tuple[Figure, ...] = ()
     text: str = ""
 
@@ -95,7 +95,7 @@ class Experiment:
         return "" if source is None else sha256_of(Path(source))
 
 
-def column(table: Table, name: str) -> Sequence[Cell]:
+def column(table: ResultTable, name: str) -> Sequence[Cell]:
     """A table's cells under that name."""
     place = table.columns.index(name)
     return [row[place] for row in table.rows]

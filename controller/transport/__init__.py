@@ -1,5 +1,9 @@
-"""The light transport T: metapixels as patches, and the products T p and T' r."""
+"""The light transport T: metapixels as patches, and the products T p and T' r.
 
-from controller.transport.light import LightTransport
+Entry: `factory.build_transport` makes the `LightTransport` of a calibration, a linear operator in SciPy's sense.
+"""
 
-__all__ = ["LightTransport"]
+from controller.transport.factory import build_transport
+from controller.transport.operator import LightTransport
+
+__all__ = ["LightTransport", "build_transport"]

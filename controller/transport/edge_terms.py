@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from controller.arrays import FloatImage
-from controller.calibrate.edges import EdgeShares
-from controller.transport.light import LightTransport
+from controller.calibrate.metapixels.depth_edges import EdgeShares
+from controller.core.arrays import FloatImage
+from controller.transport.camera_box import CameraBox
+from controller.transport.operator import LightTransport
 from controller.transport.planes import image_planes
 
 NOISES: Final = 2.0
@@ -41,7 +42,7 @@ class EdgeTerm:
     white: FloatImage
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EdgedTransport(LightTransport):
     """A light transport, ``model``, with a term at depth edges for each projector."""
 
@@ -61,17 +62,14 @@ class EdgedTransport(LightTransport):
                 flat[c, term.camera] += term.white[c] * (term.differences @ shown[c])
         return light
 
-    def adjoint_planes(self, r: FloatImage, *, out: FloatImage | None = None) -> FloatImage:
+    def adjoint_planes(
+        self, r: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
+    ) -> FloatImage:
         """T' r on planes, as ``LightTransport.adjoint_planes``."""
-        back = self.model.adjoint_planes(r, out=out)
-        for n in range(len(self.terms)):
+        back = self.model.adjoint_planes(r, projectors=projectors, out=out)
+        for n in range(*(projectors or (0, len(self.terms)))):
             self._add_term(n, r, back)
         return back
-
-    def adjoint_part(self, n: int, r: FloatImage, out: FloatImage) -> None:
-        """T_n' r of one projector, as ``LightTransport.adjoint_part``."""
-        self.model.adjoint_part(n, r, out)
-        self._add_term(n, r, out)
 
     def _add_term(self, n: int, r: FloatImage, back: FloatImage) -> None:
         term, flat = self.terms[n], r.reshape(3, -1)
@@ -88,27 +86,43 @@ class EdgedTransport(LightTransport):
         model = self.model.with_absolute_mixing()
         return dataclasses.replace(self, mixing=model.mixing, model=model, terms=terms)
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Everything that ``restored`` needs, by name."""
-        of_model = {f"model-{name}": array for name, array in self.model.arrays().items()}
-        return {**of_model, "model": np.array(kinds().index(type(self.model))), **term_arrays(self.terms)}
+    def submatrix(
+        self, box: CameraBox, pixels: npt.NDArray[np.int64], channels: tuple[int, ...]
+    ) -> sp.csr_matrix[np.float64]:
+        """The model's part of T, and what the measured terms add to it, as ``LightTransport.submatrix``."""
+        model = self.model.submatrix(box, pixels, channels)
+        return sp.csr_matrix(model + self._term_rows(box, pixels, channels))
 
-    @classmethod
-    def restored(cls, arrays: dict[str, npt.NDArray[Any]], sizes: tuple[tuple[int, int], ...]) -> EdgedTransport:
-        """From ``arrays``. Raises KeyError where one is missing."""
-        of_model = {name.removeprefix("model-"): a for name, a in arrays.items() if name.startswith("model-")}
-        return with_terms(kinds()[int(arrays["model"])].restored(of_model, sizes), terms_from(arrays, sizes))
+    def _term_rows(
+        self, box: CameraBox, pixels: npt.NDArray[np.int64], channels: tuple[int, ...]
+    ) -> sp.csr_matrix[np.float64]:
+        y, x = np.mgrid[box.top : box.bottom, box.left : box.right]
+        in_box = (y * self.camera_shape[1] + x).ravel()
+        total = sp.csr_matrix((len(channels) * in_box.size, len(channels) * pixels.size))
+        for n, term in enumerate(self.terms):
+            span = self.span(n)
+            mine = np.flatnonzero((pixels >= span.start) & (pixels < span.stop))
+            _, row, place = np.intersect1d(in_box, term.camera, assume_unique=True, return_indices=True)
+            if not (row.size and mine.size):
+                continue
+            near = sp.csc_matrix(term.differences[place], dtype=np.float64)[:, pixels[mine] - span.start]
+            spread = sp.csr_matrix((np.ones(row.size), (row, np.arange(row.size))), shape=(in_box.size, row.size))
+            chosen = sp.csr_matrix((np.ones(mine.size), (np.arange(mine.size), mine)), shape=(mine.size, pixels.size))
+            blocks = []
+            for c in channels:
+                seen = spread @ sp.diags_array(term.white[c, place].astype(np.float64)) @ near @ chosen
+                parts = [sp.csr_matrix(seen * float(self.mixing[n, c, d])) for d in channels]
+                blocks.append(sp.hstack(parts, format="csr"))
+            total = sp.csr_matrix(total + sp.vstack(blocks, format="csr"))
+        return total
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All that the products depend on, by name."""
+        of_model = {f"model-{name}": array for name, array in self.model.arrays().items()}
+        return {**of_model, **term_arrays(self.terms)}
 
 
 _PARTS: Final = ("data", "indices", "indptr", "camera", "white")
-
-
-def kinds() -> list[type[LightTransport]]:
-    """What a model may be; the place in the list is stored."""
-    from controller.transport.patch_transport import PatchTransport
-    from controller.transport.window_transport import WindowTransport
-
-    return [PatchTransport, WindowTransport]
 
 
 def term_arrays(terms: Sequence[EdgeTerm]) -> dict[str, npt.NDArray[Any]]:
@@ -121,10 +135,15 @@ def term_arrays(terms: Sequence[EdgeTerm]) -> dict[str, npt.NDArray[Any]]:
     return found
 
 
-def terms_from(arrays: Mapping[str, npt.NDArray[Any]], sizes: Sequence[tuple[int, int]]) -> tuple[EdgeTerm, ...]:
-    """Terms from ``term_arrays``; ``sizes`` (rows, columns) of the projectors. Raises KeyError where one is missing."""
+def terms_from(
+    arrays: Mapping[str, npt.NDArray[Any]], sizes: Sequence[tuple[int, int]], numbers: Sequence[int] | None = None
+) -> tuple[EdgeTerm, ...]:
+    """Terms from ``term_arrays``; ``sizes`` (rows, columns) of the projectors. Raises KeyError where one is missing.
+
+    ``numbers``: which of the terms that were given to ``term_arrays``, in this order; None: all
+    """
     terms = []
-    for n, (rows, columns) in enumerate(sizes):
+    for n, (rows, columns) in zip(range(len(sizes)) if numbers is None else numbers, sizes, strict=True):
         data, indices, indptr, camera, white = (arrays[f"edges-{n}-{name}"] for name in _PARTS)
         matrix = sp.csr_matrix((data, indices, indptr), shape=(len(camera), rows * columns))
         terms.append(EdgeTerm(matrix, camera, white))
@@ -178,7 +197,7 @@ def _modelled(
         mine = shown_in == number
         if mine.any():
             lit = np.repeat((pattern == number).astype(np.float32)[..., None], 3, axis=2)
-            light = transport.project_one(n, lit).sum(axis=2).ravel()
+            light = transport.forward_part(n, lit).sum(axis=2).ravel()
             found[mine] = light[camera[mine]] / full[camera[mine]]
     return found
 

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
-from controller.arrays import FloatImage
-from controller.compiled import compiled
+from controller.core.arrays import FloatImage
+from controller.core.jit import compiled
 
 
 @compiled(parallel=True)

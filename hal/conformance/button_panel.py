@@ -11,6 +11,7 @@ import pytest
 
 from hal.conformance.device import DeviceConformance
 from hal.deadline import Cancelled, in_seconds
+from hal.driver_calls import Caller
 from hal.errors import DeviceRefused, DeviceTimeout
 from hal.interfaces import ButtonPanel
 
@@ -63,6 +64,10 @@ class ButtonPanelConformance(DeviceConformance):
         if button_panel.capabilities.picture_px is not None:
             with pytest.raises(DeviceTimeout):
                 button_panel.show(0, self.picture(button_panel), deadline=in_seconds(-1.0))
+
+    def test_every_answer_and_error_is_of_its_type(self, button_panel: ButtonPanel) -> None:
+        assert Caller("The driver under test").device("button_panel", button_panel).capabilities.keys > 0
+        self.check_types("button_panel", button_panel)
 
     def test_closing_twice_is_harmless(self, button_panel: ButtonPanel) -> None:
         self.check_closes_twice(button_panel)

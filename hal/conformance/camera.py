@@ -13,6 +13,7 @@ import pytest
 
 from hal.conformance.device import DeviceConformance
 from hal.deadline import in_seconds
+from hal.driver_calls import Caller
 from hal.errors import DeviceRefused, DeviceTimeout
 from hal.interfaces import Camera
 from hal.values import CameraCapabilities, CapturedFile, ExposureSettings, FileKind
@@ -107,6 +108,15 @@ class CameraConformance(DeviceConformance):
 
     def test_keeps_deadlines_and_stops_when_cancelled(self, camera: Camera) -> None:
         self.check_deadline_and_cancel(camera)
+
+    def test_every_answer_and_error_is_of_its_type(self, camera: Camera, tmp_path: Path) -> None:
+        can = Caller("The driver under test").device("camera", camera).capabilities
+        self.check_types(
+            "camera",
+            camera,
+            lambda it: it.configure(self.settings(can, can.exposures_s[0]), deadline=self.soon()),
+            lambda it: it.capture(tmp_path / "shot", deadline=self.soon()),
+        )
 
     def test_closing_twice_is_harmless(self, camera: Camera) -> None:
         self.check_closes_twice(camera)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import pytest
 
 from hal.deadline import Cancelled, Deadline, in_seconds
-from hal.errors import DeviceError, DeviceTimeout
+from hal.driver_calls import Caller
+from hal.errors import DeviceError, DeviceTimeout, DriverFault
 from hal.interfaces import Device
 
 
@@ -35,6 +37,22 @@ class DeviceConformance:
             assert time.monotonic() - started < self.prompt_s, "close() must not block"
         with pytest.raises(DeviceError):
             device.identity(deadline=self.soon())
+
+    def check_types(self, kind: str, device: Device, *calls: Callable[[Any], object]) -> None:
+        """Each call returns what ``hal.interfaces`` says, and raises a ``DeviceError`` once the device is closed.
+
+        A driver that raises or returns anything else is stopped by the controller (``hal.driver_calls``), which then
+        can only say that it is broken.
+        """
+        checked = Caller("The driver under test").device(kind, device)
+        calls = (lambda it: it.identity(deadline=self.soon()), *calls)
+        for call in calls:
+            call(checked)
+        checked.close()
+        for call in calls:
+            with pytest.raises(DeviceError) as caught:
+                call(checked)
+            assert not isinstance(caught.value, DriverFault), caught.value
 
     def check_deadline_and_cancel(self, device: Device) -> None:
         started = time.monotonic()

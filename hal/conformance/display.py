@@ -68,5 +68,13 @@ class DisplayConformance(DeviceConformance):
             display.show(self.frames(display, 60), deadline=in_seconds(-1.0))
         self.check_deadline_and_cancel(display)
 
+    def test_every_answer_and_error_is_of_its_type(self, display: Display) -> None:
+        self.check_types(
+            "display",
+            display,
+            lambda it: it.outputs(deadline=self.soon()),
+            lambda it: it.show({}, deadline=self.soon()),
+        )
+
     def test_closing_twice_is_harmless(self, display: Display) -> None:
         self.check_closes_twice(display)

@@ -32,5 +32,8 @@ class LightSensorConformance(DeviceConformance):
             light_sensor.illuminance_lux(deadline=in_seconds(-1.0))
         self.check_deadline_and_cancel(light_sensor)
 
+    def test_every_answer_and_error_is_of_its_type(self, light_sensor: LightSensor) -> None:
+        self.check_types("light_sensor", light_sensor, lambda it: it.illuminance_lux(deadline=self.soon()))
+
     def test_closing_twice_is_harmless(self, light_sensor: LightSensor) -> None:
         self.check_closes_twice(light_sensor)

@@ -51,6 +51,15 @@ class PowerSwitchConformance(DeviceConformance):
     def test_keeps_deadlines_and_stops_when_cancelled(self, power_switch: PowerSwitch) -> None:
         self.check_deadline_and_cancel(power_switch)
 
+    def test_every_answer_and_error_is_of_its_type(self, power_switch: PowerSwitch) -> None:
+        self.check_types(
+            "power_switch",
+            power_switch,
+            lambda it: it.channels(deadline=self.soon()),
+            lambda it: it.state(1, deadline=self.soon()),
+            lambda it: it.switch(1, False, deadline=self.soon()),
+        )
+
     def test_closing_leaves_the_relays_as_they_are_and_twice_is_harmless(self, power_switch: PowerSwitch) -> None:
         power_switch.switch(1, False, deadline=self.soon())
         self.check_closes_twice(power_switch)

@@ -10,6 +10,7 @@ import pytest
 
 from hal.conformance.device import DeviceConformance
 from hal.deadline import in_seconds
+from hal.driver_calls import Caller
 from hal.errors import DeviceRefused, DeviceTimeout
 from hal.interfaces import Projector
 from hal.values import Power, ProjectorStatus
@@ -87,6 +88,10 @@ class ProjectorConformance(DeviceConformance):
         self.check_deadline_and_cancel(projector)
         with pytest.raises(DeviceTimeout):
             projector.status(deadline=in_seconds(-1.0))
+
+    def test_every_answer_and_error_is_of_its_type(self, projector: Projector) -> None:
+        assert Caller("The driver under test").device("projector", projector).capabilities == projector.capabilities
+        self.check_types("projector", projector, lambda it: it.status(deadline=self.soon()))
 
     def test_closing_twice_is_harmless(self, projector: Projector) -> None:
         self.check_closes_twice(projector)

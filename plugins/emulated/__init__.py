@@ -1,1 +1,1 @@
-"""Emulated devices that misbehave like real ones, and the optical bench behind them."""
+"""Emulated devices that misbehave like real ones, on an optical bench. Entry: `bench.DRIVER`."""

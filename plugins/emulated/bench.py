@@ -19,17 +19,13 @@ from typing import Any, Final
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
-from plugins.emulated.bench_usb import UsbDevices, read_usb
-from plugins.emulated.bumps import bumps_of, write_bumps
-from plugins.emulated.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.mains import Mains, boot_times, check_mains
-from plugins.emulated.objects import load_object
-from plugins.emulated.ptp_body import CameraNames
-from plugins.emulated.ptp_camera import EmulatedPtpCamera
-from plugins.emulated.quick_profile import quick_profile
-from plugins.emulated.scenario import ScenarioPlayer, read_scenario
-from plugins.emulated.serial_projector import EmulatedSerialProjector
-from plugins.emulated.staging import (
+from hal.runtime.files import read_text
+from plugins.emulated.cameras.body import CameraNames
+from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
+from plugins.emulated.optics.bumps import bumps_of, write_bumps
+from plugins.emulated.optics.objects import load_object
+from plugins.emulated.optics.staging import (
     FAST_LAMP,
     FAST_PROFILE,
     INTRINSICS,
@@ -38,10 +34,15 @@ from plugins.emulated.staging import (
     random_truth,
     size_named,
 )
-from plugins.emulated.stands import SETTINGS, Stands, read_stands
-from plugins.emulated.truth import FOLDER, CameraTruth, ObjectTruth, read_truth, write_truth
-from plugins.emulated.usb_stage_camera import STAGE_CAMERA, Exposures
-from plugins.emulated.world import World, object_of
+from plugins.emulated.optics.stands import SETTINGS, Stands, read_stands
+from plugins.emulated.optics.truth import FOLDER, CameraTruth, ObjectTruth, read_truth, write_truth
+from plugins.emulated.optics.world import World, object_of
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
+from plugins.emulated.projectors.quick_profile import quick_profile
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.emulated.scenario import ScenarioPlayer, read_scenario
+from plugins.emulated.usb.bench import UsbDevices, read_usb
 
 OBJECT_FILE: Final = f"{FOLDER}/object.npz"
 DEVICE_FAILED: Final = 3
@@ -63,25 +64,25 @@ class EmulatedBench:
         """
         size_named(size)
         kept = ObjectTruth("vase-and-bust", "", seed)
-        thing = None
+        stage_object = None
         if object_file is not None:
-            thing = load_object(object_file)
+            stage_object = load_object(object_file)
             kept = ObjectTruth("mesh", OBJECT_FILE, seed)
-        shape = thing if thing is not None else object_of(stage, kept)
+        shape = stage_object if stage_object is not None else object_of(stage, kept)
         truth = random_truth(size, seed, shape, kept, _free_ports(), self._stands)
         profile = quick_profile(LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s), stable_s=FAST_LAMP.stable_s)
         with _explained(stage):
             for folder in (FOLDER, "run"):
                 (stage / folder).mkdir(parents=True, exist_ok=True)
-            if thing is not None:
-                thing.save(stage / OBJECT_FILE)
+            if stage_object is not None:
+                stage_object.save(stage / OBJECT_FILE)
             (stage / FAST_PROFILE).write_text(profile, encoding="utf-8")
             write_truth(stage, truth)
             (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
         return device_tables(truth, shape)
 
     def disturb(self, stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:
-        """``changes``: tables of bench/bumps.toml (``plugins.emulated.bumps``). Raises as ``read_bumps``."""
+        """``changes``: tables of bench/bumps.toml (``plugins.emulated.optics.bumps``). Raises as ``read_bumps``."""
         bumps = bumps_of(changes, read_truth(stage))
         with _explained(stage):
             write_bumps(stage, *bumps.bump)
@@ -91,7 +92,7 @@ class EmulatedBench:
 
         ``scenario``: a script of faults, instead of the one in bench.toml; relative to the working folder.
         """
-        out = _Lines(json_lines)
+        out = _OutputLines(json_lines)
         stopped = threading.Event()
         with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
             try:
@@ -112,7 +113,7 @@ class _Interrupted(Exception):
     """A signal came before everything was up."""
 
 
-class _Lines:
+class _OutputLines:
     """Tells a person, or a machine, what is served."""
 
     def __init__(self, json_lines: bool) -> None:
@@ -138,7 +139,7 @@ class _Lines:
         self.say({"environment": dict(variables)}, f"To see the USB devices, begin commands with: {words}")
 
     def mains(self, projector: str, on: bool, damages: int) -> None:
-        hurt = f" Its lamp was cut hot, {damages} times so far." if damages else ""
+        hurt = f" Its lamp was switched off hot, {damages} times so far." if damages else ""
         self.say(
             {"mains": projector, "on": on, "damages": damages},
             f"Projector {projector} {'has' if on else 'has no'} mains.{hurt}",
@@ -155,7 +156,7 @@ class _Lines:
 
 
 def _start(
-    stage: Path, out: _Lines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
+    stage: Path, out: _OutputLines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
 ) -> World:
     """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
     truth, usb = read_truth(stage), read_usb(stage)
@@ -191,9 +192,9 @@ def _start(
         out.served("camera", "camera", camera.address)
     out.served("display", "display", str(stage / truth.frames))
     if usb:
-        told = stack.enter_context(Exposures(world.expose)).camera(truth.camera) if on_usb else None
-        text = script.read_text(encoding="utf-8") if script is not None else ""
-        bus = stack.enter_context(UsbDevices(usb, text, stage_camera=told))
+        camera_settings = stack.enter_context(ExposureServer(world.expose)).camera(truth.camera) if on_usb else None
+        text = read_text(script) if script is not None else ""
+        bus = stack.enter_context(UsbDevices(usb, text, stage_camera=camera_settings))
         for device in usb:
             out.served(device.name, device.kind, "usb")
         stack.enter_context(Mains(truth.mains, wires, bus.moves, out.mains))
@@ -214,18 +215,18 @@ def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:
     )
 
 
-def _follow_bumps(world: World, out: _Lines) -> None:
+def _follow_bumps(world: World, out: _OutputLines) -> None:
     try:
         count = world.follow_bumps()
     except DeviceError as error:  # somebody is writing it, or wrote it wrongly: the stage stays as it was
         out.failed(error)
         return
     if count is not None:
-        out.say({"bumps": count}, f"The stage is as it was set up, but for {count} bumps.")
+        out.say({"bumps": count}, f"The stage is as it was set up, except for {count} bumps.")
 
 
 def _free_ports() -> tuple[int, int]:
-    """Two TCP ports that nobody listens on now. The stage keeps them while no bench serves it, so they are none of
+    """Two TCP ports without a listener. The stage keeps them while no bench serves it, so they are none of
     those that the system gives to whoever asks for any.
     """
     in_any_order = secrets.SystemRandom().sample(PORTS, len(PORTS))
@@ -248,8 +249,8 @@ def _require_free(*ports: int) -> None:
         except OSError as error:
             raise DeviceError(
                 "port-in-use",
-                what=f"The camera's TCP port {port} can't be served: {os.strerror(error.errno or 0)}.",
-                remedy="End the program that uses it (another bench, perhaps), or prepare the stage anew.",
+                what=f"The camera's TCP port {port} can't be used: {os.strerror(error.errno or 0)}.",
+                remedy="End the program that uses it (perhaps another bench), or prepare the stage again.",
             ) from error
 
 

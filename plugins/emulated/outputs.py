@@ -34,7 +34,7 @@ POLL_S: Final = 0.004
 
 
 @dataclass(frozen=True, slots=True)
-class FrameSet:
+class VisibleFrameSet:
     """Frames (rows, columns, 3) uint8 by output name, presented together at ``presented_at_s`` (monotonic clock)."""
 
     sequence: int
@@ -47,9 +47,9 @@ class FrameReader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._last: tuple[tuple[int, int], FrameSet] | None = None
+        self._last: tuple[tuple[int, int], VisibleFrameSet] | None = None
 
-    def latest(self) -> FrameSet | None:
+    def latest(self) -> VisibleFrameSet | None:
         """The newest frame set, the same object while it is unchanged; None while there is no (valid) file.
 
         A set that is being written while we read is read again; when the writer never pauses, the last whole one stays.
@@ -61,7 +61,7 @@ class FrameReader:
             self._last = None
             return None
 
-    def _read(self, handle: int) -> FrameSet | None:
+    def _read(self, handle: int) -> VisibleFrameSet | None:
         status = os.fstat(handle)
         identity = (status.st_dev, status.st_ino)
         known = self._last[1] if self._last is not None and self._last[0] == identity else None
@@ -78,7 +78,7 @@ class FrameReader:
                 if after is not None and after[1] == sequence:
                     if frames is None:
                         return None
-                    found = FrameSet(sequence, presented_at_s, frames)
+                    found = VisibleFrameSet(sequence, presented_at_s, frames)
                     self._last = (identity, found)
                     return found
             time.sleep(0.0005)
@@ -118,7 +118,7 @@ class VisibleFrames:
         self._reader = FrameReader(path)
         self._latency_s = latency_s
         self._lock = threading.Lock()
-        self._history: deque[tuple[float, FrameSet | None]] = deque([(0.0, None)], maxlen=KEPT)
+        self._history: deque[tuple[float, VisibleFrameSet | None]] = deque([(0.0, None)], maxlen=KEPT)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._poll, name="outputs", daemon=True)
 
@@ -140,14 +140,14 @@ class VisibleFrames:
                 at = time.monotonic() if found is None else found.presented_at_s
                 self._history.append((max(at + self._latency_s, self._history[-1][0]), found))
 
-    def during(self, start_s: float, end_s: float) -> list[tuple[float, FrameSet | None]]:
+    def during(self, start_s: float, end_s: float) -> list[tuple[float, VisibleFrameSet | None]]:
         """The sets that were visible between two times, with their shares of that time (sum 1); None is no picture."""
         self.look()
         with self._lock:
             history = list(self._history)
         if end_s <= start_s:
             end_s = start_s + 1e-9
-        shares: list[tuple[float, FrameSet | None]] = []
+        shares: list[tuple[float, VisibleFrameSet | None]] = []
         for index, (since, frames) in enumerate(history):
             # What was shown before the oldest set we know is forgotten; the oldest stands in for it.
             begin = start_s if index == 0 else max(since, start_s)

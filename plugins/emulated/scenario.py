@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Protocol
 
 from hal.errors import DeviceError
-from plugins.emulated.lamp import EmulatedLamp
+from hal.runtime.files import read_text
+from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.tables import Between, load
 
 _WIRE: Final[dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]] = {
@@ -30,16 +31,16 @@ _WIRE: Final[dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]] =
     "busy": ({"busy": True}, {"busy": False}, {}),
 }
 """What to set at the beginning and at the end of an event, and for an event of a single answer."""
-LAMP_DEEDS: Final = ("lamp-failure", "overheat")
+LAMP_ACTIONS: Final = ("lamp-failure", "overheat")
 ONCE: Final = (*(deed for deed, (_, _, once) in _WIRE.items() if once), "slow")
-"""What hits a single answer where an event does not say for how long."""
-DEEDS: Final = (*_WIRE, "slow", *LAMP_DEEDS, "unplug")
+"""What affects a single answer where an event does not give a duration."""
+ACTIONS: Final = (*_WIRE, "slow", *LAMP_ACTIONS, "unplug")
 _NEVER: Final = -1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
-    """One fault. ``do`` is one of ``DEEDS``, ``device`` the name of one of the bench's ("": each of them).
+class FaultEvent:
+    """One fault. ``do`` is one of ``ACTIONS``, ``device`` the name of one of the bench's ("": each of them).
 
     When: ``at_s`` since the start, at the ``on_byte``-th byte or ``on_message``-th message that it hears (from 1), or
     with ``probability`` at each message. How long: ``for_s`` seconds; 0 is one answer (silence, garbage, cut, slow),
@@ -60,7 +61,7 @@ class Event:
 class Scenario:
     """A script of faults; the same ``seed`` rolls the same dice."""
 
-    event: tuple[Event, ...]
+    event: tuple[FaultEvent, ...]
     seed: Annotated[int, Between(0, 2**63 - 1)] = 1
 
 
@@ -70,7 +71,7 @@ class Knobs(Protocol):
     def set(self, **knobs: Any) -> None: ...
 
 
-class Plug(Protocol):
+class UsbPort(Protocol):
     """What can be unplugged."""
 
     def unplug(self) -> None: ...
@@ -82,8 +83,8 @@ def parse_scenario(text: str, *, file: str) -> Scenario:
     """Read a scenario. Raises DeviceError as ``tables.load``, or ``scenario-wrong`` for an event that can't happen."""
     scenario = load(text, Scenario, file=file)
     for number, event in enumerate(scenario.event, start=1):
-        if event.do not in DEEDS:
-            raise _wrong(file, number, f"{event.do!r} is not one of {', '.join(DEEDS)}")
+        if event.do not in ACTIONS:
+            raise _wrong(file, number, f"{event.do!r} is not one of {', '.join(ACTIONS)}")
         whens = (event.at_s >= 0.0, event.on_byte > 0, event.on_message > 0, event.probability > 0.0)
         if sum(whens) != 1:
             raise _wrong(file, number, "it needs exactly one of at_s, on_byte, on_message, probability")
@@ -93,12 +94,12 @@ def parse_scenario(text: str, *, file: str) -> Scenario:
 def read_scenario(path: Path) -> Scenario:
     """Read a scenario file. Raises as ``parse_scenario``, or DeviceError("scenario-missing")."""
     try:
-        return parse_scenario(path.read_text(encoding="utf-8"), file=str(path))
+        return parse_scenario(read_text(path), file=str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise DeviceError(
             "scenario-missing",
             what=f"The scenario {path} can't be read.",
-            remedy="Correct scenario in bench.toml, or leave it out.",
+            remedy="Correct scenario in bench.toml, or remove it.",
         ) from error
 
 
@@ -121,7 +122,7 @@ class ScenarioPlayer:
         device: str,
         faults: Knobs,
         lamp: EmulatedLamp | None = None,
-        plug: Plug | None = None,
+        plug: UsbPort | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._events = [event for event in scenario.event if event.device in ("", device)]
@@ -154,16 +155,16 @@ class ScenarioPlayer:
             if due or (event.probability and self._dice.random() < event.probability):
                 self._begin(event, now_s)
 
-    def _begin(self, event: Event, now_s: float) -> None:
+    def _begin(self, event: FaultEvent, now_s: float) -> None:
         self.told.append((now_s, event.do))
         begin, end = self._deed(event)
         begin()
         if event.for_s and end is not None:
             self._ends.append((now_s + event.for_s, end))
 
-    def _deed(self, event: Event) -> tuple[Callable[[], None], Callable[[], None] | None]:
+    def _deed(self, event: FaultEvent) -> tuple[Callable[[], None], Callable[[], None] | None]:
         """How an event begins and ends."""
-        if event.do in LAMP_DEEDS:
+        if event.do in LAMP_ACTIONS:
             if self._lamp is None:
                 return (lambda: None), None
             return (self._lamp.fail if event.do == "lamp-failure" else self._lamp.overheat), self._lamp.mend

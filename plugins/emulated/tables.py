@@ -49,7 +49,7 @@ def load(text: str, kind: type[Table], *, file: str) -> Table:
         raise DeviceError(
             "bench-file-unreadable",
             what=f"{file} is not valid TOML: {error}.",
-            remedy="Mend that line, or prepare the stage anew.",
+            remedy="Correct that line, or prepare the stage again.",
         ) from error
     return _Reader(text, file).table(content, kind, ())
 
@@ -136,7 +136,7 @@ class _Reader:
         return DeviceError(
             f"bench-key-{code}",
             what=f"{self._file}, line {self._line(path)}: the key {key} {what}.",
-            remedy="Correct that line, or prepare the stage anew.",
+            remedy="Correct that line, or prepare the stage again.",
         )
 
     def _line(self, path: Path_) -> int:

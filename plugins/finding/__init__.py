@@ -1,1 +1,1 @@
-"""What looks for devices, one file a bus (``hal.finding``)."""
+"""What looks for devices, one module per bus (`hal.finding`). Entry: `FINDER` in each module."""

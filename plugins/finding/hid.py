@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from hal import hid_light, hid_relay
+from hal.codecs.hid import light as hid_light
+from hal.codecs.hid import relay as hid_relay
+from hal.codecs.ptp.values import printable
 from hal.deadline import Cancelled, Deadline
 from hal.errors import DeviceError, DeviceTimeout
 from hal.finding import Finder, Found, Problem, Wanted
-from hal.ptp import printable
 from plugins.finding.access import forbidden, holders
-from plugins.hid_link import BACKENDS, HidHandle
+from plugins.hid.link import BACKENDS, HidHandle
 from plugins.worker_link import WorkerLink
 
 RULES: Final = "70-velatura-hid.rules"

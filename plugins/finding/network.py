@@ -7,14 +7,14 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from hal.codecs.projectors.pjlink import PORT
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.finding import Finder, Found, Problem, Wanted
 from hal.links import host_and_port
-from hal.pjlink import PORT
 from hal.registry import OpenContext
-from plugins.pjlink_listener import PjLinkListener
-from plugins.pjlink_projector import open_pjlink_projector
+from plugins.projectors.pjlink import open_pjlink_projector
+from plugins.projectors.pjlink_listener import PjLinkListener
 
 ANSWER_S: Final = 8.0
 

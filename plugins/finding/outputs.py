@@ -9,10 +9,10 @@ import subprocess
 from collections.abc import Sequence
 from typing import Final
 
+from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceTimeout
 from hal.finding import Finder, Found, Problem, Wanted
-from hal.ptp import printable
 
 PATIENCE_S: Final = 5.0
 _OUTPUT: Final = re.compile(

@@ -16,16 +16,16 @@ from typing import Any, Final
 
 from serial.tools import list_ports
 
+from hal.codecs.projectors.profiles import ProjectorProfile
+from hal.codecs.projectors.serial_protocol import Answer, Reply, head_bytes, parse_line, query_bytes, rest_bytes
+from hal.codecs.projectors.serial_table import Query, SerialTable
+from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
 from hal.finding import Finder, Found, Problem, Wanted
-from hal.profiles import ProjectorProfile
-from hal.ptp import printable
 from hal.serial_link import SerialLink
-from hal.serial_protocol import Answer, Reply, head_bytes, parse_line, query_bytes, rest_bytes
-from hal.serial_table import Query, SerialTable
 from plugins.finding.access import forbidden, holders
-from plugins.profile_files import load_profile, shipped_profiles
+from plugins.projectors.profile_files import load_profile, shipped_profiles
 
 RULES: Final = "70-velatura-serial.rules"
 WRITE_S: Final = 1.0
@@ -75,6 +75,8 @@ def _ports(wanted: Wanted) -> list[Port]:
         ports[str(path.resolve())] = Port(name, path, "named in stage.toml", settings)
     with contextlib.suppress(OSError):
         for path in sorted(wanted.serial_ports.iterdir()):
+            if not path.is_symlink() and not path.is_char_device():
+                continue  # such as the lock beside a link to a pseudo terminal
             ports.setdefault(str(path.resolve()), Port(str(path), path, "serial adapter"))
     for listed in list_ports.comports() if wanted.system_ports else ():
         # Ports of a board that may not be there have no hardware number.
@@ -147,7 +149,7 @@ def _nobody(port: Port, own: ProjectorProfile | None, heard: Heard, written: int
     if heard.anything:
         code = "serial-garbage"
         what = f"Something at {port.name} answers, and no profile understands it at any usual rate."
-        remedy = "Look up its commands and write a profile (docs/drivers.md), or it is no projector."
+        remedy = "Look up its commands and write a profile (docs/how-to/projector-profile.md), or it is no projector."
     return Found("serial", port.name, port.what, identity=port.name, problems=(Problem(code, what, remedy),))
 
 

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.finding import Finder, Found, Problem, Wanted
-from hal.ptp import printable
 from plugins.finding.access import forbidden, holders, running
-from plugins.ptp_usb_bus import UsbCamera, usb_cameras
+from plugins.ptp.usb.bus import UsbCamera, usb_cameras
 
 RULES: Final = "70-velatura-camera.rules"
 MONITORS: Final = ("gvfs-gphoto2-volume-monitor", "gvfsd-gphoto2", "gphoto2", "digikam", "darktable", "entangle")

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from nacl.signing import SigningKey
 
-from controller.bundle.format import Hint
+from controller.bundle.format import PlaylistEntry
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, NewLive, write_bundle
-from controller.errors import BundleError
+from controller.core.errors import BundleError
 
 KEY = SigningKey(bytes(range(32)))
 TRUSTED = [bytes(KEY.verify_key)]
@@ -49,7 +49,8 @@ def write(path: Path) -> None:
     rising = np.arange(40, dtype=np.uint8)[:, None, None]
     ramp = {name: np.tile(rising[:rows], (1, columns, 3)) for name, columns, rows in OUTPUTS}
     write_bundle(
-        path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS, key=KEY, schedule=[Hint("ramp", 900, 9)],
+        path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS, key=KEY,
+        schedule=[PlaylistEntry("ramp", 900, 9)],
         appearances=[NewAppearance("noise", noise), NewAppearance("ramp", ramp, b"\x89PNG\r\n\x1a\n" + bytes(99))],
         live=NewLive((5, 4), {"gain": random.random((4, 5, 3)).astype(np.float16)}),
     )  # fmt: skip

@@ -27,16 +27,16 @@ from typing import Any, Final, Protocol
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.values import ExposureSettings
-from plugins.emulated.ptp_camera import EmulatedPtpCamera
-from plugins.emulated.ptp_usb_camera import numbered_files
-from plugins.emulated.shot import ShotFiles, ShotSettings
-from plugins.emulated.usb_bus import environment
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.ptp_link import PtpLink
-from plugins.ptp_shot import Timing
-from plugins.ptp_still import PtpCamera
-from plugins.ptpip import PtpIpLink
-from plugins.ptpip_wire import PtpIpAddress
+from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.cameras.usb_camera import numbered_files
+from plugins.emulated.usb.bus import environment
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.ptp.ip.link import PtpIpLink
+from plugins.ptp.ip.wire import PtpIpAddress
+from plugins.ptp.link import PtpLink
+from plugins.ptp.shot import Timing
+from plugins.ptp.still import PtpCamera
 
 FLAVOURS: Final = ("generic", "eos-new", "eos-old")
 CAMERAS: Final = tuple(f"{bus} {flavour}" for bus in ("network", "usb") for flavour in FLAVOURS)
@@ -130,7 +130,7 @@ class UsbBench:
         bus.set("camera", "pipe_faults.away_s", 0.02)
 
     def connect(self) -> Callable[[Any], PtpLink]:
-        from plugins.ptp_usb_bus import UsbAddress, UsbFinder
+        from plugins.ptp.usb.bus import UsbAddress, UsbFinder
 
         return UsbFinder(UsbAddress()).connect
 

@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from plugins.emulated.ptp_camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.ptp_usb_camera import numbered_files
-from plugins.emulated.shot import ShotFiles, ShotSettings
-from plugins.emulated.usb_bus import environment
-from plugins.emulated.usb_bus_process import UsbBusProcess
+from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
+from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.cameras.usb_camera import numbered_files
+from plugins.emulated.usb.bus import environment
+from plugins.emulated.usb.process import UsbBusProcess
 
 __all__ = ["FLAVOURS", "SIZE", "Flavour", "Peer", "Way", "network_peer", "usb_peer"]
 

@@ -48,19 +48,22 @@ PORTS: Final = ("command_port", "event_port")
 
 def work(stage: Path) -> int:
     """What a person would type, and type again: calibrate unless that is done, then the appearance."""
-    from controller.calibrations import finished_calibrations
     from controller.capture import latency
-    from controller.services import calibrate, make_appearances
-    from controller.session import camera_steps, capturing, shots
-    from controller.session.progress import Silent
+    from controller.run.progress import Silent
+    from controller.services.calibrate import calibrate, make_appearances
+    from controller.stage.calibrations import finished_calibrations
+    from controller.stage.session import OwnSession
+    from controller.steps.capture import camera as camera_steps
+    from controller.steps.capture import patterns as capturing
+    from controller.steps.capture import photographs as shots
 
     for module in (latency, camera_steps, capturing, shots):
         vars(module)["LONGEST_S"] = LONGEST_S
     print(BEGUN, flush=True)
     cancel = threading.Event()
     if not finished_calibrations(stage):
-        calibrate(stage=stage, reporter=Silent(), cancel=cancel)
-    make_appearances(stage=stage, names=(APPEARANCE,), reporter=Silent(), cancel=cancel)
+        calibrate(session=OwnSession(stage), reporter=Silent(), cancel=cancel)
+    make_appearances(session=OwnSession(stage), names=(APPEARANCE,), reporter=Silent(), cancel=cancel)
     print(DONE, flush=True)
     return 0
 
@@ -101,7 +104,12 @@ class Nursery:
 
 def nursery() -> int:
     """Fork what each line asks for, and print its number; nothing here has threads."""
-    for name in ("controller.services", "plugins.player_display", "plugins.ptp_camera", "plugins.serial_projector"):
+    for name in (
+        "controller.services.calibrate",
+        "plugins.display.player",
+        "plugins.ptp.camera",
+        "plugins.projectors.serial",
+    ):
         importlib.import_module(name)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     for line in sys.stdin:

@@ -23,12 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.demo import stage as demo_stage
-from plugins.emulated import bench, staging
-from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
-from plugins.emulated.shot import ShotFiles, ShotSettings
-from plugins.emulated.staging import Size
-from plugins.emulated.stands import Stands
-from plugins.emulated.world import World
+from plugins.emulated import bench
+from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.optics import staging
+from plugins.emulated.optics.staging import Size
+from plugins.emulated.optics.stands import Stands
+from plugins.emulated.optics.world import World
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 
 MINI: Final = Size((116, 88), (324, 216), 2)
 PROJECTORS: Final = 2

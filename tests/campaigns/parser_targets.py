@@ -13,13 +13,19 @@ from pathlib import Path
 from controller.bundle import format as bundle_format
 from controller.bundle.index import parse_index
 from controller.config import load_stage
-from controller.errors import BundleError, UsageError
-from hal import hid_light, hid_relay, pjlink, pjlink_udp, ptp, ptp_eos, ptp_ip, ptp_usb
+from controller.core.errors import BundleError, UsageError
+from hal.codecs.hid import light as hid_light
+from hal.codecs.hid import relay as hid_relay
+from hal.codecs.projectors import pjlink, pjlink_udp
+from hal.codecs.projectors.profiles import parse_profile
+from hal.codecs.projectors.serial_protocol import parse_hours, parse_line
+from hal.codecs.ptp import eos as ptp_eos
+from hal.codecs.ptp import ip as ptp_ip
+from hal.codecs.ptp import usb as ptp_usb
+from hal.codecs.ptp import values as ptp
+from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
 from hal.errors import ProtocolError
-from hal.profiles import parse_profile
-from hal.ptp_datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
-from hal.serial_protocol import parse_hours, parse_line
-from plugins.profile_files import load_profile, shipped_profiles
+from plugins.projectors.profile_files import load_profile, shipped_profiles
 
 FOLDER = Path(__file__).parents[2] / "firmware_configs" / "projectors"
 PTP_NUMBERS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0x4002, 0x4004, 0x4006, 0xFFFF)
@@ -67,7 +73,7 @@ def _ptp_dataset(data: bytes) -> None:
     if which == 5:
         ptp.parse_handles(rest)
     elif which == 4 and rest:
-        from hal.ptp_datasets import parse_value
+        from hal.codecs.ptp.datasets import parse_value
 
         parse_value(rest[1:], PTP_NUMBERS[rest[0] % len(PTP_NUMBERS)])
     else:

@@ -22,9 +22,9 @@ from typing import Final
 import numpy as np
 
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.play.launch import PlayerSettings, start_player
+from controller.play.control.launch import PlayerSettings, start_player
+from tests.controller.play.display.xorg import CONNECTORS, HEIGHT, WIDTH, running_server
 from tests.controller.play.wire import Frames, Pictures, Wire, noise
-from tests.controller.play.xorg import CONNECTORS, HEIGHT, WIDTH, running_server
 
 NAMES: Final = ("P1", "P2", "P3")
 APPEARANCES: Final = 80

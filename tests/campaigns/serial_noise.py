@@ -26,15 +26,15 @@ from hal.errors import DeviceError
 from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
-from plugins.emulated.optoma import OptomaBoard
-from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
-from plugins.emulated.quick_profile import quick_profile
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
+from plugins.emulated.projectors.optoma import OptomaBoard
+from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from plugins.emulated.projectors.quick_profile import quick_profile
+from plugins.emulated.projectors.serial import Board, EmulatedSerialProjector
 from plugins.emulated.scenario import ScenarioPlayer, parse_scenario
-from plugins.emulated.serial_projector import Board, EmulatedSerialProjector
-from plugins.pjlink_projector import open_pjlink_projector
-from plugins.serial_projector import open_serial_projector
-from tests.plugins.boards import BOARDS as OTHERS
+from plugins.projectors.pjlink import open_pjlink_projector
+from plugins.projectors.serial import open_serial_projector
+from tests.plugins.projectors.boards import BOARDS as OTHERS
 
 BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {"optoma-later": OptomaBoard, **OTHERS}
 FAMILIES = (*BOARDS, "pjlink")

@@ -7,8 +7,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.controller.serve.matrix import cases, judge
-from tests.controller.serve.model import Kiosk
+from tests.controller.kiosk.matrix import cases, judge
+from tests.controller.kiosk.model import Kiosk
 
 
 def main() -> int:

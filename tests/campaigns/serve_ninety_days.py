@@ -23,9 +23,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
-from controller.panel.kiosk import Schedule, ScheduleRow
-from controller.session.machine import State
-from tests.controller.serve.model import NAMES, Kiosk
+from controller.kiosk.interface import Schedule, ScheduleRow
+from controller.run.state_machine import State
+from tests.controller.kiosk.model import NAMES, Kiosk
 
 VIENNA = ZoneInfo("Europe/Vienna")
 HOURS = {"tue": ("10:00", "18:00"), "wed": ("10:00", "18:00"), "thu": ("10:00", "21:00"), "fri": ("18:00", "01:30"),

@@ -25,10 +25,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
-from controller.errors import WorkError
-from controller.panel.kiosk import EventRow
-from controller.serve.ports import Request
-from controller.session.machine import State
+from controller.core.errors import WorkError
+from controller.kiosk.decide.interfaces import Request
+from controller.kiosk.interface import EventRow
+from controller.run.state_machine import State
 from tests.campaigns.kills import REPOSITORY, copy
 from tests.campaigns.usb_faults import WORDS, mend_usb, tether_faults, usb_faults, usb_well
 from tests.campaigns.wired_faults import Fault, camera_faults, deeds, mend_projectors, processes, wire_faults

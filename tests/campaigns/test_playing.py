@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.campaigns.playing import Found, in_memory, in_windows
-from tests.controller.play.xorg import HEIGHT, WIDTH
+from tests.controller.play.display.xorg import HEIGHT, WIDTH
 
 
 def check(found: Found, swaps: int) -> None:

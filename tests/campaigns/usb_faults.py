@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from plugins.emulated.scenario import ONCE
-from plugins.emulated.usb_bus_device import EmulatedUsbDevice, UsbFaults
-from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
-from plugins.emulated.usb_bus_scenario import DEEDS
+from plugins.emulated.usb.device import EmulatedUsbDevice, UsbFaults
+from plugins.emulated.usb.process import KINDS, UsbBusProcess
+from plugins.emulated.usb.scenario import USB_ACTIONS
 from tests.campaigns.wired_faults import FOR_S, SLOW_S, Fault, Turn, goes_on, how_long, mend_projectors, values_of
 from tests.campaigns.wired_kiosk import TETHER, TETHER_KNOBS, USB, WiredKiosk
 
@@ -79,7 +79,7 @@ def _wrongs(name: str) -> Iterator[Fault]:
 
 
 def _deeds(name: str) -> Iterator[Fault]:
-    for deed in DEEDS:
+    for deed in USB_ACTIONS:
         for for_s in (FOR_S, 0.0):
             event = f'[[event]]\ndo = "{deed}"\nat_s = 0.0\nfor_s = {for_s}\ndelay_s = {SLOW_S}\n'
 

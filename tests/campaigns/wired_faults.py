@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
+from plugins.emulated.cameras.body import CameraFaults
 from plugins.emulated.faults import WireFaults
-from plugins.emulated.ptp_body import CameraFaults
-from plugins.emulated.scenario import DEEDS, ONCE, Event, Scenario, ScenarioPlayer
+from plugins.emulated.scenario import ACTIONS, ONCE, FaultEvent, Scenario, ScenarioPlayer
 from tests.campaigns.wired_kiosk import WiredKiosk
 
 FOR_S: Final = 8.0
@@ -83,13 +83,13 @@ def how_long(deed: str, for_s: float) -> str:
 
 def deeds() -> Iterator[Fault]:
     """What a script may do to a projector, for a while and for good; and to all of them at once."""
-    for deed in DEEDS:
+    for deed in ACTIONS:
         for who in (TARGET, ""):
             for for_s in (FOR_S, 0.0):
 
                 def strike(kiosk: WiredKiosk, do: str = deed, who: str = who, for_s: float = for_s) -> None:
                     for name, wire in kiosk.projectors.items():
-                        scenario = Scenario((Event(do, who, at_s=0.0, for_s=for_s, delay_s=SLOW_S),))
+                        scenario = Scenario((FaultEvent(do, who, at_s=0.0, for_s=for_s, delay_s=SLOW_S),))
                         wire.scenario = ScenarioPlayer(
                             scenario, device=name, faults=wire.faults, lamp=kiosk.lamps[name], plug=wire
                         )

@@ -18,20 +18,20 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from benchmarks.serve import install_grey
-from controller.serve import service as services
-from controller.serve.conductor import Limits
-from controller.serve.service import Service, serving
-from controller.session.machine import State
-from plugins.emulated.lamp import LampTiming
-from plugins.emulated.mains import Mains
-from plugins.emulated.ptp_body import CameraFaults, CameraNames
-from plugins.emulated.ptp_camera import EmulatedPtpCamera
-from plugins.emulated.ptp_usb_camera import UsbCameraFaults
-from plugins.emulated.serial_projector import EmulatedSerialProjector
-from plugins.emulated.truth import MainsTruth, read_truth
-from plugins.emulated.usb_bus import environment
-from plugins.emulated.usb_bus_process import KINDS, UsbBusProcess
-from plugins.emulated.usb_stage_camera import STAGE_CAMERA, Exposures
+from controller.kiosk import service as services
+from controller.kiosk.decide.reconciler import Limits
+from controller.kiosk.service import Service, serving
+from controller.run.state_machine import State
+from plugins.emulated.cameras.body import CameraFaults, CameraNames
+from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.cameras.usb_camera import UsbCameraFaults
+from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
+from plugins.emulated.optics.truth import MainsTruth, read_truth
+from plugins.emulated.projectors.lamp import LampTiming
+from plugins.emulated.projectors.mains import Mains
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.emulated.usb.bus import environment
+from plugins.emulated.usb.process import KINDS, UsbBusProcess
 from tests.campaigns.kills import children
 from tests.campaigns.mini_stage import HonestLamp, SteadyWorld, prepare_mini
 
@@ -170,7 +170,7 @@ class WiredKiosk:
                 own = getattr(KINDS[settings["kind"]], "wrongs", {})
                 self.well[name] = {knob: bus.get(name, knob) for knob in own}
             if self._tethered:
-                exposures = stack.enter_context(Exposures(self._world.expose))
+                exposures = stack.enter_context(ExposureServer(self._world.expose))
                 bus.add(TETHER, STAGE_CAMERA, **exposures.camera(self._camera))
                 knobs = [f"{path}.{knob.name}" for path, kind in TETHER_KNOBS.items() for knob in fields(kind)]
                 self.well[TETHER] = {knob: bus.get(TETHER, knob) for knob in knobs}

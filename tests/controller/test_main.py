@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-import types
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,8 +16,8 @@ import pytest
 import typer
 
 from controller import __main__ as shell
-from controller.errors import CalibrationError, UsageError
-from controller.session.machine import TRANSITIONS
+from controller.core.errors import CalibrationError, UsageError
+from controller.run.state_machine import TRANSITIONS
 from hal.deadline import Cancelled
 from hal.errors import DeviceGone
 
@@ -29,7 +28,11 @@ def trial(
     kind: Annotated[str, typer.Argument()] = "", as_json: shell.Json = False, times: Annotated[int, typer.Option()] = 1
 ) -> None:
     """A command for these tests."""
-    shell.work("velatura_trial:trial", as_json=as_json, kind=kind, times=times)
+
+    def do(reporter: Any, cancel: threading.Event) -> dict[str, Any]:
+        return work(kind=kind, times=times, reporter=reporter, cancel=cancel)
+
+    shell.work(do, as_json=as_json)
 
 
 def work(*, kind: str, times: int, reporter: Any, cancel: threading.Event) -> dict[str, Any]:
@@ -53,9 +56,6 @@ def work(*, kind: str, times: int, reporter: Any, cancel: threading.Event) -> di
 
 @pytest.fixture(autouse=True)
 def trial_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    module = types.ModuleType("velatura_trial")
-    module.trial = work  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "velatura_trial", module)
     monkeypatch.setattr(shell, "COMMANDS", (*shell.COMMANDS, trial))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
 

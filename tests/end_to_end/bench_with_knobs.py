@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from plugins.emulated import bench
-from plugins.emulated.lamp import EmulatedLamp
-from plugins.emulated.ptp_camera import EmulatedPtpCamera
-from plugins.emulated.serial_projector import EmulatedSerialProjector
+from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.projectors.lamp import EmulatedLamp
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
 
 PROJECTORS: dict[str, EmulatedSerialProjector] = {}
 CAMERAS: list[EmulatedPtpCamera] = []

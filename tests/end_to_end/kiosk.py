@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from controller.errors import VelaturaError
-from controller.serve.control import ask
+from controller.core.errors import VelaturaError
+from controller.kiosk.api.control import ask
 from tests import waiting
 from tests.end_to_end.program import LONGEST_S
+from tests.ports import free_port
 
 
 def copied(stage: Path, to: Path) -> Path:
@@ -20,7 +22,23 @@ def copied(stage: Path, to: Path) -> Path:
         (os.link if source.endswith((".npz", ".dng")) else shutil.copy2)(source, target)
 
     left = shutil.ignore_patterns("run")
-    return Path(shutil.copytree(stage, to, symlinks=True, copy_function=keep, ignore=left))
+    copy = Path(shutil.copytree(stage, to, symlinks=True, copy_function=keep, ignore=left))
+    with_ports_of_its_own(copy)
+    return copy
+
+
+def with_ports_of_its_own(stage: Path) -> Path:
+    """``stage``, a copy: copies are served at the same time, by several workers."""
+    bench, described = stage / "bench.toml", stage / "stage.toml"
+    text, wanted = bench.read_text(), described.read_text()
+    for line in re.findall(r"^(?:command|event)_port = \d+$", text, re.MULTILINE):
+        name, _, old = line.partition(" = ")
+        new = free_port()
+        text = text.replace(line, f"{name} = {new}")
+        wanted = re.sub(rf"(?<=:){old}\b", str(new), wanted)
+    bench.write_text(text)
+    described.write_text(wanted)
+    return stage
 
 
 def wait_for(what: Callable[[], bool]) -> None:

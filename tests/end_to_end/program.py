@@ -282,8 +282,8 @@ def asked(run: Path, statement: str) -> list[tuple[Any, ...]]:
 
 
 def shots(run: Path) -> dict[str, float]:
-    """When each photograph was taken."""
-    return dict(asked(run, "SELECT name, taken_at_s FROM shots"))
+    """When each photograph was taken, by its file."""
+    return dict(asked(run, "SELECT path, taken_at_s FROM shots"))
 
 
 def processes_on(stage: Path) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.program import REPOSITORY, Command, velatura, wrong_code
+from tests.end_to_end.program import REPOSITORY, Bench, Command, strikes, velatura, wrong_code
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -37,7 +37,7 @@ MISTAKES = {
     "unknown table": Mistake(
         "[camera]\ndriver", "[light]\n[camera]\ndriver", "stage-key-unknown", "no key 'light'", "[light]"
     ),
-    "not TOML": Mistake("iso = 100", "iso = ", "stage-syntax", "this is not TOML", "iso"),
+    "not TOML": Mistake("iso = 100", "iso = ", "stage-syntax", "is not valid TOML", "iso"),
     "unknown driver": Mistake(
         'driver = "ptp"',
         'driver = "pttp"',
@@ -80,7 +80,7 @@ def test_a_mistake_in_stage_toml_is_named_with_its_line_and_changes_nothing(prep
     before = tree(prepared)
     outcome = velatura("calibrate", prepared)
     assert wrong_code(outcome) == mistake.code
-    found = re.match(r"stage\.toml, line (\d+): ", outcome.error["what"])
+    found = re.match(r"stage\.toml, line (\d+):? ", outcome.error["what"])
     assert found
     assert mistake.says in outcome.error["what"]
     assert mistake.remedy in outcome.error["remedy"]
@@ -174,6 +174,23 @@ def test_a_demo_without_a_disk_to_write_on_leaves_nothing(tmp_path: Path) -> Non
         outcome = demo.outcome()
     assert wrong_code(outcome, code=1) in ("no-space", "stage-not-written")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lens_file_of_other_pictures_is_refused_before_a_lamp_is_struck(prepared: Path) -> None:
+    file = prepared / "camera-intrinsics.toml"
+    text = re.sub(r"width_px = .*", "width_px = 640", file.read_text())
+    file.write_text(re.sub(r"height_px = .*", "height_px = 480", text))
+    with Bench(prepared):
+        outcome = velatura("calibrate", prepared)
+    assert wrong_code(outcome) == "camera-intrinsics-wrong-size"
+    assert "640 x 480" in outcome.error["what"]
+    assert strikes(prepared) == {}
+
+
+def test_a_byte_order_mark_does_not_matter(prepared: Path) -> None:
+    file = prepared / "stage.toml"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert velatura("status", prepared).code == 0
 
 
 def test_projectors_that_are_not_there_are_named_and_no_run_is_begun(prepared: Path) -> None:

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller.checking import check_stage
-from controller.opening import player_settings
-from controller.play.launch import start_player
+from controller.play.control.launch import start_player
+from controller.stage.check import check_stage
+from controller.stage.open import player_settings
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
-from plugins.player_display import DRIVER, PlayerDisplay
+from plugins.display.player import DRIVER, PlayerDisplay
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.program import Record, asked, lamps, processes_on, run_of, shots
 
 APPEARANCES = ["photograph", "new-pattern", "checkerboard", "gloss"]
 pytestmark = pytest.mark.timeout(1200)
-DOCUMENT = Path(__file__).parents[2] / "docs" / "bundle-format.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "bundle-format.md"
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +131,11 @@ def test_a_second_implementation_accepts_the_bundle_as_signed_by_this_stage(fini
     assert all(np.ptp(frame) > 100 for frame in frames)
     with pytest.raises(ValueError, match="not signed by us"):
         reader["read_index"](data, [bytes(32)])
+
+
+def test_every_kernel_it_calls_was_compiled_ahead(finished_demo: FinishedDemo) -> None:
+    """If not: run the demo with VELATURA_CACHE on an empty folder, then ``python -m hal.runtime.kernels record``."""
+    assert finished_demo.compiled == []
 
 
 def test_time_left_is_told_all_the_way_and_comes_down(finished_demo: FinishedDemo) -> None:

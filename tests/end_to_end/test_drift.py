@@ -13,13 +13,14 @@ from typing import Any
 
 import pytest
 
-from controller.drift_services import check_drift, recalibrate
-from controller.errors import CalibrationError
-from controller.services import calibrate, finished_calibration, make_appearances
-from controller.session.grading import graded
-from controller.session.journal import Journal
-from controller.session.progress import Silent
-from plugins.emulated.bumps import Bump, write_bumps
+from controller.artefacts.grade import graded
+from controller.core.errors import CalibrationError
+from controller.run.journal import Journal
+from controller.run.progress import Silent
+from controller.services.calibrate import calibrate, finished_calibration, make_appearances
+from controller.services.recalibrate import check_drift, recalibrate
+from controller.stage.session import OwnSession
+from plugins.emulated.optics.bumps import Bump, write_bumps
 from tests.end_to_end.program import REPOSITORY
 
 LEFT = Bump("projector", "left", shift_px=(1.2, -0.7))
@@ -43,10 +44,12 @@ class Bumpy:
         assert any(key in json.loads(line) for line in self.bench.stdout), "the bench ended"
 
     def drift(self) -> dict[str, Any]:
-        return dict(check_drift(stage=self.stage, details=True, reporter=Silent(), cancel=threading.Event()))
+        return dict(
+            check_drift(session=OwnSession(self.stage), details=True, reporter=Silent(), cancel=threading.Event())
+        )
 
     def recalibrate(self) -> Path:
-        return Path(recalibrate(stage=self.stage, reporter=Silent(), cancel=threading.Event())["run"])
+        return Path(recalibrate(session=OwnSession(self.stage), reporter=Silent(), cancel=threading.Event())["run"])
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +68,7 @@ def bumpy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bumpy]:
     made = Bumpy(stage, bench, stage)
     try:
         made.until("ready")
-        made.first = Path(calibrate(stage=stage, reporter=Silent(), cancel=threading.Event())["run"])
+        made.first = Path(calibrate(session=OwnSession(stage), reporter=Silent(), cancel=threading.Event())["run"])
         yield made
     finally:
         bench.communicate(timeout=20)
@@ -100,14 +103,15 @@ def test_a_turned_projector_is_corrected_without_new_codes_as_well_as_it_was(bum
 def test_one_projector_is_measured_anew_and_the_others_are_kept(bumpy: Bumpy) -> None:
     bumpy.bump(LEFT)
     last = finished_calibration(bumpy.stage)
-    asked = recalibrate(stage=bumpy.stage, projector="left", reporter=Silent(), cancel=threading.Event())
+    asked = recalibrate(session=OwnSession(bumpy.stage), projector="left", reporter=Silent(), cancel=threading.Event())
     run = Path(asked["run"])
     now, then = graded(run), graded(bumpy.first)
     assert now is not None
     assert then is not None
     assert all(percent < 1.2 * then[name] for name, percent in now.items()), (now, then)
-    taken = {path.name.partition("-")[0] for path in (run / "captures").iterdir() if path.stat().st_nlink == 1}
-    assert taken == {"left", "black", "verify"}, "of the others only the grade's pattern is photographed"
+    taken = {path.parent.name for path in (run / "captures").rglob("*.dng") if path.stat().st_nlink == 1}
+    graded_by = {f"verification-photographs-{name}" for name in ("left", "right", "above")}
+    assert taken == {"light-left", "codes-left", "black"} | graded_by, "of the others only the pattern of the grade"
     for name, kept in (("left", False), ("right", True), ("above", True)):
         assert (run / f"pixels-{name}.npz").samefile(last / f"pixels-{name}.npz") is kept
     assert finished_calibration(bumpy.stage) == run
@@ -134,7 +138,9 @@ def test_nothing_is_published_below_the_set_grade_unless_a_person_accepts_it(bum
     settings.write_text(before + "\n[calibration]\nworst_grade = 0.1\n")
     try:
         with pytest.raises(CalibrationError) as caught:
-            make_appearances(stage=bumpy.stage, names=["checkerboard"], reporter=Silent(), cancel=threading.Event())
+            make_appearances(
+                session=OwnSession(bumpy.stage), names=["checkerboard"], reporter=Silent(), cancel=threading.Event()
+            )
         assert caught.value.code == "calibration-below-grade"
         assert "--accept-grade" in caught.value.remedy
         assert not (bumpy.stage / "bundles").exists()

@@ -237,8 +237,8 @@ def test_a_kill_repeats_one_photograph_at_most(story: Story) -> None:
     killed, after = story.chapters["killed"], story.chapters["stopped while photographing"]
     assert len(killed.shots) >= 1
     assert {name: after.shots[name] for name in killed.shots} == killed.shots
-    captures = run_of(story.stage) / "captures"
-    assert {path.stem for path in captures.glob("*.dng")} == set(shots(run_of(story.stage)))
+    final, captures = shots(run_of(story.stage)), run_of(story.stage) / "captures"
+    assert {str(path.relative_to(captures.parent)) for path in captures.rglob("*.dng")} == set(final)
 
 
 def test_a_stopped_solve_goes_on_and_its_appearance_plays(story: Story) -> None:

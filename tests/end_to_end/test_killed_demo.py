@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.end_to_end.kiosk import with_ports_of_its_own
 from tests.end_to_end.program import REPOSITORY, Command, lamps, processes_on
 
 pytestmark = pytest.mark.timeout(600)
@@ -17,6 +18,7 @@ pytestmark = pytest.mark.timeout(600)
 
 def test_a_killed_demos_bench_ends_by_itself_and_the_same_command_goes_on(prepared_once: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(prepared_once, tmp_path / "out"))
+    with_ports_of_its_own(out / "stage")
     with Command("demo", "--out", out) as demo:
         demo.wait_for("Waiting for steady light")
         demo.kill()
@@ -35,6 +37,7 @@ def test_a_killed_demos_bench_ends_by_itself_and_the_same_command_goes_on(prepar
 
 def test_ctrl_c_while_the_bench_starts_ends_both(prepared_once: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(prepared_once, tmp_path / "out"))
+    with_ports_of_its_own(out / "stage")
     with Command("demo", "--out", out) as demo:
         demo.wait_for_message("Starting the bench")
         stopped = demo.interrupt()

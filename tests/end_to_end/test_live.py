@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,13 +13,14 @@ import numpy.typing as npt
 import OpenEXR
 import pytest
 
+from controller.artefacts.calibrated import Calibrated
 from controller.bundle.live_maps import LiveMaps, compensate
 from controller.play.frames import FrameFile, OutputSize
-from controller.session.live_parts import live_maps
-from controller.session.solving import Calibrated
+from controller.steps.appearance.live_parts import live_maps
 from hal.values import Power
 from tests.controller.play.wire import Frames
 from tests.end_to_end.conftest import FinishedDemo
+from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import Bench, Command, lamps, powers, processes_on, strikes, velatura, wrong_code
 from tests.waiting import eventually
 
@@ -31,7 +31,7 @@ Image = npt.NDArray[np.uint8]
 
 @pytest.fixture(scope="module")
 def stage(finished_demo: FinishedDemo, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Path(shutil.copytree(finished_demo.stage, tmp_path_factory.mktemp("live") / "stage", symlinks=True))
+    return copied(finished_demo.stage, tmp_path_factory.mktemp("live") / "stage")
 
 
 def picture(seed: int) -> Image:
@@ -42,7 +42,7 @@ def picture(seed: int) -> Image:
 
 
 def write(folder: Path, name: str, pixels: Image) -> None:
-    """Under another name first, as docs/live.md asks of a writer that can."""
+    """Under another name first, as docs/how-to/live-targets.md asks of a writer that can."""
     assert cv2.imwrite(str(folder / f"new-{name}"), np.ascontiguousarray(pixels[..., ::-1]))
     (folder / f"new-{name}").rename(folder / "pictures" / name)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.demo.bench_process import BenchProcess
-from controller.serve.control import ask
+from controller.kiosk.api.control import ask
+from controller.stage.bench import BenchProcess
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import codes, copied, wait_for
 from tests.end_to_end.program import Command, velatura

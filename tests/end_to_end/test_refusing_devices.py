@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from hal.values import Power
+from tests.end_to_end.kiosk import with_ports_of_its_own
 from tests.end_to_end.program import REPOSITORY, Bench, Command, lamps, powers, velatura, wrong_code
 
 pytestmark = pytest.mark.timeout(600)
@@ -20,6 +21,7 @@ pytestmark = pytest.mark.timeout(600)
 @pytest.fixture(scope="module")
 def served(prepared_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Bench]]:
     out = Path(shutil.copytree(prepared_once, tmp_path_factory.mktemp("served") / "out"))
+    with_ports_of_its_own(out / "stage")
     with Bench(out / "stage") as bench:
         yield out / "stage", bench
 

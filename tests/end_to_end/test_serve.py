@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.serve import NAME, install_grey, wait_for
-from controller.demo.bench_process import BenchProcess
-from controller.serve.control import ask
+from controller.kiosk.api.control import ask
+from controller.stage.bench import BenchProcess
 from tests.end_to_end.program import Command, lamps, processes_on
 
 pytestmark = pytest.mark.timeout(300)

@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.arrays import FloatImage, load_arrays
-from controller.calibrations import finished_calibration
-from controller.checking import check_stage
-from controller.demo.bench_process import BenchProcess
-from controller.serve.control import ask
-from controller.services import make_appearances
-from controller.session.progress import Silent
-from controller.session.solving import Calibrated
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.solved import read_solved
+from controller.core.arrays import FloatImage
+from controller.kiosk.api.control import ask
+from controller.run.progress import Silent
+from controller.services.calibrate import make_appearances
+from controller.stage.bench import BenchProcess
+from controller.stage.calibrations import finished_calibration
+from controller.stage.check import check_stage
+from controller.stage.session import OwnSession
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import codes, copied, wait_for
 from tests.end_to_end.program import Command
@@ -56,7 +58,7 @@ def test_the_others_take_over_for_a_dead_lamp(finished_demo: FinishedDemo, tmp_p
     # One appearance is solved for the others, instead of all.
     (stage / "stage.toml").write_text(f"{head}\n[[appearances]]\n{table}")
     shutil.rmtree(stage / "bundles")
-    make_appearances(stage=stage, names=[NAME], reporter=Silent(), cancel=threading.Event())
+    make_appearances(session=OwnSession(stage), names=[NAME], reporter=Silent(), cancel=threading.Event())
     (stage / "bench" / "dead.toml").write_text(FAULTS)
     bench = stage / "bench.toml"
     text = bench.read_text()
@@ -71,12 +73,15 @@ def test_the_others_take_over_for_a_dead_lamp(finished_demo: FinishedDemo, tmp_p
     run, names = finished_calibration(stage), check_stage(stage).names
     calibrated = Calibrated(run, names)
     black = calibrated.calibration.black
-    whole, left = (load_arrays(folder / f"appearance-{NAME}.npz") for folder in (run, run / "without" / DEAD))
-    dark = np.zeros_like(whole[f"linear-{DEAD}"])
+    whole, left = (
+        read_solved(run, NAME, names),
+        read_solved(run / "without" / DEAD, NAME, [n for n in names if n != DEAD]),
+    )
+    dark = np.zeros_like(whole.linear[DEAD])
     lit = np.logical_or.reduce([calibrated.transport.lit[number] for number, name in enumerate(names) if name != DEAD])
-    where = lit & left["reachable"] & whole["reachable"] & calibrated.calibration.object_mask
+    where = lit & left.reachable & whole.reachable & calibrated.calibration.object_mask
     errors = []
     for frames in (left, whole):
-        light = [dark if name == DEAD else frames[f"linear-{name}"] for name in names]
-        errors.append(error_of(calibrated.transport.forward(light) + black, left["target"], where))
+        light = [dark if name == DEAD else frames.linear[name] for name in names]
+        errors.append(error_of(calibrated.transport.forward(light) + black, left.target, where))
     assert errors[0] < 0.5 * errors[1], "frames solved for the others are no better than the old ones in its absence"

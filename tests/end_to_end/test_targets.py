@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -12,6 +11,7 @@ import OpenEXR
 import pytest
 
 from tests.end_to_end.conftest import FinishedDemo
+from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import asked, run_of, velatura
 
 pytestmark = pytest.mark.timeout(1200)
@@ -21,7 +21,7 @@ CAMERA_PX = (776, 520)
 @pytest.fixture(scope="module")
 def calibrated(finished_demo: FinishedDemo, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the finished demo's stage with pictures of all sorts beside it."""
-    stage = Path(shutil.copytree(finished_demo.stage, tmp_path_factory.mktemp("calibrated") / "stage", symlinks=True))
+    stage = copied(finished_demo.stage, tmp_path_factory.mktemp("calibrated") / "stage")
     width, height = CAMERA_PX
     light = np.full((height, width, 3), 0.3, np.float32)
     light[100:110, 100:120, 1] = np.nan

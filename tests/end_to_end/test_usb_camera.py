@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from plugins.emulated.bench_usb import FILE
-from plugins.emulated.truth import read_truth
+from plugins.emulated.optics.truth import read_truth
+from plugins.emulated.usb.bench import FILE
 from tests.campaigns.mini_stage import prepare_mini
 from tests.campaigns.wired_kiosk import tether
 from tests.end_to_end.program import Command, velatura, wrong_code

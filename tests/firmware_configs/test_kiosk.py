@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from controller.play.__main__ import _parser
-from controller.play.launch import PlayerSettings, start_player
+from controller.play.control.launch import PlayerSettings, start_player
+from tests.controller.play.display.xorg import HEIGHT, WIDTH, running_server
 from tests.controller.play.wire import Wire
-from tests.controller.play.xorg import HEIGHT, WIDTH, running_server
 
 CONFIGS = Path(__file__).parents[2] / "firmware_configs"
 UNITS = CONFIGS / "systemd"

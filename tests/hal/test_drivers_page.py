@@ -1,4 +1,4 @@
-"""The driver made in docs/drivers.md works as it stands there."""
+"""The driver made in docs/tutorials/first-driver.md works as it stands there."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from hal.conformance import ProjectorConformance
 from hal.deadline import in_seconds
 from hal.interfaces import Projector
 from hal.registry import OpenContext, open_device
-from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 
-PAGE = Path(__file__).parents[2] / "docs" / "drivers.md"
+PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "first-driver.md"
 TIMING = LampTiming(warm_up_s=0.1, cool_down_s=0.2)
 POWER = {LampPhase.STANDBY: b"0", LampPhase.LIT: b"1", LampPhase.COOLING: b"2", LampPhase.WARMING: b"3"}
 

@@ -16,7 +16,17 @@ Install = Callable[[str, dict[str, str], str], None]
 
 GOOD = """
 from hal.registry import Driver
-DRIVER = Driver("projector", "{name}", "a test", lambda settings, context, deadline: dict(settings),
+from hal.values import DeviceIdentity
+class Sensor:
+    def __init__(self, settings):
+        self.settings = settings
+    def identity(self, *, deadline):
+        return DeviceIdentity("Acme", self.settings["port"])
+    def illuminance_lux(self, *, deadline):
+        return 1.5
+    def close(self):
+        pass
+DRIVER = Driver("light_sensor", "{name}", "a test", lambda settings, context, deadline: Sensor(settings),
                 {{"port": "where it is plugged in", "baud": "its rate"}}, ("port",))
 """
 
@@ -42,9 +52,9 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
 def test_a_plugin_of_another_distribution_is_found_and_opens(install: Install, tmp_path: Path) -> None:
     install("acme-projectors", {"acme": "vel_acme:DRIVER"}, GOOD.format(name="acme"))
-    driver = load_drivers().get("projector", "acme")
+    driver = load_drivers().get("light_sensor", "acme")
     opened = open_device(driver, {"port": "/dev/ttyUSB0"}, OpenContext(tmp_path), in_seconds(20))
-    assert opened == {"port": "/dev/ttyUSB0"}
+    assert opened.identity(deadline=in_seconds(20)).model == "/dev/ttyUSB0"
 
 
 def test_whoever_needs_no_bench_does_not_load_one(install: Install) -> None:
@@ -62,13 +72,15 @@ def test_whoever_needs_no_bench_does_not_load_one(install: Install) -> None:
         ("NOTHING = 1", "AttributeError"),
         ("from hal.registry import Driver\nDRIVER = Driver('toaster', 'x', '', print)", "kind 'toaster'"),
         ("from hal.registry import Driver\nDRIVER = Driver('camera', 'x', '', print, {}, ('port',))", "requires port"),
+        ("from hal.registry import Driver\nDRIVER = Driver('camera', 'x', '', print, None)", "settings: nothing"),
+        ("from hal.registry import Driver\nDRIVER = Driver('camera', 'x', '', 'open')", "open: a str"),
     ],
 )
 def test_a_broken_plugin_is_reported_and_does_not_stop_the_others(install: Install, source: str, reason: str) -> None:
     install("broken-plugin", {"broken": "vel_broken:DRIVER"}, source)
     install("acme-projectors", {"acme": "vel_acme:DRIVER"}, GOOD.format(name="acme"))
     drivers = load_drivers()
-    assert drivers.get("projector", "acme").summary == "a test"
+    assert drivers.get("light_sensor", "acme").summary == "a test"
     mine = [plugin for plugin in drivers.broken if plugin.distribution == "broken-plugin"]
     assert len(mine) == 1
     assert reason in mine[0].reason
@@ -76,12 +88,15 @@ def test_a_broken_plugin_is_reported_and_does_not_stop_the_others(install: Insta
         drivers.get("projector", "not-there")
 
 
-def test_two_plugins_that_claim_one_name_are_an_error_that_names_both(install: Install) -> None:
+def test_of_two_plugins_that_claim_one_name_neither_is_used_and_every_other_is(install: Install) -> None:
     install("acme-projectors", {"acme": "vel_acme:DRIVER"}, GOOD.format(name="twin"))
     install("other-projectors", {"other": "vel_other:DRIVER"}, GOOD.format(name="twin"))
+    drivers = load_drivers()
+    assert drivers.get("projector", "pjlink").name == "pjlink"
     with pytest.raises(PluginError) as caught:
-        load_drivers()
+        drivers.get("light_sensor", "twin")
     assert caught.value.code == "driver-twice"
+    assert {plugin.distribution for plugin in drivers.broken} == {"acme-projectors", "other-projectors"}
     assert "acme-projectors" in caught.value.what
     assert "other-projectors" in caught.value.what
 
@@ -89,7 +104,7 @@ def test_two_plugins_that_claim_one_name_are_an_error_that_names_both(install: I
 def test_an_unknown_driver_names_those_of_its_kind(install: Install) -> None:
     install("acme-projectors", {"acme": "vel_acme:DRIVER"}, GOOD.format(name="acme"))
     with pytest.raises(PluginError) as caught:
-        load_drivers().get("projector", "acmee")
+        load_drivers().get("light_sensor", "acmee")
     assert caught.value.code == "driver-unknown"
     assert "acme" in caught.value.remedy
 

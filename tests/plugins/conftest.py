@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +14,33 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.pjlink_projector import EmulatedPjLinkProjector
-from plugins.emulated.quick_profile import quick_profile
-from plugins.emulated.serial_projector import EmulatedSerialProjector
-from plugins.pjlink_projector import PjLinkProjector, open_pjlink_projector
-from plugins.profile_files import load_profile
-from plugins.serial_projector import SerialProjector, open_serial_projector
-from tests.plugins.boards import BOARDS
-from tests.plugins.pjlink_advance import NOTICE, pjlink_advance_python
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from plugins.emulated.projectors.quick_profile import quick_profile
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.projectors.pjlink import PjLinkProjector, open_pjlink_projector
+from plugins.projectors.profile_files import load_profile
+from plugins.projectors.serial import SerialProjector, open_serial_projector
+from tests.plugins.projectors.boards import BOARDS
+from tests.plugins.projectors.pjlink_advance import NOTICE, pjlink_advance_python
 from tests.waiting import wait_for
 
-collect_ignore = [] if pjlink_advance_python() else ["test_pjlink_advance_peer.py"]
+SERIAL_CLIENTS = (
+    "benqprojector and epson-projector are not installed: the emulated serial projectors were not driven by them "
+    "(pip install benqprojector epson-projector)."
+)
+NOTICES = {
+    "projectors/test_pjlink_advance_peer.py": "" if pjlink_advance_python() else NOTICE,
+    "emulated/projectors/test_serial_clients.py": (
+        "" if find_spec("benqprojector") and find_spec("epson_projector") else SERIAL_CLIENTS
+    ),
+}
+collect_ignore = [file for file, notice in NOTICES.items() if notice]
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if collect_ignore:
-        terminalreporter.write_line(NOTICE)
+    for file in collect_ignore:
+        terminalreporter.write_line(NOTICES[file])
 
 
 LAMP = LampTiming(warm_up_s=0.25, cool_down_s=0.4)

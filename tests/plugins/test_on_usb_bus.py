@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from plugins.emulated.usb_bus import PRELOAD, environment
+from plugins.emulated.usb.bus import PRELOAD, environment
 
 FOLDER = Path(__file__).parent / "on_usb_bus"
 ROOT = FOLDER.parents[2]

@@ -16,6 +16,11 @@
     // The aiming page shows what the work has measured as soon as it is done.
     if (measured && running && !line) location.reload();
     running = Boolean(line);
+    const naming = Boolean(document.querySelector("[data-identifying]"));
+    for (const [id, hidden] of [["name-them", naming], ["end-naming", !naming]]) {
+      const place = document.getElementById(id);
+      if (place) place.hidden = hidden;
+    }
     if (cancel) cancel.hidden = !line || line.dataset.running !== "yes";
   }
 

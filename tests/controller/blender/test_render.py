@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.arrays import FloatImage, Mask, load_arrays
 from controller.blender.job import BUILTIN, RenderSettings, as_seen, solid, write_job
 from controller.blender.run import Blender, find_blender, render
 from controller.calibrate.values import Geometry, Pinhole
-from controller.errors import UsageError, WorkError
-from controller.solve.targets import read_picture
+from controller.core.arrays import FloatImage, Mask, load_arrays
+from controller.core.errors import UsageError, WorkError
+from controller.solve.targets.files import read_picture
 
 ROWS, COLUMNS = 90, 140
 QUICK = RenderSettings(samples=4, denoise=False, threads=1)

@@ -117,4 +117,4 @@ def test_a_folder_that_can_not_be_written_plays_on_and_says_so(folder: Path, mon
     fourth.ended()
     assert fourth.file == folder / (folder / "previous").readlink(), "it falls back, though it can not keep that"
     assert plays(folder) == 2
-    assert sum("could not be kept" in sentence for sentence in said) >= 2
+    assert sum("could not be saved" in sentence for sentence in said) >= 2

@@ -22,7 +22,7 @@ from nacl.signing import SigningKey
 from controller.bundle.index import parse_index
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance
-from controller.errors import BundleError
+from controller.core.errors import BundleError
 from tests.controller.bundle.conftest import write
 
 Table = dict[str, Any]

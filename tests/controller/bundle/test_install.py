@@ -16,7 +16,7 @@ from controller.bundle.format import Index
 from controller.bundle.install import current, install, rollback
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.errors import BundleError, WorkError
+from controller.core.errors import BundleError, WorkError
 
 
 def made(path: Path, value: int, revision: int = 0, key: SigningKey | None = None) -> Path:
@@ -180,7 +180,7 @@ def test_a_disk_that_is_read_only_or_full_leaves_what_plays(tmp_path: Path, monk
         def mkstemp(*_: object, **__: object) -> tuple[int, str]:
             raise OSError(number, os.strerror(number))
 
-        monkeypatch.setattr("controller.storage.tempfile.mkstemp", mkstemp)
+        monkeypatch.setattr("controller.core.storage.tempfile.mkstemp", mkstemp)
 
     for number, code in ((errno.EROFS, "cannot-write"), (errno.ENOSPC, "no-space"), (errno.EDQUOT, "no-space")):
         fails(number)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from controller.bundle.signing import generate_key, load_public_key, load_signing_key
-from controller.errors import UsageError
+from controller.core.errors import UsageError
 
 
 def test_a_new_key_is_private_and_is_read_back(tmp_path: Path) -> None:

@@ -17,18 +17,18 @@ from skimage.io import imread
 
 from controller.bundle.describe import as_text, describe, differences, differences_as_text
 from controller.bundle.export import export_pictures
-from controller.bundle.format import Hint
+from controller.bundle.format import PlaylistEntry
 from controller.bundle.reader import Bundle
-from controller.bundle.signing import ANYONE
+from controller.bundle.signing import ANY_SIGNER
 from controller.bundle.writer import NewAppearance, NewLive, sign_bundle, write_bundle
-from controller.errors import BundleError, UsageError
+from controller.core.errors import BundleError, UsageError
 from tests.controller.bundle.conftest import OUTPUTS, PNG, write
 
 Pictures = dict[str, dict[str, npt.NDArray[np.uint8]]]
 
 
 def test_a_description_is_json_and_says_what_was_written(signed: Path, key: SigningKey) -> None:
-    with Bundle.open_trusted(signed, ANYONE) as bundle:
+    with Bundle.open_trusted(signed, ANY_SIGNER) as bundle:
         found = json.loads(json.dumps(describe(bundle)))
         text = as_text(found)
     assert found["signed_by"] == bytes(key.verify_key).hex()
@@ -46,7 +46,7 @@ def test_a_description_is_json_and_says_what_was_written(signed: Path, key: Sign
 def test_a_date_beyond_the_calendar_is_shown_as_a_number(tmp_path: Path) -> None:
     identity: dict[str, Any] = {"stage": "s", "calibration": "c", "outputs": OUTPUTS, "appearances": []}
     write_bundle(tmp_path / "b.vel", created_unix_s=2**53, **identity)
-    with Bundle.open_trusted(tmp_path / "b.vel", ANYONE) as bundle:
+    with Bundle.open_trusted(tmp_path / "b.vel", ANY_SIGNER) as bundle:
         assert str(2**53) in as_text(describe(bundle))
 
 
@@ -74,10 +74,10 @@ def test_two_bundles_differ_in_what_was_changed_and_nothing_else(
     lines: list[str],
 ) -> None:
     files = [write(tmp_path / "a", appearances, key), write(tmp_path / "b", change(appearances), key)]
-    with Bundle.open_trusted(files[0], ANYONE) as one, Bundle.open_trusted(files[1], ANYONE) as other:
+    with Bundle.open_trusted(files[0], ANY_SIGNER) as one, Bundle.open_trusted(files[1], ANY_SIGNER) as other:
         found = differences(one, other)
     assert found["same"] == (not lines)
-    assert differences_as_text(found).splitlines() == (lines or ["The bundles hold the same."])
+    assert differences_as_text(found).splitlines() == (lines or ["The bundles have the same content."])
 
 
 def test_other_outputs_and_signers_are_told(tmp_path: Path, unsigned: Path, key: SigningKey) -> None:
@@ -86,7 +86,7 @@ def test_other_outputs_and_signers_are_told(tmp_path: Path, unsigned: Path, key:
         small, stage="demo", calibration="run-1", created_unix_s=1_700_000_000, revision=3,
         outputs=[("left", 4, 4)], appearances=[], key=key,
     )  # fmt: skip
-    with Bundle.open_trusted(unsigned, ANYONE) as one, Bundle.open_trusted(small, ANYONE) as other:
+    with Bundle.open_trusted(unsigned, ANY_SIGNER) as one, Bundle.open_trusted(small, ANY_SIGNER) as other:
         text = differences_as_text(differences(one, other))
     assert "- signed_by nobody" in text
     assert f"+ signed_by {bytes(key.verify_key).hex()}" in text
@@ -95,7 +95,7 @@ def test_other_outputs_and_signers_are_told(tmp_path: Path, unsigned: Path, key:
 
 def test_exported_pictures_are_the_frames_byte_for_byte(signed: Path, pictures: Pictures, tmp_path: Path) -> None:
     out = tmp_path / "new" / "pictures"
-    with Bundle.open_trusted(signed, ANYONE) as bundle:
+    with Bundle.open_trusted(signed, ANY_SIGNER) as bundle:
         assert export_pictures(bundle, out) == 4
     index = json.loads((out / "index.json").read_text())
     for appearance in index["appearances"]:
@@ -112,7 +112,7 @@ def test_an_export_that_is_stopped_or_may_not_begin_leaves_nothing(signed: Path,
         if done:
             raise KeyboardInterrupt
 
-    with Bundle.open_trusted(signed, ANYONE) as bundle:
+    with Bundle.open_trusted(signed, ANY_SIGNER) as bundle:
         with pytest.raises(KeyboardInterrupt):
             export_pictures(bundle, tmp_path / "x" / "y", stop)
         assert list((tmp_path / "x").iterdir()) == []
@@ -148,7 +148,7 @@ def test_schedule_and_live_section_are_told_and_compared(tmp_path: Path) -> None
     def bundle(name: str, fade_ms: int, value: float) -> Bundle:
         write_bundle(
             tmp_path / name, stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 4)],
-            appearances=[NewAppearance("a", frame)], schedule=[Hint("a", 5000, fade_ms)],
+            appearances=[NewAppearance("a", frame)], schedule=[PlaylistEntry("a", 5000, fade_ms)],
             live=NewLive((7, 6), {"gain": np.full(3, value, np.float32)}),
         )  # fmt: skip
         return Bundle.open(tmp_path / name, allow_unsigned=True)

@@ -1,4 +1,4 @@
-"""docs/bundle-format.md is the whole truth: a bundle is rebuilt from it byte by byte, and its reader refuses damage."""
+"""docs/reference/bundle-format.md is complete: a bundle is rebuilt from it byte by byte, its reader refuses damage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import zstandard
 from nacl.exceptions import BadSignatureError
 from nacl.signing import SigningKey
 
-from controller.bundle.format import Hint
+from controller.bundle.format import PlaylistEntry
 from controller.bundle.writer import NewAppearance, NewLive, write_bundle
 from tests.controller.bundle.conftest import OUTPUTS, PNG
 from tests.controller.bundle.test_round_trip import documented_reader
@@ -31,7 +31,7 @@ def full(tmp_path: Path, appearances: list[NewAppearance], key: SigningKey) -> P
               "byte": np.arange(9, dtype=np.uint8), "plain": random.random((3, 4)).astype("f4")}  # fmt: skip
     several: Document = {"stage": "dämo", "calibration": "run-1", "created_unix_s": 1_700_000_000, "revision": 3}
     write_bundle(tmp_path / "full.vel", **several, outputs=OUTPUTS, appearances=appearances, key=key,
-                 schedule=[Hint("ramp", 9000, 250)], live=NewLive((5, 7), arrays))  # fmt: skip
+                 schedule=[PlaylistEntry("ramp", 9000, 250)], live=NewLive((5, 7), arrays))  # fmt: skip
     return tmp_path / "full.vel"
 
 
@@ -117,7 +117,7 @@ def test_the_documented_reader_refuses_what_is_wrong_in_a_stripe(full: Path, key
 
 
 def test_the_page_and_the_index_name_the_same_keys(full: Path, key: SigningKey) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "bundle-format.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "bundle-format.md").read_text()
     index = documented_reader()["read_index"](full.read_bytes(), [bytes(key.verify_key)])
     tables = [index, index["outputs"][0], index["appearances"][0], index["live"], index["live"]["arrays"]["wide"]]
     for key_name in {name for table in tables for name in table}:

@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nacl.signing import SigningKey
 
-from controller.bundle.format import Hint
+from controller.bundle.format import PlaylistEntry
 from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, NewLive, write_bundle
-from controller.errors import BundleError
+from controller.core.errors import BundleError
 
 Pictures = dict[str, dict[str, npt.NDArray[np.uint8]]]
-DOCUMENT = Path(__file__).parents[3] / "docs" / "bundle-format.md"
+DOCUMENT = Path(__file__).parents[3] / "docs" / "reference" / "bundle-format.md"
 
 
 def test_the_same_input_gives_the_same_bytes(
@@ -114,12 +114,12 @@ def test_schedule_and_live_arrays_are_read_back_exactly(tmp_path: Path) -> None:
     index = write_bundle(
         path, stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 4)],
         appearances=[NewAppearance("a", {"P1": frame}), NewAppearance("b", {"P1": frame})],
-        schedule=[Hint("b", 5000, 250), Hint("a", 1, 0)], live=NewLive((11, 13), arrays),
+        schedule=[PlaylistEntry("b", 5000, 250), PlaylistEntry("a", 1, 0)], live=NewLive((11, 13), arrays),
     )  # fmt: skip
     with Bundle.open(path, allow_unsigned=True) as bundle:
         bundle.verify()
         assert bundle.index == index
-        assert bundle.index.schedule == (Hint("b", 5000, 250), Hint("a", 1, 0))
+        assert bundle.index.schedule == (PlaylistEntry("b", 5000, 250), PlaylistEntry("a", 1, 0))
         assert bundle.index.live is not None
         assert bundle.index.live.target_px == (11, 13)
         for name, values in arrays.items():
@@ -165,7 +165,7 @@ def test_the_reader_in_the_documentation_sees_the_same_pixels(
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"frames": {}}, "not exactly one frame"),
+        ({"frames": {}}, "not have exactly one frame"),
         ({"frames": {"P1": np.zeros((4, 5, 3), np.uint8)}}, "shape"),
         ({"frames": {"P1": np.zeros((6, 5, 3), np.float32)}}, "float32"),
         ({"name": "../up"}, "name"),

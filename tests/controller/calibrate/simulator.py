@@ -14,8 +14,8 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
-from controller.arrays import ByteImage, Float64, FloatImage
 from controller.capture.patterns import PatternPlan, device_frame, plan_patterns
+from controller.core.arrays import ByteImage, Float64, FloatImage
 
 ENLARGED = 10
 SUPERSAMPLED = 4

@@ -12,18 +12,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.arrays import FloatImage
-from controller.calibrate.decode import decode
-from controller.calibrate.geometry import reconstruct
-from controller.calibrate.pixels import fit_pixels
-from controller.calibrate.radiometry import measure_radiometry
-from controller.calibrate.reconstruction import CameraPrior, Reconstruction
+from controller.calibrate.correspondence.decode import decode
+from controller.calibrate.geometry.self_calibration import reconstruct
+from controller.calibrate.geometry.values import CameraPrior, Reconstruction
+from controller.calibrate.metapixels.from_phase import fit_pixels
+from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.values import Calibration, Correspondence, ProjectorCalibration, Radiometry
 from controller.capture.patterns import PatternKind, frame, plan_patterns
-from controller.errors import CalibrationError, VelaturaError
-from controller.transport import LightTransport
+from controller.core.arrays import FloatImage
+from controller.core.errors import CalibrationError, VelaturaError
+from controller.transport import LightTransport, build_transport
+from tests.controller.calibrate.geometry.test_self_calibration import CAMERA, PROJECTOR, fitted, make_stage
 from tests.controller.calibrate.simulator import Scene, Stage, positions
-from tests.controller.calibrate.test_geometry import CAMERA, PROJECTOR, fitted, make_stage
+
+pytestmark = pytest.mark.slow
 
 PLAN = plan_patterns(PROJECTOR)
 TRUTH = make_stage(11, noise_px=0.0, outliers=0.0)
@@ -52,7 +54,7 @@ def photographs(n: int, *, dead: bool = False) -> dict[str, FloatImage]:
     return {
         p.name: photograph(n, lamp * frame(p, PROJECTOR), seed)
         for seed, p in enumerate(PLAN)
-        if p.kind is not PatternKind.MOSAIC
+        if p.kind is not PatternKind.COLOUR_TILES
     }
 
 
@@ -73,7 +75,7 @@ def calibrated(order: Sequence[int], dead: int | None = None) -> Calibrated:
         parts.append(ProjectorCalibration(NAMES[n], fit.metapixels, LINEAR, white, fit.phase_map))
     mask = np.any([part.white.max(axis=2) > 0 for part in parts], axis=0)
     black = photographs(0)["black"]
-    return Calibrated(found, LightTransport.build(Calibration(tuple(parts), black, mask, np.eye(3))))
+    return Calibrated(found, build_transport(Calibration(tuple(parts), black, mask, np.eye(3))))
 
 
 def solved(found: Sequence[Correspondence]) -> Reconstruction:
@@ -100,7 +102,7 @@ def test_photographs_become_a_shape_and_a_transport_that_predicts(whole: Calibra
     for n in range(3):
         seen = photographs(n)["random-0"] - photographs(n)["black"]
         use = whole.transport.lit[n]
-        difference = (whole.transport.project_one(n, pattern) - seen)[use]
+        difference = (whole.transport.forward_part(n, pattern) - seen)[use]
         assert np.sqrt(np.mean(difference**2) / np.mean(seen[use] ** 2)) < 0.03
 
 
@@ -110,7 +112,7 @@ def test_projectors_in_another_order_give_the_same_stage(whole: Calibrated, geom
     pattern = frame(PLAN.of_kind(PatternKind.RANDOM)[0], PROJECTOR)
     for place, n in enumerate(order):
         np.testing.assert_array_equal(
-            other.transport.project_one(place, pattern), whole.transport.project_one(n, pattern)
+            other.transport.forward_part(place, pattern), whole.transport.forward_part(n, pattern)
         )
     turned = solved(other.correspondences)
     both = np.isfinite(turned.geometry.points_m[..., 2]) & np.isfinite(geometry.geometry.points_m[..., 2])
@@ -126,9 +128,9 @@ def test_a_dead_projector_lights_nothing_is_named_by_the_geometry_and_harms_no_o
     hurt = calibrated((0, 1, 2), dead=1)
     assert np.mean(hurt.correspondences[1].valid) < 1e-3
     white = np.ones((PROJECTOR[1], PROJECTOR[0], 3), np.float32)
-    assert np.mean(hurt.transport.project_one(1, white)) < 1e-4
+    assert np.mean(hurt.transport.forward_part(1, white)) < 1e-4
     for n in (0, 2):
-        np.testing.assert_array_equal(hurt.transport.project_one(n, white), whole.transport.project_one(n, white))
+        np.testing.assert_array_equal(hurt.transport.forward_part(n, white), whole.transport.forward_part(n, white))
     with pytest.raises(CalibrationError, match="rojector"):
         solved(hurt.correspondences)
 

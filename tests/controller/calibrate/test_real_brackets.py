@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from controller.calibrate.radiometry import check_linearity
+from tests.controller.calibrate.photometry.linearity import check_linearity
 
 
 @pytest.mark.parametrize("filter_nm", [450, 550, 600])

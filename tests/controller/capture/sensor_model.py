@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.capture.demosaic import SensorLevels
-from controller.capture.linearity import Exposed
+from controller.capture.linearity import RawExposure
 
 RGGB = np.array([[0, 1], [1, 2]])
 
@@ -38,7 +38,7 @@ class SensorModel:
 
     def expose(
         self, light: npt.NDArray[np.float64], exposure_s: float, seed: int, *, told_s: float | None = None
-    ) -> Exposed:
+    ) -> RawExposure:
         """``light`` (rows, columns) in full scales (of 3967 steps) per second."""
         rng = np.random.default_rng(seed)
         electrons = rng.poisson(light * exposure_s * 3967 * self.electrons) + rng.normal(0, self.read_e, light.shape)
@@ -46,7 +46,7 @@ class SensorModel:
         share = np.clip(steps / (self.ceiling - self.black), 0, None)
         steps = steps * (1 - self.bend * np.clip((share - 0.7) / 0.3, 0, 1))
         samples = np.clip(np.rint(steps + self.black), 0, self.ceiling).astype(np.uint16)
-        return Exposed(samples, told_s if told_s is not None else exposure_s)
+        return RawExposure(samples, told_s if told_s is not None else exposure_s)
 
 
 def textured(rows: int = 240, columns: int = 320, *, low: float = 0.05, high: float = 30.0) -> npt.NDArray[np.float64]:

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.arrays import FloatImage, Mask
-from controller.capture.brackets import CameraNoise, choose_brackets, choose_exposure, least_level, merge_brackets
-from controller.errors import UsageError
+from controller.capture.brackets import CameraNoise, choose_brackets, choose_exposure, merge_brackets, minimum_level
+from controller.core.arrays import FloatImage, Mask
+from controller.core.errors import UsageError
 
 EXPOSURES = tuple(2.0**stop for stop in np.arange(-12, 3, 1 / 3))
 NOISE = CameraNoise(shot=1 / 5000, read=8 / 5000)
@@ -119,7 +119,7 @@ def test_two_exposures_are_enough_for_a_camera_as_the_papers(decades: float, cou
 
 
 def test_the_least_level_is_where_noise_is_the_share_asked_for() -> None:
-    level = least_level(NOISE, 0.05)
+    level = minimum_level(NOISE, 0.05)
     assert np.sqrt(NOISE.shot * level + NOISE.read**2) == pytest.approx(0.05 * level)
 
 

@@ -5,8 +5,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.arrays import Float64
 from controller.capture.demosaic import WORTH_THREADS, SensorLevels, bayer_kernels, demosaic, fill_bad
+from controller.core.arrays import Float64
 
 ORDERS = {"RGGB": [[0, 1], [1, 2]], "BGGR": [[2, 1], [1, 0]], "GRBG": [[1, 0], [2, 1]], "GBRG": [[1, 2], [0, 1]]}
 CODES = {

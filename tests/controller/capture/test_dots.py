@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.capture.dots import dot_frame, dot_patterns, dot_spacing
-from controller.errors import UsageError
+from controller.core.errors import UsageError
 
 
 @settings(max_examples=20, deadline=None)

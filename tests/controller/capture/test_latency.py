@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.arrays import FloatImage
 from controller.capture.latency import (
     CHANGED_FRAMES,
     RESOLUTION_S,
@@ -17,7 +16,8 @@ from controller.capture.latency import (
     same_picture,
 )
 from controller.capture.profile import CameraNoise
-from controller.errors import CalibrationError
+from controller.core.arrays import FloatImage
+from controller.core.errors import CalibrationError
 
 EXPOSURE_S = 1 / 15
 NOISE = CameraNoise()

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.arrays import FloatImage
 from controller.capture.noise import measure_noise
+from controller.core.arrays import FloatImage
 from tests.controller.capture.sensor_model import SensorModel, textured
 
 

@@ -12,10 +12,10 @@ from controller.capture.patterns import (
     device_frame,
     encode_frame,
     frame,
-    mosaic_levels,
     plan_patterns,
+    tile_levels,
 )
-from controller.errors import UsageError
+from controller.core.errors import UsageError
 
 RESPONSE = np.stack([(np.arange(256) / 255) ** gamma for gamma in (2.2, 2.0, 1.8)])
 
@@ -67,7 +67,7 @@ def test_adjacent_cells_differ_in_one_bit() -> None:
 def test_every_frame_is_finite_light_between_black_and_white() -> None:
     plan = plan_patterns((61, 47))
     for pattern in plan:
-        if pattern.kind is PatternKind.MOSAIC:
+        if pattern.kind is PatternKind.COLOUR_TILES:
             assert device_frame(pattern, plan.size_px).shape == (47, 61, 3)
             continue
         image = frame(pattern, plan.size_px)
@@ -80,8 +80,8 @@ def test_every_frame_is_finite_light_between_black_and_white() -> None:
 
 @pytest.mark.parametrize("size_px", [(280, 210), (1400, 1050)])
 def test_a_mosaic_shows_every_level_in_every_channel_and_no_channel_tells_of_another(size_px: tuple[int, int]) -> None:
-    mosaics = plan_patterns(size_px).of_kind(PatternKind.MOSAIC)
-    levels = np.concatenate([mosaic_levels(pattern, size_px).reshape(-1, 3) for pattern in mosaics]).astype(float)
+    mosaics = plan_patterns(size_px).of_kind(PatternKind.COLOUR_TILES)
+    levels = np.concatenate([tile_levels(pattern, size_px).reshape(-1, 3) for pattern in mosaics]).astype(float)
     for channel in range(3):
         shown = np.unique(levels[:, channel])
         assert shown[0] == 0
@@ -92,10 +92,10 @@ def test_a_mosaic_shows_every_level_in_every_channel_and_no_channel_tells_of_ano
 
 @pytest.mark.parametrize("size_px", [(61, 47), (1400, 1050)])
 def test_a_mosaics_tiles_lie_on_the_gray_codes_cells(size_px: tuple[int, int]) -> None:
-    pattern = plan_patterns(size_px).of_kind(PatternKind.MOSAIC)[-1]
+    pattern = plan_patterns(size_px).of_kind(PatternKind.COLOUR_TILES)[-1]
     image = device_frame(pattern, size_px)
     y, x = np.mgrid[0 : size_px[1], 0 : size_px[0]] // CELL_PX
-    np.testing.assert_array_equal(image, mosaic_levels(pattern, size_px)[y, x])
+    np.testing.assert_array_equal(image, tile_levels(pattern, size_px)[y, x])
 
 
 def test_the_random_pattern_is_the_same_every_time_and_differs_by_seed() -> None:
@@ -112,7 +112,7 @@ def test_patterns_between_black_and_white_need_the_response() -> None:
         device_frame(plan.sinusoids("phase-x")[0], plan.size_px)
     assert caught.value.code == "response-missing"
     with pytest.raises(UsageError, match="device values"):
-        frame(plan.of_kind(PatternKind.MOSAIC)[0], plan.size_px)
+        frame(plan.of_kind(PatternKind.COLOUR_TILES)[0], plan.size_px)
 
 
 def test_a_projector_of_a_few_pixels_is_refused() -> None:

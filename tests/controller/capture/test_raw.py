@@ -8,9 +8,9 @@ import numpy.typing as npt
 import pytest
 import scipy.ndimage
 
-from controller.arrays import Float64
 from controller.capture.raw import develop, read_photograph
-from controller.errors import UsageError, WorkError
+from controller.core.arrays import Float64
+from controller.core.errors import UsageError, WorkError
 
 tifffile = pytest.importorskip("tifffile")
 

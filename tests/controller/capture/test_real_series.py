@@ -13,20 +13,20 @@ import numpy.typing as npt
 import pytest
 import tifffile
 
-from controller.arrays import Float64
 from controller.capture.demosaic import SensorLevels
 from controller.capture.jpeg_response import measure_response
-from controller.capture.linearity import Exposed, check_series
+from controller.capture.linearity import RawExposure, check_series
 from controller.capture.noise import measure_noise
+from controller.core.arrays import Float64
 
 LEVELS = SensorLevels(np.array([[0, 1], [1, 2]]), np.zeros((2, 2)), np.full((2, 2), 255.0), np.full((2, 2), 250.0))
 """8-bit samples, made smaller: what lies near a clipped one holds some of its light."""
 
 
-def series(filter_nm: int) -> list[Exposed]:
+def series(filter_nm: int) -> list[RawExposure]:
     folder = Path(os.environ["VELATURA_DATA"]) / "linear_bllanos" / "color_checker"
     paths = sorted((int(path.name.split("_")[3][:-2]), path) for path in folder.glob(f"*_{filter_nm}nm_*.tif"))
-    return [Exposed(tifffile.imread(path).astype(np.uint16), ms / 1000) for ms, path in paths]
+    return [RawExposure(tifffile.imread(path).astype(np.uint16), ms / 1000) for ms, path in paths]
 
 
 @pytest.mark.parametrize("filter_nm", [400, 450, 500, 550, 600, 650, 700])

@@ -1,4 +1,4 @@
-"""Regions and appearances on a real scheduler with two real workers, one of which may be killed."""
+"""Appearances on a real scheduler with two real workers, one of which may be killed."""
 
 from __future__ import annotations
 
@@ -15,18 +15,16 @@ import pytest
 from distributed import Client, Scheduler
 
 from benchmarks._synthetic import synthetic_calibration
-from controller.arrays import FloatImage
 from controller.cluster import connect
 from controller.cluster.appearances import SpreadAppearances
 from controller.cluster.connect import Cluster, connected
-from controller.cluster.regions import each_on
 from controller.cluster.tasks import Outcome, StageData
-from controller.errors import UsageError, VelaturaError, WorkError
+from controller.core.arrays import FloatImage
+from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.solve.appearance import Base, base_image, solve_base
-from controller.solve.regions import solve_regions
-from controller.solve.request import Answer, SolveOptions, answer
-from controller.solve.targets_values import Target
-from controller.transport import LightTransport
+from controller.solve.request import AppearanceResult, SolveOptions, solve_appearance
+from controller.solve.targets.values import Target
+from controller.transport import LightTransport, build_transport
 from controller.transport.planes import frame_planes
 from tests.controller.cluster.machines import Machines, machines
 
@@ -36,7 +34,7 @@ OPTIONS = SolveOptions(share=0.9, smoothness=0.001, mode="full")
 
 @cache
 def solved() -> tuple[LightTransport, Base]:
-    transport = LightTransport.build(CALIBRATION)
+    transport = build_transport(CALIBRATION)
     return transport, solve_base(transport, base_image(CALIBRATION), CALIBRATION.black)
 
 
@@ -51,12 +49,12 @@ def picture(number: int) -> Target:
     return Target(np.repeat(wave[..., None], 3, 2).astype(np.float32), np.ones((96, 120), np.bool_))
 
 
-def here(number: int) -> Answer:
+def here(number: int) -> AppearanceResult:
     transport, base = solved()
-    return answer(transport, base, CALIBRATION.black, picture(number), OPTIONS)
+    return solve_appearance(transport, base, CALIBRATION.black, picture(number), OPTIONS)
 
 
-def assert_same(found: Answer, expected: Answer) -> None:
+def assert_same(found: AppearanceResult, expected: AppearanceResult) -> None:
     np.testing.assert_array_equal(frame_planes(found.frames), frame_planes(expected.frames))
     np.testing.assert_array_equal(found.target, expected.target)
     np.testing.assert_array_equal(found.reachable, expected.reachable)
@@ -95,15 +93,6 @@ def test_appearances_made_elsewhere_are_the_same_to_the_bit(cluster: Cluster) ->
         spread.begin(f"picture {number}", picture(number), OPTIONS)
     for number in range(4):
         assert_same(spread.answer(f"picture {number}", lambda: None), here(number))
-
-
-def test_regions_solved_elsewhere_are_the_same_to_the_bit(cluster: Cluster) -> None:
-    transport, _ = solved()
-    target = CALIBRATION.black + np.float32(0.5) * transport.reach()
-    local = solve_regions(transport, target, CALIBRATION.black, solver="clarabel")
-    spread = solve_regions(transport, target, CALIBRATION.black, solver="clarabel", each=each_on(cluster))
-    assert spread.regions == local.regions > 20
-    np.testing.assert_array_equal(frame_planes(spread.frames), frame_planes(local.frames))
 
 
 def test_equal_stages_have_one_name_and_others_another() -> None:
@@ -221,4 +210,4 @@ def test_without_the_extra_the_package_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(UsageError) as refused, connected("tcp://127.0.0.1:1"):
         pass
-    assert refused.value.code == "cluster-missing"
+    assert refused.value.code == "extra-missing"

@@ -12,7 +12,7 @@ import pytest
 
 from controller.cluster.connect import connected
 from controller.cluster.tasks import Outcome
-from controller.errors import WorkError
+from controller.core.errors import WorkError
 from tests.controller.cluster.machines import machines
 
 OPENSSL = shutil.which("openssl")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from controller.config.arguments import allowed, checked_arguments
 from controller.config.lines import KeyLines
 from controller.config.problems import Place
-from controller.errors import UsageError
+from controller.core.errors import UsageError
 
 PLACE = Place("stage.toml", KeyLines("a = 0\nb = 0\n"))
 Colour = tuple[float, float, float]

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from controller.config import load_stage
+from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.demo import stage as module
 from controller.demo.stage import BUILDING, MARK, prepare
-from controller.errors import UsageError, VelaturaError, WorkError
 from hal.errors import DeviceError
 
 TABLES = {

@@ -11,24 +11,24 @@ from typing import Any
 
 import pytest
 
-from controller.app import LOCK
 from controller.config import load_stage
+from controller.core.errors import UsageError
+from controller.core.storage import exclusive
 from controller.doctor.examine import Tools, examine
 from controller.doctor.values import Examination
-from controller.errors import UsageError
-from controller.storage import exclusive
+from controller.stage.run import LOCK
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy
 from hal.finding import Finder, Found, Wanted, load_finders
-from hal.registry import Driver, Drivers, load_drivers
-from plugins.emulated.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.quick_profile import quick_profile
-from plugins.emulated.serial_projector import EmulatedSerialProjector
-from tests.controller.rig_model import ModelCamera, ModelDisplay
-from tests.controller.session.lamp_model import World
-from tests.controller.session.test_mains import Board
-from tests.controller.test_app import Told
-from tests.controller.test_app_relays_and_light import Sensor
+from hal.registry import BrokenPlugin, Driver, Drivers, load_drivers
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.quick_profile import quick_profile
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from tests.controller.rig.lamp_model import World
+from tests.controller.rig.rig_model import ModelCamera, ModelDisplay
+from tests.controller.rig.test_mains_relays import Board
+from tests.controller.stage.test_relays_and_light import Sensor
+from tests.controller.stage.test_run import Told
 
 LAMP = LampTiming(0.2, 0.2)
 STAGE = """\
@@ -243,6 +243,52 @@ def test_a_bus_that_cannot_be_looked_at_stops_no_other(hall: Hall) -> None:
     hall.others = [Finder("broken", fail)]
     seen = hall.examine()
     assert codes(seen) == ["bus-taken"]
+    assert len(seen.found) == 1
+
+
+def boom(*_: object) -> Any:
+    raise ZeroDivisionError("a mistake of the driver's author")
+
+
+@pytest.mark.parametrize("call", ["open", "check", "identity", "capabilities", "close"])
+def test_a_driver_that_raises_anything_is_named_and_everything_else_is_still_told(hall: Hall, call: str) -> None:
+    class Bad(ModelCamera):
+        """Fails in one call."""
+
+    if call == "capabilities":
+        Bad.capabilities = property(boom)  # type: ignore[assignment,method-assign]
+    elif call in ("identity", "close"):
+        setattr(Bad, call, lambda self, **_: boom())
+    bad = Driver("camera", "model", "A camera.", boom if call == "open" else lambda *_: Bad(), {"address": "where"},
+                 check=boom if call == "check" else None)  # fmt: skip
+    hall.drivers = Drivers((*(one for one in hall.drivers.list if one.kind != "camera"), bad))
+    hall.plug("left")
+    seen = hall.examine()
+    assert "driver-fault" in codes(seen)
+    fault = next(finding.problem for finding in seen.findings if finding.problem.code == "driver-fault")
+    for word in ("'model'", "camera", call, "ZeroDivisionError"):
+        assert word in fault.what
+    assert "1200 lamp hours" in str(seen.tried[0].answer), "the projector was tried too"
+
+
+def test_two_drivers_of_one_name_are_a_problem_and_nothing_else_is_lost(hall: Hall) -> None:
+    claimed = ("projector", "acme")
+    twice = [BrokenPlugin(f"p{n} = p{n}:DRIVER", f"dist-{n}", "two", "Uninstall one.", claimed) for n in (1, 2)]
+    hall.drivers = Drivers(hall.drivers.list, tuple(twice))
+    hall.plug("left")
+    seen = hall.examine()
+    assert codes(seen) == ["plugin-broken", "plugin-broken"]
+    assert seen.findings[0].problem.remedy == "Uninstall one."
+    assert len(seen.tried) == 2
+
+
+@pytest.mark.parametrize("found", [boom, lambda *_: None, lambda *_: ["a camera"]])
+def test_a_finder_that_raises_or_finds_nonsense_stops_no_other(hall: Hall, found: Any) -> None:
+    hall.plug("left")
+    hall.others = [Finder("odd bus", found)]
+    seen = hall.examine()
+    assert codes(seen) == ["driver-fault"]
+    assert "odd bus" in seen.findings[0].problem.what
     assert len(seen.found) == 1
 
 

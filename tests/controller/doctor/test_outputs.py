@@ -12,13 +12,13 @@ import pytest
 
 from controller.capture.acquire import Acquirer
 from controller.doctor.outputs import judge, show_numbers, who_shows_what
-from controller.session.rig import Rig, RigProjector
-from controller.session.safety import LampGuard
+from controller.rig.lamp_guard import LampGuard
+from controller.rig.rig import Rig, RigProjector
 from hal.deadline import Deadline, in_seconds
 from hal.values import CapturedFile, ExposureSettings, FileKind, Presented, ProjectorCapabilities
-from tests.controller.rig_model import EXPOSURES_S, ModelCamera, ModelDisplay
-from tests.controller.session.lamp_model import RULES, Lamp, Shelf, World, soon
-from tests.controller.test_app import Told
+from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World, soon
+from tests.controller.rig.rig_model import EXPOSURES_S, ModelCamera, ModelDisplay
+from tests.controller.stage.test_run import Told
 
 NAMES = ("left", "right")
 SIZE_PX = (4, 3)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from controller.arrays import ByteImage
-from controller.errors import UsageError
+from controller.core.arrays import ByteImage
+from controller.core.errors import UsageError
 from controller.live.sources import FolderSource, VideoSource, open_source
 
 

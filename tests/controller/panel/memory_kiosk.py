@@ -1,4 +1,7 @@
-"""A kiosk in memory: our own Protocol, done honestly but without devices: the panel can be driven to its ends."""
+"""A kiosk in memory, without devices: the panel can be driven to its ends.
+
+It keeps the contract of tests/controller/kiosk/contract.py, as the real one does.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +14,18 @@ from pathlib import Path
 
 from PIL import Image
 
-from controller.errors import UsageError, WorkError
-from controller.panel.kiosk import (
+from controller.core.errors import UsageError, WorkError
+from controller.kiosk.decide.hours import check_schedule
+from controller.kiosk.interface import (
     Achieved,
     Aiming,
     Appearance,
     BundleIdentity,
     Comparison,
-    ComputeSettings,
     DeviceRow,
     EventRow,
     Finding,
+    Fit,
     FoundDevice,
     Grade,
     Job,
@@ -39,10 +43,12 @@ from controller.panel.kiosk import (
     TriedDevice,
     Unsubscribe,
 )
+from controller.kiosk.store import settings, targets
+from tests.controller.kiosk.vase import TEXT
 
 STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")
 BORN = 1_767_600_000.0
-TOML = '[stage]\nname = "Head of a boy"\n'
+TOML = TEXT.replace("The vase", "Head of a boy")
 
 
 def devices() -> tuple[DeviceRow, ...]:
@@ -58,9 +64,14 @@ def devices() -> tuple[DeviceRow, ...]:
 
 
 class MemoryKiosk:
-    """``step_s`` how long a step of a job takes. ``pictures`` a folder for what it draws."""
+    """``step_s`` how long a step of a job takes. ``pictures`` a folder for what it draws. ``names``: its appearances,
+    of which it plays the first; ``run``: the finished calibration; ``toml``: stage.toml.
+    """
 
-    def __init__(self, pictures: Path, *, step_s: float = 0.05) -> None:
+    def __init__(
+        self, pictures: Path, *, step_s: float = 0.05, names: Sequence[str] = ("marble", "warm wood"),
+        run: str = "first", toml: str = TOML,
+    ) -> None:  # fmt: skip
         self._folder, self._step_s = pictures, step_s
         pictures.mkdir(parents=True, exist_ok=True)
         self._lock = threading.RLock()
@@ -68,12 +79,10 @@ class MemoryKiosk:
         self._cancel = threading.Event()
         self._worker: threading.Thread | None = None
         self._events: list[EventRow] = []
-        self._schedule = Schedule("Europe/Vienna", (ScheduleRow("mon", "10:00", "18:00", "marble"),), "03:00")
-        self._toml = TOML
+        self._schedule = Schedule("Europe/Vienna", (ScheduleRow("mon", "10:00", "18:00", names[0]),), "03:00")
+        self._toml = toml
         self.asked: list[tuple[str, object]] = []
-        self._appearances = {
-            name: Appearance(name, BORN, 1.2, preview=self._drawn(name)) for name in ("marble", "warm wood")
-        }
+        self._appearances = {name: Appearance(name, BORN, 1.2, name == names[0], self._drawn(name)) for name in names}
         self._results: dict[str, Results] = {}
         self._comparisons: dict[str, Comparison] = {}
         self._state = KioskState(
@@ -83,12 +92,12 @@ class MemoryKiosk:
             reason="Everything is well but one projector, whose part the others took over.",
             since_unix_s=BORN,
             devices=devices(),
-            playing="marble",
+            playing=names[0],
             next_event=NextEvent("Closes", BORN + 7200),
             bundle=BundleIdentity(17, "9f2c" * 16, BORN),
             lamps=(Lamp("left", 1204.0, 88, True, 3000), Lamp("right", 3120.0, 203, False, 3000)),
         )
-        self._finish("first", "full")
+        self._finish(run, "full")
         for number in range(12):
             self.note("info", f"Heartbeat {number}: all projectors answer.")
         self.note("warning", "The projector right was struck twice.", "lamp-struck")
@@ -124,18 +133,17 @@ class MemoryKiosk:
 
     def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
         self._callbacks.append(callback)
-        return lambda: self._callbacks.remove(callback)
+        return lambda: self._callbacks.remove(callback) if callback in self._callbacks else None
 
     def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
-        if projector is not None and projector not in [row.name for row in self._state.devices]:
-            raise UsageError("projector-wrong", what=f"There is no projector {projector}.", remedy="Choose another.")
+        if projector is not None and projector not in [row.name for row in devices() if row.kind == "projector"]:
+            raise UsageError("projector-unknown", what=f"There is no projector {projector}.", remedy="Choose another.")
         return self._begin(f"Recalibration ({kind})", "calibrating", lambda run: self._finish(run, kind))
 
     def _begin(self, name: str, state: str, finish: Callable[[str], None]) -> Job:
         with self._lock:
+            self._check_idle()
             old = self._state.job
-            if old is not None and not old.ended:
-                raise WorkError("job-running", what=f"{old.name} is running.", remedy="Wait for it, or cancel it.")
             number = 1 if old is None else old.number + 1
             job = Job(number, name, tuple(JobStep(title, 0.0) for title in STEPS), 60.0, run=f"run-{number}")
             self._cancel.clear()
@@ -143,6 +151,22 @@ class MemoryKiosk:
             self._worker = threading.Thread(target=self._work, args=(job, finish), daemon=True)
             self._worker.start()
             return job
+
+    def _check_idle(self) -> None:
+        if self._state.job is not None and not self._state.job.ended:
+            raise WorkError("busy", what="Other work is going on.", remedy="Wait for it to end, or cancel it.")
+
+    def job(self, number: int) -> Job | None:
+        job = self._state.job
+        if job is None or job.number != number:
+            raise WorkError("job-given-up", what="The kiosk gave the work up.", remedy="See the events.")
+        return job
+
+    def close(self) -> None:
+        """End the job that is running."""
+        self._cancel.set()
+        if self._worker is not None:
+            self._worker.join(20)
 
     def _work(self, job: Job, finish: Callable[[str], None]) -> None:
         for at in range(len(STEPS)):
@@ -169,7 +193,7 @@ class MemoryKiosk:
     def cancel(self) -> None:
         job = self._state.job
         if job is None or job.ended:
-            raise WorkError("no-job", what="No job is running.", remedy="There is nothing to cancel.")
+            raise WorkError("nothing-to-cancel", what="No work is going on.", remedy="There is nothing to do.")
         self._cancel.set()
 
     def play(self, name: str) -> None:
@@ -188,8 +212,13 @@ class MemoryKiosk:
     def start(self) -> None:
         self.change(state="powering", reason="The stage was opened by hand.")
 
-    def compute(self, name: str, target: Path, settings: ComputeSettings) -> Job:
-        self.asked.append(("compute", (name, target.read_bytes()[:4], settings)))
+    def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
+        return targets.fitted(target.read_bytes(), (240, 160), fit)
+
+    def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:
+        settings.check_name(name)
+        self.fitted(target, fit)
+        self.asked.append(("compute", (name, target.read_bytes()[:4])))
         preview = self._drawn(name)
 
         def finish(_: str) -> None:
@@ -221,6 +250,9 @@ class MemoryKiosk:
         return [self._comparisons[name] for name in self._appearances if name in self._comparisons]
 
     def remove_appearance(self, name: str) -> None:
+        if name == self._state.playing or name in [row.appearance for row in self._schedule.rows]:
+            raise UsageError("appearance-in-use", what="It is playing, or scheduled.", remedy="Play another one.")
+        self._check_idle()
         self._known(name)
         del self._appearances[name]
 
@@ -233,11 +265,15 @@ class MemoryKiosk:
         return self._schedule
 
     def set_schedule(self, schedule: Schedule) -> None:
+        check_schedule(schedule, list(self._appearances))
         self._schedule = schedule
         self.change()
 
     def identify(self, on: bool) -> None:
         self.change(identifying=on)
+
+    def seen(self, number: int | None = None) -> None:
+        self.change(failures=tuple(row for row in self._state.failures if number is not None and row.number > number))
 
     def doctor(self) -> Sequence[Finding]:
         return [
@@ -247,12 +283,15 @@ class MemoryKiosk:
 
     def backup(self) -> Path:
         file = self._folder.parent / "backup.velatura"
-        file.write_bytes(b"a backup")
+        file.write_bytes(b"a backup\n" + self._toml.encode())
         return file
 
     def restore(self, backup: Path) -> None:
-        if backup.read_bytes() != b"a backup":
-            raise UsageError("backup-wrong", what="This is not a backup of ours.", remedy="Choose another file.")
+        self._check_idle()
+        head, _, text = backup.read_bytes().partition(b"\n")
+        if head != b"a backup":
+            raise UsageError("not-a-backup", what="This is not a backup of ours.", remedy="Choose another file.")
+        self._toml = text.decode()
 
     def diagnostics(self) -> Path:
         file = self._folder.parent / "diagnostics.zip"
@@ -263,10 +302,10 @@ class MemoryKiosk:
         return self._toml
 
     def validate_settings(self, text: str) -> None:
-        if "[stage]" not in text:
-            raise UsageError("stage-key-missing", what="stage.toml: [stage] is missing.", remedy="Add [stage].")
+        settings.validate(text)
 
     def save_settings(self, text: str) -> None:
+        self._check_idle()
         self.validate_settings(text)
         self._toml = text
         self.change(needs_setup=False)
@@ -299,12 +338,16 @@ class MemoryKiosk:
         return self._begin("Test shots", "calibrating", lambda run: None)
 
     def find_devices(self) -> Sequence[FoundDevice]:
+        tables = TEXT.partition("[[projectors]]")[2].partition("[[appearances]]")[0]
+        projector, _, rest = tables.partition("[camera]")
+        camera, _, display = rest.partition("[display]")
         return [
-            FoundDevice("tty0", "projector", "serial", "Optoma on ttyUSB0", '[[projectors]]\nname = "left"'),
-            FoundDevice("usb", "camera", "ptp", "Canon EOS R5 on USB", '[camera]\ndriver = "ptp"'),
+            FoundDevice("tty0", "projector", "serial", "Optoma on ttyUSB0", f"[[projectors]]{projector}"),
+            FoundDevice("usb", "camera", "ptp", "Canon EOS R5 on USB", f"[camera]{camera}"),
+            FoundDevice("screen", "display", "player", "One output of the graphics card", f"[display]{display}"),
         ]
 
     def try_device(self, key: str) -> TriedDevice:
-        if key not in ("tty0", "usb"):
-            raise UsageError("device-unknown", what="There is no such device.", remedy="Search again.")
+        if key not in [one.key for one in self.find_devices()]:
+            return TriedDevice(False, "It is not there any more. Plug it in and search again.")
         return TriedDevice(key == "usb", "It answered in 12 ms." if key == "usb" else "No answer. Check the cable.")

@@ -6,7 +6,7 @@ import contextlib
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +15,12 @@ import uvicorn
 from argon2 import PasswordHasher
 from starlette.applications import Starlette
 
-from controller.panel.accounts import Accounts, Role
+from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.operation import Operation
+from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.store.accounts import Accounts, Role
 from controller.panel.app import make_panel
 from controller.panel.context import PanelOptions
-from controller.panel.kiosk import Kiosk
 
 QUICK_HASH = PasswordHasher(time_cost=1, memory_cost=64, parallelism=1)
 """Argon2id all the same; the real cost has a test of its own."""
@@ -73,10 +75,11 @@ def csrf(page: str) -> str:
 
 @contextlib.contextmanager
 def served(
-    kiosk: Kiosk, folder: Path, *, port: int = 0, options: PanelOptions | None = None, accounts: Accounts | None = None
-) -> Iterator[Served]:
+    kiosk: Kiosk, folder: Path, *, port: int = 0, options: PanelOptions | None = None, accounts: Accounts | None = None,
+    operations: Sequence[Operation] = OPERATIONS,
+) -> Iterator[Served]:  # fmt: skip
     accounts = accounts or accounts_in(folder)
-    app = make_panel(kiosk, accounts, options or PanelOptions(folder=folder, frames_per_s=20))
+    app = make_panel(kiosk, accounts, options or PanelOptions(folder=folder, frames_per_s=20), operations)
     config = uvicorn.Config(
         app, host="127.0.0.1", port=port, log_level="error", ws="none", server_header=False, timeout_graceful_shutdown=1
     )

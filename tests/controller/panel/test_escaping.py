@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.panel.kiosk import (
+from controller.kiosk.interface import (
     Appearance,
     DeviceRow,
     Grade,

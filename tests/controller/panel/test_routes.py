@@ -5,8 +5,8 @@ from __future__ import annotations
 import httpx
 import pytest
 
-from controller.panel.accounts import Role
-from controller.panel.visitors import Entry
+from controller.kiosk.store.accounts import Role
+from controller.panel.auth.identity import Entry
 from tests.controller.panel.served import Served, csrf
 
 PUBLIC = {"/login", "/static/style.css", "/static/panel.js", "/static/icon.svg"}

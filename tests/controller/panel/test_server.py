@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from controller.errors import UsageError, WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.panel.app import make_panel
 from controller.panel.context import PanelOptions
 from controller.panel.server import PanelServer, check_exposure
@@ -44,7 +44,7 @@ def test_a_port_that_is_taken_is_told_and_a_stopped_panel_frees_it(tmp_path: Pat
         if taken:
             with pytest.raises(WorkError) as caught:
                 second.start()
-            assert caught.value.code == "panel-not-started"
+            assert caught.value.code == "panel-port-taken"
             first.stop()
         else:
             assert second.start() == address

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from controller.errors import UsageError
-from controller.panel.accounts import Accounts, Role
+from controller.core.errors import UsageError
+from controller.kiosk.store.accounts import Accounts, Role
 from controller.panel.answers import INCOMING, temporary
 from controller.panel.app import make_panel
 from controller.panel.context import PanelOptions

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from controller.plan.thing import Thing, read_thing
+from controller.plan.target_object import TargetObject, read_target_object
 from controller.plan.values import ProjectorModel
 
 
@@ -20,8 +20,8 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def thing(ball: Path) -> Thing:
-    return read_thing(ball, height_m=0.3, up="+y", front="+z")
+def target_object(ball: Path) -> TargetObject:
+    return read_target_object(ball, height_m=0.3, up="+y", front="+z")
 
 
 @pytest.fixture(scope="session")

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from controller.arrays import Float64, Mask
+from controller.core.arrays import Float64, Mask
 from controller.plan.aim import aimed
 from controller.plan.optics import FWHM, best_focus, blur, lit_by
-from controller.plan.thing import Thing, sampled
+from controller.plan.target_object import TargetObject, sampled
 from controller.plan.values import Placement, ProjectorModel, Spot, Surface
 from tests.controller.plan.conftest import EYE
 
@@ -101,11 +101,13 @@ def test_what_lies_beside_the_picture_behind_or_turned_away_gets_nothing() -> No
     assert not lit.lux.any()
 
 
-def test_the_balls_far_side_and_what_another_thing_shades_get_nothing(thing: Thing, model: ProjectorModel) -> None:
-    surface = sampled(thing, 800, np.concatenate((EYE, -EYE)), seed=1)
+def test_the_balls_far_side_and_what_another_thing_shades_get_nothing(
+    target_object: TargetObject, model: ProjectorModel
+) -> None:
+    surface = sampled(target_object, 800, np.concatenate((EYE, -EYE)), seed=1)
     placement = aimed(model, Spot("front", (0.0, 0.0, -1.5)), surface, 0.9)
     assert placement is not None
-    lit = lit_by(placement, surface, thing)
+    lit = lit_by(placement, surface, target_object)
     front = surface.points_m[:, 2] < -0.05
     assert lit.reached[front].mean() > 0.95
     assert not lit.reached[surface.points_m[:, 2] > 0.02].any()
@@ -144,11 +146,17 @@ def test_the_best_focus_is_where_scipy_finds_the_least_blur() -> None:
     side=st.floats(-0.3, 0.3),
 )  # fmt: skip
 def test_an_aimed_projector_holds_the_object_in_the_middle_and_stays_level(
-    thing: Thing, model: ProjectorModel, right: float, above: float, distance: float, up: float, side: float
+    target_object: TargetObject,
+    model: ProjectorModel,
+    right: float,
+    above: float,
+    distance: float,
+    up: float,
+    side: float,
 ) -> None:
     a, b = np.deg2rad(right), np.deg2rad(above)
     at = distance * np.array([np.sin(a) * np.cos(b), -np.sin(b), -np.cos(a) * np.cos(b)])
-    surface = sampled(thing, 400, EYE, seed=2)
+    surface = sampled(target_object, 400, EYE, seed=2)
     shifted = replace(model, lens_shift=(side, up))
     placement = aimed(shifted, Spot("there", (float(at[0]), float(at[1]), float(at[2]))), surface, 0.8)
     assert placement is not None
@@ -165,6 +173,6 @@ def test_an_aimed_projector_holds_the_object_in_the_middle_and_stays_level(
     assert not inside or taken == pytest.approx(0.8, rel=0.01)
 
 
-def test_nothing_can_be_aimed_from_within_the_object(thing: Thing, model: ProjectorModel) -> None:
-    surface = sampled(thing, 400, EYE, seed=2)
+def test_nothing_can_be_aimed_from_within_the_object(target_object: TargetObject, model: ProjectorModel) -> None:
+    surface = sampled(target_object, 400, EYE, seed=2)
     assert aimed(model, Spot("inside", (0.0, 0.0, 0.0)), surface, 0.8) is None

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.errors import UsageError
-from controller.plan_services import plan, write_example
-from tests.controller.session.listening import Listening
+from controller.core.errors import UsageError
+from controller.services.plan import plan, write_example
+from tests.controller.run.listening import Listening
 
 
 def test_the_example_with_a_mesh_becomes_a_page_and_figures(tmp_path: Path, ball: Path) -> None:

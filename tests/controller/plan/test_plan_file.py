@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.errors import UsageError
+from controller.core.errors import UsageError
 from controller.plan.plan_file import EXAMPLE, read_plan
 
 
@@ -37,7 +37,7 @@ def test_the_example_is_a_plan_of_three_projectors_in_places_named_and_all_round
         ("lumens = 3000.0", 'lumens = "bright"', "plan-key-type", ("line 14", "lumens")),
         ("throw_ratio = [1.6, 2.0]", "throw_ratio = [2.0, 1.6]", "plan-key-value", ("line 15", "throw_ratio")),
         ("above_degrees = [0.0, 40.0]", "above_degrees = [0.0, 95.0]", "plan-key-value", ("above_degrees",)),
-        ("step_degrees = 10.0", "step_degrees = 0.5", "plan-key-value", ("too many places",)),
+        ("step_degrees = 10.0", "step_degrees = 0.5", "plan-key-value", ("too many positions",)),
         ("[goal]", "[goal", "plan-syntax", ("line",)),
         ("positions_m = [[0.0, -0.2, -1.5], [0.5, -0.2, -1.4], [-0.5, -0.2, -1.4]]", "positions_m = []",
          "plan-key-value", ("positions_m",)),

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.errors import UsageError, WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.plan.search import Candidate, Measure, candidates_of, chosen, in_the_way
-from controller.plan.thing import Thing, sampled
-from controller.plan.values import Goal, ProjectorModel, Spot, Surface
+from controller.plan.target_object import TargetObject, sampled
+from controller.plan.values import PlanGoal, ProjectorModel, Spot, Surface
 from tests.controller.plan.conftest import EYE
 
-GOAL = Goal(4000.0, 0.8, 2, 75.0, 0.9, 0.1, 0.3)
+GOAL = PlanGoal(4000.0, 0.8, 2, 75.0, 0.9, 0.1, 0.3)
 
 
 def on_ring(count: int, distance_m: float = 1.3) -> list[Spot]:
@@ -27,20 +27,22 @@ def on_ring(count: int, distance_m: float = 1.3) -> list[Spot]:
 
 
 @pytest.fixture(scope="module")
-def surface(thing: Thing) -> Surface:
-    return sampled(thing, 600, EYE, seed=3)
+def surface(target_object: TargetObject) -> Surface:
+    return sampled(target_object, 600, EYE, seed=3)
 
 
-def tried(thing: Thing, surface: Surface, model: ProjectorModel, goal: Goal, *, count: int) -> list[list[Candidate]]:
-    return candidates_of([model] * count, on_ring(9), surface, thing, goal, EYE)
+def tried(
+    target_object: TargetObject, surface: Surface, model: ProjectorModel, goal: PlanGoal, *, count: int
+) -> list[list[Candidate]]:
+    return candidates_of([model] * count, on_ring(9), surface, target_object, goal, EYE)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("goal", [GOAL, replace(GOAL, lux=12000.0, overlap=3), replace(GOAL, detail_mm=0.3, overlap=1)])
 def test_the_best_set_of_all_is_found(
-    thing: Thing, surface: Surface, model: ProjectorModel, goal: Goal, count: int
+    target_object: TargetObject, surface: Surface, model: ProjectorModel, goal: PlanGoal, count: int
 ) -> None:
-    by_model = tried(thing, surface, model, goal, count=count)
+    by_model = tried(target_object, surface, model, goal, count=count)
     best = chosen(by_model, surface, goal)
     judge = Measure.of(by_model[0], surface, goal)
     at = [np.asarray(one.placement.position_m) for one in by_model[0]]
@@ -53,41 +55,47 @@ def test_the_best_set_of_all_is_found(
 
 
 def test_more_projectors_are_never_worse_and_more_light_wanted_never_better(
-    thing: Thing, surface: Surface, model: ProjectorModel
+    target_object: TargetObject, surface: Surface, model: ProjectorModel
 ) -> None:
-    by_count = [chosen(tried(thing, surface, model, GOAL, count=n), surface, GOAL).quality for n in (1, 2, 3)]
+    by_count = [chosen(tried(target_object, surface, model, GOAL, count=n), surface, GOAL).quality for n in (1, 2, 3)]
     assert by_count == sorted(by_count)
     demanding = replace(GOAL, lux=40000.0)
-    assert chosen(tried(thing, surface, model, demanding, count=2), surface, demanding).quality < by_count[1]
+    assert chosen(tried(target_object, surface, model, demanding, count=2), surface, demanding).quality < by_count[1]
 
 
-def test_a_place_in_the_audiences_view_is_none(thing: Thing, surface: Surface, model: ProjectorModel) -> None:
+def test_a_place_in_the_audiences_view_is_none(
+    target_object: TargetObject, surface: Surface, model: ProjectorModel
+) -> None:
     spots = [Spot("in front", (0.0, 0.0, -1.0)), Spot("beside", (0.9, 0.0, -0.9))]
-    (found,) = candidates_of([model], spots, surface, thing, GOAL, EYE)
+    (found,) = candidates_of([model], spots, surface, target_object, GOAL, EYE)
     assert [one.placement.spot.name for one in found] == ["beside"]
     assert in_the_way(np.array([0.0, 0.0, -1.0]), EYE, surface, 0.1)
     with pytest.raises(UsageError) as refused:
-        candidates_of([model], spots[:1], surface, thing, GOAL, EYE)
+        candidates_of([model], spots[:1], surface, target_object, GOAL, EYE)
     assert refused.value.code == "plan-no-place"
 
 
-def test_two_can_not_stand_in_one_place(thing: Thing, surface: Surface, model: ProjectorModel) -> None:
-    by_model = candidates_of([model, model], on_ring(9)[:1], surface, thing, GOAL, EYE)
+def test_two_can_not_stand_in_one_place(target_object: TargetObject, surface: Surface, model: ProjectorModel) -> None:
+    by_model = candidates_of([model, model], on_ring(9)[:1], surface, target_object, GOAL, EYE)
     with pytest.raises(UsageError) as refused:
         chosen(by_model, surface, GOAL)
     assert refused.value.code == "plan-too-crowded"
 
 
-def test_light_that_is_too_flat_counts_for_nothing(thing: Thing, surface: Surface, model: ProjectorModel) -> None:
+def test_light_that_is_too_flat_counts_for_nothing(
+    target_object: TargetObject, surface: Surface, model: ProjectorModel
+) -> None:
     strict = replace(GOAL, steepest_degrees=30.0)
-    (wide,), (narrow,) = (candidates_of([model], on_ring(1), surface, thing, goal, EYE) for goal in (GOAL, strict))
+    (wide,), (narrow,) = (
+        candidates_of([model], on_ring(1), surface, target_object, goal, EYE) for goal in (GOAL, strict)
+    )
     assert 0 < narrow[0].useful.sum() < wide[0].useful.sum()
     assert narrow[0].lit.cosine[narrow[0].useful].min() >= np.cos(np.deg2rad(30.0))
 
 
-def test_it_stops_on_request(thing: Thing, surface: Surface, model: ProjectorModel) -> None:
+def test_it_stops_on_request(target_object: TargetObject, surface: Surface, model: ProjectorModel) -> None:
     cancel = threading.Event()
     cancel.set()
     with pytest.raises(WorkError) as stopped:
-        candidates_of([model], on_ring(3), surface, thing, GOAL, EYE, cancel=cancel)
+        candidates_of([model], on_ring(3), surface, target_object, GOAL, EYE, cancel=cancel)
     assert stopped.value.code == "cancelled"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.play.launch import PlayerProcess, PlayerSettings, start_player
+from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
 from tests.controller.play.wire import Wire, noise
 
 OUTPUTS = [("P1", 40, 30), ("P2", 41, 31), ("Prój3", 39, 29)]

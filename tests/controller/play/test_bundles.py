@@ -9,7 +9,7 @@ from typing import Any
 
 from controller.bundle.signing import generate_key, load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.play.launch import PlayerProcess
+from controller.play.control.launch import PlayerProcess
 from tests.controller.play.wire import Frames, Wire, noise, same
 
 Outputs = list[tuple[str, int, int]]

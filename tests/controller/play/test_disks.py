@@ -20,7 +20,7 @@ from typing import TypeVar
 import pytest
 
 from controller.bundle.install import current, install
-from controller.play.launch import PlayerProcess
+from controller.play.control.launch import PlayerProcess
 from tests.controller.play.conftest import write_noise
 from tests.controller.play.wire import Frames, Wire, noise, same
 
@@ -69,7 +69,7 @@ def test_a_disk_that_becomes_read_only_stops_no_picture(
                 assert same(shown.read(), noise(outputs, seed))
                 assert wire.ask("show", sequence=inbox.write(noise(outputs, 60 + seed)))["ok"]
                 assert same(shown.read(), noise(outputs, 60 + seed))
-            assert "could not be kept" in player.log.read_text()
+            assert "could not be saved" in player.log.read_text()
         assert wire.ask("play", appearance="4")["ok"]
     os.kill(player.pid, signal.SIGKILL)
     player.restart()
@@ -89,7 +89,7 @@ def test_an_installed_bundle_plays_from_a_disk_that_is_read_only_from_the_start(
             assert wire.ask("play", appearance="1")["ok"]
             assert same(Frames(tmp_path / "out.frame").read(), noise(outputs, 1))
         assert player.terminate() == 0
-    assert "count of starts could not be kept" in player.log.read_text()
+    assert "count of starts could not be saved" in player.log.read_text()
     assert not (folder / "starts.json").exists()
 
 
@@ -111,7 +111,7 @@ def test_an_installation_onto_a_disk_that_is_full_or_read_only_leaves_what_plays
     installed = install(write_noise(tmp_path / "1.vel"), folder, allow_unsigned=True)
     program = """
 import sys; from pathlib import Path
-from controller.bundle.install import install; from controller.errors import VelaturaError
+from controller.bundle.install import install; from controller.core.errors import VelaturaError
 try:
     install(Path(sys.argv[1]), Path(sys.argv[2]), allow_unsigned=True)
 except VelaturaError as error:

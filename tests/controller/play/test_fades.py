@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.play.launch import PlayerProcess
+from controller.play.control.launch import PlayerProcess
 from tests.controller.play.wire import Frames, Pictures, Wire, dark, noise, same
 
 Outputs = list[tuple[str, int, int]]

@@ -17,8 +17,8 @@ import pytest
 from controller.bundle.install import install
 from controller.bundle.signing import generate_key, load_signing_key
 from controller.bundle.writer import NewAppearance, sign_bundle, write_bundle
-from controller.errors import WorkError
-from controller.play.launch import PlayerProcess
+from controller.core.errors import WorkError
+from controller.play.control.launch import PlayerProcess
 from tests.controller.play.conftest import OUTPUTS, write_noise
 from tests.controller.play.wire import Frames, Wire, noise
 

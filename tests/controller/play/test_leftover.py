@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.play import launch
-from controller.play.launch import PlayerProcess, PlayerSettings, end_leftover, replace_player
+from controller.play.control import launch
+from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover, replace_player
 
 
 @pytest.mark.parametrize("hangs", [False, True])

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.errors import WorkError
-from controller.play.launch import PlayerProcess
+from controller.core.errors import WorkError
+from controller.play.control.launch import PlayerProcess
 from tests.controller.play.wire import Frames, Wire, dark, noise, same
 
 Outputs = list[tuple[str, int, int]]
@@ -52,7 +52,7 @@ def exit_code(player: PlayerProcess) -> int:
 def quiet(player: PlayerProcess) -> bool:
     """Whether its log holds nothing but that its bundle is not signed."""
     (line,) = player.log.read_text().splitlines()
-    return line.startswith("WARNING: The bundle carries no signature")
+    return line.startswith("WARNING: The bundle has no signature")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -150,13 +150,13 @@ def test_a_second_player_does_not_start_and_the_first_goes_on(wire: Wire, folder
     ("arguments", "code", "sentence"),
     [
         (["--outputs", "P1:0x8", "--frames", "f"], 2, "a side is not"),
-        (["--outputs", "P1:8x8,P1:8x8", "--frames", "f"], 2, "one name"),
+        (["--outputs", "P1:8x8,P1:8x8", "--frames", "f"], 2, "same name"),
         (["--outputs", "P1", "--frames", "f"], 2, "NAME:WIDTHxHEIGHT"),
         (["--outputs", "P1:8x8", "--frames", "f", "--rate", "0"], 2, "rate"),
         (["--outputs", "P1:8x8", "--frames", "f", "--rate", "nan"], 2, "rate"),
         (["--outputs", "P1:8x8", "--frames", "f", "--trusted", "/nowhere"], 2, "key file"),
         (["--outputs", "P1:8x8", "--frames", "/proc/f"], 1, "could not be written"),
-        (["--outputs", "P1:8x8", "--frames", "f", "--bundle", "/nowhere"], 1, "can not be read"),
+        (["--outputs", "P1:8x8", "--frames", "f", "--bundle", "/nowhere"], 1, "can't be read"),
     ],
 )
 def test_a_wrong_start_says_what_and_what_to_do(
@@ -171,7 +171,7 @@ def test_a_wrong_start_says_what_and_what_to_do(
 
 
 def test_a_player_that_does_not_start_is_told_with_its_reason(start: Start) -> None:
-    with pytest.raises(WorkError, match=r"/nowhere/b\.vel can not be read") as caught:
+    with pytest.raises(WorkError, match=r"/nowhere/b\.vel can't be read") as caught:
         start(bundle=Path("/nowhere/b.vel"))
     assert caught.value.code == "player-not-started"
 
@@ -208,7 +208,7 @@ def test_starting_loads_neither_the_window_library_nor_the_rest_of_the_controlle
         "pydantic",
         "typer",
         "rich",
-        "controller.app",
+        "controller.stage.run",
         "controller.config",
         "hal",
     }

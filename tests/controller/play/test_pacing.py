@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.play import pacing, presenting
-from controller.play.coming import Coming
 from controller.play.frames import FrameSet, OutputSize
+from controller.play.pending_presentation import PendingPresentation
 from controller.play.presenting import Presenter
 from tests.controller.play.conftest import OUTPUTS, write_noise
 from tests.controller.play.wire import Wire
@@ -88,7 +88,7 @@ def play(presenter: Presenter, clocks: Clocks, count: int) -> None:
     presenter.begin_sequence(RATE_HZ)
     tick = presenter.soon()
     for _ in range(count):
-        coming = Coming("appearance", "a", black, tick, None, paced=True)
+        coming = PendingPresentation("appearance", "a", black, tick, None, paced=True)
         while not presenter.present(coming, black):
             clocks.sleep(max(presenter.patience_s(coming), 0.0001))
         tick = coming.first_tick + 1
@@ -123,7 +123,7 @@ def test_a_fade_takes_its_time_however_slow_its_steps_are(clocks: Clocks) -> Non
         output = Slow(clocks, takes_s=[takes_s] * 200)
         presenter = Presenter(output, SIZES, RATE_HZ)
         black = FrameSet.black(SIZES)
-        coming = Coming("appearance", "a", black, presenter.soon(), None, fade_s=2.0)
+        coming = PendingPresentation("appearance", "a", black, presenter.soon(), None, fade_s=2.0)
         while not presenter.present(coming, black):
             clocks.sleep(max(presenter.patience_s(coming), 0.0001))
         assert output.flips_s[-1] - output.flips_s[0] == pytest.approx(2.0, abs=0.15)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.play.launch import PlayerProcess
+from controller.play.control.launch import PlayerProcess
 from tests.controller.play.wire import Frames, Wire, dark, noise, same
 
 Outputs = list[tuple[str, int, int]]

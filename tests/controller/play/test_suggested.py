@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 from nacl.signing import SigningKey
 
-from controller.bundle.format import Hint
+from controller.bundle.format import PlaylistEntry
 from controller.bundle.signing import write_public_key
-from controller.play.launch import PlayerProcess
+from controller.play.control.launch import PlayerProcess
 from tests.controller.play.conftest import write_noise
 from tests.controller.play.wire import Frames, Wire, noise, same
 
 Outputs = list[tuple[str, int, int]]
 Start = Callable[..., PlayerProcess]
-SCHEDULE = [Hint("3", 40, 0), Hint("1", 60, 0), Hint("5", 3_600_000, 50)]
+SCHEDULE = [PlaylistEntry("3", 40, 0), PlaylistEntry("1", 60, 0), PlaylistEntry("5", 3_600_000, 50)]
 
 
 @pytest.fixture
@@ -84,14 +84,14 @@ def test_a_bundle_that_nobody_signed_is_refused_or_told_for_as_long_as_it_is_loa
         assert wire.ask("load-bundle", path=str(bundle))["ok"]
         status = wire.ask("status")
         assert (status["signed_by"], status["warning"]["code"]) == (None, "bundle-unproven")
-        assert "anyone may have made it" in status["warning"]["what"]
+        assert "origin is unknown" in status["warning"]["what"]
         assert wire.ask("load-bundle", path=str(signed))["ok"]
         status = wire.ask("status")
         assert (status["signed_by"], status["warning"]) == (bytes(key.verify_key).hex(), None)
-    assert player.log.read_text().count("WARNING: The bundle carries no signature") == 1
+    assert player.log.read_text().count("WARNING: The bundle has no signature") == 1
 
 
 def test_a_key_that_is_on_no_list_proves_nothing(start: Start, tmp_path: Path) -> None:
     signed = write_noise(tmp_path / "signed.vel", key=SigningKey(bytes(32)))
     with Wire(start(bundle=signed, allow_unsigned=True).socket) as wire:
-        assert "a key that the stage does not list" in wire.ask("status")["warning"]["what"]
+        assert "a key that stage.toml does not list" in wire.ask("status")["warning"]["what"]

@@ -13,9 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import controller.play
-from controller.play.launch import PlayerProcess, PlayerSettings, start_player
+from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
+from tests.controller.play.display.xorg import HEIGHT, WIDTH, running_server
 from tests.controller.play.wire import Frames, Wire, noise, same
-from tests.controller.play.xorg import HEIGHT, WIDTH, running_server
 
 Outputs = list[tuple[str, int, int]]
 Start = Callable[..., PlayerProcess]

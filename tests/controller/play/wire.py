@@ -1,4 +1,4 @@
-"""The player's socket and frame file as docs/player-protocol.md tells them, written without looking at the player."""
+"""The player's socket and frame file as docs/reference/player-protocol.md has them, without looking at the player."""
 
 from __future__ import annotations
 

@@ -13,15 +13,19 @@ import cv2
 import numpy as np
 import pytest
 
-from controller.arrays import save_arrays
-from controller.errors import UsageError
+from controller.artefacts.calibration import read_calibration
+from controller.artefacts.grade import ErrorMaps, write_grade
+from controller.artefacts.projectors import Light, PixelFigures, write_radiometry_figures
+from controller.bundle.export import png
+from controller.core.arrays import save_arrays
+from controller.core.errors import UsageError
 from controller.report import plots
-from controller.report.calibration import Asked, resolution_px, size_px, write_calibration_report
-from controller.session.calibrating import read_calibration
-from controller.session.journal import Journal
+from controller.report.calibration import StageDescription, resolution_px, size_px, write_calibration_report
+from controller.run.journal import Journal
+from controller.run.step_id import StepId
 
 NAMES = ("left", "<b>right</b>")
-ASKED = Asked("A <script>stage</script>", NAMES, 8.0)
+ASKED = StageDescription("A <script>stage</script>", NAMES, 8.0)
 CAMERA = (40, 60)
 PROJECTOR = (12, 16)
 
@@ -30,7 +34,7 @@ def write_run(runs: Path, name: str, errors: tuple[float, float]) -> Path:
     """A run of two projectors: the second lights the right half of the camera's picture only, and half as finely."""
     run = runs / name
     with Journal(run) as journal:
-        journal.complete("verify", {}, (), began_at_s=time.time())
+        journal.complete(StepId("verify"), {}, (), began_at_s=time.time())
     verification: dict[str, Any] = {}
     maps = {}
     for number, projector in enumerate(NAMES):
@@ -39,9 +43,8 @@ def write_run(runs: Path, name: str, errors: tuple[float, float]) -> Path:
             white[:, : CAMERA[1] // 2] = 0
         black = np.full((*CAMERA, 3), 0.001, np.float32)
         response = np.linspace(0, 1, 256)[None].repeat(3, axis=0) ** 2.2
-        light = {"response": response, "mixing": np.eye(3), "camera_to_xyz": np.eye(3)}
-        save_arrays(run / f"radiometry-{projector}.npz", light | {"white": white, "black": black})
-        (run / f"radiometry-{projector}.json").write_text("{}")
+        Light(response, np.eye(3), white, black, np.eye(3)).write(run, projector)
+        write_radiometry_figures(run, projector, {})
         rows, columns = np.indices(PROJECTOR)
         centre = np.stack([columns * CAMERA[1] / PROJECTOR[1], rows * CAMERA[0] / PROJECTOR[0]], axis=-1)
         covariance = np.broadcast_to(np.array([1.0, 0.0, 1.0]) * (1 + 3 * number), (*PROJECTOR, 3))
@@ -53,13 +56,11 @@ def write_run(runs: Path, name: str, errors: tuple[float, float]) -> Path:
                 "modulation": np.ones(CAMERA, np.float32), "seen": np.ones(CAMERA, bool),
             },
         )  # fmt: skip
-        (run / f"pixels-{projector}.json").write_text(json.dumps({"fitted": 192, "pixels": 192}))
+        PixelFigures(192, 192, 2400).write(run, projector)
         why = [{"reason": "moved", "error_share": 0.5, "area_share": 0.1, "sentence": "It <i>moved</i>."}]
         verification[projector] = {"relative_rms": errors[number] / 100, "grade": "A", "reasons": why}
-        maps[projector] = np.full(CAMERA, errors[number] / 100, np.float32)
-    save_arrays(run / "verification.npz", maps)
-    (run / "verification.json").write_text(json.dumps(verification))
-    assert cv2.imwrite(str(run / "verification.png"), np.zeros((2 * CAMERA[0], CAMERA[1], 3), np.uint8))
+        maps[projector] = ErrorMaps(np.full(CAMERA, errors[number] / 100, np.float32), np.zeros(CAMERA, np.uint8))
+    write_grade(run, verification, maps, png(np.zeros((2 * CAMERA[0], CAMERA[1], 3), np.uint8)))
     points = np.dstack([np.zeros(CAMERA), np.zeros(CAMERA), np.ones(CAMERA)]).astype(np.float32)
     save_arrays(run / "geometry.npz", {"points_m": points, "normals": points})
     (run / "geometry.json").write_text(json.dumps({"reprojection_rms_px": 0.025}))

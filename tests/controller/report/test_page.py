@@ -10,19 +10,19 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.report.page import Goal, Page, Picture, Row, render, write_report
+from controller.report.page import Goal, Page, PictureRow, ReportPicture, render, write_report
 
 GREY = np.full((6, 8, 3), 128, np.uint8)
 EVIL = "<script>alert('x')</script><img src=x onerror=\"y\">&amp;"
 
 
 def page(text: str = "plain") -> Page:
-    picture = Picture(text, GREY, text)
+    picture = ReportPicture(text, GREY, text)
     return Page(
         title=text,
         summary=text,
         goals=(Goal(text, text, text, True, text), Goal("no goal", "1"), Goal("missed", "2", "1", False)),
-        rows=(Row(text, ((text, text),), (picture, picture)),),
+        rows=(PictureRow(text, ((text, text),), (picture, picture)),),
         galleries=((text, text, (picture,)),),
         steps=((text, 1.5), ("nothing", 0.0)),
         facts={text: text},

@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration
-from controller.errors import UsageError
+from controller.core.arrays import FloatImage
+from controller.core.errors import UsageError
 from controller.solve.adapt import GIVEN_UP, adapt, adapt_gently, contrast_kept
-from controller.solve.drive import Drive
-from controller.transport import LightTransport
+from controller.solve.drive_levels import DriveLevels
+from controller.transport import build_transport
 from tests.controller.solve.conftest import plane_calibration
 
 Stage = Callable[..., Calibration]
 STAGE = plane_calibration(projector=(40, 52), camera=(120, 160), spill=0.0)
-TRANSPORT = LightTransport.build(STAGE)
-DRIVE = Drive(TRANSPORT)
+TRANSPORT = build_transport(STAGE)
+DRIVE = DriveLevels(TRANSPORT)
 WHITE = float(TRANSPORT.reach().max())
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from controller.calibrate.values import Calibration
-from controller.errors import UsageError
+from controller.core.errors import UsageError
 from controller.solve.appearance import (
     Base,
     BaseKind,
@@ -22,14 +22,14 @@ from controller.solve.appearance import (
     scale_frames,
     solve_base,
 )
-from controller.transport import LightTransport
+from controller.transport import LightTransport, build_transport
 
 Stage = Callable[..., Calibration]
 Image = npt.NDArray[np.float32]
 
 
 def based(calibration: Calibration, kind: BaseKind = "white") -> tuple[LightTransport, Base]:
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     return transport, solve_base(transport, base_image(calibration, kind), calibration.black)
 
 
@@ -56,7 +56,7 @@ def test_scaling_by_one_gives_the_base_back(stage: Stage, kind: BaseKind) -> Non
 def test_scaling_a_uniform_target_is_exact_with_mixed_colours(stage: Stage) -> None:
     calibration = stage(spill=0.2)
     transport, base = based(calibration)
-    target = scaled(base, calibration.black, np.full((*transport.shape, 3), 0.6, np.float32))
+    target = scaled(base, calibration.black, np.full((*transport.camera_shape, 3), 0.6, np.float32))
     light = transport.forward(scale_frames(transport, base, target, calibration.black))
     np.testing.assert_allclose(light, 0.6 * base.solution.light, atol=1e-3)
 
@@ -64,7 +64,7 @@ def test_scaling_a_uniform_target_is_exact_with_mixed_colours(stage: Stage) -> N
 def test_a_scale_without_fine_detail_is_as_good_as_the_base(stage: Stage) -> None:
     calibration = stage()
     transport, base = based(calibration)
-    scale = smooth_scale(transport.shape)
+    scale = smooth_scale(transport.camera_shape)
     target = scaled(base, calibration.black, scale)
     light = transport.forward(scale_frames(transport, base, target, calibration.black))
     mask = transport.object_mask
@@ -93,16 +93,16 @@ def test_a_full_solve_from_the_scaled_base_keeps_what_the_scale_loses(stage: Sta
 def test_a_smooth_target_is_left_to_the_scale(stage: Stage) -> None:
     calibration = stage()
     transport, base = based(calibration)
-    target = scaled(base, calibration.black, smooth_scale(transport.shape))
+    target = scaled(base, calibration.black, smooth_scale(transport.camera_shape))
     assert make_appearance(transport, base, target, calibration.black).mode == "scale"
 
 
 def test_a_high_pass_base_takes_the_fine_detail_and_leaves_a_smooth_scale(stage: Stage) -> None:
     calibration = stage()
     transport, white = based(calibration)
-    stripes = 0.7 + 0.3 * (np.arange(transport.shape[1]) % 4 < 2)
-    fine = np.broadcast_to(stripes.astype(np.float32)[None, :, None], (*transport.shape, 3))
-    target = scaled(white, calibration.black, 0.6 * smooth_scale(transport.shape) * fine)
+    stripes = 0.7 + 0.3 * (np.arange(transport.camera_shape[1]) % 4 < 2)
+    fine = np.broadcast_to(stripes.astype(np.float32)[None, :, None], (*transport.camera_shape, 3))
+    target = scaled(white, calibration.black, 0.6 * smooth_scale(transport.camera_shape) * fine)
     image = high_pass_base(transport, white.image, target, calibration.black)
     base = solve_base(transport, image, calibration.black)
     before = fine_detail(transport, white, target, calibration.black)
@@ -113,7 +113,7 @@ def test_a_high_pass_base_takes_the_fine_detail_and_leaves_a_smooth_scale(stage:
 
 def test_a_base_that_is_black_in_places_spoils_nothing_around_them(stage: Stage) -> None:
     calibration = stage()
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     image = base_image(calibration)
     whole = solve_base(transport, image, calibration.black)
     image = image.copy()
@@ -122,7 +122,7 @@ def test_a_base_that_is_black_in_places_spoils_nothing_around_them(stage: Stage)
     base = prepare_base(transport, image, calibration.black, whole.solution)
     frames = scale_frames(transport, base, whole.image, calibration.black)
     light = transport.forward(frames)
-    outside = np.ones(transport.shape, np.bool_)
+    outside = np.ones(transport.camera_shape, np.bool_)
     outside[15:45, 25:55] = False
     np.testing.assert_allclose(light[outside], whole.solution.light[outside], atol=1e-3)
     assert all(np.isfinite(frame).all() and frame.min() >= 0 and frame.max() <= 1 for frame in frames)
@@ -130,7 +130,7 @@ def test_a_base_that_is_black_in_places_spoils_nothing_around_them(stage: Stage)
 
 def test_an_entirely_black_base_gives_dark_frames(stage: Stage) -> None:
     calibration = stage()
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     base = solve_base(transport, calibration.black, calibration.black)
     frames = scale_frames(transport, base, np.full((60, 80, 3), 0.5, np.float32), calibration.black)
     assert max(float(frame.max()) for frame in frames) < 1e-5

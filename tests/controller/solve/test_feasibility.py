@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from controller.calibrate.values import Calibration
-from controller.errors import UsageError, WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.solve.feasibility import Feasibility, choose_exposure, feasibility, target_radiance
-from controller.transport import LightTransport
+from controller.transport import build_transport
 
 Stage = Callable[..., Calibration]
 
@@ -24,8 +24,8 @@ def test_at_the_chosen_exposure_the_stated_share_is_bright_enough_and_no_brighte
     stage: Stage, seed: int, share: float
 ) -> None:
     calibration = stage(seed)
-    transport = LightTransport.build(calibration)
-    target = np.random.default_rng(seed).random((*transport.shape, 3)).astype(np.float32)
+    transport = build_transport(calibration)
+    target = np.random.default_rng(seed).random((*transport.camera_shape, 3)).astype(np.float32)
     exposure = choose_exposure(transport, target, calibration.black, share=share)
     within, beyond = (
         feasibility(transport, target_radiance(target, calibration.black, e), calibration.black, margin=1e-6)
@@ -47,7 +47,7 @@ def test_what_all_projectors_make_together_is_within_reach_and_a_little_more_is_
 ) -> None:
     """Through T itself: the same colour on all projectors is driven by just that colour, crosstalk and all."""
     calibration = stage()
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     frames = [np.broadcast_to(np.array(colour, np.float32), (*size, 3)).copy() for size in transport.sizes]
     light = transport.forward(frames)
     mask = transport.object_mask
@@ -62,7 +62,7 @@ def test_what_all_projectors_make_together_is_within_reach_and_a_little_more_is_
 
 def test_a_colour_purer_than_the_projectors_primaries_is_out_of_reach(stage: Stage) -> None:
     calibration = stage()
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     red = transport.reach() * np.array([0.5, 0, 0], np.float32)
     found = feasibility(transport, red + calibration.black, calibration.black)
     assert not found.reachable.any()
@@ -71,7 +71,7 @@ def test_a_colour_purer_than_the_projectors_primaries_is_out_of_reach(stage: Sta
 
 def test_the_feasibility_map_says_what_is_missing_and_what_is_too_much(stage: Stage) -> None:
     calibration = stage()
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     reach = transport.reach()
     target = calibration.black + 0.5 * reach
     target[30, 40] = calibration.black[30, 40] + 1.25 * reach[30, 40]
@@ -93,14 +93,14 @@ def test_a_radiance_is_never_below_the_black_image(stage: Stage) -> None:
 def test_a_black_target_has_no_exposure(stage: Stage) -> None:
     calibration = stage()
     with pytest.raises(WorkError) as failed:
-        choose_exposure(LightTransport.build(calibration), np.zeros_like(calibration.black), calibration.black)
+        choose_exposure(build_transport(calibration), np.zeros_like(calibration.black), calibration.black)
     assert failed.value.code == "no-light"
 
 
 def test_a_share_outside_zero_to_one_is_refused(stage: Stage) -> None:
     calibration = stage()
     with pytest.raises(UsageError) as refused:
-        choose_exposure(LightTransport.build(calibration), calibration.black, calibration.black, share=0)
+        choose_exposure(build_transport(calibration), calibration.black, calibration.black, share=0)
     assert refused.value.code == "share-out-of-range"
 
 
@@ -109,8 +109,8 @@ def test_pixels_without_light_in_a_channel_do_not_bear_on_the_exposure(stage: St
     dark = [dataclasses.replace(p, white=p.white.copy()) for p in calibration.projectors]
     for part in dark:
         part.white[10:20, 10:20, 2] = 0
-    transport = LightTransport.build(dataclasses.replace(calibration, projectors=tuple(dark)))
-    target = np.full((*transport.shape, 3), 0.5, np.float32)
+    transport = build_transport(dataclasses.replace(calibration, projectors=tuple(dark)))
+    target = np.full((*transport.camera_shape, 3), 0.5, np.float32)
     exposure = choose_exposure(transport, target, calibration.black)
     found = feasibility(transport, target_radiance(target, calibration.black, exposure), calibration.black)
     assert 0 < exposure < np.inf

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
 from skimage.color import rgb2lab
 
-from controller.errors import UsageError
+from controller.core.errors import UsageError
 from controller.solve.metrics import colour_difference, compare, lab_of, sharpness
 
 SRGB = np.array(
@@ -64,6 +67,23 @@ def test_blur_lowers_the_sharpness_and_a_flat_result_has_none() -> None:
     picture, mask = linear_picture(), np.ones((50, 60), np.bool_)
     assert sharpness(np.full_like(picture, 0.3), picture, 1.0, mask) < 0.05
     assert sharpness(np.roll(picture, 3, 1), picture, 1.0, mask) < 0.7
+
+
+def dotted(period_px: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    """Dots so dense that much more than a tenth of the picture is edge, all of one strength; soft as a camera's."""
+    y, x = np.mgrid[0:150, 0:200]
+    off = [np.abs((axis + period_px / 2) % period_px - period_px / 2) for axis in (y, x)]
+    dots = ndimage.gaussian_filter((np.hypot(*off) < period_px / 3).astype(np.float32), 0.8)
+    return np.asarray(0.7 - 0.5 * dots[..., None] * np.ones(3), np.float32)
+
+
+@settings(max_examples=25, deadline=None)
+@given(period_px=st.floats(14, 26), contrast=st.floats(0.8, 1.0))
+def test_edges_of_a_dense_pattern_are_there_though_its_contrast_is_less(period_px: float, contrast: float) -> None:
+    picture, mask = dotted(period_px), np.ones((150, 200), np.bool_)
+    paler = picture.mean() + np.float32(contrast) * (picture - picture.mean())
+    assert sharpness(paler, picture, 1.0, mask) > 0.85
+    assert sharpness(np.roll(paler, round(period_px / 4), 1), picture, 1.0, mask) < 0.5
 
 
 def test_an_empty_mask_is_refused() -> None:

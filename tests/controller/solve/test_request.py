@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.arrays import FloatImage
+from controller.core.arrays import FloatImage
 from controller.solve.appearance import Base, Mode, base_image, solve_base
-from controller.solve.request import SolveOptions, answer
-from controller.solve.targets_values import Target
-from controller.transport import LightTransport
+from controller.solve.request import SolveOptions, solve_appearance
+from controller.solve.targets.values import Target
+from controller.transport import LightTransport, build_transport
 from tests.controller.solve.conftest import plane_calibration
 
 STAGE = plane_calibration(projector=(40, 52), camera=(120, 160), spill=0.0)
@@ -20,7 +20,7 @@ OPTIONS = SolveOptions(share=0.9, smoothness=0.001)
 
 @pytest.fixture(scope="module")
 def transport() -> LightTransport:
-    return LightTransport.build(STAGE)
+    return build_transport(STAGE)
 
 
 @pytest.fixture(scope="module")
@@ -49,20 +49,20 @@ def picture(pitch_px: float) -> Target:
 def test_fine_detail_is_solved_in_full_or_advised_to_be(
     transport: LightTransport, base: Base, pitch_px: float, mode: Mode, made: str, advised: bool
 ) -> None:
-    found = answer(transport, base, STAGE.black, picture(pitch_px), replace(OPTIONS, mode=mode))
+    found = solve_appearance(transport, base, STAGE.black, picture(pitch_px), replace(OPTIONS, mode=mode))
     assert found.figures["mode"] == made
     assert (found.figures["advice"] is not None) is advised
 
 
 def test_reachable_pixels_are_those_where_the_target_says_something(transport: LightTransport, base: Base) -> None:
-    found = answer(transport, base, STAGE.black, picture(40), OPTIONS)
+    found = solve_appearance(transport, base, STAGE.black, picture(40), OPTIONS)
     assert not found.reachable[:10].any()
     assert found.reachable[10:].mean() > 0.85
 
 
 def test_adaptation_brings_more_pixels_into_reach_and_tells_the_contrast(transport: LightTransport, base: Base) -> None:
     options = replace(OPTIONS, share=0.4, adapt=1.0)
-    figures = answer(transport, base, STAGE.black, picture(30), options).figures
+    figures = solve_appearance(transport, base, STAGE.black, picture(30), options).figures
     values = {key: value for key, value in figures.items() if isinstance(value, float)}
     assert values["reachable_share"] < 0.6 < 0.95 < values["adapted_share"], "all but the few given up"
     assert values["contrast_kept"] > values["contrast_kept_cut_off"]

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from controller.calibrate.values import Calibration
-from controller.errors import UsageError
-from controller.solve.bounded import solve_bounded
+from controller.core.errors import UsageError
+from controller.solve.bounded.solver import solve_bounded
 from controller.solve.traditional import traditional_compensation
-from controller.transport import LightTransport
+from controller.transport import build_transport
 
 Stage = Callable[..., Calibration]
 
 
 def test_a_smooth_reachable_ratio_is_made_by_one_projector_alone(stage: Stage) -> None:
     calibration = stage(spill=0.2)
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     target = calibration.black + 0.5 * calibration.projectors[1].white
     frames = traditional_compensation(calibration, target, 1)
     assert not frames[0].any()
@@ -41,7 +41,7 @@ def test_it_is_clipped_and_stays_finite_where_there_is_no_light(stage: Stage) ->
 
 def test_the_global_solve_is_much_nearer_to_a_target_with_detail(stage: Stage) -> None:
     calibration = stage()
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     rng = np.random.default_rng(0)
     frames = [(0.2 + 0.6 * rng.random((*size, 3))).astype(np.float32) for size in transport.sizes]
     target = transport.forward(frames) + calibration.black

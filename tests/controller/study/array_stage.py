@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from controller.arrays import FloatImage
-from controller.calibrate.shares import gaussian_weights, normalised
 from controller.calibrate.values import (
     Calibration,
     Geometry,
@@ -17,8 +15,10 @@ from controller.calibrate.values import (
     ProjectorCalibration,
     Radiometry,
 )
-from controller.study.subject import Dots, Subject
-from controller.transport import LightTransport
+from controller.core.arrays import FloatImage
+from controller.study.lab.subject import Dots, Subject
+from controller.transport import LightTransport, build_transport
+from tests.controller.transport.sparse_shares import gaussian_weights, normalised
 
 CAMERA = (96, 128)
 PITCH_PX = 3.0
@@ -68,7 +68,7 @@ def array_subject(projectors: int = 3, seed: int = 0) -> Subject:
     mask = np.zeros(CAMERA, np.bool_)
     mask[8:-8, 8:-8] = True
     calibration = Calibration(tuple(parts), black, mask, np.eye(3))
-    transport = LightTransport.build(calibration)
+    transport = build_transport(calibration)
     return Subject(calibration, shell(), transport, ArrayLight(calibration, transport, rng))
 
 

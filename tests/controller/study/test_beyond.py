@@ -11,17 +11,16 @@ from typing import cast
 import numpy as np
 import pytest
 
-from controller.arrays import FloatImage
-from controller.calibrate.drift import Culprit, Drift, ProjectorDrift
-from controller.calibrate.registration import Motion
-from controller.errors import CalibrationError
-from controller.session.modes import DotOptions
-from controller.study.adaptation import CUT, GENTLE, adaptation, bands_kept
-from controller.study.drifting import LEVELS_PX, Bumped, _criteria, drifting
-from controller.study.effort import effort
-from controller.study.robustness import TROUBLES, quantised, robustness
-from controller.study.stagehand import Again, Change
-from controller.study.subject import Dots, Parts, Subject
+from controller.artefacts.modes import DotOptions
+from controller.calibrate.verify.drift import Drift, DriftCause, ProjectorDrift
+from controller.calibrate.verify.registration import Motion
+from controller.core.arrays import FloatImage
+from controller.core.errors import CalibrationError
+from controller.study.experiments.adaptation import CUT, GENTLE, adaptation, bands_kept
+from controller.study.experiments.drift import LEVELS_PX, BumpResult, _criteria, drifting
+from controller.study.experiments.effort import effort
+from controller.study.experiments.robustness import DISTURBANCES, quantised, robustness
+from controller.study.lab.subject import BenchChange, Dots, Recalibration, SessionParts, Subject
 from controller.study.values import column
 from tests.controller.study.array_stage import ArrayLight, array_subject
 
@@ -35,10 +34,10 @@ class Clumsy:
     """Moves a stage in arrays as ``changes`` say: every bump shifts what the projectors show, till it is calibrated."""
 
     subject: Subject
-    changes: tuple[Change, ...] = ()
+    changes: tuple[BenchChange, ...] = ()
     done: list[str] = field(default_factory=list)
 
-    def disturb(self, *changes: Change) -> None:
+    def disturb(self, *changes: BenchChange) -> None:
         self.changes = changes
 
     def _moved_px(self, what: str) -> float:
@@ -49,8 +48,8 @@ class Clumsy:
 
     def drift(self, name: str) -> Drift:
         moved = {what: self._moved_px(what) for what in ("projector", "camera", "object")}
-        culprit = next((kind for what, kind in (("camera", Culprit.CAMERA), ("object", Culprit.OBJECT))
-                        if moved[what] > 0.2), Culprit.NOBODY)  # fmt: skip
+        culprit = next((kind for what, kind in (("camera", DriftCause.CAMERA), ("object", DriftCause.OBJECT))
+                        if moved[what] > 0.2), DriftCause.NONE)  # fmt: skip
         projectors = tuple(
             ProjectorDrift(part.name, motion(moved["projector"] if n == 0 else 0.0), (1.0, 1.0, 1.0),
                            (0.01, 0.01, 0.01), 0.0, 1.0)
@@ -58,22 +57,22 @@ class Clumsy:
         )  # fmt: skip
         return Drift(projectors, motion(moved["camera"] + moved["object"]), culprit, 0.0, 1.0)
 
-    def quickly(self, name: str) -> Again:
+    def quickly(self, name: str) -> Recalibration:
         return self.again(name)
 
-    def again(self, name: str, options: DotOptions | None = None) -> Again:
+    def again(self, name: str, options: DotOptions | None = None) -> Recalibration:
         self.done.append(name)
         if any(change.get("gloss", 0) > 0.02 for change in self.changes):
             raise CalibrationError("too-glossy", what="The object mirrors.", remedy="Dull it.")
         subject = dataclasses.replace(self.subject, light=array_subject().light)
         spacing = 0 if options is None or options.spacing_px is None else options.spacing_px
         photographs = 3 * (30 + (spacing**2 if options is not None and options.mode == "paper" else 0))
-        return Again(subject, photographs, {"p0": 1.2, "p1": 1.4})
+        return Recalibration(subject, photographs, {"p0": 1.2, "p1": 1.4})
 
 
 @dataclass
 class Disturbed:
-    """``Light`` that shows what a clumsy hand made of the frames."""
+    """``Photographer`` that shows what a clumsy hand made of the frames."""
 
     light: ArrayLight
     hand: Clumsy
@@ -95,7 +94,7 @@ def stage() -> tuple[Subject, Clumsy]:
     hand = Clumsy(subject)
     assert isinstance(subject.light, ArrayLight)
     subject.light = Disturbed(subject.light, hand)
-    subject.parts = cast(Parts, SimpleNamespace(hand=hand))
+    subject.parts = cast(SessionParts, SimpleNamespace(hand=hand))
     return subject, hand
 
 
@@ -114,8 +113,8 @@ def test_costly_bumps_that_nobody_notices_wrong_names_and_bad_mending_are_told_a
     _, hand = stage()
     hand.disturb({"what": "camera", "shift_px": (5.0, 0.0)})
     blind = hand.drift("quiet")
-    found = [Bumped("a projector", 5.0, 9.0, False, False, 0.0, 4.0, 9, 1.2, 95),
-             Bumped("the camera", 5.0, None, False, False, 0.0)]  # fmt: skip
+    found = [BumpResult("a projector", 5.0, 9.0, False, False, 0.0, 4.0, 9, 1.2, 95),
+             BumpResult("the camera", 5.0, None, False, False, 0.0)]  # fmt: skip
     undisturbed, noticed, named, mended = _criteria(1.0, blind, found)
     assert not undisturbed.holds
     assert not noticed.holds
@@ -137,7 +136,7 @@ def test_every_trouble_is_met_at_every_level_and_one_that_can_not_be_calibrated_
     subject, hand = stage()
     result = robustness(subject)
     (table,) = result.tables
-    assert len(table.rows) == 1 + sum(len(trouble.levels) for trouble in TROUBLES)
+    assert len(table.rows) == 1 + sum(len(trouble.levels) for trouble in DISTURBANCES)
     by = {(row[0], row[1]): row for row in table.rows}
     assert by["highlights", 0.05][6] == "The object mirrors."
     assert by["highlights", 0.05][3] is None

@@ -9,13 +9,13 @@ import pytest
 
 from controller.calibrate.values import PhaseMap
 from controller.capture.dots import dot_patterns
-from controller.study import ablation, earlier, live
 from controller.study.catalogue import EXPERIMENTS
-from controller.study.earlier import feathered
-from controller.study.measuring import Quality, Way, unbounded_inverse
-from controller.study.photographing import dots_as_shares
-from controller.study.residual import PAPER, Made, _criteria, residual
-from controller.study.sharpness import local_sharpness
+from controller.study.experiments import ablation, earlier, live
+from controller.study.experiments.earlier import feathered
+from controller.study.experiments.residual import PAPER, ResidualResult, _criteria, residual
+from controller.study.experiments.sharpness import local_sharpness
+from controller.study.lab.measuring import Quality, Variant, unbounded_inverse
+from controller.study.lab.photographing import dots_as_shares
 from controller.study.values import column
 from tests.controller.study.array_stage import ArrayLight, array_subject
 
@@ -35,7 +35,7 @@ def test_the_residual_falls_with_projectors_and_each_count_is_photographed() -> 
 def test_a_figure_above_the_papers_is_a_miss_with_its_reason() -> None:
     nothing = np.zeros((2, 2, 3), np.float32)
     made = [
-        Made(count, nothing, np.full((3, 3), model, np.float32), np.full((3, 3), shown, np.float32), 0.004,
+        ResidualResult(count, nothing, np.full((3, 3), model, np.float32), np.full((3, 3), shown, np.float32), 0.004,
              Quality(0, 0, 0, 1, 1))
         for count, model, shown in ((1, 0.02, 0.03), (2, 0.012, 0.02), (3, 0.009, 0.01))
     ]  # fmt: skip
@@ -84,7 +84,7 @@ def test_every_experiment_says_what_it_does_not_show() -> None:
 
 def test_sharpness_is_measured_for_one_and_for_all_naive_and_full(monkeypatch: pytest.MonkeyPatch) -> None:
     few = partial(unbounded_inverse, iterations=12)
-    monkeypatch.setattr("controller.study.sharpness.unbounded_inverse", few)
+    monkeypatch.setattr("controller.study.experiments.sharpness.unbounded_inverse", few)
     subject = array_subject(2)
     result = local_sharpness(subject)
     (table,) = result.tables
@@ -105,7 +105,7 @@ def test_an_ablation_whose_steps_each_help_holds_and_one_step_back_is_told() -> 
     names = (*ablation.FALLS, ablation.QUADRILATERALS, ablation.OURS)
 
     def judged(*errors: float) -> list[bool | None]:
-        steps = [Way(n, 1.0, nothing, quality_of(e)) for n, e in zip(names, errors, strict=True)]
+        steps = [Variant(n, 1.0, nothing, quality_of(e)) for n, e in zip(names, errors, strict=True)]
         return [criterion.holds for criterion in ablation._criteria(steps)]
 
     assert judged(7, 6, 5, 4, 3, 4, 2) == [True] * 6
@@ -114,7 +114,7 @@ def test_an_ablation_whose_steps_each_help_holds_and_one_step_back_is_told() -> 
 
 def test_ours_is_compared_with_every_earlier_system() -> None:
     nothing = np.zeros((2, 2, 3), np.float32)
-    made = [Way(f"system {e}", 1.0, nothing, quality_of(e)) for e in (3, 1, 2)]
+    made = [Variant(f"system {e}", 1.0, nothing, quality_of(e)) for e in (3, 1, 2)]
     first, second = earlier._criteria(made)
     assert first.holds
     assert second.holds is False

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from controller import study_services
-from controller.errors import UsageError
-from controller.session.progress import Silent
+from controller.core.errors import UsageError
+from controller.run.progress import Silent
+from controller.services import study as study_services
+from controller.services.study import prepare_scene, study
 from controller.study import catalogue
-from controller.study.scenes import SCENES
-from controller.study.values import Criterion, Experiment, Result, Table
-from controller.study_services import prepare_scene, study
+from controller.study.catalogue import SCENES
+from controller.study.values import Criterion, Experiment, Result, ResultTable
 
 
 def run(out: Path, *names: str, size: str = "small") -> Path:
@@ -27,7 +27,7 @@ def test_an_experiment_without_a_stage_is_done_and_gets_its_page(
 ) -> None:
     def counted(subject: object) -> Result:
         assert subject is None
-        return Result((Criterion("three", "3", True),), (Table("t", "Counted", ("n",), ((3,),)),))
+        return Result((Criterion("three", "3", True),), (ResultTable("t", "Counted", ("n",), ((3,),)),))
 
     toy = Experiment("toy", "A toy", "Beyond", "it counts.", None, counted)
     for module in (catalogue, study_services):

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from controller.arrays import FloatImage
 from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
+from controller.core.arrays import FloatImage
 from controller.transport import LightTransport
 
 IDENTITY_MIXING = np.eye(3)

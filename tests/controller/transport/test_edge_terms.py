@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from controller.calibrate.edges import EdgeShares, edge_patterns
-from controller.calibrate.shares import gaussian_weights, normalised
+from controller.calibrate.metapixels.depth_edges import EdgeShares, edge_patterns
 from controller.calibrate.values import Calibration
-from controller.transport import LightTransport
+from controller.transport import build_transport
 from controller.transport.edge_terms import EdgedTransport, EdgeTerm, edge_term, term_arrays, terms_from, with_terms
 from tests.controller.transport.conftest import random_calibration
+from tests.controller.transport.sparse_shares import gaussian_weights, normalised
 
 CAMERA = (60, 80)
 
@@ -47,19 +47,19 @@ def two_surfaces() -> tuple[Calibration, list[sp.csr_matrix[np.float64]], EdgeSh
 
 
 def edged_of(calibration: Calibration, measured: EdgeShares) -> EdgedTransport:
-    model = LightTransport.build(calibration)
+    model = build_transport(calibration)
     return with_terms(model, (edge_term(model, 0, measured, calibration.projectors[0].white),))
 
 
 def test_measured_shares_bring_the_prediction_to_the_truth_at_edges() -> None:
     calibration, (truth,), measured = two_surfaces()
     part = calibration.projectors[0]
-    model, edged = LightTransport.build(calibration), edged_of(calibration, measured)
+    model, edged = build_transport(calibration), edged_of(calibration, measured)
     p = np.random.default_rng(3).random((12, 16, 3)).astype(np.float32)
     lit = model.lit[0]
     light = np.asarray(truth @ (p.reshape(-1, 3) @ part.radiometry.mixing.T))
     real = (part.white * light.reshape(*CAMERA, 3))[lit]
-    before, after = (np.sqrt(np.mean((t.project_one(0, p)[lit] - real) ** 2)) for t in (model, edged))
+    before, after = (np.sqrt(np.mean((t.forward_part(0, p)[lit] - real) ** 2)) for t in (model, edged))
     assert after < 0.35 * before
 
 
@@ -83,7 +83,7 @@ def test_the_adjoint_is_the_transpose() -> None:
 
 def test_one_projectors_part_of_the_transpose_is_its_own_pixels() -> None:
     calibration = random_calibration(8, camera=CAMERA, sizes=((12, 16), (7, 5)))
-    model = LightTransport.build(calibration)
+    model = build_transport(calibration)
     random = np.random.default_rng(8)
     terms = []
     for n, (rows, columns) in enumerate(model.sizes):
@@ -95,7 +95,7 @@ def test_one_projectors_part_of_the_transpose_is_its_own_pixels() -> None:
         whole = transport.adjoint_planes(r)
         for n in range(2):
             part = np.full_like(whole, -7)
-            transport.pull(n, r, part)
+            transport.adjoint_of_buffer(n, r.reshape(-1), part)
             np.testing.assert_allclose(part[:, transport.span(n)], whole[:, transport.span(n)], rtol=1e-5, atol=1e-5)
             assert (np.delete(part, np.r_[transport.span(n)], axis=1) == -7).all()
 
@@ -114,15 +114,15 @@ def test_nothing_measured_changes_nothing() -> None:
         np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.float32), np.full_like(measured.pattern, -1)
     )
     p = np.random.default_rng(6).random((12, 16, 3)).astype(np.float32)
-    model = LightTransport.build(calibration)
-    np.testing.assert_array_equal(edged_of(calibration, nothing).project_one(0, p), model.project_one(0, p))
+    model = build_transport(calibration)
+    np.testing.assert_array_equal(edged_of(calibration, nothing).forward_part(0, p), model.forward_part(0, p))
 
 
 def test_terms_come_back_from_their_arrays(tmp_path: Path) -> None:
     calibration, _, measured = two_surfaces()
     edged = edged_of(calibration, measured)
-    again = EdgedTransport.restored(edged.arrays(), edged.sizes)
-    p = np.random.default_rng(7).random((12, 16, 3)).astype(np.float32)
-    np.testing.assert_array_equal(again.project_one(0, p), edged.project_one(0, p))
     terms = terms_from(term_arrays(edged.terms), edged.sizes)
+    again = with_terms(edged.model, terms)
+    p = np.random.default_rng(7).random((12, 16, 3)).astype(np.float32)
+    np.testing.assert_array_equal(again.forward_part(0, p), edged.forward_part(0, p))
     np.testing.assert_array_equal(terms[0].differences.toarray(), edged.terms[0].differences.toarray())

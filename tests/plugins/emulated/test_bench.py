@@ -21,9 +21,9 @@ import serial
 
 from hal.errors import DeviceError
 from plugins.emulated.bench import EmulatedBench
-from plugins.emulated.shot import ShotSettings
-from plugins.emulated.truth import BenchTruth, MainsTruth, read_truth, write_truth
-from plugins.emulated.world import World
+from plugins.emulated.cameras.shot import ShotSettings
+from plugins.emulated.optics.truth import BenchTruth, MainsTruth, read_truth, write_truth
+from plugins.emulated.optics.world import World
 
 SERVE = """
 import sys

@@ -15,14 +15,14 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.finding import Found, Known, Wanted
-from plugins.emulated.board_sanyo import SanyoBoard
-from plugins.emulated.boards_binary import NecBoard
-from plugins.emulated.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
-from plugins.emulated.lamp import EmulatedLamp, LampPhase, LampTiming
-from plugins.emulated.serial_projector import Board, EmulatedSerialProjector
+from plugins.emulated.projectors.board_sanyo import SanyoBoard
+from plugins.emulated.projectors.boards_binary import NecBoard
+from plugins.emulated.projectors.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
+from plugins.emulated.projectors.serial import Board, EmulatedSerialProjector
 from plugins.finding import serial_ports
 from plugins.finding.access import forbidden
-from plugins.profile_files import load_profile
+from plugins.projectors.profile_files import load_profile
 
 ROOT = Path(__file__).parents[3]
 BOARDS: dict[str, Callable[[EmulatedLamp], Board] | None] = {

@@ -12,14 +12,15 @@ from pathlib import Path
 import pytest
 from StreamDeck.ProductIDs import USBVendorIDs
 
-from hal import hid_light, hid_relay
-from hal.ptp_usb import STILL_IMAGE_CLASS
-from plugins.emulated.hid_key_panel import EmulatedKeyPanel
-from plugins.emulated.hid_light_sensor import EmulatedLightSensor
-from plugins.emulated.hid_relay import EmulatedRelayBoard
-from plugins.emulated.ptp_usb_camera import numbered_camera
-from plugins.emulated.usb_bus import UsbBus
-from plugins.emulated.usb_bus_device import EmulatedUsbDevice, UsbNames
+from hal.codecs.hid import light as hid_light
+from hal.codecs.hid import relay as hid_relay
+from hal.codecs.ptp.usb import STILL_IMAGE_CLASS
+from plugins.emulated.cameras.usb_camera import numbered_camera
+from plugins.emulated.usb.bus import UsbBus
+from plugins.emulated.usb.device import EmulatedUsbDevice, UsbNames
+from plugins.emulated.usb.key_panel import EmulatedKeyPanel
+from plugins.emulated.usb.light_sensor import EmulatedLightSensor
+from plugins.emulated.usb.relay import EmulatedRelayBoard
 from plugins.finding import hid, serial_ports, usb_cameras
 from tests.plugins.finding.udev_rules import Given, Part, given, parse
 

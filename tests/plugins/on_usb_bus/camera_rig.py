@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from hal.deadline import in_seconds
-from plugins.emulated.ptp_usb_camera import numbered_files
-from plugins.emulated.shot import ShotSettings
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.ptp_still import PtpCamera
-from plugins.ptp_usb_bus import UsbAddress, UsbFinder
-from tests.plugins.ptp_rig import FLAVOURS, PATIENT, SHORT
+from plugins.emulated.cameras.shot import ShotSettings
+from plugins.emulated.cameras.usb_camera import numbered_files
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.ptp.still import PtpCamera
+from plugins.ptp.usb.bus import UsbAddress, UsbFinder
+from tests.plugins.ptp.ptp_rig import FLAVOURS, PATIENT, SHORT
 
 SIZE = 300_000
 NAMES = ("camera", "other", "relay", "a", "b")

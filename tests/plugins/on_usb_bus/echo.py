@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plugins.emulated.usb_bus_device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, Setup, Stall, UsbNames
+from plugins.emulated.usb.device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
 
 
 class EchoDevice(EmulatedUsbDevice):
@@ -14,7 +14,7 @@ class EchoDevice(EmulatedUsbDevice):
         super().__init__(UsbNames(0x1209, 0x0001, "Tests", "Echo", serial))
         self.stored = b""
 
-    def class_request(self, setup: Setup, data: bytes) -> bytes:
+    def class_request(self, setup: SetupPacket, data: bytes) -> bytes:
         if setup.request != 1:
             raise Stall
         if setup.to_host:

@@ -10,9 +10,9 @@ import pytest
 from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.ptp_camera import open_camera
-from plugins.ptp_still import PtpCamera
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.ptp.camera import open_camera
+from plugins.ptp.still import PtpCamera
 from tests.plugins.on_usb_bus.camera_rig import bus, lasting_bus
 
 __all__ = ["bus", "lasting_bus"]

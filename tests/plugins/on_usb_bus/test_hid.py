@@ -13,15 +13,15 @@ from typing import Any
 
 import pytest
 
-from controller.session.darkness import Darkness
+from controller.rig.ambient_light import Darkness
 from hal.conformance import LightSensorConformance, PowerSwitchConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from plugins.emulated.bench import EmulatedBench
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.hid_light_sensor import ColorHugLightSensor
-from plugins.hid_link import BACKENDS
-from plugins.hid_relay import RelayBoard
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.hid.light_sensor import ColorHugLightSensor
+from plugins.hid.link import BACKENDS
+from plugins.hid.relay import RelayBoard
 
 BOTH = pytest.mark.parametrize("backend", sorted(BACKENDS))
 OpenRelay = Callable[..., RelayBoard]

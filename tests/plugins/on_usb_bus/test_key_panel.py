@@ -14,14 +14,14 @@ import pytest
 from StreamDeck.DeviceManager import DeviceManager
 from StreamDeck.Devices.StreamDeckOriginalV2 import StreamDeckOriginalV2
 
-from controller.session.keys import KeyService, key_picture, technicians_keys
-from controller.session.machine import Event, Machine, State
+from controller.rig.key_panel import KeyService, key_picture, technicians_keys
+from controller.run.state_machine import Event, Machine, State
 from hal.conformance import ButtonPanelConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
-from plugins import stream_deck
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.stream_deck import StreamDeckPanel
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.hid import stream_deck
+from plugins.hid.stream_deck import StreamDeckPanel
 
 
 @pytest.fixture

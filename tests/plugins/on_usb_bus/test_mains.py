@@ -10,21 +10,21 @@ from pathlib import Path
 import pytest
 import serial
 
-from controller.session.mains import Circuit, close_circuits, open_circuits
-from controller.session.power import light, power_down
-from controller.session.safety import LampGuard
+from controller.rig.lamp_guard import LampGuard
+from controller.rig.mains_relays import Circuit, close_circuits, open_circuits
+from controller.rig.power import light, power_down
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.registry import OpenContext
-from plugins.emulated.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.mains import Mains
-from plugins.emulated.quick_profile import quick_profile
-from plugins.emulated.serial_projector import EmulatedSerialProjector
-from plugins.emulated.truth import MainsTruth
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.hid_relay import RelayBoard
-from plugins.serial_projector import open_serial_projector
-from tests.controller.session.lamp_model import Shelf
+from plugins.emulated.optics.truth import MainsTruth
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.mains import Mains
+from plugins.emulated.projectors.quick_profile import quick_profile
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.hid.relay import RelayBoard
+from plugins.projectors.serial import open_serial_projector
+from tests.controller.rig.lamp_model import Shelf
 from tests.waiting import eventually
 
 LAMP = LampTiming(warm_up_s=0.2, cool_down_s=600.0)

@@ -10,11 +10,11 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused
 from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from plugins.ptp_camera import open_camera
-from plugins.ptp_usb_bus import UsbAddress, UsbFinder, usb_cameras
+from plugins.emulated.usb.process import UsbBusProcess
+from plugins.ptp.camera import open_camera
+from plugins.ptp.usb.bus import UsbAddress, UsbFinder, usb_cameras
 from tests.plugins.on_usb_bus.camera_rig import SIZE, Rig, bus, lasting_bus, rig, running
-from tests.plugins.ptp_rig import SHORT
+from tests.plugins.ptp.ptp_rig import SHORT
 
 __all__ = ["bus", "lasting_bus", "rig"]
 

@@ -11,9 +11,9 @@ import pytest
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceGone, DeviceTimeout
 from hal.values import ExposureSettings
-from plugins.emulated.usb_bus_process import UsbBusProcess
+from plugins.emulated.usb.process import UsbBusProcess
 from tests.plugins.on_usb_bus.camera_rig import Rig, bus, lasting_bus, rig, running
-from tests.plugins.ptp_rig import FLAVOURS, HASTY, SHORT, when
+from tests.plugins.ptp.ptp_rig import FLAVOURS, HASTY, SHORT, when
 
 __all__ = ["bus", "lasting_bus", "rig"]
 

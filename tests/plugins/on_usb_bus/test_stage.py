@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from controller.app import run_on_stage
-from controller.checking import check_stage
-from controller.session.rig import Rig
-from controller.session.runner import Context, Step
+from controller.rig.rig import Rig
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.stage.check import check_stage
+from controller.stage.session import OwnSession
 from hal.errors import DeviceRefused
 from hal.registry import Drivers, load_drivers
-from plugins.emulated.usb_bus_process import UsbBusProcess
-from tests.controller.test_app import STAGE, Models
+from plugins.emulated.usb.process import UsbBusProcess
+from tests.controller.stage.test_run import STAGE, Models
 
 TABLES = """
 [[relays]]
@@ -46,9 +47,11 @@ def run(models: Models, bus: UsbBusProcess) -> list[list[bool]]:
             seen.append(bus.get("relay", "state"))
             return ()
 
-        return [Step("look", look)]
+        return [Step(StepId("look"), look)]
 
-    run_on_stage(checked, steps, name="trial", reporter=models.told, cancel=models.cancel, dark=True)
+    OwnSession(checked.stage.folder).run(
+        checked, steps, name="trial", reporter=models.told, cancel=models.cancel, dark=True
+    )
     return seen
 
 

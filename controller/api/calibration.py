@@ -1,0 +1,204 @@
+"""From captures to a calibration, step by step or at once, and what a run of Velatura left in its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.api.captures import CaptureSet
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.calibration import object_mask, projectors_of
+from controller.artefacts.geometry import read_geometry
+from controller.artefacts.grade import graded
+from controller.calibrate.correspondence import decode as correspondence_decode
+from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
+from controller.calibrate.photometry.radiometry import measure_radiometry
+from controller.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
+from controller.capture.patterns import plan_patterns
+from controller.capture.profile import CameraProfile, load_profile
+from controller.capture.raw import CAMERA_BLUR_PX, SRGB_TO_XYZ
+from controller.core.errors import CalibrationError, UsageError
+from controller.transport import LightTransport
+
+
+def decode(captures: CaptureSet) -> Correspondence:
+    """Where on the projector's picture each camera pixel looks, from Gray code and phase shift.
+
+    The Gray code says in which period of the 24-pixel sinusoid a camera pixel lies, the phase of that one in which
+    period of the fine sinusoids, and these where in it. Positions are fitted by planes over neighbours on one surface.
+
+    Parameters
+    ----------
+    captures : needs ``black``, ``gray-*``, ``phase-*`` and ``blur-*``
+
+    Returns
+    -------
+    ``Correspondence``: ``projector_px`` (camera rows, columns, 2) float32, x and y in projector pixels, NaN where not
+    valid; ``modulation`` (rows, columns) float32, contrast of the sinusoids, 0 to 1; ``valid`` (rows, columns) bool
+
+    Errors: ``capture-missing``, ``capture-shape-wrong``, ``captures-inconsistent`` (photographs in the wrong order).
+    """
+    blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5) if captures.from_bayer else 0.0
+    return correspondence_decode.decode(captures.pictures, plan_patterns(captures.projector_px), camera_blur_px=blur_px)
+
+
+def measure_response(captures: CaptureSet) -> Radiometry:
+    """How the projector turns device values into light, from mosaics of coloured tiles.
+
+    Parameters
+    ----------
+    captures : (rows, columns, 3) pictures; needs ``black``, ``white``, ``gray-*`` and ``mosaic-*``
+
+    Returns
+    -------
+    ``Radiometry``: ``response`` (3, 256) float64, light of each device value per channel, rising from 0 to 1;
+    ``mixing`` (3, 3) float64, camera channel by projector channel, each row adds up to 1
+
+    Errors: ``capture-missing``, ``capture-shape-wrong``, ``projector-dark``, ``colours-do-not-add``, ``colours-alike``.
+    """
+    return measure_radiometry(captures.pictures, plan_patterns(captures.projector_px))[0]
+
+
+def fit_metapixels(captures: CaptureSet, correspondence: Correspondence) -> FittedPixels:
+    """Where the light of each projector pixel lands in the camera picture (metapixels, paper 4.2.2, eq. 8).
+
+    Parameters
+    ----------
+    captures : needs ``black`` and ``blur-*``
+    correspondence : what ``decode`` found in the same captures
+
+    Returns
+    -------
+    ``FittedPixels``: ``metapixels`` with ``centre_px`` (projector rows, columns, 2) float32, camera x and y;
+    ``covariance_px2`` (projector rows, columns, 3) float32, xx, xy, yy in camera pixels squared; ``valid`` bool; NaN
+    where not valid. ``phase_map``: the same measurement for each camera pixel. ``mosaic``: the camera's Bayer pattern
+
+    Errors: ``capture-missing``, ``capture-shape-wrong``.
+    """
+    return fit_pixels(captures.pictures, plan_patterns(captures.projector_px), correspondence)
+
+
+def calibrate(captures: Mapping[str, CaptureSet]) -> Calibration:
+    """Calibrate several projectors from their captures: response, correspondence and metapixels of each.
+
+    The same steps as ``velatura calibrate`` in its fast mode. Geometry (poses and points) is not part of it.
+
+    Parameters
+    ----------
+    captures : by projector name; (rows, columns, 3) pictures of one camera position, all in one unit. Needs all
+        patterns but ``random-*``. The black picture of the first projector counts for all
+
+    Returns
+    -------
+    ``Calibration``: ``projectors`` in the order given, each with ``name``, ``metapixels``, ``radiometry``, ``white``
+    (camera rows, columns, 3) float32 and ``phase_map``; ``black`` (camera rows, columns, 3) float32; ``object_mask``
+    (camera rows, columns) bool; ``camera_to_xyz`` (3, 3), of sRGB where the pictures do not say it
+
+    Errors: those of ``measure_response``, ``decode`` and ``fit_metapixels``; ``projector-reaches-nothing``,
+    ``captures-missing``.
+    """
+    if not captures:
+        raise UsageError(
+            "captures-missing", what="There are no captures of any projector.", remedy="Give at least one CaptureSet."
+        )
+    parts, mosaics = [], []
+    for name, one in captures.items():
+        part, mosaic = _calibrated(name, one)
+        parts.append(part)
+        mosaics.append(mosaic)
+    first = next(iter(captures.values()))
+    red, green, blue = CAMERA_BLUR_PX if first.from_bayer else (0.0, 0.0, 0.0)
+    to_xyz = SRGB_TO_XYZ if first.camera_to_xyz is None else first.camera_to_xyz
+    black = np.nan_to_num(first.pictures["black"])
+    return Calibration(tuple(parts), black, object_mask(parts), to_xyz, (red, green, blue), mosaics[-1])
+
+
+def _calibrated(name: str, captures: CaptureSet) -> tuple[ProjectorCalibration, npt.NDArray[np.int64] | None]:
+    radiometry = measure_response(captures)
+    correspondence = decode(captures)
+    if not correspondence.valid.any():
+        raise CalibrationError(
+            "projector-reaches-nothing",
+            what=f"No pixel of projector {name} was found on the object.",
+            remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
+        )
+    fitted = fit_metapixels(captures, correspondence)
+    white = np.nan_to_num(np.maximum(captures.pictures["white"] - captures.pictures["black"], 0)).astype(np.float32)
+    return ProjectorCalibration(name, fitted.metapixels, radiometry, white, fitted.phase_map), fitted.mosaic
+
+
+class CalibratedRun:
+    """What a calibration run left in its folder; each part is read when it is first asked for, and kept.
+
+    ``folder``: the run's; ``projectors``: their names
+    """
+
+    def __init__(self, folder: Path, projectors: Sequence[str]) -> None:
+        self.folder = folder
+        self.projectors = tuple(projectors)
+        self._calibrated = Calibrated(folder, self.projectors)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Metapixels, response and white image of each projector, and the black image."""
+        return self._calibrated.calibration
+
+    @property
+    def transport(self) -> LightTransport:
+        """The light transport, with the corrections at depth edges where the run has measured them."""
+        return self._calibrated.transport
+
+    @cached_property
+    def geometry(self) -> Geometry:
+        """Poses and surface: ``points_m`` (camera rows, columns, 3) float32, metres in the camera's frame."""
+        geometry = read_geometry(self.folder)
+        poses = dict(zip(projectors_of(self.folder), geometry.projectors, strict=True))
+        return replace(geometry, projectors=tuple(poses[name] for name in self.projectors))
+
+    @cached_property
+    def camera(self) -> CameraProfile | None:
+        """What the run has measured of its camera; None where it has not."""
+        return load_profile(self.folder)
+
+    @cached_property
+    def grade(self) -> dict[str, float]:
+        """Error of the prediction by projector name, per cent of the light; empty where the run was not graded."""
+        return graded(self.folder) or {}
+
+
+def read_run(folder: Path | str, projectors: Sequence[str] | None = None) -> CalibratedRun:
+    """Open the folder of a finished calibration, ``STAGE/runs/...-calibrate``.
+
+    Parameters
+    ----------
+    folder : the run's
+    projectors : names of those to use, in this order; without it all of the run
+
+    Returns
+    -------
+    ``CalibratedRun`` with ``calibration``, ``transport``, ``geometry``, ``camera`` and ``grade``
+
+    Errors: ``not-calibrated``, ``projector-unknown``; ``array-file-unreadable`` when a part is damaged.
+    """
+    folder = Path(folder)
+    try:
+        found = projectors_of(folder)
+    except (OSError, ValueError, KeyError) as error:
+        raise UsageError(
+            "not-calibrated",
+            what=f"{folder} holds no finished calibration.",
+            remedy="Give the folder of a finished calibration: STAGE/runs/...",
+        ) from error
+    unknown = next((name for name in projectors or () if name not in found), None)
+    if unknown is not None:
+        raise UsageError(
+            "projector-unknown",
+            what=f"The run has no projector {unknown}.",
+            remedy=f"Choose from {', '.join(found)}.",
+        )
+    return CalibratedRun(folder, found if projectors is None else projectors)

@@ -1,0 +1,218 @@
+"""The photographs of one projector's patterns: what to show, and a folder of pictures that says which is which."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.api.photographs import develop, merge_brackets
+from controller.capture.patterns import device_frame, plan_patterns
+from controller.capture.profile import CameraProfile
+from controller.core.arrays import ByteImage, Float64, FloatImage
+from controller.core.errors import UsageError
+
+DESCRIPTION: Final = "captures.toml"
+Pictures = Mapping[str, "str | Sequence[tuple[str, float]]"]
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureSet:
+    """What a camera saw of one projector's patterns.
+
+    ``pictures``: by pattern name (``draw_patterns``), (rows, columns) or (rows, columns, 3) float32 linear light, in
+    one unit, NaN where saturated. A dictionary of arrays, or a mapping that loads each when it is asked for.
+    ``projector_px``: (width, height) of the projector
+    ``camera_to_xyz`` (3, 3) float64: linear camera RGB to CIE XYZ (D65); None where it is not known
+    ``from_bayer``: the pictures were interpolated bilinearly from a Bayer pattern, as ``develop`` does it
+    """
+
+    pictures: Mapping[str, FloatImage]
+    projector_px: tuple[int, int]
+    camera_to_xyz: Float64 | None = None
+    from_bayer: bool = False
+
+
+def draw_patterns(projector_px: tuple[int, int], *, response: npt.ArrayLike | None = None) -> dict[str, ByteImage]:
+    """The pictures to show, one after the other, to calibrate one projector; the others are black meanwhile.
+
+    ``black``, ``white``; ``gray-x-0``.., ``gray-y-0``..: Gray code of cells 12 projector pixels wide, coarsest bit
+    first; ``mosaic-0``..: coloured tiles, from which the response is measured; ``phase-x-0`` to ``2``, ``phase-y-..``:
+    sinusoids of 24 pixels in three steps of a third of a period; ``blur-x-..``, ``blur-y-..``, ``blur-d-..``: fine
+    sinusoids of 5, 5 and 7 pixels; ``random-0``: a picture to check the result with.
+
+    Sinusoids and the random picture need the projector's response: photograph the others first, then use
+    ``measure_response``.
+
+    Parameters
+    ----------
+    projector_px : (width, height), at least 24 pixels a side
+    response : (3, 256) linear light of each device value per channel, 0 at black, 1 at white
+        (``Radiometry.response``); without it, only the pictures that need none are returned
+
+    Returns
+    -------
+    by name, in the order to show them: (rows, columns, 3) uint8 device values
+
+    Errors: ``projector-too-small``, ``response-not-rising``.
+    """
+    table = None if response is None else np.asarray(response, np.float64)
+    return {
+        pattern.name: device_frame(pattern, projector_px, table)
+        for pattern in plan_patterns(projector_px)
+        if table is not None or not pattern.needs_response
+    }
+
+
+def read_captures(
+    folder: Path | str,
+    *,
+    projector_px: tuple[int, int] | None = None,
+    pictures: Pictures | None = None,
+    exposure_s: float | None = None,
+    camera: CameraProfile | None = None,
+) -> CaptureSet:
+    """The photographs of one projector's patterns from a folder. Each is developed when it is asked for.
+
+    ``captures.toml`` in the folder says which file is which pattern; arguments count before it. Without a table
+    ``[pictures]``, each file is the pattern that it is named after, for example ``gray-x-0.CR2``.
+
+    ::
+
+        projector_px = [1400, 1050]     # width, height
+        exposure_s = 0.05               # of every picture that gives none of its own
+
+        [pictures]
+        black = "IMG_0001.CR2"
+        gray-x-0 = "IMG_0004.CR2"
+        white = [
+            { file = "IMG_0002.CR2", exposure_s = 0.0125 },
+            { file = "IMG_0003.CR2", exposure_s = 0.05 },
+        ]
+
+    Parameters
+    ----------
+    projector_px : (width, height)
+    pictures : by pattern name, a file's name in the folder, or several (file name, exposure in seconds) that are merged
+    exposure_s : seconds; 1 where nothing says it
+    camera : as ``develop``
+
+    Returns
+    -------
+    ``CaptureSet``: (rows, columns, 3) float32 pictures in full scales per second
+
+    Errors: ``captures-description-wrong``, ``capture-file-missing``; those of ``develop`` when a picture is asked for.
+    """
+    folder = Path(folder)
+    said = _description(folder / DESCRIPTION)
+    size = projector_px or said.get("projector_px")
+    if size is None:
+        raise _wrong(folder, "it does not say the size of the projector", "Give projector_px = [width, height].")
+    named = pictures if pictures is not None else _pictures(folder, said.get("pictures"))
+    each_s = float(exposure_s if exposure_s is not None else said.get("exposure_s", 1.0))
+    files: dict[str, list[tuple[Path, float]]] = {}
+    for name, value in named.items():
+        taken = [(value, each_s)] if isinstance(value, str) else value
+        files[name] = [(folder / file, float(seconds or each_s)) for file, seconds in taken]
+        missing = next((path for path, _ in files[name] if not path.is_file()), None)
+        if missing is not None:
+            raise UsageError(
+                "capture-file-missing",
+                what=f"There is no file {missing} for the pattern {name}.",
+                remedy="Correct its name in captures.toml, or copy the file into the folder.",
+            )
+    first = next(iter(files.values()), None)
+    if first is None:
+        raise _wrong(folder, "it holds no picture of a pattern", "Name the files after the patterns, or list them.")
+    sample = develop(first[0][0], camera=camera)
+    width, height = size
+    return CaptureSet(
+        _Folder(files, camera), (int(width), int(height)), sample.camera_to_xyz, from_bayer=sample.bayer is not None
+    )
+
+
+class _Folder(Mapping[str, FloatImage]):
+    """Photographs by pattern name, developed each time they are asked for."""
+
+    def __init__(self, files: Mapping[str, Sequence[tuple[Path, float]]], camera: CameraProfile | None) -> None:
+        self._files = files
+        self._camera = camera
+
+    def __getitem__(self, name: str) -> FloatImage:
+        taken = self._files[name]
+        images = [develop(path, camera=self._camera).image for path, _ in taken]
+        seconds = [self._true_s(exposure_s) for _, exposure_s in taken]
+        if len(images) > 1:
+            noise = None if self._camera is None else self._camera.noise
+            return merge_brackets(images, seconds, noise=noise).radiance
+        return np.asarray(images[0] / np.float32(seconds[0]), np.float32)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def _true_s(self, exposure_s: float) -> float:
+        return exposure_s if self._camera is None else self._camera.true_exposure(exposure_s)
+
+
+def _description(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        return {}
+    try:
+        said = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise _wrong(path, f"it is not TOML ({error})", "Correct the line.") from error
+    unknown = sorted(set(said) - {"projector_px", "exposure_s", "pictures"})
+    if unknown:
+        raise _wrong(path, f"the key {unknown[0]} is not known", "Use projector_px, exposure_s and [pictures].")
+    size = said.get("projector_px", [1, 1])
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(side, int) and side > 0 for side in size)):
+        raise _wrong(path, "projector_px is not two whole numbers", "Write it as [1400, 1050].")
+    if not _is_time(said.get("exposure_s", 1)):
+        raise _wrong(path, "exposure_s is not a number above 0", "Write the exposure time in seconds.")
+    return said
+
+
+def _pictures(folder: Path, table: Any) -> Pictures:
+    """Files by pattern from the table ``[pictures]``; without one, from the names of the files."""
+    if table is None:
+        return {path.stem: path.name for path in sorted(folder.iterdir()) if path.is_file() and _is_pattern(path.stem)}
+    if not isinstance(table, dict):
+        raise _wrong(folder, "pictures is not a table", "Write one line for each pattern below [pictures].")
+    found: dict[str, str | Sequence[tuple[str, float]]] = {}
+    for name, value in table.items():
+        rows = value if isinstance(value, list) else [{"file": value}]
+        if not rows or not all(_is_taken(row) for row in rows):
+            raise _wrong(
+                folder,
+                f"the pattern {name} has no file name",
+                'Write "FILE", or a list of { file = "FILE", exposure_s = SECONDS }.',
+            )
+        found[name] = [(row["file"], float(row.get("exposure_s", 0))) for row in rows]
+    return found
+
+
+def _is_pattern(stem: str) -> bool:
+    first, _, rest = stem.partition("-")
+    return stem in ("black", "white") or (first in ("gray", "mosaic", "phase", "blur", "random") and bool(rest))
+
+
+def _is_taken(row: Any) -> bool:
+    if not isinstance(row, dict) or set(row) - {"file", "exposure_s"} or not isinstance(row.get("file"), str):
+        return False
+    return _is_time(row.get("exposure_s", 1))
+
+
+def _is_time(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < np.inf
+
+
+def _wrong(where: Path, why: str, remedy: str) -> UsageError:
+    return UsageError("captures-description-wrong", what=f"{where} can't be used: {why}.", remedy=remedy)

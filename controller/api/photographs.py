@@ -1,0 +1,121 @@
+"""Photographs as linear light: development of one file, and exposure brackets merged to one image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.api.arrays import as_images
+from controller.capture import brackets, raw
+from controller.capture.brackets import MergedBracket
+from controller.capture.profile import CameraNoise, CameraProfile
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.errors import WorkError
+from controller.solve.targets.files import read_picture
+
+PLAIN: Final = (".png", ".tif", ".tiff")
+"""Whole numbers without a camera's colour pattern, taken as linear light."""
+
+
+@dataclass(frozen=True, slots=True)
+class Developed:
+    """One photograph in linear light.
+
+    ``image`` (rows, columns, 3) float32 camera RGB: 0 at the black level, 1 at full scale; noise may go below 0; NaN
+    where the photograph is saturated
+    ``saturated`` (rows, columns) bool: a sample that this pixel is made of was saturated
+    ``noise``: variance of a sample of value v is ``noise.shot`` v + ``noise.read`` squared; None where it is not known
+    ``camera_to_xyz`` (3, 3) float64: linear camera RGB to CIE XYZ (D65); None where the file does not say it
+    ``bayer`` (2, 2) int64: colours of the samples that the image was interpolated from (0 red, 1 green, 2 blue) at even
+    and odd rows and columns; None where each pixel had three colours
+    """
+
+    image: FloatImage
+    saturated: Mask
+    noise: CameraNoise | None
+    camera_to_xyz: Float64 | None
+    bayer: npt.NDArray[np.int64] | None
+
+
+def develop(path: Path | str, *, camera: CameraProfile | None = None) -> Developed:
+    """Read one photograph as linear light.
+
+    RAW files (all that LibRaw reads, from sensors with a Bayer pattern): black level subtracted, scaled to full scale,
+    colours interpolated bilinearly. JPEG files: by the camera's measured response. PNG and TIFF files of 8 or 16 bits
+    and EXR files are taken as linear light as they are; the largest whole number counts as saturated.
+
+    Parameters
+    ----------
+    path : the file; its name's ending says what it is
+    camera : what was measured of the camera (black level, clipping, bad pixels, response, noise), for example
+        ``read_run(folder).camera``; where it is given, it counts before what the file says
+
+    Errors: ``photograph-unreadable``, ``raw-not-bayer``, ``jpeg-response-missing``, ``target-unreadable`` (EXR).
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix in (".exr", *PLAIN):
+        image, saturated = _exr(path) if suffix == ".exr" else _plain(path)
+        image[saturated] = np.nan
+        return Developed(image, saturated, None, None, None)
+    photograph = raw.read_photograph(path, profile=camera)
+    noise = None if camera is None else camera.noise
+    return Developed(photograph.measured(), photograph.saturated, noise, photograph.camera_to_xyz, photograph.colours)
+
+
+def _plain(path: Path) -> tuple[FloatImage, Mask]:
+    """(rows, columns, 3) of 0 to 1, and which pixels are at the largest number."""
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    except (OSError, cv2.error) as error:
+        raise _unreadable(path, error) from error
+    if decoded is None or decoded.dtype not in (np.uint8, np.uint16):
+        raise _unreadable(path, "it is not a picture of 8 or 16 bits")
+    colours = np.repeat(decoded[..., None], 3, axis=2) if decoded.ndim == 2 else decoded[..., 2::-1]
+    full = 255 if decoded.dtype == np.uint8 else 65535
+    return np.asarray(colours / np.float32(full), np.float32), np.any(colours == full, axis=2)
+
+
+def _exr(path: Path) -> tuple[FloatImage, Mask]:
+    """Linear light as it is; a pixel that is not finite counts as saturated."""
+    image = np.ascontiguousarray(read_picture(path)[..., :3])
+    return image, np.asarray(~np.isfinite(image).all(axis=2))
+
+
+def _unreadable(path: Path, reason: object) -> WorkError:
+    return WorkError(
+        "photograph-unreadable",
+        what=f"The photograph {path.name} can't be read ({reason}).",
+        remedy="Check that the file exists and opens in another program.",
+    )
+
+
+def merge_brackets(
+    images: Sequence[npt.ArrayLike], exposures_s: Sequence[float], *, noise: CameraNoise | None = None
+) -> MergedBracket:
+    """Merge exposures of one still scene into one image without a ceiling (HDR).
+
+    Each sample is weighted by the inverse of its variance, which the noise model gives from a first estimate.
+
+    Parameters
+    ----------
+    images : of one size, (rows, columns, 3) float32, 0 at black and 1 at full scale, NaN where saturated
+        (``Developed.image``)
+    exposures_s : exposure time of each image, seconds, above 0
+    noise : the camera's; without it that of a 12-bit APS-C camera
+
+    Returns
+    -------
+    ``MergedBracket``: ``radiance`` (rows, columns, 3) float32, full scales per second, NaN where no exposure measured
+    it, and ``sigma`` of the same shape, its standard deviation.
+
+    Errors: ``bracket-mismatch``.
+    """
+    return brackets.merge_brackets(as_images(images), exposures_s, noise=noise)

@@ -1,0 +1,85 @@
+"""The whole calibration that a run left in its folder, read back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.artefacts.geometry import read_geometry_figures
+from controller.artefacts.modes import mode_of, read_metapixels
+from controller.artefacts.photographs import BLACK, Taken, codes_of, light_of
+from controller.artefacts.projectors import Light, Pixels
+from controller.calibrate.values import (
+    Calibration,
+    Correspondence,
+    PhaseMap,
+    ProjectorCalibration,
+)
+from controller.capture.brackets import merge_brackets
+from controller.capture.raw import CAMERA_BLUR_PX
+from controller.core.arrays import FloatImage, Mask
+
+LIT_SHARE = 0.004
+"""A camera pixel counts as lit where a projector's white is above this share of the brightest white there is."""
+
+
+def merge_photographs(taken: Sequence[Taken]) -> FloatImage:
+    """HDR radiance in full scales per second from photographs of one picture."""
+    noise = taken[0].profile.noise if taken and taken[0].profile is not None else None
+    return merge_brackets([t.read().measured() for t in taken], [t.exposure_s for t in taken], noise=noise).radiance
+
+
+def read_black(folder: Path) -> FloatImage:
+    """The HDR black image of a run, merged from its photographs."""
+    return merge_photographs(BLACK.read(folder))
+
+
+def read_captures(folder: Path, projector: str) -> dict[str, Taken]:
+    """All photographs of one projector's patterns, by the pattern's name."""
+    return {**light_of(projector).by_name(folder), **codes_of(projector).by_name(folder)}
+
+
+def read_correspondence(folder: Path, projector: str) -> Correspondence:
+    """What was decoded from the sinusoids of a projector."""
+    return Pixels.read(folder, projector).correspondence
+
+
+def projectors_of(folder: Path) -> list[str]:
+    """The run's projectors, in its order. Raises OSError, ValueError or KeyError for a run without geometry."""
+    return list(read_geometry_figures(folder)["projectors"])
+
+
+def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
+    """The calibration that a finished run left in ``folder``."""
+    parts = []
+    for name in projectors:
+        light = Light.read(folder, name)
+        phase_map, mosaic = read_phase_map(folder, name)
+        parts.append(
+            ProjectorCalibration(
+                name, read_metapixels(folder, name), light.radiometry, np.nan_to_num(light.white), phase_map
+            )
+        )
+    black = np.nan_to_num(light.black)
+    red, green, blue = CAMERA_BLUR_PX
+    camera_blur_px = (red, green, blue)
+    return Calibration(tuple(parts), black, object_mask(parts), light.camera_to_xyz, camera_blur_px, mosaic)
+
+
+def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.NDArray[np.int64] | None]:
+    """A projector's phase map and the camera's mosaic; None where the run has none, or its metapixels are from dots."""
+    if mode_of(folder) == "paper":
+        return None, None
+    pixels = Pixels.read(folder, projector)
+    return (None, None) if pixels.phase_map is None else (pixels.phase_map, pixels.known_mosaic)
+
+
+def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:
+    """Camera pixels that some projector lights noticeably in every channel."""
+    brightest = max(float(np.percentile(part.white, 99.9)) for part in parts)
+    masks = [part.white.min(axis=2) > LIT_SHARE * brightest for part in parts]
+    lit: Mask = np.logical_or.reduce(masks)
+    return lit

@@ -1,0 +1,129 @@
+"""What photographs of appearances were found to achieve, read from the runs' folders.
+
+``steps.appearance.compare`` writes them.
+
+Light on purpose: the kiosk asks for this while it plays, with nothing loaded that calibrates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from controller.artefacts.names import json_path, npz_path, read_json, write_json
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+COMPARE: Final = "compare"
+"""What such runs are called; their folders' names end with it."""
+PICTURES: Final = ("before", "target", "achieved", "error", "resolution")
+MOST: Final = 50
+"""So many runs are looked at, the newest."""
+_KIND: Final = "compared"
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """One appearance in one run: ``photographed_unix_s`` when, on which ``calibration`` it was solved, and how near.
+
+    ``delta_e00_median``, ``delta_e00_p95``: CIEDE2000; ``rmse`` of the target's white; ``sharpness_lambda`` 0 to 1
+    (paper 6, eq. 9), all over the reachable pixels of the object; ``reachable_share`` of its pixels, if it is known;
+    ``window_px`` the side of the resolution map's windows, camera pixels
+    """
+
+    run: str
+    name: str
+    title: str
+    calibration: str
+    photographed_unix_s: float
+    delta_e00_median: float
+    delta_e00_p95: float
+    rmse: float
+    sharpness_lambda: float
+    reachable_share: float | None
+    window_px: int
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedImages:
+    """``compared-NAME.npz``, of the camera's picture.
+
+    ``photograph`` (rows, columns, 3) float32: full scales per second, linear
+    ``error`` (rows, columns) float16: CIEDE2000, NaN where not compared
+    ``resolution``: the resolution map, one value for each of its windows
+    """
+
+    photograph: npt.NDArray[Any]
+    error: npt.NDArray[Any]
+    resolution: npt.NDArray[Any]
+
+
+def write_compared(run: Path, one: Compared, images: ComparedImages) -> list[Path]:
+    """``compared-NAME.json`` and ``.npz``."""
+    from controller.core.arrays import save_arrays
+
+    figures = {key: value for key, value in asdict(one).items() if key != "run"}
+    parts = {"photograph": images.photograph, "error": images.error, "resolution": images.resolution}
+    arrays = npz_path(run, _KIND, one.name)
+    save_arrays(arrays, parts)
+    return [write_json(json_path(run, _KIND, one.name), figures), arrays]
+
+
+def read_images(run: Path, name: str) -> ComparedImages:
+    """What ``write_compared`` wrote of an appearance."""
+    from controller.core.arrays import load_arrays
+
+    return ComparedImages(**load_arrays(npz_path(run, _KIND, name)))
+
+
+def picture_path(run: Path, name: str, picture: str) -> Path:
+    """``picture``: one of ``PICTURES``."""
+    return run / f"{_KIND}-{name}-{picture}.jpg"
+
+
+def compared_in(run: Path) -> tuple[Compared, ...]:
+    """What a run holds, by name; a file that can't be read is left out, since the others say something without it."""
+    found = []
+    for path in sorted(run.glob(f"{_KIND}-*.json")):
+        try:
+            content: dict[str, Any] = read_json(path)
+            found.append(Compared(run=run.name, **content))
+        except (OSError, ValueError, TypeError):
+            continue
+    return tuple(found)
+
+
+def all_compared(stage: Path) -> dict[Path, tuple[Compared, ...]]:
+    """The runs that have photographed anything, oldest first, at most ``MOST``, each with what it holds.
+
+    A run is read again only when something in its folder was replaced: the kiosk asks every few seconds.
+    """
+    folders = sorted((stage / "runs").glob(f"*-{COMPARE}"))[-MOST:]
+    held = {folder: _remembered(folder, folder.stat().st_mtime_ns) for folder in folders}
+    return {folder: found for folder, found in held.items() if found}
+
+
+@lru_cache(maxsize=4 * MOST)
+def _remembered(run: Path, changed_ns: int) -> tuple[Compared, ...]:
+    return compared_in(run)
+
+
+def history_of(stage: Path, names: Collection[str]) -> dict[str, tuple[Compared, ...]]:
+    """Each of these appearances with what was found of it, oldest first; without those that nobody photographed."""
+    found: dict[str, list[Compared]] = {}
+    for known in all_compared(stage).values():
+        for one in known:
+            if one.name in names:
+                found.setdefault(one.name, []).append(one)
+    return {name: tuple(found[name]) for name in names if name in found}
+
+
+def pictures_of(stage: Path, one: Compared) -> dict[str, Path]:
+    """The pictures of it that the run holds, by ``PICTURES``."""
+    run = stage / "runs" / one.run
+    files = {picture: picture_path(run, one.name, picture) for picture in PICTURES}
+    return {picture: file for picture, file in files.items() if file.exists()}

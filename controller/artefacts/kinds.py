@@ -1,0 +1,64 @@
+"""The kinds of steps whose artefacts or identity others ask for, and short ways to write their identities."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable
+from typing import Final
+
+from controller.run.step_id import StepId
+
+
+class StepKind(enum.StrEnum):
+    """The ``kind`` of a ``StepId``. A file of the step is usually called after it: see ``artefacts.names``."""
+
+    EXPOSURE = "exposure"
+    DELAY = "delay"
+    CAMERA_RESPONSE = "camera-response"
+    BLACK = "black"
+    CAMERA = "camera"
+    LIGHT = "light"
+    RADIOMETRY = "radiometry"
+    CODES = "codes"
+    PIXELS = "pixels"
+    GEOMETRY = "geometry"
+    DOTS = "dots"
+    METAPIXELS = "metapixels"
+    STUDY_DOTS = "study-dots"
+    EDGE_DOTS = "edge-dots"
+    EDGES = "edges"
+    EDGE_TERMS = "edge-terms"
+    MODE = "mode"
+    DRIFT_PHOTOGRAPHS = "drift-photographs"
+    DRIFT = "drift"
+    PLAN = "plan"
+    VERIFICATION_PHOTOGRAPHS = "verification-photographs"
+    VERIFY = "verify"
+    CALIBRATED = "calibrated"
+    BASE = "base"
+    TARGET = "target"
+    APPEARANCE = "appearance"
+    PUBLISH = "publish"
+    PHOTOGRAPH = "photograph"
+    TRADITIONAL = "traditional"
+    PLAYBACK = "playback"
+    COMPARE = "compare"
+    PICTURES = "pictures"
+
+
+OF_PROJECTORS: Final = (
+    StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.DOTS, StepKind.METAPIXELS,
+    StepKind.STUDY_DOTS, StepKind.EDGE_DOTS, StepKind.EDGES,
+)  # fmt: skip
+"""Kinds of which there is one step for each projector."""
+
+CALIBRATED: Final = StepId(StepKind.CALIBRATED)
+"""The step whose row in the journal says that the run's calibration is complete."""
+
+
+def of_projectors(names: Iterable[str], *kinds: StepKind) -> tuple[StepId, ...]:
+    """The steps of these kinds of each of these projectors, one projector after the other."""
+    return tuple(StepId(kind, projector) for projector in names for kind in kinds)
+
+
+__all__ = ["CALIBRATED", "OF_PROJECTORS", "StepKind", "of_projectors"]

@@ -1,0 +1,210 @@
+"""The photographs of a run: where they lie, the index that lists them, and the note beside each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.names import CAPTURES, read_json, safe_name, stem, write_json
+from controller.capture.profile import CameraProfile, load_profile
+from controller.capture.raw import Photograph, read_photograph
+from controller.core.arrays import FloatImage
+from controller.run.step_id import ShotId
+
+PATTERN: Final = "pattern"
+"""The name of a projector's photograph where each projector has one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """A photograph on disk, with the exposure that the camera confirmed, in seconds.
+
+    ``fresh``: it was taken just now, not by an earlier run.
+    """
+
+    name: str
+    path: Path
+    exposure_s: float
+    fresh: bool = False
+    profile: CameraProfile | None = field(default=None, compare=False, repr=False)
+    """What the run has measured of the camera, where it has."""
+    projector: str | None = None
+    """The projector that shone alone; None for several, or none."""
+
+    def read(self) -> Photograph:
+        return read_photograph(self.path, profile=self.profile)
+
+    def per_second(self) -> FloatImage:
+        """(rows, columns, 3) float32: full scales per second, NaN where saturated."""
+        photograph = self.read()
+        image = photograph.image
+        image /= np.float32(self.exposure_s)
+        image[photograph.saturated] = np.nan
+        return image
+
+
+@dataclass(frozen=True, slots=True)
+class PhotographSet:
+    """Photographs that are listed together, in one index: KIND.json, KIND-PROJECTOR.json, KIND.NNN-PROJECTOR.json.
+
+    ``projector``: the one that shines alone in all of them; ``batch``: which part of a long list it is, from 0
+    """
+
+    kind: str
+    projector: str | None = None
+    batch: int | None = None
+
+    def index(self, run: Path) -> Path:
+        """The file that lists them."""
+        return run / f"{stem(self.kind, self.projector, part=self.batch)}.json"
+
+    def shot(self, name: str, projector: str | None = None) -> ShotId:
+        """The identity of one of them; ``projector`` where the set has none itself."""
+        return ShotId(str(self.kind), name, projector or self.projector)
+
+    def write(self, run: Path, taken: Sequence[Taken]) -> Path:
+        """List them, in the order in which they were taken; the index."""
+        rows = [
+            {
+                "name": one.name,
+                "projector": one.projector,
+                "path": str(one.path.relative_to(run)),
+                "exposure_s": one.exposure_s,
+            }
+            for one in taken
+        ]
+        return write_json(self.index(run), rows)
+
+    def read(self, run: Path) -> tuple[Taken, ...]:
+        """What the index lists, with the run's word on how long exposures truly are."""
+        profile = load_profile(run)
+        index = self.index(run)
+        if self.batch is not None and not index.exists():  # as journal format 1 had it
+            index = run / f"{self.kind}-{self.projector}-{self.batch:03d}.json"
+        return tuple(self._taken(run, row, profile) for row in read_json(index))
+
+    def by_name(self, run: Path) -> dict[str, Taken]:
+        """As ``read``, by name; for a set of one projector or of none, whose names differ."""
+        return {one.name: one for one in self.read(run)}
+
+    def by_projector(self, run: Path, name: str = PATTERN) -> dict[str | None, Taken]:
+        """As ``read``, those of this name by the projector that shone alone."""
+        return {one.projector: one for one in self.read(run) if one.name == name}
+
+    def _taken(self, run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> Taken:
+        name, projector = (row["name"], row["projector"]) if "projector" in row else self._of_format_1(row["name"])
+        told_s = float(row["exposure_s"])
+        exposure_s = told_s if profile is None else profile.true_exposure(told_s)
+        return Taken(name, run / row["path"], exposure_s, profile=profile, projector=projector)
+
+    def _of_format_1(self, name: str) -> tuple[str, str | None]:
+        """Name and projector from an index of journal format 1, where both were one text."""
+        if self.projector is not None:
+            return name.removeprefix(f"{self.projector}-"), self.projector
+        if self.kind == StepKind.DRIFT_PHOTOGRAPHS:
+            shown = name.removeprefix("drift-")
+            return (shown, None) if shown in ("white", "black") else (PATTERN, shown)
+        if self.kind == StepKind.VERIFICATION_PHOTOGRAPHS:
+            return PATTERN, name.removeprefix("verify-")
+        return name, None
+
+
+def light_of(projector: str) -> PhotographSet:
+    """White, Gray code and colour tiles of one projector."""
+    return PhotographSet(StepKind.LIGHT, projector)
+
+
+def codes_of(projector: str) -> PhotographSet:
+    """The sinusoids and the random pattern of one projector."""
+    return PhotographSet(StepKind.CODES, projector)
+
+
+def white_again_of(projector: str) -> PhotographSet:
+    """White of one projector, photographed once more by a quick recalibration."""
+    return PhotographSet("white", projector)
+
+
+BLACK: Final = PhotographSet(StepKind.BLACK)
+CAMERA_RESPONSE: Final = PhotographSet(StepKind.CAMERA_RESPONSE)
+DRIFT: Final = PhotographSet(StepKind.DRIFT_PHOTOGRAPHS)
+"""One photograph of each projector's pattern, one of white and one of black."""
+VERIFICATION: Final = PhotographSet(StepKind.VERIFICATION_PHOTOGRAPHS)
+"""One photograph of each projector's random pattern."""
+
+WHITE: Final = "white"
+
+
+def white_name(number: int) -> str:
+    """One exposure of the bracket of white."""
+    return f"{WHITE}-{number}"
+
+
+def white_bracket(taken: Sequence[Taken]) -> list[Taken]:
+    """The bracket of white among the photographs of a projector's light."""
+    found = {one.name: one for one in taken}
+    names = (white_name(number) for number in range(len(found)))
+    return [found[name] for name in names if name in found]
+
+
+def captures_folder(run: Path, shot: ShotId) -> Path:
+    """Where the photograph lies: those of one kind and projector lie together, so that no two have the same name."""
+    return run / CAPTURES / stem(shot.kind, shot.projector)
+
+
+def captured(run: Path, of: PhotographSet) -> int:
+    """How many photographs of a set's kind and projector lie in the run, listed or not."""
+    folder = captures_folder(run, of.shot(""))
+    if not folder.is_dir():
+        return 0
+    return sum(1 for path in folder.iterdir() if path.suffix != NOTE_SUFFIX and not path.name.startswith("."))
+
+
+def capture_name(shot: ShotId) -> str:
+    """The photograph's name in its folder, without suffix."""
+    return safe_name(shot.name)
+
+
+def write_exposure(photograph: Path, exposure_s: float) -> None:
+    """Note, beside a photograph, the exposure that the camera confirmed, in seconds."""
+    write_json(_note(photograph), {"exposure_s": exposure_s})
+
+
+def read_exposure(photograph: Path) -> float:
+    """The exposure that the camera confirmed for a photograph, in seconds."""
+    return float(read_json(_note(photograph))["exposure_s"])
+
+
+def _note(photograph: Path) -> Path:
+    return photograph.with_suffix(NOTE_SUFFIX)
+
+
+NOTE_SUFFIX: Final = ".json"
+"""Of the notes beside photographs."""
+
+
+class Developed(Mapping[str, FloatImage]):
+    """Photographs by pattern name, in full scales per second, read each time they are asked for.
+
+    ``ready`` holds images that are there already (HDR black and white) and go before the photographs.
+    """
+
+    def __init__(self, taken: Mapping[str, Taken], ready: Mapping[str, FloatImage]) -> None:
+        self._taken = taken
+        self._ready = ready
+
+    def __getitem__(self, name: str) -> FloatImage:
+        if name in self._ready:
+            return self._ready[name]
+        return self._taken[name].per_second()
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._ready
+        yield from (name for name in self._taken if name not in self._ready)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)

@@ -1,0 +1,199 @@
+"""What a run measured of each projector: its light, its metapixels, its dots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.names import json_path, npz_path, read_json, write_json
+from controller.calibrate.values import Correspondence, Metapixels, PhaseMap, Radiometry
+from controller.core.arrays import Float64, FloatImage, Mask, load_arrays, save_arrays
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """``radiometry-PROJECTOR.npz``: light in full scales per second of the camera, linear.
+
+    ``response`` (3, 256) and ``mixing`` (3, 3): see ``Radiometry``
+    ``white`` (camera rows, columns, 3) float32: HDR white of this projector alone less ``black``, NaN where saturated
+    ``black`` (camera rows, columns, 3) float32: all projectors at black, NaN where saturated
+    ``camera_to_xyz`` (3, 3): linear camera RGB to CIE XYZ (D65)
+    """
+
+    response: Float64
+    mixing: Float64
+    white: FloatImage
+    black: FloatImage
+    camera_to_xyz: Float64
+
+    @property
+    def radiometry(self) -> Radiometry:
+        return Radiometry(self.response, self.mixing)
+
+    @staticmethod
+    def path(run: Path, projector: str) -> Path:
+        return npz_path(run, StepKind.RADIOMETRY, projector)
+
+    def write(self, run: Path, projector: str) -> Path:
+        return _save(self.path(run, projector), self)
+
+    @classmethod
+    def read(cls, run: Path, projector: str) -> Self:
+        arrays = load_arrays(cls.path(run, projector))
+        return cls(**{name: arrays[name] for name in _names(cls)})
+
+
+@dataclass(frozen=True, slots=True)
+class Pixels:
+    """``pixels-PROJECTOR.npz``: correspondences, metapixels and phase map from the sinusoids, in pixels.
+
+    ``projector_px``, ``modulation``, ``seen``: see ``Correspondence``
+    ``centre_px``, ``covariance_px2``, ``valid``: see ``Metapixels``
+    ``shown_px``, ``spread_px2``: see ``PhaseMap``; None in runs from before there was one
+    ``mosaic`` (2, 2) int: see ``Calibration``; of size 0 where each camera pixel has its own three colours
+    """
+
+    projector_px: FloatImage
+    modulation: FloatImage
+    seen: Mask
+    centre_px: FloatImage
+    covariance_px2: FloatImage
+    valid: Mask
+    shown_px: FloatImage | None
+    spread_px2: FloatImage | None
+    mosaic: npt.NDArray[np.int64] | None
+
+    @property
+    def correspondence(self) -> Correspondence:
+        return Correspondence(self.projector_px, self.modulation, self.seen)
+
+    @property
+    def metapixels(self) -> Metapixels:
+        return Metapixels(self.centre_px, self.covariance_px2, self.valid)
+
+    @property
+    def phase_map(self) -> PhaseMap | None:
+        if self.shown_px is None or self.spread_px2 is None:
+            return None
+        return PhaseMap(self.shown_px, self.spread_px2)
+
+    @property
+    def known_mosaic(self) -> npt.NDArray[np.int64] | None:
+        """The camera's mosaic, None where it is not known or there is none."""
+        return self.mosaic if self.mosaic is not None and self.mosaic.size else None
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Those that there are, by name."""
+        return {name: array for name in _names(Pixels) if (array := getattr(self, name)) is not None}
+
+    @staticmethod
+    def path(run: Path, projector: str) -> Path:
+        return npz_path(run, StepKind.PIXELS, projector)
+
+    def write(self, run: Path, projector: str) -> Path:
+        return _save(self.path(run, projector), self)
+
+    @classmethod
+    def read(cls, run: Path, projector: str) -> Self:
+        arrays = load_arrays(cls.path(run, projector))
+        later: dict[str, Any] = {name: arrays.get(name) for name in _LATER}
+        return cls(**{name: arrays[name] for name in _names(cls) if name not in later}, **later)
+
+
+_LATER = ("shown_px", "spread_px2", "mosaic")
+"""Arrays that older runs do not have."""
+
+
+@dataclass(frozen=True, slots=True)
+class DotMetapixels:
+    """``dots-PROJECTOR.npz``: metapixels from dots, as ``Metapixels``; ``reason`` (rows, columns): why one is bad."""
+
+    centre_px: FloatImage
+    covariance_px2: FloatImage
+    valid: Mask
+    reason: npt.NDArray[Any]
+
+    @property
+    def metapixels(self) -> Metapixels:
+        return Metapixels(self.centre_px, self.covariance_px2, self.valid)
+
+    def write(self, run: Path, projector: str) -> Path:
+        return _save(npz_path(run, StepKind.DOTS, projector), self)
+
+    @classmethod
+    def read(cls, run: Path, projector: str) -> Self:
+        arrays = load_arrays(npz_path(run, StepKind.DOTS, projector))
+        return cls(**{name: arrays[name] for name in _names(cls)})
+
+
+@dataclass(frozen=True, slots=True)
+class DotNotes:
+    """``dots-PROJECTOR.json``: the dots' spacing in projector pixels and the exposure of their photographs."""
+
+    spacing_px: int
+    exposure_s: float
+
+    def write(self, run: Path, kind: str, projector: str) -> Path:
+        """``kind``: that of the step that takes the photographs."""
+        return write_json(json_path(run, kind, projector), asdict(self))
+
+    @classmethod
+    def read(cls, run: Path, kind: str, projector: str) -> Self:
+        row = read_json(json_path(run, kind, projector))
+        return cls(int(row["spacing_px"]), float(row["exposure_s"]))
+
+
+def write_radiometry_figures(run: Path, projector: str, figures: Mapping[str, Any]) -> Path:
+    """``radiometry-PROJECTOR.json``: how well the response was measured (docs/reference/report.md)."""
+    return write_json(json_path(run, StepKind.RADIOMETRY, projector), figures)
+
+
+def read_radiometry_figures(run: Path, projector: str) -> Any:
+    """What ``write_radiometry_figures`` wrote; {} where there is none."""
+    return _read_figures(json_path(run, StepKind.RADIOMETRY, projector))
+
+
+@dataclass(frozen=True, slots=True)
+class PixelFigures:
+    """``pixels-PROJECTOR.json``: of ``pixels`` projector pixels ``fitted`` ones have a metapixel.
+
+    ``camera_pixels``: how many camera pixels see the projector
+    """
+
+    fitted: int
+    pixels: int
+    camera_pixels: int
+
+    def write(self, run: Path, projector: str) -> Path:
+        return write_json(json_path(run, StepKind.PIXELS, projector), asdict(self))
+
+    @classmethod
+    def read(cls, run: Path, projector: str) -> Self | None:
+        """None where there are none."""
+        row = _read_figures(json_path(run, StepKind.PIXELS, projector))
+        return cls(int(row["fitted"]), int(row["pixels"]), int(row["camera_pixels"])) if row else None
+
+
+def write_dot_figures(run: Path, projector: str, figures: Mapping[str, Any]) -> Path:
+    """``metapixels-PROJECTOR.json``: how the dots were fitted; for people."""
+    return write_json(json_path(run, StepKind.METAPIXELS, projector), figures)
+
+
+def _read_figures(path: Path) -> Any:
+    return read_json(path) if path.exists() else {}
+
+
+def _names(kind: type[Light | Pixels | DotMetapixels]) -> list[str]:
+    return [one.name for one in fields(kind)]
+
+
+def _save(path: Path, value: Light | Pixels | DotMetapixels) -> Path:
+    arrays = {name: getattr(value, name) for name in _names(type(value))}
+    save_arrays(path, {name: array for name, array in arrays.items() if array is not None})
+    return path

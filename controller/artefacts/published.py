@@ -1,0 +1,87 @@
+"""What a run published and what was photographed of it: bundle, thumbnails, photographs, playback, report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.names import json_path, npz_path, read_json, write_json
+from controller.artefacts.solved import solved_figures_path
+from controller.core.arrays import FloatImage, load_arrays, save_arrays
+from controller.core.storage import sha256_of, write_atomically
+
+BUNDLE: Final = "bundle.vel"
+BUNDLE_FIGURES: Final = "bundle"
+
+
+@dataclass(frozen=True, slots=True)
+class BundleFigures:
+    """``bundle.json``: the bundle's size in bytes, how many times smaller than raw frames it is, where it lies."""
+
+    bytes: int
+    ratio: float
+    file: str
+    names: tuple[str, ...]
+
+    def write(self, run: Path) -> Path:
+        return write_json(json_path(run, BUNDLE_FIGURES), asdict(self))
+
+    @classmethod
+    def read(cls, run: Path) -> BundleFigures:
+        row = read_json(json_path(run, BUNDLE_FIGURES))
+        return cls(int(row["bytes"]), float(row["ratio"]), str(row["file"]), tuple(row["names"]))
+
+
+def write_playback(run: Path, figures: Mapping[str, Any]) -> Path:
+    """``playback.json``: how evenly the appearances were swapped (docs/reference/report.md)."""
+    return write_json(json_path(run, StepKind.PLAYBACK), figures)
+
+
+def read_playback(run: Path) -> Any:
+    """What ``write_playback`` wrote."""
+    return read_json(json_path(run, StepKind.PLAYBACK))
+
+
+def write_photograph(run: Path, kind: StepKind, name: str, picture: FloatImage) -> Path:
+    """``photograph-NAME.npz`` or ``traditional-NAME.npz``: an appearance in HDR, full scales per second, linear."""
+    path = npz_path(run, kind, name)
+    save_arrays(path, {"photograph": np.asarray(picture, np.float32)})
+    return path
+
+
+def has_photograph(run: Path, kind: StepKind, name: str) -> bool:
+    """Whether the run holds that photograph."""
+    return npz_path(run, kind, name).exists()
+
+
+def read_photograph_of(run: Path, kind: StepKind, name: str) -> FloatImage:
+    """(camera rows, columns, 3) float32, as ``write_photograph`` wrote it."""
+    picture: FloatImage = load_arrays(npz_path(run, kind, name))["photograph"]
+    return picture
+
+
+def read_thumbnail(run: Path, name: str) -> bytes | None:
+    """The PNG file of an appearance as it was solved last; None where there is none yet."""
+    path = _thumbnail(run, name)
+    return path.read_bytes() if path.exists() else None
+
+
+def write_thumbnail(run: Path, name: str, png: bytes) -> None:
+    """Keep it until the appearance is solved anew, and remove the older ones."""
+    for older in run.glob(f"thumbnail-{name}-{'[0-9a-f]' * 16}.png"):
+        older.unlink()
+    write_atomically(_thumbnail(run, name), png)
+
+
+def _thumbnail(run: Path, name: str) -> Path:
+    return run / f"thumbnail-{name}-{sha256_of(solved_figures_path(run, name))[:16]}.png"
+
+
+def exported_path(run: Path, kind: str) -> Path:
+    """Where the object lies for other programs: a file by its format, or Blender's folder."""
+    return run / ("blender" if kind == "blender" else f"object.{kind}")

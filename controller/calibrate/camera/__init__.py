@@ -1,0 +1,1 @@
+"""The camera itself: intrinsics from a ChArUco board (`charuco`) or from EXIF data (`exif`)."""

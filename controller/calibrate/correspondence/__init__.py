@@ -1,0 +1,3 @@
+"""Which projector coordinate each camera pixel sees: Gray code and phase shift. Entry: `decode.decode`,
+`phase_map`.
+"""

@@ -1,0 +1,1 @@
+"""Poses and surface points without a known target. Entry: `self_calibration.reconstruct`."""

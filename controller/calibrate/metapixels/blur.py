@@ -1,0 +1,138 @@
+"""How far a projector pixel's light spreads, from the contrast that fine sinusoids lose.
+
+A sinusoid of f cycles per projector pixel, blurred by a Gaussian of covariance S, keeps the modulation
+M = exp(-2 pi^2 f' S f). Three directions give the three numbers of S. The pixel's own square is part of S.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.calibrate.correspondence.captures import Captures, grey
+from controller.calibrate.correspondence.inverse_map import cells_of
+from controller.calibrate.values import Correspondence
+from controller.capture.patterns import BLUR_FREQUENCIES, PERIOD_PX, PatternPlan
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.jit import compiled
+
+NEIGHBOURHOOD = 7
+"""Projector pixels a side over which the contrast is averaged; focus changes slowly over a surface."""
+LEAST_CONTRAST = 0.02
+LEAST_VARIANCE_PX2 = 0.02
+MOST_VARIANCE_PX2 = 16.0
+
+
+def measure_blur(captures: Captures, plan: PatternPlan, correspondence: Correspondence) -> tuple[FloatImage, Mask]:
+    """Blur covariance S of each projector pixel.
+
+    Parameters
+    ----------
+    captures : needs ``black`` and ``blur-*``; linear, in one unit
+    correspondence : of the same projector
+
+    Returns
+    -------
+    (rows, columns, 3) float32 of the projector's image: xx, xy, yy in projector pixels squared; and where it is valid
+
+    Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
+    """
+    cells = cells_of(correspondence, plan.size_px)
+    black = grey(captures, "black")
+    contrast = [
+        _contrast(captures, plan, f"blur-{name}", frequency, black, correspondence, cells)
+        for name, frequency in BLUR_FREQUENCIES.items()
+    ]
+    blur, measured = _covariance(np.stack(contrast), np.array(list(BLUR_FREQUENCIES.values())))
+    coarse = _coarse_variance(correspondence.modulation, cells, plan.size_px)
+    guessed = ~measured & np.isfinite(coarse)
+    blur[guessed] = coarse[guessed, None] * np.array([1, 0, 1], np.float32)
+    return blur, measured | guessed
+
+
+def _coarse_variance(modulation: FloatImage, cells: npt.NDArray[np.int32], size_px: tuple[int, int]) -> FloatImage:
+    """Variance, the same in all directions, that the phase patterns tell; NaN where they were not seen.
+
+    It serves where the fine sinusoids are washed out altogether.
+    """
+    width, height = size_px
+    seen = cells >= 0
+    total = np.bincount(cells[seen], weights=modulation[seen], minlength=width * height).reshape(height, width)
+    count = np.bincount(cells[seen], minlength=width * height).reshape(height, width).astype(np.float64)
+    size = (NEIGHBOURHOOD, NEIGHBOURHOOD)
+    around = [cv2.boxFilter(sums, -1, size, normalize=False) for sums in (total, count)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        typical = np.where(around[1] > 0.5, around[0] / around[1], np.nan)
+    variance = -np.log(np.clip(typical, 1e-3, 1.0)) * PERIOD_PX**2 / (2 * np.pi**2)
+    return np.asarray(np.clip(variance, LEAST_VARIANCE_PX2, MOST_VARIANCE_PX2), np.float32)
+
+
+def _contrast(
+    captures: Captures,
+    plan: PatternPlan,
+    prefix: str,
+    frequency: tuple[float, float],
+    black: FloatImage,
+    correspondence: Correspondence,
+    cells: npt.NDArray[np.int32],
+) -> FloatImage:
+    """Modulation around each projector pixel, (rows, columns); NaN where nothing was seen.
+
+    Each camera pixel's wave is turned back by the phase it should have before the waves are added, so that noise
+    cancels instead of adding contrast, and so does the alias of the projector's pixel grid.
+    """
+    width, height = plan.size_px
+    wave, light = np.zeros(width * height), np.zeros(width * height)
+    position, along = correspondence.projector_px, np.array(frequency)
+    steps = plan.sinusoids(prefix)
+    images = [grey(captures, pattern.name, black.shape) for pattern in steps]
+    # a wave of which a step is missing would have another contrast
+    whole = np.where(np.isfinite(sum(images, -black)), cells, np.int32(-1))
+    for pattern, image in zip(steps, images, strict=True):
+        _add_step(image, black, position, whole, along, pattern.phase_rad, wave, light)
+    # n pictures of W/2 (1 + M cos) each: the light adds up to n W/2, the wave to n W M/4
+    size = (NEIGHBOURHOOD, NEIGHBOURHOOD)
+    around = [cv2.boxFilter(sums.reshape(height, width), -1, size, normalize=False) for sums in (wave, light)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(2 * around[0] / around[1], np.float32)
+
+
+@compiled()
+def _add_step(
+    image: FloatImage,
+    black: FloatImage,
+    position: FloatImage,
+    cells: npt.NDArray[np.int32],
+    frequency: Float64,
+    phase_rad: float,
+    wave: Float64,
+    light: Float64,
+) -> None:
+    rows, columns = cells.shape
+    for row in range(rows):
+        for column in range(columns):
+            cell = cells[row, column]
+            value = image[row, column] - black[row, column]
+            if cell >= 0:
+                along = frequency[0] * position[row, column, 0] + frequency[1] * position[row, column, 1]
+                wave[cell] += value * np.cos(2 * np.pi * along - phase_rad)
+                light[cell] += value
+
+
+def _covariance(contrast: FloatImage, frequencies: Float64) -> tuple[FloatImage, Mask]:
+    """Solve -ln M = 2 pi^2 (fx^2 Sxx + 2 fx fy Sxy + fy^2 Syy) for S, kept positive definite.
+
+    ``contrast`` (3, rows, columns); ``frequencies`` (3, 2) cycles per projector px.
+    """
+    fx, fy = frequencies.T
+    equations = 2 * np.pi**2 * np.stack([fx * fx, 2 * fx * fy, fy * fy], axis=1)
+    with np.errstate(invalid="ignore"):
+        valid = np.all(contrast > LEAST_CONTRAST, axis=0)
+        lost = -np.log(np.clip(np.nan_to_num(contrast, nan=1.0), LEAST_CONTRAST, 1.0))
+    solved = np.tensordot(np.linalg.inv(equations), lost, axes=1)
+    xx = np.clip(solved[0], LEAST_VARIANCE_PX2, MOST_VARIANCE_PX2)
+    yy = np.clip(solved[2], LEAST_VARIANCE_PX2, MOST_VARIANCE_PX2)
+    limit = np.sqrt((xx - LEAST_VARIANCE_PX2 / 2) * (yy - LEAST_VARIANCE_PX2 / 2))
+    xy = np.clip(solved[1], -limit, limit)
+    return np.stack([xx, xy, yy], axis=2).astype(np.float32), np.asarray(valid)

@@ -1,0 +1,1 @@
+"""The response and colour mixing of a projector. Entry: `radiometry.measure_radiometry`."""

@@ -1,0 +1,114 @@
+"""The colour tiles as the camera sees them: one measurement of light for each, away from the tile's border."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.calibrate.correspondence.captures import Captures, coloured
+from controller.calibrate.correspondence.gray_code import decode_cells
+from controller.capture.patterns import PatternKind, PatternPlan, cells_of_frame, tile_levels
+from controller.core.arrays import Float64, FloatImage, Mask
+
+LIT_SHARE = 0.05
+"""Of the 99th percentile of white: darker camera pixels add noise and stray light."""
+BORDER_SHARE = 0.28
+"""Of a tile's side, on each side of it, that may contain a neighbour's light."""
+FEWEST_PIXELS = 4
+NOISE = 1e-4
+"""Variance of a photograph's value at the white of the brightest pixels, relative; shot noise falls with the light."""
+SYSTEMATIC = 0.002
+"""Of full scale: differences from tile to tile besides noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class TileMeasurements:
+    """Measurements of all colour tiles, one for each tile.
+
+    ``levels`` (tiles, 3) int64 device values shown; ``ratio`` (tiles, 3) light per camera channel, white being 1;
+    ``weight`` (tiles, 3): inverse of its variance; ``pixels``: camera pixels that they come from
+    """
+
+    levels: npt.NDArray[np.int64]
+    ratio: Float64
+    weight: Float64
+    pixels: int
+
+
+def measure_tiles(captures: Captures, plan: PatternPlan, black: FloatImage, white: FloatImage) -> TileMeasurements:
+    """Find the tiles by the Gray code and measure each.
+
+    Parameters
+    ----------
+    captures : needs ``gray-*`` and ``mosaic-*``
+    black, white : (rows, columns, 3) linear light of black, and of white above black; NaN where not known
+
+    Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
+    """
+    tiles_patterns = plan.of_kind(PatternKind.COLOUR_TILES)
+    side = tiles_patterns[0].tile_cells
+    half = np.asarray(white.sum(axis=2) / 2, np.float32)
+    axes = [decode_cells(captures, plan, axis, black.sum(axis=2) + half, half) for axis in range(2)]
+    across, down = cells_of_frame(plan.size_px)
+    tile = (axes[1].cell // side) * -(-across // side) + axes[0].cell // side
+    framed = (axes[0].cell < across) & (axes[1].cell < down)
+    seen = (axes[0].weak == 0) & (axes[1].weak == 0) & framed
+    # At a border of cells: of two tiles, or of two cells of one tile. Their neighbours tell which.
+    between = axes[0].sure & axes[1].sure & framed & ~seen
+    inside = _interior(np.where(seen, tile, -1).astype(np.int32), between, _lit(white))
+    number = -(-across // side) * -(-down // side)
+    which = tile[inside]
+    count = np.bincount(which, minlength=number)
+    total = _sums(white[inside], which, number)
+    full = np.maximum(np.percentile(white[inside], 99, axis=0), 1e-12) if which.size else np.ones(3)
+    used = np.flatnonzero((count >= FEWEST_PIXELS) & np.all(total > 0, axis=1))
+    levels, ratios, weights = [], [], []
+    for pattern in tiles_patterns:
+        light = coloured(captures, pattern.name, black.shape[:2])[inside] - black[inside]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = (_sums(light, which, number) / total)[used]
+            variance = NOISE * (np.maximum(ratio, 0) + ratio**2 + 0.02) * full / total[used] + SYSTEMATIC**2
+        measured = np.isfinite(ratio).all(axis=1)
+        levels.append(_levels_of(tile_levels(pattern, plan.size_px), side)[used][measured])
+        ratios.append(ratio[measured])
+        weights.append(1 / variance[measured])
+    ratio, weight = np.concatenate(ratios), np.concatenate(weights)
+    return TileMeasurements(np.concatenate(levels), ratio, weight, int(which.size))
+
+
+def _levels_of(cells: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.int64]:
+    return cells[::side, ::side].reshape(-1, 3).astype(np.int64)
+
+
+def _sums(light: FloatImage, which: npt.NDArray[np.int32], number: int) -> Float64:
+    """(number, 3): ``light`` (pixels, 3) added up by tile; NaN where one pixel of a tile is not known."""
+    return np.stack([np.bincount(which, light[:, channel], number) for channel in range(3)], axis=1)
+
+
+def _lit(white: FloatImage) -> Mask:
+    known: Mask = np.asarray(np.isfinite(white).all(axis=2))
+    if not known.any():
+        return known
+    bright = np.percentile(white[known][::7], 99, axis=0)
+    return np.asarray(known & np.all(white > LIT_SHARE * bright, axis=2) & np.all(bright > 0))
+
+
+def _interior(tile: npt.NDArray[np.int32], between: Mask, lit: Mask) -> Mask:
+    """Lit camera pixels around which, as far as a neighbouring tile's light may reach, all is the same tile.
+
+    ``tile``: -1 where it is not known; what is ``between`` is taken for whatever lies around it
+    """
+    counts = np.bincount(tile[lit & (tile >= 0)]) if np.any(lit & (tile >= 0)) else np.zeros(1, np.int64)
+    sizes = counts[counts > 0]
+    if not sizes.size:
+        return np.zeros_like(lit)
+    side_px = float(np.sqrt(np.percentile(sizes, 75)))
+    reach = max(1, round(BORDER_SHARE * side_px))
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    value = tile.astype(np.float32)  # exact up to 16 million tiles
+    least = cv2.erode(np.where(between, np.float32(np.inf), value), kernel)
+    most = cv2.dilate(np.where(between, np.float32(-np.inf), value), kernel)
+    return np.asarray(lit & (least == most) & (tile >= 0))

@@ -1,0 +1,97 @@
+"""The calibration's grade: a random pattern predicted by the light transport, and the same pattern photographed."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.errors import CalibrationError
+
+NEIGHBOURHOOD_PX = 15
+
+
+class Grade(enum.Enum):
+    """By the relative error: A up to 2 %, B up to 4 %, C up to 8 %, D above."""
+
+    A = "A"
+    B = "B"
+    C = "C"
+    D = "D"
+
+
+LIMITS = ((Grade.A, 0.02), (Grade.B, 0.04), (Grade.C, 0.08))
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """How well a photograph was predicted.
+
+    ``relative_rms`` rms of predicted less photographed over the rms of the photographed light without the black image
+    ``gain`` (3,) photographed over predicted light per camera channel: 1, or the lamp has dimmed
+    ``without_gain_rms`` the relative error that remains when the gain is taken out: what is left is place and shape
+    ``error_map`` (rows, columns) float32: the same ratio around each camera pixel, NaN outside the mask
+    ``grade`` of ``relative_rms``
+    """
+
+    relative_rms: float
+    gain: tuple[float, float, float]
+    without_gain_rms: float
+    error_map: FloatImage
+    grade: Grade
+
+
+def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, mask: Mask) -> Verification:
+    """Compare a predicted with a photographed pattern.
+
+    Parameters
+    ----------
+    predicted, photographed, black : (rows, columns, 3) linear camera images in one unit, black light included in both
+        pictures; NaN where not measured
+    mask : (rows, columns) camera pixels that count
+
+    Raises
+    ------
+    CalibrationError("verification-shape-wrong")
+    CalibrationError("verification-dark")  nothing to compare
+    """
+    if not predicted.shape == photographed.shape == black.shape == (*mask.shape, 3):
+        raise CalibrationError(
+            "verification-shape-wrong",
+            what=f"The prediction {predicted.shape} and the photograph {photographed.shape} differ in size.",
+            remedy="Do not change the camera's picture size, and verify again.",
+        )
+    use = mask & np.all(np.isfinite(predicted) & np.isfinite(photographed) & np.isfinite(black), axis=2)
+    seen = np.where(use[:, :, None], photographed - black, 0).astype(np.float64)
+    light_predicted = np.where(use[:, :, None], predicted - black, 0).astype(np.float64)
+    light = float(np.sum(seen**2))
+    if not light > 0 or not np.any(light_predicted):
+        raise CalibrationError(
+            "verification-dark",
+            what="The photograph of the random pattern shows no light where the calibration expects it.",
+            remedy="Check that lamps and shutters are open and that the pattern was shown, and verify again.",
+        )
+    gain = np.sum(seen * light_predicted, axis=(0, 1)) / np.maximum(np.sum(light_predicted**2, axis=(0, 1)), 1e-30)
+    relative = float(np.sqrt(np.sum((light_predicted - seen) ** 2) / light))
+    without = float(np.sqrt(np.sum((gain * light_predicted - seen) ** 2) / light))
+    red, green, blue = (float(value) for value in gain)
+    return Verification(
+        relative, (red, green, blue), without, _error_map(light_predicted, seen, use), grade_of(relative)
+    )
+
+
+def grade_of(relative_rms: float) -> Grade:
+    """The grade of a relative error; NaN is D."""
+    return next((grade for grade, limit in LIMITS if relative_rms <= limit), Grade.D)
+
+
+def _error_map(light_predicted: Float64, seen: Float64, use: Mask) -> FloatImage:
+    size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
+    error = cv2.boxFilter(np.sum((light_predicted - seen) ** 2, axis=2), -1, size)
+    light = cv2.boxFilter(np.sum(seen**2, axis=2), -1, size)
+    floor = 1e-4 * float(np.sum(seen**2)) / max(int(np.count_nonzero(use)), 1)
+    ratio = np.sqrt(np.maximum(error, 0) / np.maximum(light, floor))
+    return np.where(use, ratio, np.nan).astype(np.float32)

@@ -1,0 +1,31 @@
+"""``velatura account``: who may log in at the panel, and the tokens of machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from controller.cli import console
+from controller.cli.derived import commands
+from controller.cli.running import Json, StageFolder
+
+SUMMARY = "Who may log in at the stage's panel, and the tokens of machines."
+
+
+def list_(stage: StageFolder, as_json: Json = False) -> None:
+    """All accounts and tokens."""
+    accounts, tokens = _call(stage, "accounts"), _call(stage, "tokens")
+    lines = [f"{one['name']:<32} {one['role']}{', one-time password' if one['one_time'] else ''}" for one in accounts]
+    lines += [f"{one['name']:<32} {one['role']}, token" for one in tokens]
+    found = {"accounts": accounts, "tokens": tokens}
+    console.show_result(found if as_json else "\n".join(lines) or "There are none yet.", as_json=as_json)
+
+
+def _call(stage: Path, op: str) -> Any:
+    from controller.kiosk.api.offline_dispatch import call
+
+    return call(stage, op)
+
+
+list_.__name__ = "list"
+COMMANDS = (list_, *commands("account"))

@@ -1,0 +1,51 @@
+"""``velatura live``."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from controller.cli.running import Json, StageFolder, work
+
+if TYPE_CHECKING:
+    from controller.run.progress import Reporter
+
+
+def live(
+    stage: StageFolder,
+    source: Annotated[
+        Path, typer.Argument(help="A video file, a folder that fills with pictures, or a shared frame file.")
+    ],
+    fps: Annotated[float, typer.Option(help="Take at most so many pictures a second.", min=0.1, max=240)] = 25.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end; a folder in turn.")] = False,
+    seconds: Annotated[float, typer.Option(help="How long; without it, until it ends or Ctrl-C.", min=0)] = 0.0,
+    into: Annotated[
+        Path | None,
+        typer.Option(help="Touch no device; write to this frame file, which a player elsewhere shows live."),
+    ] = None,
+    targets: Annotated[
+        bool, typer.Option("--targets", help="With --into: targets, for a player with shaders.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Light the projectors and show a stream of targets as it comes, by base and scale."""
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.services.live import feed, live
+        from controller.stage.session import OwnSession
+
+        if into is not None:
+            return feed(
+                stage=stage, source=source, into=into, targets=targets, rate_hz=fps, loop=loop,
+                seconds=seconds or None, reporter=reporter, cancel=cancel,
+            )  # fmt: skip
+        return live(
+            session=OwnSession(stage), source=source, rate_hz=fps, loop=loop, seconds=seconds or None,
+            reporter=reporter, cancel=cancel,
+        )  # fmt: skip
+
+    work(do, as_json=as_json)

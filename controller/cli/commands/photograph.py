@@ -1,0 +1,35 @@
+"""``velatura photograph``."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from controller.cli.running import Json, StageFolder, appearance_names, work
+
+if TYPE_CHECKING:
+    from controller.run.progress import Reporter
+
+
+def photograph(
+    stage: StageFolder,
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Appearances of the installed bundle; all of them if none is given.", autocompletion=appearance_names
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Photograph what the installed appearances achieve, compare with their targets, and write a report."""
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.services.compare import photograph
+        from controller.stage.session import OwnSession
+
+        return photograph(session=OwnSession(stage), names=tuple(names or ()), reporter=reporter, cancel=cancel)
+
+    work(do, as_json=as_json)

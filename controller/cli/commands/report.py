@@ -1,0 +1,24 @@
+"""``velatura report``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from controller.cli import console
+from controller.cli.running import Json
+
+
+def report(
+    where: Annotated[
+        Path, typer.Argument(metavar="RUN", help="A run's folder, STAGE/runs/...; or a stage: its newest.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Where the report goes; else into the run's folder.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write report.html and report.json of a calibration, of photographs of appearances, or of a demo again."""
+    from controller.services.report import report_of
+
+    console.show_result(report_of(where, out), as_json=as_json)

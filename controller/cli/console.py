@@ -1,0 +1,210 @@
+"""What a person sees on the terminal, and what a machine reads with ``--json``."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import json
+import os
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, TextIO
+
+from controller.core.text import duration, printable
+from controller.run.progress import Level, Phase, Progress, Reporter
+
+PLAIN_EVERY: Final = 0.25
+"""Share of a step after which plain output says another line."""
+
+
+@contextlib.contextmanager
+def reporter(*, as_json: bool, stream: TextIO | None = None) -> Iterator[Reporter]:
+    """The reporter for ``stream``: JSON lines (default stdout), Rich on a terminal, plain lines elsewhere (stderr)."""
+    if as_json:
+        yield JsonReporter(stream or sys.stdout)
+    elif (stream or sys.stderr).isatty():
+        with RichReporter(stream or sys.stderr) as rich_reporter:
+            yield rich_reporter
+    else:
+        yield PlainReporter(stream or sys.stderr)
+
+
+class JsonReporter:
+    """One JSON object a line: ``{"progress": {...}}`` and ``{"message": {...}}``."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._lock = threading.Lock()
+
+    def progress(self, now: Progress) -> None:
+        self.line(
+            progress={
+                "step": now.step,
+                "index": now.index,
+                "count": now.count,
+                "phase": now.phase.value,
+                "fraction": round(now.fraction, 4),
+                "step_fraction": round(now.step_fraction, 4),
+                "elapsed_s": round(now.elapsed_s, 2),
+                "left_s": None if now.left_s is None else round(now.left_s, 1),
+                "note": now.note,
+            }
+        )
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self.line(message={"level": level.value, "text": text})
+
+    def line(self, **content: Any) -> None:
+        """Print ``content`` as one line, at once."""
+        with self._lock:
+            print(json.dumps(content, default=str), file=self._stream, flush=True)
+
+
+class PlainReporter:
+    """One line for each change of step, and for each quarter of a long one."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._lock = threading.Lock()
+        self._last: tuple[int, Phase, int] | None = None
+
+    def progress(self, now: Progress) -> None:
+        mark = (now.index, now.phase, int(now.step_fraction / PLAIN_EVERY) if now.phase is Phase.RUNNING else 0)
+        if mark == self._last:
+            return
+        self._last = mark
+        left = "" if now.left_s is None or now.fraction >= 1 else f", {duration(now.left_s)} left"
+        what = {Phase.RUNNING: now.note or "...", Phase.DONE: "done", Phase.SKIPPED: "done earlier"}[now.phase]
+        self._print(f"[{now.fraction:4.0%}{left}] {now.index + 1}/{now.count} {now.step}: {what}")
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self._print(text if level is Level.INFO else f"{level.value}: {text}")
+
+    def _print(self, text: str) -> None:
+        # Work that lights lamps does not end because nobody can read how far it is.
+        with self._lock, contextlib.suppress(OSError):
+            print(printable(text), file=self._stream, flush=True)
+
+
+class RichReporter:
+    """A bar with steps, percentage and time left; finished steps stay above it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+        from rich.progress import Progress as Bar
+
+        self._console = Console(file=stream, highlight=False)
+        self._bar = Bar(
+            TextColumn("{task.fields[step]}", markup=False),
+            BarColumn(),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[left]}", markup=False),
+            console=self._console,
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=1.0, step="", left="", visible=False)
+
+    def __enter__(self) -> RichReporter:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def progress(self, now: Progress) -> None:
+        left = "" if now.left_s is None else f"{duration(now.left_s)} left"
+        note = f": {now.note}" if now.note else ""
+        step = printable(f"{now.index + 1}/{now.count} {now.step}{note}")
+        self._bar.update(self._task, completed=now.fraction, step=step, left=left, visible=True)
+        if now.phase is not Phase.RUNNING:
+            mark = "done" if now.phase is Phase.DONE else "done earlier"
+            self._above(f"{duration(now.elapsed_s):>12}  {now.step}: {mark}", "green")
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self._above(text, {Level.INFO: "", Level.WARNING: "yellow", Level.ERROR: "bold red"}[level])
+
+    def _above(self, text: str, style: str) -> None:
+        from rich.text import Text
+
+        self._console.print(Text(printable(text), style=style))
+
+
+def show_error(code: str, what: str, remedy: str, *, as_json: bool) -> None:
+    """One sentence on what happened and one on what to do, on stderr; for machines one JSON line on stdout."""
+    if as_json:
+        JsonReporter(sys.stdout).line(error={"code": code, "what": printable(what), "remedy": printable(remedy)})
+        return
+    if not sys.stderr.isatty() or importlib.util.find_spec("rich") is None:
+        print(f"velatura: {printable(what)}\n{printable(remedy)}", file=sys.stderr, flush=True)  # noqa: T201
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    message = Text.assemble(("velatura: ", "bold red"), printable(what), "\n", (printable(remedy), "bold"))
+    Console(stderr=True, highlight=False, soft_wrap=True).print(message)
+
+
+def prepare_streams() -> None:
+    """Make the standard streams usable: a closed one leads nowhere, and no character that it can't show stops us.
+
+    A closed stream's number would otherwise be that of the next opened file, into which children would then write.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            handle = os.open(os.devnull, os.O_RDWR)
+            if handle != number:
+                os.dup2(handle, number)
+                os.close(handle)
+            os.set_inheritable(number, True)
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False, encoding="utf-8"))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper) and isinstance(sys.stdout.buffer, io.RawIOBase):
+        # PYTHONUNBUFFERED: what could not be written would be forgotten, and ``output_lost`` could not find it
+        sys.stdout = open(1, "w", 1, closefd=False, encoding=sys.stdout.encoding)  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def output_lost() -> bool:
+    """Whether standard output can't be written to; says so on standard error, and writes no more to it."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            what = f"The output could not be written: {error.strerror}."
+            with contextlib.suppress(OSError):
+                show_error("output-lost", what, "Check where the output goes, and start again.", as_json=False)
+        # Else the interpreter tries again at its end, and fails with a message of its own.
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
+        return True
+    return False
+
+
+def show_result(result: Mapping[str, Any] | str | None, *, as_json: bool) -> None:
+    """What a command returned: ``{"result": ...}`` for machines; for people the text, or ``key: value`` lines."""
+    if as_json:
+        JsonReporter(sys.stdout).line(result=result)
+    elif isinstance(result, str):
+        print(result, flush=True)  # noqa: T201 - the command line's own output
+    elif result is not None:
+        lines = (f"{printable(str(key))}: {printable(_words(value))}" for key, value in result.items())
+        print("\n".join(lines), flush=True)  # noqa: T201 - the command line's own output
+
+
+def _words(value: Any) -> str:
+    """A value for people, without the marks that Python writes it with."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "-"
+    if isinstance(value, list | tuple | set | frozenset):
+        between = "; " if any(isinstance(item, Mapping) for item in value) else ", "
+        return between.join(map(_words, value)) or "-"
+    return str(value)

@@ -1,0 +1,149 @@
+"""What ``velatura serve`` runs: the service, its socket and the panel, until it is told to end."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import UsageError, VelaturaError
+from controller.core.storage import runtime_folder
+from controller.kiosk.api.control import NAME, ControlServer
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.operations.dispatch import socket_table
+from controller.kiosk.service import serving
+from controller.kiosk.store.accounts import FOLDER
+from controller.panel.mqtt.options import BrokerOptions
+from controller.run.progress import Level, Reporter
+from hal.errors import DeviceError
+
+RETRY_S: Final = 5.0
+PORT: Final = 8377
+
+
+@dataclass(frozen=True, slots=True)
+class PanelAddress:
+    """Where the panel listens. ``names``: under which browsers may reach it, besides the host; ``broker``: of the
+    building's control.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = PORT
+    certificate: Path | None = None
+    key: Path | None = None
+    names: tuple[str, ...] = ()
+    broker: BrokerOptions | None = None
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """``HOST:PORT`` or ``PORT``. Raises UsageError("address-wrong")."""
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise UsageError("address-wrong", what=f"{text[:64]!r} is no address.", remedy="Write HOST:PORT.")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def serve(
+    *,
+    stage: Path,
+    panel: PanelAddress | None,
+    leave_lit: bool,
+    setup: bool,
+    reporter: Reporter,
+    cancel: threading.Event,
+) -> Mapping[str, Any]:
+    """Run the stage until ``cancel``; the settings are read again when somebody saves them.
+
+    ``setup``: go on without a valid stage.toml, for the panel's first page.
+    Raises what ``serving`` raises at the first start, unless ``setup``.
+    """
+    stage = stage.resolve()
+    if panel is not None:
+        _check_panel(panel)
+    kiosk = StageKiosk(stage)
+    with contextlib.ExitStack() as stack:
+        first, socket_served = True, False
+        while not cancel.is_set():
+            kiosk.reload.clear()
+            try:
+                with serving(stage, cancel, leave_lit=leave_lit) as service:
+                    kiosk.attach(service)
+                    if not socket_served:
+                        socket_served = True
+                        path = runtime_folder(stage) / NAME
+                        stack.enter_context(ControlServer(path, socket_table(kiosk.holders())))
+                    if first:
+                        _open_panel(stack, kiosk, panel, reporter)
+                        reporter.say(f"{stage.name} is served.")
+                        first = False
+                    _wait(kiosk, cancel)
+                kiosk.detach()
+            except (VelaturaError, DeviceError) as error:
+                if first and not setup:
+                    raise
+                kiosk.attach(None, f"{error.what} {error.remedy}" if (stage / "stage.toml").exists() else "")
+                reporter.say(f"{error.what} {error.remedy}", Level.ERROR)
+                if first:
+                    _open_panel(stack, kiosk, panel, reporter)
+                    first = False
+                kiosk.reload.wait(RETRY_S)
+    return {"served": str(stage)}
+
+
+def _check_panel(where: PanelAddress) -> None:
+    """Before any device is opened. Raises what the panel's start would raise, and UsageError("file-unreadable")."""
+    from controller.core.files import require_regular
+    from controller.panel.server import check_port
+
+    files = (where.certificate, where.key, *((where.broker.password_file, where.broker.certificates)
+                                             if where.broker is not None else ()))  # fmt: skip
+    for file in filter(None, files):
+        try:
+            require_regular(file)
+        except OSError as error:
+            raise UsageError("file-unreadable", what=f"{file} can't be read: {error.strerror}.",
+                             remedy="Check the path, or leave the option out.") from error  # fmt: skip
+    check_port(where.host, where.port)
+
+
+def _wait(kiosk: StageKiosk, cancel: threading.Event) -> None:
+    while not cancel.is_set() and not kiosk.reload.is_set():
+        cancel.wait(0.2)
+
+
+def _open_panel(stack: contextlib.ExitStack, kiosk: StageKiosk, panel: PanelAddress | None, reporter: Reporter) -> None:
+    if panel is not None:
+        stack.enter_context(_panel(kiosk, panel, reporter))
+
+
+@contextlib.contextmanager
+def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterator[None]:
+    """The panel in a thread of its own. The player is another process, so that no page delays a picture."""
+    from controller.kiosk.store.accounts import FIRST_ACCOUNT
+    from controller.panel.app import make_panel
+    from controller.panel.context import PanelOptions
+    from controller.panel.server import PanelServer
+
+    options = PanelOptions(
+        folder=kiosk.stage / FOLDER, host=where.host, port=where.port,
+        tls_certificate=where.certificate, tls_key=where.key, broker=where.broker,
+    )  # fmt: skip
+    options = replace(options, hosts=(*options.hosts, where.host, *where.names))
+    accounts = kiosk.held_accounts()
+    password = accounts.first_start()
+    app = make_panel(kiosk, accounts, options)
+    kiosk.sessions_ended = app.state.panel.sessions.end_all
+    server = PanelServer(app, options)
+    address = server.start()
+    reporter.say(f"The panel is at {address}.")
+    if password is not None:
+        reporter.say(f"First login: {FIRST_ACCOUNT}, password {password} (once).", Level.WARNING)
+        # Only capitals can be shown, and the one-time password is taken in capitals, too.
+        kiosk.announce(("velatura", address, FIRST_ACCOUNT, password), lambda: accounts.entered)
+    try:
+        yield
+    finally:
+        server.stop()

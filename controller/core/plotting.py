@@ -1,0 +1,29 @@
+"""Figures of matplotlib and what they come to as pictures; without any window.
+
+matplotlib is imported by the first figure, not with this module: what draws nothing must not wait for it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from controller.core.arrays import ByteImage
+
+
+def figure_of(size_in: tuple[float, float], *, dpi: int, constrained: bool = False) -> Any:
+    """An empty figure (width, height) in inches; ``constrained``: what is drawn in it is kept apart."""
+    # Agg by hand: pyplot would look for a window system, and keeps every figure for ever.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size_in, dpi=dpi, layout="constrained" if constrained else None)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def picture_of(figure: Any) -> ByteImage:
+    """(rows, columns, 3) uint8 RGB of a figure of ``figure_of``, whose background must be opaque."""
+    figure.canvas.draw()
+    return np.array(np.asarray(figure.canvas.buffer_rgba())[..., :3], np.uint8)

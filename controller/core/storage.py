@@ -1,0 +1,125 @@
+"""Files that survive a power cut: temporary name, fsync, rename, fsync of the folder; hashes; locks."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import stat
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from controller.core.errors import UsageError, WorkError
+
+
+def write_atomically(path: Path, data: bytes, *, mode: int = 0o644) -> None:
+    """Replace ``path`` by ``data`` so that a reader, or a machine after a power cut, finds the old or the new bytes.
+
+    Raises WorkError("no-space") when the disk is full; ``path`` is then as it was.
+    """
+    stream_atomically(path, lambda file: file.write(data), mode=mode)
+
+
+def stream_atomically(path: Path, write: Callable[[BinaryIO], object], *, mode: int = 0o644) -> None:
+    """As ``write_atomically``, for content that ``write`` produces into an open binary file."""
+    temporary: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        temporary = Path(name)
+        with os.fdopen(handle, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(mode)
+        temporary.replace(path)
+    except OSError as error:
+        raise _explained(error, path) from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def clear_unfinished_writes(folder: Path) -> None:
+    """Remove the temporary files that a killed process left below ``folder``; nobody may be writing there."""
+    for temporary in folder.rglob(".*.part"):
+        temporary.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in ``folder`` durable."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _explained(error: OSError, path: Path) -> WorkError:
+    import errno
+
+    # EFBIG: a limit on the size of files, of the user's or the disk's format (FAT: 4 GiB).
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return WorkError(
+            "no-space",
+            what=f"There was no space left to write {path.name}.",
+            remedy=f"Free some on the disk that holds {path.parent} and start again; nothing is left half-written.",
+        )
+    return WorkError(
+        "cannot-write",
+        what=f"{path} could not be written: {error.strerror}.",
+        remedy="Check the folder's permissions and that its disk is mounted for writing.",
+    )
+
+
+def sha256_of(path: Path) -> str:
+    """Hex SHA-256 of a file's bytes, read in blocks."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextlib.contextmanager
+def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
+    """Hold the lock file ``path`` for the duration, or raise UsageError("already-running").
+
+    The lock dies with the process, so a power cut leaves none behind. Raises WorkError("no-space" or "cannot-write")
+    where the file can not be made.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        opened = path.open("a")
+    except OSError as error:
+        raise _explained(error, path) from error
+    with opened as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UsageError(
+                "already-running",
+                what=f"{what_is_running} is already running on this stage.",
+                remedy="Wait for it to end, or stop it first.",
+            ) from error
+        yield
+
+
+def runtime_folder(stage: Path) -> Path:
+    """A short, private folder for this stage's sockets (a unix socket's path has at most 107 bytes).
+
+    Under ``$XDG_RUNTIME_DIR`` or the system's temporary folder; mode 0700 and owned by this user, or refused.
+    """
+    base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
+    digest = hashlib.sha256(str(stage.resolve()).encode()).hexdigest()[:12]
+    folder = base / f"velatura-{os.getuid()}-{digest}"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise UsageError(
+            "runtime-folder-unsafe",
+            what=f"{folder} belongs to someone else or is open to others.",
+            remedy="Remove it, or set XDG_RUNTIME_DIR to a private folder, and start again.",
+        )
+    return folder

@@ -1,0 +1,217 @@
+"""What the camera sees, how well the projectors cover the object, and what a target asks too much of."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import Mask
+from controller.core.errors import VelaturaError
+from controller.core.storage import write_atomically
+from controller.kiosk.interface import Aiming, ProjectorAim
+from controller.kiosk.store.runs import began_s
+from controller.kiosk.store.targets import fitted
+from controller.kiosk.supervisors.devices import Devices
+from controller.stage.calibrations import finished_calibration, finished_calibrations
+from controller.stage.check import Checked, check_stage
+from hal.deadline import in_seconds
+from hal.errors import DeviceError
+from hal.interfaces import LiveViewCamera
+
+if TYPE_CHECKING:
+    from controller.artefacts.calibrated import Calibrated
+    from controller.calibrate.values import Geometry
+
+GRAZING: Final = 0.25
+"""Cosine of the angle to the normal, below which light grazes."""
+LEAST_COVERAGE, SOFT_FOCUS, MUCH = 0.5, 0.4, 0.1
+DIM, BURNT = 0.25, 0.98
+DARK = 0.1
+"""Below this share of the median light of the object, a place is too dark to work with."""
+FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
+"""As ``controller.steps.capture.aiming`` writes them, which is not loaded before there is something to photograph."""
+MAPS, MAPS_KEPT = "kiosk/feasibility", 20
+_ANSWER_S = 5.0
+_UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
+_measured: dict[Path, Aiming] = {}
+_lock = threading.Lock()
+
+
+def camera_picture(devices: Devices) -> bytes | None:
+    """The camera's live picture, decoded and encoded anew, as JPEG; None without live view, or while it works."""
+    import cv2
+
+    if not devices.camera.lent.acquire(timeout=0.5):
+        return None
+    try:
+        # Not before it is ours: its keeper may let go of it and open it anew meanwhile.
+        camera = devices.camera.device
+        if not isinstance(camera, LiveViewCamera) or not camera.capabilities.live_view:
+            return None
+        data = camera.live_view(deadline=in_seconds(_ANSWER_S))
+    except DeviceError:
+        return None
+    finally:
+        devices.camera.lent.release()
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if picture is None:
+        return None
+    done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return encoded.tobytes() if done else None
+
+
+def aiming(checked: Checked) -> Aiming:
+    """Coverage, overlap and focus by the newest test shots, or by the calibration where that is newer or alone.
+
+    Where that one can't be read, by the test shots that there are; without any, the hint says what is wrong.
+    """
+    folder = checked.stage.folder
+    shots = _of_shots(folder / FOLDER)
+    try:
+        run = next(iter(finished_calibrations(folder)), None)
+        if run is None or (shots is not None and shots.measured_unix_s > began_s(run.name)):
+            return shots or Aiming()
+        return _remembered(run, checked.names)
+    except VelaturaError as error:
+        return shots or Aiming(hints=(f"{error.what} {error.remedy}",))
+    except _UNREADABLE as error:
+        return shots or Aiming(hints=(f"The calibration can't be read ({type(error).__name__}). Calibrate anew.",))
+
+
+def _remembered(run: Path, names: Sequence[str]) -> Aiming:
+    from controller.artefacts.calibrated import Calibrated
+
+    with _lock:
+        if run not in _measured:
+            _measured.clear()
+            _measured[run] = _of_calibration(Calibrated(run, names))
+        return _measured[run]
+
+
+def _of_shots(folder: Path) -> Aiming | None:
+    try:
+        return _judged(folder, json.loads((folder / FIGURES).read_text()))
+    except _UNREADABLE:
+        # New ones are taken in seconds; damaged ones must not keep anybody from the page where that is asked for.
+        return None
+
+
+def _judged(folder: Path, found: dict[str, Any]) -> Aiming:
+    aims = tuple(ProjectorAim(**row) for row in found["projectors"])
+    exposure, camera = found["exposure"], found["camera_focus"]
+    hints = [*_hints(aims), *_shared_hints(found["too_dark"], found["too_soft"])]
+    if exposure < DIM or exposure > BURNT:
+        word = "dark" if exposure < DIM else "bright"
+        hints.append(f"The camera's picture is too {word}: change its aperture, or the ISO in stage.toml.")
+    if camera < SOFT_FOCUS:
+        hints.append("No pattern is sharp anywhere: focus the camera first.")
+    return Aiming(aims, found["overlap"], found["too_dark"], found["too_soft"], camera, exposure, tuple(hints),
+                  "test shots", found["measured_unix_s"], folder / PICTURE)  # fmt: skip
+
+
+def _hints(aims: Sequence[ProjectorAim]) -> list[str]:
+    hints = [f"{aim.projector} lights {aim.coverage:.0%} of the object: turn it, or move it further away."
+             for aim in aims if aim.coverage < LEAST_COVERAGE]  # fmt: skip
+    return hints + [f"{aim.projector} is out of focus." for aim in aims if aim.focus < SOFT_FOCUS]
+
+
+def _shared_hints(dark: float, grazing: float) -> list[str]:
+    hints = []
+    if dark > MUCH:
+        hints.append(f"{dark:.0%} of the object is too dark: turn a projector towards it, or clear what shades it.")
+    if grazing > MUCH:
+        hints.append(
+            f"Light grazes, or is soft, on {grazing:.0%} of the object: move a projector more to the front of it."
+        )
+    return hints
+
+
+def _of_calibration(calibrated: Calibrated) -> Aiming:
+    transport, calibration = calibrated.transport, calibrated.calibration
+    mask = calibration.object_mask
+    lit = np.stack([np.asarray(one, bool) & mask for one in transport.lit])
+    white = sum(np.asarray(part.white, np.float32).mean(axis=2) for part in calibration.projectors)
+    on_object = np.asarray(white)[mask]
+    usual = float(np.median(on_object)) if on_object.size else 1.0
+    area = max(1, int(np.count_nonzero(mask)))
+    aims = []
+    for number, part in enumerate(calibration.projectors):
+        covariance = part.metapixels.covariance_px2[part.metapixels.valid]
+        size_px = float(np.sqrt(np.median(covariance[:, 0] + covariance[:, 2]) / 2)) if len(covariance) else np.inf
+        pitch_px = float(np.sqrt(max(1, int(lit[number].sum())) / max(1, len(covariance))))
+        # A sharp pixel's light has a standard deviation of about a third of the distance to the next.
+        focus = float(np.clip(pitch_px / max(3 * size_px, 1e-6), 0, 1))
+        aims.append(ProjectorAim(part.name, float(lit[number].sum() / area), focus))
+    dark = float((on_object < DARK * usual).mean()) if on_object.size else 0.0
+    grazing = grazing_share(read_geometry_of(calibrated), lit, mask)
+    return Aiming(
+        tuple(aims), float((lit.sum(axis=0) >= 2).sum() / area), dark, grazing,
+        None, None, (*_hints(aims), *_shared_hints(dark, grazing)), "calibration", began_s(calibrated.folder.name),
+    )  # fmt: skip
+
+
+def grazing_share(geometry: Geometry, lit: npt.NDArray[np.bool_], mask: Mask) -> float:
+    """The share of the object that is lit, and by no projector steeper than ``GRAZING`` (a cosine)."""
+    steepest = np.zeros(mask.shape)
+    for part, pinhole in zip(lit, geometry.projectors, strict=True):
+        centre_m = -pinhole.rotation.T @ pinhole.translation_m
+        towards = centre_m - geometry.points_m
+        cosine = np.einsum("ijk,ijk->ij", towards, geometry.normals) / np.maximum(np.linalg.norm(towards, axis=2), 1e-9)
+        steepest = np.maximum(steepest, np.where(part, np.nan_to_num(cosine), 0))
+    known = lit.any(axis=0) & mask & np.isfinite(geometry.normals).all(axis=2)
+    return float((steepest[known] < GRAZING).mean()) if known.any() else 0.0
+
+
+def read_geometry_of(calibrated: Calibrated) -> Geometry:
+    """As ``artefacts.geometry.read_geometry``."""
+    from controller.artefacts.geometry import read_geometry
+
+    return read_geometry(calibrated.folder, calibrated.projectors)
+
+
+def feasibility_map(stage: Path, target: Path) -> Path:
+    """A PNG of how far the target is out of reach; the newest ``MAPS_KEPT`` stay on the disk.
+
+    Raises UsageError("not-calibrated", "target-unreadable"), WorkError("no-space").
+    """
+    import cv2
+
+    from controller.artefacts.calibrated import Calibrated
+    from controller.solve.feasibility import choose_exposure, feasibility
+    from controller.solve.targets.files import load_target
+
+    checked = check_stage(stage)
+    path = checked.stage.folder / MAPS / f"{target.stem[:64]}.png"
+    _keep_newest(path.parent, MAPS_KEPT - 1)
+    calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
+    transport, black = calibrated.transport, calibrated.calibration.black
+    size_px = (black.shape[1], black.shape[0])
+    with tempfile.TemporaryDirectory() as folder:
+        # EXR is made for this view by whoever renders it.
+        whole = target if target.suffix.lower() == ".exr" else Path(folder) / "target.png"
+        if whole != target:
+            whole.write_bytes(fitted(target.read_bytes(), size_px))
+        asked = load_target(whole, size_px)
+    exposure = choose_exposure(transport, asked.image, black, share=checked.stage.tables.solve.exposure_share)
+    found = feasibility(transport, np.float32(exposure) * asked.image, black)
+    worst = np.maximum(found.too_bright, found.too_dark).max(axis=2)
+    grey = np.where(calibrated.calibration.object_mask & asked.mask, np.clip(worst, 0, 1), 0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Whole or not at all: somebody may ask for the same one at the same time.
+    write_atomically(path, cv2.imencode(".png", (255 * grey).astype(np.uint8))[1].tobytes())
+    return path
+
+
+def _keep_newest(folder: Path, most: int) -> None:
+    """Every target that somebody uploads gets a map of its own, for months."""
+    with contextlib.suppress(FileNotFoundError):  # somebody else does the same at the same time
+        for _, file in sorted((file.stat().st_mtime_ns, file) for file in folder.glob("*.png"))[:-most]:
+            file.unlink()

@@ -1,0 +1,93 @@
+"""What can be done on a stage's folder, with or without a running kiosk."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from controller.config import load_stage
+from controller.kiosk.interface import Appearance, Comparison, EventRow, LampDay, Results, Schedule
+from controller.kiosk.store import archive, runs, settings
+from controller.kiosk.store.bundle_store import BundleStock
+from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.store.schedule_file import ScheduleFile
+from controller.kiosk.supervisors.lamp_history import LampHistory
+from controller.stage.calibrations import stage_trust, worst_grade
+from controller.stage.check import check_stage
+
+
+class FolderKiosk:
+    """The methods of the operations that are declared ``offline``, for a caller that holds the stage's lock where they
+    change something. See ``controller.kiosk.interface.Kiosk`` for what each does.
+    """
+
+    def __init__(self, stage: Path) -> None:
+        self.stage = stage
+
+    def events(self, after: int = 0) -> Sequence[EventRow]:
+        with contextlib.closing(EventLog(self.stage / EventLog.FILE)) as log:
+            return log.after(after)
+
+    def appearances(self) -> Sequence[Appearance]:
+        return appearances_of(self._stock(), self.comparisons(), playing="")
+
+    def comparisons(self) -> Sequence[Comparison]:
+        return runs.comparisons(self.stage, self._stock().names())
+
+    def lamp_history(self) -> Sequence[LampDay]:
+        return LampHistory(self.stage).days()
+
+    def runs(self) -> Sequence[str]:
+        return runs.names(self.stage)
+
+    def results(self, run: str) -> Results:
+        return runs.results(self.stage, run, worst_grade(check_stage(self.stage)))
+
+    def feasibility(self, target: Path) -> Path:
+        from controller.kiosk.api.aim import feasibility_map
+
+        return feasibility_map(self.stage, target)
+
+    def schedule(self) -> Schedule:
+        return self._schedule().now
+
+    def set_schedule(self, schedule: Schedule) -> None:
+        self._schedule().replace(schedule, self._stock().names())
+
+    def settings(self) -> str:
+        return settings.text(self.stage)
+
+    def validate_settings(self, text: str) -> None:
+        settings.validate(text)
+
+    def save_settings(self, text: str) -> None:
+        settings.save(self.stage, text)
+
+    def backup(self) -> Path:
+        return archive.backup(self.stage)
+
+    def restore(self, backup: Path) -> None:
+        archive.restore(self.stage, backup)
+
+    def diagnostics(self) -> Path:
+        return archive.diagnostics(self.stage, {"state": "no kiosk runs"})
+
+    def _stock(self) -> BundleStock:
+        return BundleStock(self.stage, stage_trust(load_stage(self.stage)))
+
+    def _schedule(self) -> ScheduleFile:
+        return ScheduleFile(self.stage, load_stage(self.stage).tables.schedule)
+
+
+def appearances_of(stock: BundleStock, compared: Sequence[Comparison], *, playing: str) -> tuple[Appearance, ...]:
+    """Those of the installed bundle, in its order; ``playing``: the name of the one on the projectors, or empty."""
+    index = stock.index(stock.bundle())
+    if index is None:
+        return ()
+    made, previews = float(index.created_unix_s), stock.previews()
+    errors = {one.name: one.history[0].delta_e for one in compared}
+    return tuple(
+        Appearance(one.name, made, errors.get(one.name), one.name == playing, previews.get(one.name))
+        for one in index.appearances
+    )

@@ -1,0 +1,316 @@
+"""A kiosk as its panel and the command line see it: ``controller.kiosk.interface.Kiosk`` over the running service."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import UsageError, WorkError
+from controller.core.storage import write_atomically
+from controller.kiosk.api import aim, finding
+from controller.kiosk.api.control import plain
+from controller.kiosk.api.folder import FolderKiosk, appearances_of
+from controller.kiosk.api.snapshot import Snapshots
+from controller.kiosk.decide.interfaces import Request
+from controller.kiosk.interface import (
+    Aiming,
+    Appearance,
+    Comparison,
+    EventRow,
+    Finding,
+    Fit,
+    FoundDevice,
+    Job,
+    KioskState,
+    LampDay,
+    RecalibrationKind,
+    Results,
+    Schedule,
+    TriedDevice,
+    Unsubscribe,
+)
+from controller.kiosk.jobs.job_runner import title_of
+from controller.kiosk.operations.accounts import AccountActions
+from controller.kiosk.service import Service
+from controller.kiosk.store import archive, runs, settings, targets
+from controller.kiosk.store.accounts import Accounts, stage_accounts
+
+NOTICE_S: Final = 900.0
+"""How long a notice may stay; a lamp should not burn for it all night."""
+AIMING_S: Final = 900.0
+_REVISIONS: Final = 1_000_000_000
+
+
+class StageKiosk(FolderKiosk):
+    """What is not here is done as without a service, by ``FolderKiosk``.
+
+    Goes on while the service is made anew; ``service`` None while stage.toml is missing or wrong. ``accounts`` are
+    those of panel and socket, once somebody needs them; ``sessions_ended`` is the panel's, where there is one.
+    ``reload`` is set when somebody changed the settings: whoever runs the service then starts it again.
+    """
+
+    def __init__(self, stage: Path) -> None:
+        super().__init__(stage)
+        self.reload = threading.Event()
+        self.accounts: Accounts | None = None
+        self.sessions_ended: Callable[[str], object] = lambda name: None
+        self._service: Service | None = None
+        self._lock = threading.RLock()
+        self._opening_accounts = threading.Lock()
+        self._callbacks: list[Callable[[], None]] = []
+        self._last = KioskState(0, stage.name, "off", "The stage is not set up yet.", time.time(), needs_setup=True)
+        self._events = 0
+        self._snapshots = Snapshots(stage)
+        self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
+        self._notice_ends_s = float("inf")
+
+    def attach(self, service: Service | None, reason: str = "") -> None:
+        """The service that runs from now on, or why there is none."""
+        with self._lock:
+            self._service = service
+            if service is None:
+                revision = self._last.revision + 1
+                state, why = ("fault", reason) if reason else ("off", "The stage is not set up yet.")
+                self._last = KioskState(revision, self.stage.name, state, why, time.time(), needs_setup=True)
+            else:
+                starts = int(service.log.value("starts") or 0) + 1
+                service.log.keep("starts", str(starts))
+                self._last = replace(self._last, revision=starts * _REVISIONS)
+                service.changed = self._refresh
+                self._show_notice()
+        self._notify()
+
+    def detach(self) -> None:
+        """The service has ended, and the next one may have read its files: nothing may be asked of the one that was."""
+        self._service = None
+
+    def held_accounts(self) -> Accounts:
+        """Those that the panel and everybody at the socket change: others would write over what they have written."""
+        with self._opening_accounts:
+            if self.accounts is None:
+                self.accounts = stage_accounts(self.stage)
+            return self.accounts
+
+    def holders(self) -> dict[str, Any]:
+        """Who does the operations of the socket."""
+        return {"kiosk": self, "accounts": AccountActions(self.held_accounts, self._end_sessions)}
+
+    def _end_sessions(self, name: str) -> None:
+        # Of the panel that is there when it happens.
+        self.sessions_ended(name)
+
+    @property
+    def service(self) -> Service:
+        """Raises WorkError("not-set-up", "begins-anew")."""
+        service = self._service
+        if service is None and not self._last.needs_setup:
+            raise WorkError("begins-anew", what="The kiosk begins anew.", remedy="Ask again in a moment.")
+        if service is None:
+            raise WorkError("not-set-up", what=self._last.reason, remedy="Set the stage up first.")
+        return service
+
+    def announce(self, lines: tuple[str, ...], until: Callable[[], bool]) -> None:
+        """Show text on the projectors in turn, with their lamps lit, until ``until`` is true or it is too late.
+
+        Only on a stage with nothing to play yet: its audience is whoever sets it up.
+        """
+        self._notice = (lines, until)
+        self._show_notice()
+
+    def _show_notice(self) -> None:
+        service = self._service
+        if service is not None and self._notice is not None and service.stock.bundle() is None:
+            service.player.notice = self._notice[0]
+            service.conductor.light_for(NOTICE_S)
+            self._notice_ends_s = time.monotonic() + NOTICE_S
+
+    def _end_notice(self, service: Service) -> None:
+        if self._notice is not None and (self._notice[1]() or time.monotonic() > self._notice_ends_s):
+            self._notice = None
+            service.player.notice = ()
+            service.conductor.light_for(0.0)
+
+    # -- asked often
+
+    def snapshot(self) -> KioskState:
+        return self._last
+
+    def events(self, after: int = 0) -> Sequence[EventRow]:
+        return () if self._service is None else self._service.log.after(after)
+
+    def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
+        with self._lock:
+            self._callbacks.append(callback)
+        return lambda: self._callbacks.remove(callback) if callback in self._callbacks else None
+
+    def _refresh(self) -> None:
+        service = self._service
+        if service is None:
+            return
+        self._end_notice(service)
+        now = self._snapshots.of(service, self._last.revision + 1)
+        with self._lock:
+            # Once: an event that is told between two looks would count as one that the panel was told of.
+            events = service.log.number
+            same = replace(now, revision=self._last.revision) == self._last and self._events == events
+            self._events = events
+            if not same:
+                self._last = now
+        if not same:
+            self._notify()
+
+    def _notify(self) -> None:
+        for callback in tuple(self._callbacks):
+            callback()
+
+    # -- commands
+
+    def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
+        """``projector``: all of that one, whatever ``kind``. Raises UsageError("projector-unknown"), WorkError."""
+        service = self.service
+        if projector is not None and projector not in service.checked.names:
+            raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
+                             remedy=f"It is one of {', '.join(service.checked.names)}.")  # fmt: skip
+        asked = Request(kind, light=True) if projector is None else Request("projector", True, arguments=(projector,))
+        return self._begun(service, asked, title_of(asked))
+
+    def _begun(self, service: Service, asked: Request, name: str) -> Job:
+        # Before it is asked for: it may begin at once.
+        number = service.works.reserve()
+        service.ask(replace(asked, number=number))
+        return Job(number, name)
+
+    def job(self, number: int) -> Job | None:
+        """A job that was asked for; None while it waits. Raises WorkError("job-given-up") where it never will begin."""
+        service = self.service
+        # In this order: what is neither waiting nor running, and yet not known then, was given up.
+        waits = service.conductor.waits(number)
+        if (found := service.works.known(number)) is None and not waits:
+            raise WorkError("job-given-up", what="The kiosk gave the work up, or began anew meanwhile.",
+                            remedy="`velatura events` tells why.")  # fmt: skip
+        return found
+
+    def cancel(self) -> None:
+        self.service.conductor.cancel()
+
+    def play(self, name: str) -> None:
+        service = self.service
+        service.stock.check_name(name)
+        service.conductor.choose(name)
+        service.conductor.open()
+
+    def stop(self) -> None:
+        self.service.conductor.shut()
+
+    def start(self) -> None:
+        for keeper in self.service.devices.projectors:
+            keeper.forgive()
+        self.service.conductor.open()
+
+    def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
+        picture, size_px = target.read_bytes(), targets.camera_view_px(self.stage)
+        return picture if size_px is None else targets.fitted(picture, size_px, fit)
+
+    def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:
+        service = self.service
+        settings.check_name(name)
+        picture = self.fitted(target, fit)
+        kept = self.stage / "appearances" / f"{name}.png"
+        with service.conductor.idle():
+            write_atomically(kept, picture)
+            settings.add_picture(self.stage, name, kept)
+            return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
+
+    def appearances(self) -> Sequence[Appearance]:
+        return appearances_of(self.service.stock, self.comparisons(), playing=self._last.playing)
+
+    def compare(self, name: str | None = None) -> Job:
+        service = self.service
+        service.stock.check_name(name)
+        asked = Request("compare", light=True, arguments=() if name is None else (name,))
+        return self._begun(service, asked, title_of(asked))
+
+    def comparisons(self) -> Sequence[Comparison]:
+        return runs.comparisons(self.stage, self.service.stock.names())
+
+    def remove_appearance(self, name: str) -> None:
+        service = self.service
+        if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
+            raise UsageError("appearance-in-use", what=f"{name} is playing, or the schedule names it.",
+                             remedy="Play another one, and take it out of the schedule.")  # fmt: skip
+        with service.conductor.idle():
+            settings.remove_picture(self.stage, name)
+            settings.forget_solved(self.stage, name)
+            service.ask(Request("publish"))
+
+    def lamp_history(self) -> Sequence[LampDay]:
+        return () if self._service is None else self._service.lamp_history.days()
+
+    def schedule(self) -> Schedule:
+        return Schedule("UTC") if self._service is None else self._service.schedule.now
+
+    def set_schedule(self, schedule: Schedule) -> None:
+        self.service.schedule.replace(schedule, self.service.stock.names())
+
+    def identify(self, on: bool) -> None:
+        self.service.player.identifying = on
+        with self._lock:
+            # At once: whoever asked looks at the next page before the service has looked again.
+            self._last = replace(self._last, identifying=on, revision=self._last.revision + 1)
+        self._notify()
+
+    def seen(self, number: int | None = None) -> None:
+        log = self.service.log
+        log.seen(log.number if number is None else number)
+        with self._lock:
+            self._last = replace(self._last, failures=log.failures, revision=self._last.revision + 1)
+        self._notify()
+
+    def doctor(self) -> Sequence[Finding]:
+        return finding.findings(self.stage, self._service)
+
+    def restore(self, backup: Path) -> None:
+        with self._idle():
+            archive.restore(self.stage, backup)
+            self.reload.set()
+
+    def diagnostics(self) -> Path:
+        return archive.diagnostics(self.stage, {"state": plain(self._last), "events": plain(self.events())})
+
+    def save_settings(self, text: str) -> None:
+        with self._idle():
+            settings.save(self.stage, text)
+            self.reload.set()
+
+    def _idle(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext() if self._service is None else self._service.conductor.idle()
+
+    def camera_picture(self) -> bytes | None:
+        return None if self._service is None else aim.camera_picture(self._service.devices)
+
+    def results(self, run: str) -> Results:
+        return runs.results(self.stage, run, self.service.checked.stage.tables.calibration.worst_grade)
+
+    def report(self, run: str) -> Path:
+        return runs.report(self.stage, run, self.service.checked)
+
+    def aiming(self) -> Aiming:
+        return aim.aiming(self.service.checked)
+
+    def test_shots(self) -> Job:
+        service, asked = self.service, Request("aim", light=True)
+        job = self._begun(service, asked, title_of(asked))
+        # Whoever aims takes them again and again; a lamp must not be struck for each.
+        service.conductor.light_for(AIMING_S, closed_too=True)
+        return job
+
+    def find_devices(self) -> Sequence[FoundDevice]:
+        return finding.find(self.stage)
+
+    def try_device(self, key: str) -> TriedDevice:
+        return finding.try_device(self.stage, key)

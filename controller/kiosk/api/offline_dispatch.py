@@ -1,0 +1,128 @@
+"""What a command asks of a stage: of the running kiosk, or of the folder itself where none runs."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from controller.config import load_stage
+from controller.core.errors import UsageError
+from controller.core.text import printable
+from controller.kiosk.api.control import ask, is_running, plain
+from controller.kiosk.api.folder import FolderKiosk
+from controller.kiosk.decide.hours import check_schedule
+from controller.kiosk.interface import Schedule, ScheduleRow
+from controller.kiosk.operations.accounts import AccountActions
+from controller.kiosk.operations.dispatch import local_values, offline_operation
+from controller.kiosk.operations.operation import Effect, Operation
+from controller.kiosk.store.bundle_store import BundleStock
+from controller.stage.calibrations import stage_trust
+from controller.stage.run import stage_lock
+
+LEVELS: Final = ("info", "warning", "error")
+LONG_S: Final = 600.0
+
+
+def call(stage: Path, op: str, **arguments: Any) -> Any:
+    """Ask the running kiosk, or do it here. Raises UsageError("not-serving") for what only a running one can do."""
+    if is_running(stage):
+        return ask(stage, op, timeout_s=LONG_S, **arguments)
+    folder = load_stage(stage).folder
+    operation = offline_operation(op)
+    if operation is None:
+        raise UsageError("not-serving", what="No kiosk runs on this stage.", remedy="Start it with `velatura serve`.")
+    values = local_values(operation, arguments)
+    # A kiosk that begins has read what is changed here before it answers: it would not know of the change.
+    with contextlib.nullcontext() if operation.effect is Effect.LOOKS else stage_lock(folder):
+        return plain(operation.of(_holder(operation, folder), values))
+
+
+def _holder(operation: Operation, folder: Path) -> object:
+    if operation.holder == "kiosk":
+        return FolderKiosk(folder)
+    from controller.kiosk.store.accounts import stage_accounts
+
+    accounts = stage_accounts(folder)
+    return AccountActions(lambda: accounts, lambda name: None)
+
+
+def status_of(stage: Path) -> dict[str, Any]:
+    """The running kiosk's state, or that none runs."""
+    if is_running(stage):
+        return dict(ask(stage, "status"))
+    loaded = load_stage(stage)
+    stock = BundleStock(loaded.folder, stage_trust(loaded))
+    reason = "No kiosk runs on this stage."
+    return {"stage": loaded.tables.stage.name, "state": "off", "reason": reason, "devices": [], "playing": "",
+            "appearances": list(stock.names()), "serving": False}  # fmt: skip
+
+
+def status_text(state: Mapping[str, Any]) -> str:
+    """For people: what devices said in it reaches no terminal as it came."""
+    lines = [f"{state['stage']}: {state['state']}" + (f" ({state['reason']})" if state["reason"] else "")]
+    if state.get("playing"):
+        lines.append(f"Playing {state['playing']}.")
+    for row in state["devices"]:
+        values = ", ".join(f"{value['label']} {value['text']}" for value in row["values"])
+        lines.append(f"  {row['kind']:<10} {row['name']:<12} {values}")
+        if row["problem"]:
+            lines.append(f"    {row['problem']} {row['remedy']}")
+    job = state.get("job")
+    if job and not job["ended"]:
+        step = job["steps"][-1] if job["steps"] else {"title": "", "done": 0.0}
+        lines.append(f"{job['name']}: {step['title']} {step['done']:.0%}")
+    return "\n".join(map(printable, lines))
+
+
+def changed_schedule(
+    now: Mapping[str, Any], zone: str | None, hours: Sequence[str] | None, drift_check: str | None
+) -> dict[str, Any]:
+    """The schedule with what a command line says. Raises UsageError("schedule-wrong", "schedule-zone")."""
+    rows = list(now["rows"]) if hours is None else [_row(text) for text in hours]
+    content: dict[str, Any] = {
+        "time_zone": zone if zone is not None else now["time_zone"],
+        "rows": rows,
+        "drift_check": drift_check if drift_check is not None else now["drift_check"],
+    }
+    check_schedule(Schedule(content["time_zone"], tuple(ScheduleRow(**row) for row in rows), content["drift_check"]))
+    return content
+
+
+def _row(text: str) -> dict[str, str]:
+    day, equals, span = text.partition("=")
+    opens, dash, closes = span.partition("-")
+    if not equals or (span != "closed" and not dash):
+        raise UsageError("schedule-wrong", what=f"{text[:64]!r} are no opening hours.",
+                         remedy="Write DAY=HH:MM-HH:MM or DAY=closed.")  # fmt: skip
+    if span == "closed":
+        opens = closes = ""
+    return {"day": day, "opens": opens, "closes": closes, "appearance": ""}
+
+
+def schedule_text(schedule: Mapping[str, Any]) -> str:
+    """For people."""
+    lines = [f"Time zone {schedule['time_zone']}"]
+    lines += [
+        f"  {row['day']:<10} {row['opens']}-{row['closes']} {row['appearance']}"
+        if row["opens"] else f"  {row['day']:<10} closed"
+        for row in schedule["rows"]
+    ]  # fmt: skip
+    if not schedule["rows"]:
+        lines.append("  always open")
+    check = schedule["drift_check"]
+    lines.append(f"Drift check at {check}" if check else "No nightly drift check")
+    return "\n".join(map(printable, lines))
+
+
+def aiming_text(found: Mapping[str, Any]) -> str:
+    """For people."""
+    lines = [f"{one['projector']}: {one['coverage']:.0%} of the object, focus {one['focus']:.0%}"
+             for one in found["projectors"]]  # fmt: skip
+    lines.append(f"Lit by two or more {found['overlap']:.0%}, too dark {found['too_dark']:.0%}, "
+                 f"too grazing {found['too_grazing']:.0%}")  # fmt: skip
+    if not found["source"]:
+        lines = ["Nothing has been measured yet. Take test shots: `velatura aim STAGE --shots`."]
+    pictures = [f"Picture: {found['picture']}"] if found["picture"] else []
+    return "\n".join(map(printable, [*lines, *found["hints"], *pictures]))

@@ -1,0 +1,121 @@
+"""Which time it is, as far as that can be known: the wall clock, what it said before, whether it is synchronised."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Final
+
+from controller.kiosk.decide.planner import DOUBT_S, HOLD_S, believed
+from controller.kiosk.store.event_log import Decision, EventLog
+
+_UNSYNCHRONISED: Final = 0x40
+_KEEP_EVERY_S: Final = 60.0
+_PROVE_S: Final = 3600.0
+"""A clock that jumped far ahead is remembered only when it stays there for so long: a glitch must leave no trace."""
+_SET_S: Final = 30.0
+"""A clock that moves by more than this between two looks was set; one that is disciplined moves by less."""
+
+
+def synchronised() -> bool:
+    """Whether the kernel says that its clock is disciplined (adjtimex(2), STA_UNSYNC)."""
+    # struct timex begins with modes, offset, freq, maxerror, esterror, status; 256 bytes hold all of it.
+    buffer = (ctypes.c_long * 32)()
+    try:
+        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(buffer))
+    except (OSError, AttributeError):
+        return False
+    status = ctypes.cast(ctypes.byref(buffer, 5 * ctypes.sizeof(ctypes.c_long)), ctypes.POINTER(ctypes.c_int))[0]
+    return bool(state >= 0 and not status & _UNSYNCHRONISED) and os.name == "posix"
+
+
+class Clockwork:
+    """Turns clocks into the time to plan with; remembers the latest over restarts."""
+
+    def __init__(
+        self,
+        log: EventLog,
+        wall: Callable[[], float],
+        monotonic: Callable[[], float],
+        is_synchronised: Callable[[], bool] = synchronised,
+    ) -> None:
+        self._log, self._wall, self._monotonic, self._synchronised = log, wall, monotonic, is_synchronised
+        kept = log.value("latest")
+        self._latest: float | None = None if kept is None else float(kept)
+        self._kept = self._latest
+        self._ahead_since_s: float | None = None
+        self._known: bool | None = None
+        self._offset_s: float | None = None
+
+    def now(self) -> float | None:
+        """Unix seconds to plan with, or None while nobody knows the time; says so when that changes."""
+        wall_s = self._wall()
+        self._notice(wall_s - self._monotonic())
+        now_s = believed(wall_s, self._latest, synchronised=self._synchronised())
+        if (now_s is not None) is not self._known and (self._known is not None or now_s is None):
+            self._log.tell(_LOST if now_s is None else _FOUND)
+        self._known = now_s is not None
+        if now_s is not None and self._proven(now_s):
+            self._latest = now_s
+            if self._kept is None or abs(now_s - self._kept) >= _KEEP_EVERY_S:
+                self._kept = now_s
+                self._log.keep("latest", repr(now_s))
+        return now_s
+
+    @property
+    def since_s(self) -> float:
+        """When this stage first knew the time; infinite before."""
+        kept = self._log.value("since")
+        if kept is None and self._latest is not None:
+            kept = repr(self._latest)
+            self._log.keep("since", kept)
+        return float("inf") if kept is None else float(kept)
+
+    def _notice(self, offset_s: float) -> None:
+        before_s, self._offset_s = self._offset_s, offset_s
+        if before_s is not None and abs(offset_s - before_s) > _SET_S:
+            self._log.tell(_set(offset_s - before_s))
+
+    def _proven(self, now_s: float) -> bool:
+        if self._latest is None or now_s - self._latest <= DOUBT_S or self._synchronised():
+            self._ahead_since_s = None
+            return True
+        if self._ahead_since_s is None:
+            self._ahead_since_s = self._monotonic()
+        return self._monotonic() - self._ahead_since_s >= _PROVE_S
+
+
+def beginning(log: EventLog) -> Decision:
+    """What a service says as it begins, so that the log accounts for the time in which none ran."""
+    last = next((row.code for row in reversed(log.after(0)) if row.code in (_BEGAN, "service-ended")), "")
+    if last != _BEGAN:
+        return Decision(_BEGAN, "The kiosk begins.")
+    latest = log.value("latest")
+    when = "" if latest is None else f", after {datetime.fromtimestamp(float(latest), UTC):%Y-%m-%d %H:%M} UTC"
+    return Decision(
+        _BEGAN, f"The kiosk begins; the one before was cut off{when}.",
+        "If there was no power cut, see the machine's own log.", "warning",
+    )  # fmt: skip
+
+
+def _set(by_s: float) -> Decision:
+    how = f"The clock was set {'ahead' if by_s > 0 else 'back'} by {_span(abs(by_s))}."
+    held = -HOLD_S <= by_s < 0
+    then = "The kiosk's time stands still until the clock has caught up." if held else ""
+    return Decision("clock-set", how, then, "warning")
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds / 86_400:.0f} days" if seconds > 2 * 86_400 else f"{max(1, round(seconds / 60))} min"
+
+
+_BEGAN: Final = "service-started"
+_LOST: Final = Decision(
+    "clock-unknown",
+    "Nobody knows what time it is: the clock was lost.",
+    "Set it, or connect the network; until then without_time under [schedule] says what is done.",
+    "error",
+)
+_FOUND: Final = Decision("clock-known", "The clock tells the time again.")

@@ -1,0 +1,123 @@
+"""What the schedule wants now: a pure function of the clock, the schedule and what was done.
+
+Open or closed is a level, never an event, so nothing about it can be missed. What happens once (the nightly check) has
+a key with its date; whoever did it, or could not, writes the key down, so nothing happens twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from datetime import date, timedelta
+from functools import lru_cache
+from typing import Final
+
+from controller.kiosk.decide.hours import Opening, always_open, local_day, moment, openings, zone_of
+from controller.kiosk.interface import NextEvent, Schedule
+
+EARLIEST_S: Final = 1_735_689_600.0
+"""2025-01-01: a clock before that was never set."""
+HOLD_S: Final = 2 * 3600.0
+"""A clock that was set back by up to this much: time stands still until it has caught up."""
+DOUBT_S: Final = 36 * 3600.0
+"""A clock that is further back than that, and not synchronised, was lost rather than set."""
+WINDOW_S: Final = 6 * 3600.0
+"""A nightly check that could not begin within this time is left out."""
+LOOK_BACK_DAYS: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Something to be done once: ``what`` is "drift check"; possible from ``begins_s`` until ``ends_s``."""
+
+    key: str
+    what: str
+    begins_s: float
+    ends_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """``open`` None: nobody knows the time. ``due`` can begin now, ``expired`` can't any more and were not done.
+
+    ``changes_s``: the next moment (Unix seconds) at which ``open`` will be another; None where none is in sight.
+    """
+
+    open: bool | None
+    appearance: str = ""
+    due: tuple[Task, ...] = ()
+    expired: tuple[Task, ...] = ()
+    next: NextEvent | None = None
+    changes_s: float | None = None
+
+
+def believed(now_s: float, latest_s: float | None, *, synchronised: bool) -> float | None:
+    """The time to plan with, from the clock and the latest time that was ever believed; None if nobody knows it."""
+    if now_s < EARLIEST_S:
+        return None
+    if latest_s is None or now_s >= latest_s:
+        return now_s
+    if latest_s - now_s <= HOLD_S:
+        return latest_s
+    return now_s if synchronised or latest_s - now_s <= DOUBT_S else None
+
+
+def plan(now_s: float | None, schedule: Schedule, done: Collection[str], *, since_s: float) -> Plan:
+    """What is wanted at ``now_s`` (as ``believed``). ``since_s``: when this stage began to keep the schedule."""
+    if always_open(schedule):
+        due, expired = _tasks(now_s, schedule, done, since_s) if now_s is not None else ((), ())
+        return Plan(True, due=due, expired=expired)
+    if now_s is None:
+        return Plan(None)
+    known = openings(schedule, now_s)
+    present = [opening for opening in known if opening.begins_s <= now_s < opening.ends_s]
+    due, expired = _tasks(now_s, schedule, done, since_s)
+    appearance, following = present[-1].appearance if present else "", _next(known, now_s, schedule)
+    return Plan(bool(present), appearance, due, expired, following, _changes_s(known, now_s))
+
+
+def merged(known: Sequence[Opening]) -> list[Opening]:
+    """Without overlaps: times at which the stage really opens and closes."""
+    found: list[Opening] = []
+    for opening in known:
+        if found and opening.begins_s <= found[-1].ends_s:
+            found[-1] = Opening(found[-1].begins_s, max(found[-1].ends_s, opening.ends_s))
+        else:
+            found.append(opening)
+    return found
+
+
+def _changes_s(known: Sequence[Opening], now_s: float) -> float | None:
+    edges = (edge for one in merged(known) for edge in (one.begins_s, one.ends_s))
+    return min((edge for edge in edges if edge > now_s), default=None)
+
+
+def _next(known: Sequence[Opening], now_s: float, schedule: Schedule) -> NextEvent | None:
+    coming = [NextEvent("opens", one.begins_s) for one in merged(known)]
+    coming += [NextEvent("closes", one.ends_s) for one in merged(known)]
+    coming += [NextEvent(task.what, task.begins_s) for task in _all_tasks(now_s, schedule)]
+    return min((event for event in coming if event.at_unix_s > now_s), key=lambda event: event.at_unix_s, default=None)
+
+
+def _all_tasks(now_s: float, schedule: Schedule) -> tuple[Task, ...]:
+    if not schedule.drift_check:
+        return ()
+    return _checks(schedule.drift_check, schedule.time_zone, local_day(now_s, zone_of(schedule.time_zone)))
+
+
+@lru_cache(maxsize=8)
+def _checks(clock: str, zone: str, today: date) -> tuple[Task, ...]:
+    found = []
+    for number in range(-LOOK_BACK_DAYS, 2):
+        day = today + timedelta(days=number)
+        begins_s = moment(day, clock, zone_of(zone))
+        found.append(Task(f"drift-check {day.isoformat()}", "drift check", begins_s, begins_s + WINDOW_S))
+    return tuple(found)
+
+
+def _tasks(
+    now_s: float, schedule: Schedule, done: Collection[str], since_s: float
+) -> tuple[tuple[Task, ...], tuple[Task, ...]]:
+    left = [task for task in _all_tasks(now_s, schedule) if task.key not in done and task.begins_s >= since_s]
+    due = tuple(task for task in left if task.begins_s <= now_s < task.ends_s)
+    return due, tuple(task for task in left if task.ends_s <= now_s)

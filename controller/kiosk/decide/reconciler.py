@@ -1,0 +1,308 @@
+"""Decides what the stage does: schedule, technician, lamps, player and work come together here, and nowhere else.
+
+``step`` looks at all of them, moves the state machine, and says what is wanted of each. It waits for nothing, so a
+device that hangs holds up only its own keeper.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from controller.core.errors import WorkError
+from controller.kiosk.decide.clock import Clockwork
+from controller.kiosk.decide.content_selector import Pictures
+from controller.kiosk.decide.interfaces import (
+    BLACK,
+    Condition,
+    Keeper,
+    PlayerPort,
+    PlayerView,
+    ProjectorView,
+    Request,
+    Stock,
+    Works,
+)
+from controller.kiosk.decide.job_queue import Agenda
+from controller.kiosk.decide.operator_overrides import Wishes
+from controller.kiosk.decide.planner import Plan, plan
+from controller.kiosk.interface import Schedule
+from controller.kiosk.store.event_log import Decision, EventLog
+from controller.run.state_machine import Event, Machine, State
+
+RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
+"""Between attempts to come out of FAULT."""
+_ON: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Deadlines of the states, in seconds."""
+
+    power_up_s: float = 1800.0
+    cool_down_s: float = 900.0
+
+
+class Conductor:
+    """The kiosk's decisions. ``step`` is called about four times a second by one thread; commands come from any.
+
+    Parameters
+    ----------
+    schedule : asked at every step
+    clock : the time to plan with; ``monotonic``: seconds that only go up, for deadlines
+    without_time : whether the stage is open while nobody knows the time
+    """
+
+    def __init__(
+        self,
+        keepers: Sequence[Keeper],
+        player: PlayerPort,
+        works: Works,
+        stock: Stock,
+        log: EventLog,
+        *,
+        schedule: Callable[[], Schedule],
+        clock: Clockwork,
+        monotonic: Callable[[], float],
+        without_time: bool = False,
+        limits: Limits | None = None,
+    ) -> None:
+        self._keepers, self._player, self._log = keepers, player, log
+        self._schedule, self._clock, self._monotonic = schedule, clock, monotonic
+        self._limits = limits or Limits()
+        self._agenda = Agenda(works, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
+        self.machine = Machine(self._changed)
+        self.wishes = Wishes(log, without_time=without_time)
+        self._pictures = Pictures(stock, self.wishes, self._agenda, log)
+        self._lock = threading.RLock()
+        self._plan = Plan(None)
+        self._since_s = monotonic()
+        self._attempts, self._missing = 0, frozenset[str]()
+        self._lit_until_s, self._lit_closed = float("-inf"), False
+
+    # -- asked from outside
+
+    @property
+    def plan(self) -> Plan:
+        return self._plan
+
+    @property
+    def working(self) -> bool:
+        """Whether work runs or waits."""
+        with self._lock:
+            return self._agenda.head is not None
+
+    def waits(self, number: int) -> bool:
+        """Whether the job of this number has not begun yet, and will."""
+        with self._lock:
+            return self._agenda.waits(number)
+
+    def open(self) -> None:
+        """Play until the schedule says otherwise the next time."""
+        with self._lock:
+            self.wishes.override(True, self._plan)
+            self._since_s = min(self._since_s, self._monotonic() - RETRY_S[-1])
+
+    def shut(self) -> None:
+        """Stop, and cool the lamps, until the schedule says otherwise the next time."""
+        with self._lock:
+            self._agenda.cancel()
+            self._lit_until_s = float("-inf")
+            self.wishes.override(False, self._plan)
+
+    def choose(self, appearance: str) -> None:
+        """Play this appearance of the bundle from now on."""
+        with self._lock:
+            self.wishes.choose(appearance, self._plan)
+
+    def light_for(self, seconds: float, *, closed_too: bool = False) -> None:
+        """Light, also with nothing to play, while open or ``closed_too``; 0 ends it, and so does ``shut``."""
+        with self._lock:
+            self._lit_until_s, self._lit_closed = self._monotonic() + seconds, closed_too
+
+    def ask(self, *requests: Request) -> None:
+        """Queue work. Raises WorkError("busy") while other work runs or waits, and with the reason it can't be done."""
+        with self._lock:
+            self._agenda.ask(*requests)
+
+    @contextlib.contextmanager
+    def idle(self) -> Iterator[None]:
+        """What work reads may be changed: none begins meanwhile, and only who is here may ask for some.
+
+        Raises WorkError("busy") while work runs or waits, and while somebody else is here.
+        """
+        with self._lock:
+            self._agenda.hold()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._agenda.let_go()
+
+    def cancel(self) -> None:
+        """Raises WorkError("nothing-to-cancel")."""
+        with self._lock:
+            if self._agenda.head is None:
+                raise WorkError("nothing-to-cancel", what="No work is going on.", remedy="There is nothing to do.")
+            self._agenda.cancel()
+
+    # -- one step
+
+    def step(self) -> None:
+        with self._lock:
+            # First: what is done now must not be due in the plan.
+            self._take_finished()
+            self._look_at_the_clock()
+            wanted_open = self.wishes.open(self._plan)
+            self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
+            views = [keeper.view for keeper in self._keepers]
+            open_now = self._pictures.something(wanted_open)
+            lit_anyway = (wanted_open or self._lit_closed) and self._monotonic() < self._lit_until_s
+            light = open_now or lit_anyway or self._agenda.needs_light
+            self._move(views, light, open_now)
+            cooling = self.machine.state in (State.COOLING, State.OFF)
+            for keeper in self._keepers:
+                if keeper.want_lit is not (wanted := light and not cooling):
+                    keeper.want_lit = wanted
+            self._begin_work(views)
+            self._show(views, open_now)
+
+    def _look_at_the_clock(self) -> None:
+        now_s = self._clock.now()
+        self._plan = plan(now_s, self._schedule(), self._log.done(), since_s=self._clock.since_s)
+        self.wishes.follow(self._plan)
+
+    # -- work
+
+    def _take_finished(self) -> None:
+        finished = self._agenda.take_finished()
+        if finished is not None and self.machine.state is State.CALIBRATING:
+            event = Event.CANCEL if finished.failed else Event.CALIBRATED
+            self._go(event, finished.outcome.reason)
+
+    def _begin_work(self, views: Sequence[ProjectorView]) -> None:
+        head = self._agenda.head
+        state = self.machine.state
+        if state is State.FAULT and head is not None and head.light:
+            self._agenda.drop(_FAULTY)
+        if head is not None and head.light and state not in (State.READY, State.PLAYING, State.DEGRADED):
+            return
+        if (request := self._agenda.ready(views)) is None:
+            return
+        if request.light:
+            self._go(Event.RECALIBRATE, f"{request.kind} begins")
+            self._player.want = None
+        self._agenda.begin()
+
+    # -- states
+
+    def _move(self, views: Sequence[ProjectorView], light: bool, open_now: bool) -> None:
+        state = self.machine.state
+        if state is State.OFF:
+            if light:
+                self._go(Event.START, "the lamps are wanted")
+        elif state is State.COOLING:
+            self._cool(views)
+        elif state is State.FAULT:
+            self._mend(views, light)
+        elif state is State.CALIBRATING:
+            return
+        elif not light:
+            self._go(Event.STOP, "closed" if not open_now else "nothing to do")
+        elif state in (State.POWERING, State.WARMING):
+            self._power(views, state)
+        else:
+            self._keep_playing(views, state, open_now)
+
+    def _power(self, views: Sequence[ProjectorView], state: State) -> None:
+        shining = [view for view in views if view.shines]
+        coming = [view for view in views if view.coming]
+        late = self._monotonic() - self._since_s > self._limits.power_up_s
+        if (coming and not late) or not views:
+            return
+        if not shining:
+            self._go(Event.FAIL, _reasons(views) or "No lamp gave light in time.")
+        elif state is State.POWERING:
+            self._go(Event.LAMPS_LIT, _reasons(views))
+        elif late or all(view.stable_left_s <= 0 for view in shining if view.condition is Condition.LIT):
+            self._go(Event.LAMPS_STABLE, _reasons(views))
+
+    def _keep_playing(self, views: Sequence[ProjectorView], state: State, open_now: bool) -> None:
+        shining = [view.name for view in views if view.shines]
+        reasons = _reasons(views)
+        if self._player.view.problem is not None:
+            reasons = f"{self._player.view.problem.reason} {reasons}".strip()
+        self._missing = frozenset(view.name for view in views if not view.shines)
+        if not shining and not any(view.coming for view in views):
+            self._go(Event.FAIL, reasons or "No lamp gives light.")
+        elif state is State.DEGRADED:
+            if not reasons and not self._missing:
+                self._go(Event.RECOVERED, "every projector gives light again")
+        elif reasons or self._missing:
+            self._go(Event.DEGRADE, reasons or f"{', '.join(sorted(self._missing))} gives no light.")
+        elif state is State.READY and open_now and not self._agenda.needs_light:
+            self._go(Event.PLAY, "open")
+        elif state is State.PLAYING and not open_now:
+            self._go(Event.PAUSE, "closed")
+
+    def _cool(self, views: Sequence[ProjectorView]) -> None:
+        lit = [view for view in views if view.condition is Condition.LIT or view.maybe_lit or not view.looked]
+        if not lit:
+            self._go(Event.COOLED, "every lamp is off or cooling by itself")
+        elif self._monotonic() - self._since_s > self._limits.cool_down_s:
+            names = ", ".join(view.name for view in lit)
+            self._go(Event.FAIL, f"The lamp of {names} could not be switched off. Switch it off by its remote control.")
+
+    def _mend(self, views: Sequence[ProjectorView], light: bool) -> None:
+        if not light:
+            if not any(view.condition is Condition.LIT or view.maybe_lit for view in views) or self._waited(60.0):
+                self._go(Event.STOP, "closed")
+        elif any(view.condition is Condition.LIT for view in views) or self._waited(
+            RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
+        ):
+            self._attempts += 1
+            self._go(Event.START, "another attempt")
+
+    def _waited(self, seconds: float) -> bool:
+        return self._monotonic() - self._since_s >= seconds
+
+    def _go(self, event: Event, reason: str) -> None:
+        self._since_s = self._monotonic()
+        self.machine.handle(event, reason)
+        if event in (Event.PLAY, Event.COOLED):
+            self._attempts = 0
+
+    def _changed(self, change: object) -> None:
+        machine = self.machine
+        bad = machine.state in (State.FAULT, State.DEGRADED)
+        remedy = "See the devices for what to do." if bad else ""
+        text = f"The stage is {machine.state.value}" + (f": {machine.reason}" if machine.reason else "")
+        level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
+        self._log.tell(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
+
+    # -- the picture
+
+    def _show(self, views: Sequence[ProjectorView], open_now: bool) -> None:
+        state = self.machine.state
+        if state is State.CALIBRATING:
+            return
+        # Where every lamp is dark, nobody takes over.
+        missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
+        self._player.want = self._pictures.of(self._plan, missing) if open_now and state in _ON else BLACK
+
+    @property
+    def player(self) -> PlayerView:
+        return self._player.view
+
+
+def _reasons(views: Sequence[ProjectorView]) -> str:
+    return " ".join(view.problem.text for view in views if view.problem is not None)
+
+
+_FAULTY: Final = Decision(
+    "work-impossible", "The work was given up: the stage is in a fault.",
+    "See what the fault is, mend that, and ask again.", "error",
+)  # fmt: skip

@@ -1,0 +1,181 @@
+"""Does work in a thread of its own, and keeps what the panel shows of it."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from controller.core.errors import VelaturaError
+from controller.kiosk.decide.interfaces import Finished, Request
+from controller.kiosk.interface import Job, JobStep
+from controller.kiosk.store.event_log import Decision, EventLog
+from controller.run.progress import Level, Phase, Progress
+from hal.deadline import Cancelled
+from hal.errors import DeviceError
+
+TITLES: Final[Mapping[str, str]] = {
+    "aim": "Test shots",
+    "drift": "Drift check",
+    "quick": "Quick recalibration",
+    "projector": "Recalibration of projector",
+    "full": "Full recalibration",
+    "compare": "Photographing",
+    "publish": "Appearances",
+    "compute": "New appearance",
+    "report": "Report of",
+    "takeover": "Frames without a projector",
+    "variants": "Frames for the loss of a projector",
+}
+
+
+REMEMBERED: Final = 16
+"""Jobs that ended, for whoever follows one and looks only now and then."""
+
+
+def title_of(request: Request) -> str:
+    """What people read of it."""
+    return " ".join((TITLES.get(request.kind, request.kind), *request.arguments))
+
+
+class JobReporter:
+    """A ``run.progress.Reporter`` that keeps a ``Job`` up to date. ``changed`` is called after each change."""
+
+    def __init__(self, job: Job, log: EventLog, changed: Callable[[], None]) -> None:
+        self.job, self._log, self._changed = job, log, changed
+        self._steps: list[JobStep] = []
+
+    def progress(self, now: Progress) -> None:
+        if len(self._steps) != now.count:
+            self._steps = [JobStep("", 0.0)] * now.count
+        done = 1.0 if now.phase is not Phase.RUNNING else now.step_fraction
+        self._steps[now.index] = JobStep(now.step, done)
+        self.job = replace(self.job, steps=tuple(self._steps[: now.index + 1]), left_s=now.left_s, count=now.count)
+        self._changed()
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self._log.tell(Decision("work-told", text, "", level.value))
+        self._changed()
+
+
+Do = Callable[[Request, JobReporter, threading.Event], Finished]
+"""Does one kind of work; raises VelaturaError, DeviceError or Cancelled."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """``refusal`` says from memory why it can't be done now, or None."""
+
+    do: Do
+    refusal: Callable[[Request], Decision | None] = lambda request: None
+
+
+class ThreadWorks:
+    """One piece of work at a time; see ``ports.Works``. ``number`` is that of the last job of the service before."""
+
+    def __init__(
+        self, kinds: Mapping[str, Kind], log: EventLog, changed: Callable[[], None] = lambda: None, *, number: int = 0
+    ) -> None:
+        self._kinds, self._log, self._changed = kinds, log, changed
+        self._number = number
+        self._lock = threading.Lock()
+        self._request: Request | None = None
+        self._reporter: JobReporter | None = None
+        self._ended: OrderedDict[int, Job] = OrderedDict()
+        self._cancel = threading.Event()
+        self._finished: Finished | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def job(self) -> Job | None:
+        """The work that is going on, or ended last."""
+        return None if self._reporter is None else self._reporter.job
+
+    @property
+    def number(self) -> int:
+        """The last that a job has, or was promised, also in a service before."""
+        return self._number
+
+    def reserve(self) -> int:
+        """The number of a job that is asked for now, and may begin later or never; no other gets it."""
+        with self._lock:
+            self._number += 1
+            return self._number
+
+    def known(self, number: int) -> Job | None:
+        """The job of this number, if it goes on or ended lately; None while it waits, and where it never began."""
+        job = self.job
+        return job if job is not None and job.number == number else self._ended.get(number)
+
+    @property
+    def running(self) -> Request | None:
+        return self._request
+
+    def refusal(self, request: Request) -> Decision | None:
+        return self._kinds[request.kind].refusal(request)
+
+    def begin(self, request: Request) -> None:
+        self._request, self._cancel = request, threading.Event()
+        title = title_of(request)
+        self._reporter = JobReporter(Job(request.number or self.reserve(), title), self._log, self._changed)
+        self._log.tell(Decision("work-begins", f"{title} begins."))
+        thread = threading.Thread(
+            target=self._run, args=(request, self._reporter, self._cancel), name=f"work-{request.kind}", daemon=True
+        )
+        try:
+            thread.start()
+            self._thread = thread
+        except RuntimeError as error:
+            # Of a system that gives no more threads. Whoever waits for this work would do so for good.
+            self._end(_crashed(request, error), self._reporter)
+
+    def finished(self) -> Finished | None:
+        with self._lock:
+            found, self._finished = self._finished, None
+            if found is not None:
+                self._request = None
+            return found
+
+    def cancel(self) -> None:
+        self._cancel.set()
+
+    def close(self, timeout_s: float) -> None:
+        """Ask for the end, and wait for it."""
+        self._cancel.set()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    def _run(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> None:
+        try:
+            finished = self._kinds[request.kind].do(request, reporter, cancel)
+        except Cancelled as error:
+            finished = Finished(request, Decision(error.code, error.what, error.remedy), failed=True)
+        except (VelaturaError, DeviceError) as error:
+            finished = Finished(request, Decision(error.code, error.what, error.remedy, "error"), failed=True)
+        except BaseException as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk goes on, and says it
+            finished = _crashed(request, error)
+        self._end(finished, reporter)
+
+    def _end(self, finished: Finished, reporter: JobReporter) -> None:
+        reporter.job = replace(
+            reporter.job, ended=True, failed=finished.failed, outcome=finished.outcome.text, left_s=None
+        )
+        self._ended[reporter.job.number] = reporter.job
+        while len(self._ended) > REMEMBERED:
+            self._ended.popitem(last=False)
+        with self._lock:
+            self._finished = finished
+        self._changed()
+
+
+def _crashed(request: Request, error: BaseException) -> Finished:
+    what = f"The work met an error that Velatura does not know ({type(error).__name__}: {error})."
+    return Finished(request, Decision("crash", what, "Export the diagnostics.", "error"), failed=True)
+
+
+def run_name(result: Mapping[str, object]) -> str:
+    """The name of the run's folder that a service returned."""
+    return Path(str(result["run"])).name if "run" in result else ""

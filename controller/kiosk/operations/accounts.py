@@ -1,0 +1,90 @@
+"""Accounts and tokens as operations; ``AccountActions`` has their methods."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from controller.kiosk.operations.fields import Field
+from controller.kiosk.operations.operation import Answer, Effect, Operation
+from controller.kiosk.roles import ACCOUNT_NAME, LONGEST_PASSWORD, Role
+
+if TYPE_CHECKING:
+    from controller.kiosk.store.accounts import Accounts
+
+_NAME: Final = Field("name", "1 to 32 small letters, digits, dots, dashes; begins with a letter", pattern=ACCOUNT_NAME,
+                     longest=32)  # fmt: skip
+_ROLE: Final = Field("role", "viewer, operator or technician", choices=("viewer", "operator", "technician"),
+                     usual="viewer")  # fmt: skip
+_PASSWORD: Final = Field("password", "10 characters or more", longest=LONGEST_PASSWORD, secret=True)
+
+
+class AccountActions:
+    """What may be done with accounts and tokens. ``held`` gives them when they are first needed; ``ended`` gets the
+    name of whose sessions have to end; inside ``costly`` a password is hashed.
+    """
+
+    def __init__(
+        self, held: Callable[[], Accounts], ended: Callable[[str], object],
+        costly: contextlib.AbstractContextManager[Any] | None = None,
+    ) -> None:  # fmt: skip
+        self._held, self._ended = held, ended
+        self._costly = costly or contextlib.nullcontext()
+
+    def accounts(self) -> Sequence[dict[str, Any]]:
+        found = self._held().all()
+        return [{"name": one.name, "role": one.role.name.lower(), "one_time": one.one_time} for one in found]
+
+    def tokens(self) -> Sequence[dict[str, Any]]:
+        """Without what they show."""
+        found = self._held().tokens()
+        return [{"name": one.name, "role": one.role.name.lower(), "made_unix_s": one.made_unix_s} for one in found]
+
+    def add_account(self, name: str, role: str, password: str) -> None:
+        with self._costly:
+            self._held().add(name, Role.named(role), password)
+
+    def set_role(self, name: str, role: str) -> None:
+        self._held().set_role(name, Role.named(role))
+        self._ended(name)
+
+    def set_password(self, name: str, password: str) -> None:
+        with self._costly:
+            self._held().set_password(name, password)
+        self._ended(name)
+
+    def remove_account(self, name: str) -> None:
+        self._held().remove(name)
+        self._ended(name)
+
+    def add_token(self, name: str, role: str) -> dict[str, str]:
+        return {"token": self._held().add_token(name, Role.named(role))}
+
+    def remove_token(self, name: str) -> None:
+        self._held().remove_token(name)
+
+
+def _declared(name: str, about: str, effect: Effect, **more: Any) -> Operation:
+    return Operation(name, about, Role.TECHNICIAN, effect, holder="accounts", offline=True, **more)
+
+
+ACCOUNT_OPERATIONS: Final = (
+    _declared("accounts", "Who may log in", Effect.LOOKS, within="account list"),
+    _declared("tokens", "The machines' tokens, without what they show", Effect.LOOKS, within="account list"),
+    _declared("add-account", "Make an account", Effect.CHANGES, fields=(_NAME, _ROLE, _PASSWORD),
+              answer=Answer.NOTHING, http=("POST", "/accounts"), command="account add", said="{name} may log in."),
+    _declared("set-role", "Change an account's role, and end its sessions", Effect.CHANGES, fields=(_NAME, _ROLE),
+              answer=Answer.NOTHING, http=("PUT", "/accounts/{name}/role"), command="account role",
+              said="{name} is {role} now."),
+    _declared("set-password", "Give an account a new password, and end its sessions", Effect.CHANGES,
+              fields=(_NAME, _PASSWORD), answer=Answer.NOTHING, http=("PUT", "/accounts/{name}/password"),
+              command="account password", said="The new password is in use."),
+    _declared("remove-account", "Remove an account, and end its sessions", Effect.CHANGES, fields=(_NAME,),
+              answer=Answer.NOTHING, http=("DELETE", "/accounts/{name}"), command="account remove",
+              said="{name} is removed."),
+    _declared("add-token", "Make a token; the answer shows it once", Effect.CHANGES, fields=(_NAME, _ROLE),
+              http=("POST", "/tokens"), command="account add-token"),
+    _declared("remove-token", "Remove a token", Effect.CHANGES, fields=(_NAME,), answer=Answer.NOTHING,
+              http=("DELETE", "/tokens/{name}"), command="account remove-token", said="The token {name} is removed."),
+)  # fmt: skip

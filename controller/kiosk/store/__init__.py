@@ -1,0 +1,3 @@
+"""What the kiosk keeps on disk: events, runs, bundles, settings, schedule, accounts, photographs and how long
+they stay.
+"""

@@ -1,0 +1,231 @@
+"""Backup, restore and diagnostics of a stage as tar files; never with a secret in them."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import platform
+import shutil
+import sqlite3
+import tarfile
+import tempfile
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from controller.artefacts.grade import FIGURES
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.names import json_path
+from controller.artefacts.published import BUNDLE_FIGURES
+from controller.config import load_stage
+from controller.core.errors import UsageError, WorkError
+from controller.core.files import require_regular
+from controller.core.storage import sync_folder
+from controller.stage.calibrations import finished_calibrations
+from hal.runtime.caches import kept
+
+FOLDER: Final = "kiosk/archives"
+MARK: Final = "velatura-backup.json"
+RESTORING: Final = ".restoring"
+"""An unpacked and checked backup: while it is there, its parts are on their way to their places."""
+REPLACED: Final = "kiosk/replaced"
+KEPT: Final = 5
+CUT_OFF_S: Final = 3600.0
+"""A backup to which nothing was written for so long is not being made any more."""
+MOST_FILES: Final = 100_000
+ROOM_SHARE: Final = 0.9
+"""Of the free space that a backup may fill when it is unpacked; the kiosk's own log needs some."""
+_SECRET: Final = ("keys", "kiosk", "run")
+_BACKED_UP: Final = ("stage.toml", "schedule.toml", "profiles", "appearances", "bundles", "bundles-without")
+
+
+def backup(stage: Path) -> Path:
+    """A new file with settings, the newest calibration, appearances and bundles; without keys, accounts and logs."""
+    parts = [stage / name for name in _BACKED_UP if (stage / name).exists()]
+    runs = finished_calibrations(stage)
+    parts += runs[:1]
+    path = _new(stage, "backup", "tar.gz")
+    mark = json.dumps({"velatura": 1, "made_unix_s": time.time(), "run": runs[0].name if runs else ""})
+
+    def write(archive: tarfile.TarFile) -> None:
+        _add(archive, MARK, mark.encode())
+        for part in parts:
+            archive.add(part, str(part.relative_to(stage)), filter=_harmless)
+
+    return _written(path, write)
+
+
+def restore(stage: Path, file: Path) -> None:
+    """Replace settings, calibration and appearances by those of a backup; what was there stays in kiosk/replaced.
+
+    Everything is unpacked and checked beside before anything is replaced; from then on it happens, be it by
+    ``finish_restore`` after a power cut. Raises UsageError("not-a-backup"), WorkError("no-space") and what
+    ``load_stage`` raises for the settings in it.
+    """
+    finish_restore(stage)
+    with tempfile.TemporaryDirectory(prefix=".restore-", dir=stage) as name:
+        fresh = Path(name) / "fresh"
+        fresh.mkdir()
+        _unpack(file, fresh)
+        load_stage(fresh)
+        old = stage / REPLACED
+        shutil.rmtree(old, ignore_errors=True)
+        old.mkdir(parents=True)
+        fresh.rename(stage / RESTORING)
+        sync_folder(stage)
+    finish_restore(stage)
+
+
+def finish_restore(stage: Path) -> bool:
+    """Go on with a restore that was cut off between its parts, so that no mixture stays; whether there was one."""
+    fresh, old = stage / RESTORING, stage / REPLACED
+    if not fresh.exists():
+        return False
+    for part in sorted(fresh.iterdir()):
+        if part.name in (*_SECRET, MARK):
+            continue
+        if part.name == "runs":
+            _merge_runs(part, stage / "runs")
+            continue
+        if (stage / part.name).exists():
+            (stage / part.name).rename(old / part.name)
+        part.rename(stage / part.name)
+    sync_folder(stage)
+    shutil.rmtree(fresh)
+    return True
+
+
+def clear_cut_off(stage: Path) -> None:
+    """Remove what a kill left of restores and backups, which may be gigabytes each. For the holder of the stage."""
+    for folder in stage.glob(".restore-*"):
+        shutil.rmtree(folder, ignore_errors=True)
+    for part in (stage / FOLDER).glob(".*.part"):
+        with contextlib.suppress(OSError):
+            if time.time() - part.stat().st_mtime > CUT_OFF_S:
+                part.unlink()
+
+
+def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:
+    """A new file for whoever helps from afar: ``facts``, events, journals and logs; no secret, no picture."""
+    path = _new(stage, "diagnostics", "tar.gz")
+    system = {"system": platform.platform(), "python": platform.python_version(), "disk": _disk(stage),
+              "outside_the_stage": [dataclasses.asdict(one) for one in kept()]}  # fmt: skip
+
+    def write(archive: tarfile.TarFile) -> None:
+        _add(archive, "facts.json", json.dumps({**system, **facts}, indent=1, default=str).encode())
+        for name in ("stage.toml", "schedule.toml", "lamps.json"):
+            if (stage / name).is_file():
+                archive.add(stage / name, name)
+        for database in sorted([*stage.glob("runs/*/journal.sqlite"), *stage.glob("kiosk/events.sqlite")])[-20:]:
+            with contextlib.suppress(sqlite3.Error):
+                _add(archive, str(database.relative_to(stage)), _copy_of(database))
+        for text in _texts(stage):
+            archive.add(text, str(text.relative_to(stage)))
+
+    return _written(path, write)
+
+
+def _texts(stage: Path) -> Iterable[Path]:
+    runs = Path("runs/*")
+    found = (runs / FIGURES, json_path(runs, StepKind.DRIFT), json_path(runs, BUNDLE_FIGURES), Path("run/*.log"))
+    for pattern in found:
+        yield from sorted(stage.glob(str(pattern)))[-20:]
+
+
+def _copy_of(database: Path) -> bytes:
+    """As it stands now, though somebody writes to it."""
+    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as source:
+        return source.serialize()
+
+
+def _new(stage: Path, what: str, suffix: str) -> Path:
+    folder = stage / FOLDER
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for old in sorted(folder.glob(f"{what}-*"))[: -KEPT + 1]:
+        old.unlink(missing_ok=True)
+    return folder / f"{what}-{time.strftime('%Y%m%d-%H%M%S')}-{time.monotonic_ns() % 1_000_000:06d}.{suffix}"
+
+
+def _written(path: Path, write: Any) -> Path:
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with tarfile.open(part, "w:gz", compresslevel=1) as archive:
+            write(archive)
+        part.chmod(0o600)
+        part.replace(path)
+    except OSError as error:
+        raise WorkError("cannot-write", what=f"{path.name} could not be written: {error.strerror}.",
+                        remedy="See whether there is space on the disk, and try again.") from error  # fmt: skip
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    info = tarfile.TarInfo(name)
+    info.size, info.mtime = len(data), int(time.time())
+    archive.addfile(info, io.BytesIO(data))
+
+
+def _harmless(info: tarfile.TarInfo) -> tarfile.TarInfo | None:
+    """Only files, folders, and the links of a bundle folder (to a name beside them); no key, no unfinished write."""
+    name = PurePosixPath(info.name)
+    if name.suffix == ".key" or name.name.startswith("."):
+        return None
+    if info.issym():
+        return info if "/" not in info.linkname else None
+    return info if info.isfile() or info.isdir() else None
+
+
+def _unpack(file: Path, folder: Path) -> None:
+    try:
+        require_regular(file)
+        with tarfile.open(file, "r:gz") as archive:
+            members = []
+            for count, member in enumerate(archive):
+                if count >= MOST_FILES or _harmless(member) is None:
+                    raise _not_ours()
+                members.append(member)
+            if not members or members[0].name != MARK:
+                raise _not_ours()
+            _require_room(folder, sum(member.size for member in members))
+            # The data filter refuses absolute paths, "..", devices and links that lead out.
+            archive.extractall(folder, members, filter="data")
+    except (tarfile.TarError, OSError, EOFError, ValueError) as error:
+        raise _not_ours() from error
+
+
+def _require_room(folder: Path, size: int) -> None:
+    """Raises WorkError("no-space"): what is small when packed may be large."""
+    free = shutil.disk_usage(folder).free
+    if size > ROOM_SHARE * free:
+        raise WorkError("no-space", what=f"The backup needs {size / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free.",
+                        remedy="Free some space on the disk of the stage.")  # fmt: skip
+
+
+def _not_ours() -> UsageError:
+    return UsageError(
+        "not-a-backup",
+        what="This file is not a backup of a Velatura stage, or it is damaged.",
+        remedy="Take a file that `velatura backup` or the panel made.",
+    )
+
+
+def _merge_runs(fresh: Path, runs: Path) -> None:
+    """The newest finished calibration counts; a restored one that is older than what is there takes its place."""
+    runs.mkdir(exist_ok=True)
+    for run in sorted(fresh.iterdir()):
+        newest = max((other.name for other in runs.iterdir()), default="")
+        name = run.name
+        if newest > name:
+            name = f"{time.strftime('%Y%m%d-%H%M%S')}-{name.partition('-')[2].partition('-')[2] or 'calibrate'}"
+        if not (runs / name).exists():
+            run.rename(runs / name)
+
+
+def _disk(stage: Path) -> dict[str, int]:
+    usage = shutil.disk_usage(stage)
+    return {"total": usage.total, "free": usage.free}

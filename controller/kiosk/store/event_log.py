@@ -1,0 +1,247 @@
+"""The kiosk's memory in SQLite: the event log, what was done, and a few values. A full disk stops nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from controller.kiosk.interface import EventLevel, EventRow
+
+MOST_EVENTS: Final = 20_000
+MOST_DONE: Final = 400
+SHOWN: Final = 2_000
+MOST_FAILURES: Final = 20
+_TRIM_EVERY: Final = 200
+_RETRY_S: Final = 30.0
+_LEVELS: Final[dict[str, EventLevel]] = {"info": "info", "warning": "warning", "error": "error"}
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS events (
+    number INTEGER PRIMARY KEY AUTOINCREMENT, unix_s REAL NOT NULL, level TEXT NOT NULL, code TEXT NOT NULL,
+    text TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS done (number INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT UNIQUE NOT NULL, how TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS kept (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the kiosk noticed or decided. ``reason`` and ``remedy`` are sentences; the remedy may be empty."""
+
+    code: str
+    reason: str
+    remedy: str = ""
+    level: EventLevel = "info"
+
+    @property
+    def text(self) -> str:
+        return f"{self.reason} {self.remedy}".strip()
+
+
+class EventLog:
+    """Safe to use from several threads. ``problem`` says why the disk takes nothing now, or is None.
+
+    ``durable``: what is told survives a power cut, too; without it only the end of the process.
+    What the disk refuses is kept in memory and written when there is space again. A damaged file is put aside.
+    """
+
+    FILE: Final = "kiosk/events.sqlite"
+
+    def __init__(self, path: Path, *, wall: Callable[[], float] = time.time, durable: bool = True) -> None:
+        self.path, self._wall, self._durable = path, wall, durable
+        self._lock = threading.RLock()
+        self.problem: str | None = None
+        self._retry_at_s = 0.0
+        self._away = False
+        self._database = self._opened()
+        self._recent: deque[EventRow] = deque(self._load(), SHOWN)
+        self._number = self._last_number()
+        self._waiting: deque[EventRow] = deque(maxlen=SHOWN)
+        self._done: dict[str, str] = dict(self._query("SELECT key, how FROM done ORDER BY number"))
+        self._kept: dict[str, str] = dict(self._query("SELECT name, value FROM kept"))
+        self._failures = self._read_failures()
+        self._unwritten: set[tuple[str, str]] = set()
+
+    # -- events
+
+    def tell(self, decision: Decision) -> EventRow:
+        """Add one line. Never raises for the disk's sake."""
+        with self._lock:
+            self._number += 1
+            row = EventRow(self._number, self._wall(), decision.level, decision.text, decision.code)
+            self._recent.append(row)
+            self._waiting.append(row)
+            self._flush()
+            return row
+
+    def tell_failure(self, decision: Decision) -> None:
+        """Add one line, which stays among ``failures`` until somebody has seen it."""
+        with self._lock:
+            self._failures = (*self._failures, self.tell(decision))[-MOST_FAILURES:]
+            self._keep_failures()
+
+    @property
+    def failures(self) -> tuple[EventRow, ...]:
+        """Those that nobody has seen yet, oldest first, at most ``MOST_FAILURES``."""
+        return self._failures
+
+    def seen(self, number: int) -> None:
+        """Somebody has seen the failures up to this number."""
+        with self._lock:
+            self._failures = tuple(row for row in self._failures if row.number > number)
+            self._keep_failures()
+
+    def _keep_failures(self) -> None:
+        self.keep("failures", json.dumps([asdict(row) for row in self._failures]))
+
+    def _read_failures(self) -> tuple[EventRow, ...]:
+        try:
+            return tuple(EventRow(**row) for row in json.loads(self._kept.get("failures", "[]")))
+        except (ValueError, TypeError):
+            return ()
+
+    def after(self, number: int) -> Sequence[EventRow]:
+        """Events with a larger number, oldest first, at most the newest ``SHOWN``."""
+        with self._lock:
+            return [row for row in self._recent if row.number > number]
+
+    @property
+    def number(self) -> int:
+        return self._number
+
+    # -- what was done, and values
+
+    def done(self) -> frozenset[str]:
+        with self._lock:
+            return frozenset(self._done)
+
+    def mark_done(self, key: str, how: str) -> None:
+        """Remember that ``key`` was done, or left out; in memory at once, on disk as soon as it lets us."""
+        with self._lock:
+            self._done[key] = how
+            self._unwritten.add(("done", key))
+            self._flush(now=True)
+
+    def value(self, name: str) -> str | None:
+        with self._lock:
+            return self._kept.get(name)
+
+    def keep(self, name: str, value: str) -> None:
+        with self._lock:
+            if self._kept.get(name) != value:
+                self._kept[name] = value
+                self._unwritten.add(("kept", name))
+                self._flush()
+
+    def close(self) -> None:
+        with self._lock:
+            self._flush(now=True)
+            self._database.close()
+
+    # -- the disk
+
+    def _flush(self, *, now: bool = False) -> None:
+        if self.problem is not None and not now and time.monotonic() < self._retry_at_s:
+            return
+        try:
+            if self._away:
+                self._database, self._away = self._connected(self.path), False
+            with self._database as database:
+                for row in self._waiting:
+                    database.execute(
+                        "INSERT OR IGNORE INTO events VALUES (?, ?, ?, ?, ?)",
+                        (row.number, row.unix_s, row.level, row.code, row.text),
+                    )
+                for kind, key in self._unwritten:
+                    if kind == "done":
+                        database.execute("INSERT OR REPLACE INTO done (key, how) VALUES (?, ?)", (key, self._done[key]))
+                    else:
+                        database.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, self._kept[key]))
+                if self._number % _TRIM_EVERY == 0:
+                    self._trim(database)
+        except (sqlite3.Error, OSError) as error:
+            self.problem, self._retry_at_s = str(error), time.monotonic() + _RETRY_S
+            return
+        self._waiting.clear()
+        self._unwritten.clear()
+        self.problem = None
+
+    def _trim(self, database: sqlite3.Connection) -> None:
+        database.execute("DELETE FROM events WHERE number <= ?", (self._number - MOST_EVENTS,))
+        database.execute("DELETE FROM done WHERE number <= (SELECT MAX(number) FROM done) - ?", (MOST_DONE,))
+        for key in list(self._done)[: max(0, len(self._done) - MOST_DONE)]:
+            del self._done[key]
+
+    def _opened(self) -> sqlite3.Connection:
+        try:
+            return self._connected(self.path)
+        except (sqlite3.DatabaseError, OSError) as error:
+            self.problem = str(error)
+            if isinstance(error, sqlite3.Error) and _is_damage(error):
+                # A damaged log must not keep the stage dark; it is kept for whoever wants to look into it.
+                with contextlib.suppress(OSError, sqlite3.Error):
+                    self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
+                    database = self._connected(self.path)
+                    self.problem = None
+                    return database
+            self._away = True
+            return self._copied()
+
+    def _copied(self) -> sqlite3.Connection:
+        """In memory, what can be read of a log that can't be opened, as on a disk without space; see ``_flush``."""
+        database = self._connected(Path(":memory:"))
+        with (
+            contextlib.suppress(sqlite3.Error),
+            contextlib.closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?immutable=1", uri=True)) as source,
+        ):
+            source.backup(database)
+        return database
+
+    def _connected(self, path: Path) -> sqlite3.Connection:
+        if str(path) != ":memory:":
+            path.parent.mkdir(parents=True, exist_ok=True)
+        database = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
+        try:
+            database.execute("PRAGMA journal_mode=WAL")
+            # What was done must not be done again after a power cut.
+            database.execute(f"PRAGMA synchronous={'FULL' if self._durable else 'OFF'}")
+            database.executescript(_SCHEMA)
+        except sqlite3.Error:
+            database.close()
+            raise
+        return database
+
+    def _load(self) -> list[EventRow]:
+        rows = self._query("SELECT number, unix_s, level, text, code FROM events ORDER BY number DESC LIMIT 2000")
+        return [EventRow(n, s, _LEVELS.get(level, "info"), text, code) for n, s, level, text, code in reversed(rows)]
+
+    def _last_number(self) -> int:
+        found = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
+        if found:
+            return int(found[0][0])
+        # After a damaged log, and beside one that can't be read, numbers go on far above any that it can have had.
+        return int(self._wall()) if self._away or list(self.path.parent.glob("*.damaged-*")) else 0
+
+    def _query(self, statement: str) -> list[tuple]:  # type: ignore[type-arg]
+        try:
+            return self._database.execute(statement).fetchall()
+        except sqlite3.Error as error:
+            self.problem = str(error)
+            return []
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    """Whether the file is at fault, and not a disk without space, or a system without free handles."""
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
+    return code & 0xFF in _DAMAGE or code in _UNREADABLE
+
+
+_DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT, sqlite3.SQLITE_ERROR)
+_UNREADABLE: Final = (sqlite3.SQLITE_IOERR_READ, sqlite3.SQLITE_IOERR_SHORT_READ, sqlite3.SQLITE_IOERR_CORRUPTFS)

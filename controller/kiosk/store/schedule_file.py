@@ -1,0 +1,87 @@
+"""The stage's schedule: schedule.toml, which the panel writes, or else the table [schedule] of stage.toml."""
+
+from __future__ import annotations
+
+import threading
+import tomllib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final
+
+from pydantic import ValidationError
+
+from controller.config.models import ScheduleTable
+from controller.config.writer import toml_text
+from controller.core.errors import UsageError
+from controller.core.files import read_text
+from controller.core.storage import write_atomically
+from controller.kiosk.decide.hours import check_schedule
+from controller.kiosk.interface import Schedule, ScheduleRow
+
+FILE: Final = "schedule.toml"
+_HEADING: Final = "# Opening hours; written by the panel. It takes the place of [schedule] in stage.toml.\n\n"
+
+
+def of_table(table: ScheduleTable) -> Schedule:
+    """Raises UsageError as ``check_schedule``."""
+    rows = tuple(ScheduleRow(row.day, row.opens, row.closes, row.appearance) for row in table.hours)
+    schedule = Schedule(table.time_zone, rows, table.drift_check)
+    check_schedule(schedule)
+    return schedule
+
+
+class ScheduleFile:
+    """The schedule that holds now; read once, replaced by ``replace``. Safe to use from several threads."""
+
+    def __init__(self, stage: Path, table: ScheduleTable) -> None:
+        self._path, self._lock = stage / FILE, threading.Lock()
+        self._without_time = table.without_time
+        self.problem: UsageError | None = None
+        self._now = of_table(table)
+        try:
+            self._now = self._read() or self._now
+        except UsageError as error:
+            # A damaged file must not keep the stage dark; stage.toml's hours hold meanwhile.
+            self.problem = error
+
+    @property
+    def now(self) -> Schedule:
+        return self._now
+
+    @property
+    def open_without_time(self) -> bool:
+        return self._without_time == "open"
+
+    def replace(self, schedule: Schedule, appearances: Collection[str]) -> None:
+        """Check it, write it, and use it. Raises UsageError as ``check_schedule``, WorkError("no-space")."""
+        check_schedule(schedule, appearances)
+        hours = [
+            {"day": row.day, "opens": row.opens, "closes": row.closes, "appearance": row.appearance}
+            for row in schedule.rows
+        ]
+        content = {
+            "time_zone": schedule.time_zone, "drift_check": schedule.drift_check,
+            "without_time": self._without_time, "hours": hours,
+        }  # fmt: skip
+        with self._lock:
+            write_atomically(self._path, (_HEADING + toml_text(content)).encode())
+            self._now, self.problem = schedule, None
+
+    def _read(self) -> Schedule | None:
+        try:
+            content = tomllib.loads(read_text(self._path))
+            table = ScheduleTable.model_validate(content)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, ValidationError, RecursionError) as error:
+            raise UsageError(
+                "schedule-unreadable",
+                what=f"{FILE} can't be read: {_reason(error)}.",
+                remedy="Save the schedule anew in the panel; the one of stage.toml holds meanwhile.",
+            ) from error
+        self._without_time = table.without_time
+        return of_table(table)
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or (str(error).splitlines() or ["it is wrong"])[0]

@@ -1,0 +1,98 @@
+"""stage.toml as the panel changes it: validated before it is saved, the old text kept beside."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Final
+
+from controller.artefacts.solved import remove_solved
+from controller.config.editing import rewrite_stage
+from controller.config.lines import KeyLines
+from controller.config.loader import FILE, LARGEST_BYTES, parse_stage
+from controller.config.problems import Place
+from controller.core.errors import UsageError
+from controller.core.files import LARGEST_TEXT, read_bytes
+from controller.core.storage import write_atomically
+from controller.stage.calibrations import finished_calibrations
+from controller.stage.check import check_stage
+
+BEFORE: Final = "stage.toml.before"
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+
+def text(stage: Path) -> str:
+    """The text of stage.toml, empty when there is none."""
+    file = stage / FILE
+    return read_bytes(file, LARGEST_TEXT).decode("utf-8-sig", errors="replace") if file.exists() else ""
+
+
+def validate(content: str) -> None:
+    """Raises UsageError naming line, key and what is allowed."""
+    if len(content.encode()) > LARGEST_BYTES:
+        raise UsageError("stage-unreadable", what=f"{FILE} is too long.", remedy="Write less than 1 MiB.")
+    try:
+        parsed = tomllib.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise UsageError("stage-syntax", what=f"{FILE}: this is not TOML: {error}.", remedy="Mend the line.") from error
+    parse_stage(parsed, Place(FILE, KeyLines(content)))
+
+
+def save(stage: Path, content: str) -> None:
+    """Validate, keep the old text as ``BEFORE``, and write; drivers' own keys are checked, too.
+
+    Raises UsageError as above; stage.toml is then as it was.
+    """
+    validate(content)
+    before = text(stage)
+    write_atomically(stage / FILE, content.encode())
+    try:
+        check_stage(stage)
+    except BaseException:
+        if before:
+            write_atomically(stage / FILE, before.encode())
+        else:
+            (stage / FILE).unlink()
+        raise
+    if before:
+        write_atomically(stage / BEFORE, before.encode())
+
+
+def check_name(name: str) -> None:
+    """Raises UsageError("appearance-name")."""
+    if not _NAME.fullmatch(name):
+        raise UsageError("appearance-name", what=f"{name[:64]!r} can't be an appearance's name.",
+                         remedy="Use 1 to 64 letters, digits, - and _, a letter or digit first.")  # fmt: skip
+
+
+def add_picture(stage: Path, name: str, picture: Path) -> None:
+    """Add an appearance of kind "picture" to stage.toml, if it has none of this name. Raises as ``rewrite_stage``."""
+    tables = parse_stage(tomllib.loads(text(stage)), Place(FILE, KeyLines(text(stage))))
+    if any(table.name == name for table in tables.appearances):
+        return
+    entry = {"name": name, "kind": "picture", "file": str(picture.relative_to(stage))}
+    rewrite_stage(stage / FILE, (), {"appearances": [entry]})
+
+
+def remove_picture(stage: Path, name: str) -> None:
+    """Take an appearance out of stage.toml. Raises UsageError("appearance-unknown") and as ``rewrite_stage``."""
+    content = text(stage)
+    parsed = tomllib.loads(content)
+    position = next((n for n, one in enumerate(parsed.get("appearances", [])) if one.get("name") == name), None)
+    if position is None:
+        raise UsageError("appearance-unknown", what=f"stage.toml has no appearance {name[:64]!r}.",
+                         remedy="Choose another one.")  # fmt: skip
+    lines = content.split("\n")
+    first = KeyLines(content).line(("appearances", position)) - 1
+    following = (n for n in range(first + 1, len(lines)) if lines[n].lstrip().startswith("["))
+    last = next(following, len(lines))
+    left = "\n".join([*lines[:first], *lines[last:]])
+    validate(left)
+    write_atomically(stage / FILE, left.encode())
+
+
+def forget_solved(stage: Path, name: str) -> None:
+    """Remove an appearance's frames of the newest calibration: what is solved there stays in every new bundle."""
+    for run in finished_calibrations(stage)[:1]:
+        remove_solved(run, name)

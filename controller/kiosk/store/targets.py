@@ -1,0 +1,68 @@
+"""Pictures that become targets: fitted to the camera's view, of which a target must be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.errors import UsageError, VelaturaError
+from controller.kiosk.values import Fit
+from controller.stage.calibrations import finished_calibrations
+from controller.stage.check import check_stage
+
+
+def camera_view_px(stage: Path) -> tuple[int, int] | None:
+    """(width, height) of the camera's picture in the newest finished calibration; None without one."""
+    from controller.artefacts.calibrated import Calibrated
+
+    try:
+        names = check_stage(stage).names
+        run = next(iter(finished_calibrations(stage)), None)
+        return None if run is None else Calibrated(run, names).camera_px
+    except (VelaturaError, OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def fitted(picture: bytes, size_px: tuple[int, int], how: Fit = "fit") -> bytes:
+    """``picture`` (PNG) as a PNG of the size of the camera's view; the same bytes where it has that size already.
+
+    "fit" shows the whole picture, and "fill" fills the view and loses the edges that are too long; "crop" keeps the
+    picture's own pixels, in the middle of the view. What is left free is transparent: it stays dark.
+    Raises UsageError("target-unreadable").
+    """
+    import cv2
+
+    found = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED) if picture else None
+    if found is None:
+        raise UsageError("target-unreadable", what="The target can't be read as a picture.", remedy="Save it as PNG.")
+    height, width = found.shape[:2]
+    if (width, height) == size_px:
+        return picture
+    across, down = size_px[0] / width, size_px[1] / height
+    scale = 1.0 if how == "crop" else min(across, down) if how == "fit" else max(across, down)
+    if scale != 1.0:
+        wanted = (max(1, round(width * scale)), max(1, round(height * scale)))
+        found = cv2.resize(found, wanted, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    return cv2.imencode(".png", _in_the_middle(_with_alpha(found), size_px))[1].tobytes()
+
+
+def _with_alpha(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    import cv2
+
+    if picture.ndim == 3 and picture.shape[2] == 4:
+        return picture
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGRA if picture.ndim == 2 else cv2.COLOR_BGR2BGRA))
+
+
+def _in_the_middle(picture: npt.NDArray[Any], size_px: tuple[int, int]) -> npt.NDArray[Any]:
+
+    height, width = picture.shape[:2]
+    view = np.zeros((size_px[1], size_px[0], 4), picture.dtype)
+    rows, columns = min(height, size_px[1]), min(width, size_px[0])
+    top, left = (height - rows) // 2, (width - columns) // 2
+    down, right = (size_px[1] - rows) // 2, (size_px[0] - columns) // 2
+    view[down : down + rows, right : right + columns] = picture[top : top + rows, left : left + columns]
+    return view

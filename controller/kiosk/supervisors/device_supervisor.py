@@ -1,0 +1,102 @@
+"""Keeps a device open that is looked at now and then (camera, light sensor, relays), and opens it again when lost."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from controller.core.errors import VelaturaError
+from controller.kiosk.interface import DeviceRow, LiveValue
+from controller.kiosk.store.event_log import Decision
+from hal.deadline import Deadline, in_seconds
+from hal.errors import DeviceError
+from hal.interfaces import Device
+
+OPEN_S: Final = 20.0
+LOOK_S: Final = 10.0
+_REOPEN_S: Final = (2.0, 5.0, 15.0)
+"""Not longer: who has plugged a cable in again stands there and waits."""
+
+Look = Callable[[Device, Deadline], tuple[LiveValue, ...]]
+
+
+class DeviceKeeper:
+    """One device. ``step`` is called over and over by one thread.
+
+    ``look`` asks the device something and returns what to show; ``every_s`` between two looks.
+    """
+
+    def __init__(
+        self, name: str, kind: str, driver: str, open_it: Callable[[Deadline], Device], look: Look,
+        tell: Callable[[Decision], object], *, every_s: float = 30.0, monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        self.name, self.kind, self.driver = name, kind, driver
+        self._open, self._look, self._tell = open_it, look, tell
+        self._every_s, self._monotonic = every_s, monotonic
+        self._device: Device | None = None
+        self._values: tuple[LiveValue, ...] = ()
+        self._problem: Decision | None = None
+        self._next_s, self._failures = 0.0, 0
+        self._closed = False
+        self.lent = threading.Lock()
+
+    @property
+    def device(self) -> Device | None:
+        """The opened device; None while it is missing."""
+        return self._device
+
+    @property
+    def problem(self) -> Decision | None:
+        return self._problem
+
+    @property
+    def row(self) -> DeviceRow:
+        what, remedy = (None, "") if self._problem is None else (self._problem.reason, self._problem.remedy)
+        return DeviceRow(self.name, self.kind, self.driver, self._values, what, remedy)
+
+    def step(self) -> None:
+        """Look once if it is time to; not while somebody works with the device."""
+        if self._monotonic() < self._next_s or not self.lent.acquire(blocking=False):
+            return
+        try:
+            if self._device is None:
+                self._device = self._open(in_seconds(OPEN_S))
+            self._values = self._look(self._device, in_seconds(LOOK_S))
+            self._well()
+        except (DeviceError, VelaturaError) as error:
+            self._lost(Decision(error.code, error.what, error.remedy, "error"))
+        finally:
+            if self._closed:
+                # While it was opened: nobody else would ever let go of it, and the next service needs it.
+                self._let_go()
+            self.lent.release()
+
+    def close(self) -> None:
+        """Let go of the device, for good."""
+        self._closed = True
+        self._let_go()
+
+    def _let_go(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            try:
+                device.close()
+            except DeviceError as error:
+                self._tell(Decision(error.code, error.what, error.remedy, "warning"))
+
+    def _well(self) -> None:
+        if self._problem is not None:
+            self._tell(Decision("device-back", f"{self.name} is there again."))
+        self._problem, self._failures = None, 0
+        self._next_s = self._monotonic() + self._every_s
+
+    def _lost(self, problem: Decision) -> None:
+        self._let_go()
+        self._values = ()
+        self._next_s = self._monotonic() + _REOPEN_S[min(self._failures, len(_REOPEN_S) - 1)]
+        self._failures += 1
+        if self._problem is None or self._problem.code != problem.code:
+            self._tell(problem)
+        self._problem = problem

@@ -1,0 +1,68 @@
+"""How each lamp has burnt, day by day: one file of the stage, written when something has changed."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import VelaturaError
+from controller.core.files import read_bytes
+from controller.core.storage import write_atomically
+from controller.kiosk.interface import Lamp, LampDay
+
+FILE: Final = "kiosk/lamps.json"
+MOST_DAYS: Final = 400
+EVERY_S: Final = 600.0
+
+
+class LampHistory:
+    """Safe to use from several threads. A disk that takes nothing costs days of history, and nothing else."""
+
+    def __init__(self, stage: Path, *, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._path, self._monotonic = stage / FILE, monotonic
+        self._lock = threading.Lock()
+        self._days = _read(self._path)
+        self._next_s = float("-inf")
+
+    def days(self) -> Sequence[LampDay]:
+        """Oldest first."""
+        with self._lock:
+            return list(self._days)
+
+    def note(self, lamps: Sequence[Lamp], today: date, *, now: bool = False) -> None:
+        """What the lamps' counters say; kept every ten minutes, or at once if ``now``."""
+        if not now and self._monotonic() < self._next_s:
+            return
+        self._next_s = self._monotonic() + EVERY_S
+        with self._lock:
+            for lamp in lamps:
+                self._one(LampDay(lamp.projector, today.isoformat(), round(lamp.hours, 2), lamp.strikes))
+            content = [[one.projector, one.day, one.hours, one.strikes] for one in self._days]
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(self._path, json.dumps(content).encode())
+        except (OSError, VelaturaError):
+            # Tried again in ten minutes; the event log's own row tells of the disk.
+            return
+
+    def _one(self, found: LampDay) -> None:
+        own = [one for one in self._days if one.projector == found.projector]
+        last = own[-1] if own else None
+        if found.strikes == 0 or (last is not None and (last.hours, last.strikes) == (found.hours, found.strikes)):
+            return
+        others = [one for one in self._days if one.projector != found.projector]
+        kept = [one for one in own if one.day != found.day][-(MOST_DAYS - 1) :]
+        self._days = sorted([*others, *kept, found], key=lambda one: one.day)
+
+
+def _read(path: Path) -> list[LampDay]:
+    try:
+        rows: Any = json.loads(read_bytes(path))
+        return [LampDay(str(name), str(day), float(hours), int(strikes)) for name, day, hours, strikes in rows]
+    except (OSError, ValueError, TypeError, RecursionError):
+        return []

@@ -1,0 +1,117 @@
+"""Mains relays that follow the lamps: closed while light is wanted, opened when what is behind them has cooled."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import cast
+
+from controller.kiosk.interface import LiveValue
+from controller.kiosk.store.event_log import Decision
+from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceKeeper
+from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.rig.lamp_guard import LampGuard
+from controller.rig.mains_relays import Circuit
+from hal.deadline import Deadline, in_seconds
+from hal.errors import DeviceError
+from hal.interfaces import Device
+from hal.values import DeviceIdentity
+
+Tell = Callable[[Decision], object]
+
+
+class Boards:
+    """Every relay board of a stage as one device."""
+
+    def __init__(self, circuits: tuple[Circuit, ...], stack: contextlib.ExitStack) -> None:
+        self.circuits, self._stack = circuits, stack
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        return DeviceIdentity("Velatura", "mains relays")
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+class MainsKeeper(DeviceKeeper):
+    """Closes the relays while light is wanted, and opens each once the lamps behind it have cooled.
+
+    One relay that fails keeps no other from being switched, and a projector that is silent costs no other its time.
+    """
+
+    def __init__(
+        self, driver: str, open_it: Callable[[Deadline], Device], tell: Tell,
+        *, monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0, monotonic=monotonic)
+        self.want_on = True
+        self.keepers: tuple[ProjectorKeeper, ...] = ()
+        self._off: frozenset[str] = frozenset()
+        self._booted_at_s: dict[str, float] = {}
+
+    def silences(self, projector: str) -> bool:
+        """Whether the projector has no mains, or boots because it just got them: nobody need ask it anything."""
+        return projector in self._off or self._monotonic() < self._booted_at_s.get(projector, 0.0)
+
+    def _switch(self, device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
+        boards = cast("Boards", device)
+        act: Callable[[Circuit], str]
+        if self.want_on:
+            # From now on they are asked: one that stays without mains is to be told of as lost, not as dark.
+            self._off = frozenset()
+            act = self._give
+        else:
+            guards = {keeper.name: keeper.guard for keeper in self.keepers}
+            act = partial(self._cut, guards=guards)
+        values, failed = [], list[DeviceError]()
+        for circuit in boards.circuits:
+            try:
+                values.append(LiveValue(circuit.name, act(circuit)))
+            except DeviceError as error:
+                failed.append(error)
+        if failed:
+            raise failed[0]
+        return tuple(values)
+
+    def _give(self, circuit: Circuit) -> str:
+        if circuit.close(deadline=in_seconds(LOOK_S)):
+            self._tell(Decision("mains-on", f"Mains on: {circuit.name}."))
+            self._booted_at_s |= dict.fromkeys(circuit.feeds, self._monotonic() + circuit.boot_s)
+        return "on"
+
+    def _cut(self, circuit: Circuit, guards: dict[str, LampGuard | None]) -> str:
+        # Asked although it may be known, and before anybody behind it: a board that is away is to be told of now, and
+        # not to be taken for the silence of those who have lost their mains with it.
+        if not circuit.on(deadline=in_seconds(LOOK_S)):
+            return self._is_off(circuit)
+        self._off -= frozenset(circuit.feeds)  # closed by a hand, or by another program
+        known = {name: guard for name, guard in guards.items() if guard is not None}
+        if any(name not in known for name in circuit.feeds):
+            return "as it was"
+        try:
+            circuit.open(known, deadline=in_seconds(LOOK_S))
+        except DeviceError as error:
+            if error.code == "mains-lamp-hot":
+                return "on until the lamps have cooled"
+            if not _answer([known[name] for name in circuit.feeds]):
+                return "on, for nobody knows whether the lamps have cooled"
+            raise
+        return self._is_off(circuit)
+
+    def _is_off(self, circuit: Circuit) -> str:
+        if not self._off.issuperset(circuit.feeds):
+            self._off |= frozenset(circuit.feeds)
+            self._tell(Decision("mains-off", f"Mains off: {circuit.name}."))
+        return "off"
+
+
+def _answer(guards: Sequence[LampGuard]) -> bool:
+    """Whether all these projectors do; what is wrong with one that doesn't is told by its own keeper."""
+    try:
+        for guard in guards:
+            guard.status(deadline=in_seconds(guard.answer_s))
+    except DeviceError:
+        return False
+    return True

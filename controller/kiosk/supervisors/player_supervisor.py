@@ -1,0 +1,241 @@
+"""Keeps the player running and showing what is wanted: a watchdog with back-off, in a thread of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import VelaturaError, WorkError
+from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing
+from controller.kiosk.store.event_log import Decision
+from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
+from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover
+
+ANSWER_S: Final = 0.8
+MOST_MISSES: Final = 2
+"""Unanswered questions in a row after which a player counts as hung."""
+READY_S: Final = 8.0
+HEALTHY_S: Final = 20.0
+"""A player that ran for so long is started again at once when it dies."""
+BACK_OFF_S: Final = (0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 15.0, 30.0)
+NOTICE_TURN_S: Final = 10.0
+"""On an object that all projectors light, the text of several at once could not be read."""
+STARTS_WITH_BUNDLE: Final = 4
+"""Failed starts in a row after which the player is started without the installed bundle, so that it shows black."""
+
+
+class PlayerKeeper:
+    """The player of a stage; see ``ports.PlayerPort``.
+
+    ``settings`` is asked at each start (the flag: with the installed bundle); ``tell`` hears what happens. ``notice``:
+    lines of text that one projector after the other shows as long as nothing else is wanted than black.
+    """
+
+    def __init__(
+        self,
+        runtime: Path,
+        settings: Callable[[bool], PlayerSettings],
+        tell: Callable[[Decision], object],
+        *,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._runtime, self._settings, self._tell, self._monotonic = runtime, settings, tell, monotonic
+        self.want: Showing | None = BLACK
+        self.identifying = False
+        self.notice: tuple[str, ...] = ()
+        self._process: PlayerProcess | None = None
+        self._channel: socket.socket | None = None
+        self._view = PlayerView()
+        self._identities: dict[str, Path] = {}
+        self._misses, self._failed = 0, 0
+        self._start_at_s, self._started_at_s = 0.0, 0.0
+        self._numbers = 0
+        self._identified = False
+        self._noticed: tuple[int, tuple[str, ...]] | None = None
+        self._hello: dict[str, Any] = {}
+        self._closed = False
+
+    @property
+    def view(self) -> PlayerView:
+        return self._view
+
+    def step(self) -> None:
+        """Look once, and do what follows; blocks for a start at most."""
+        if self._process is None:
+            if self._monotonic() >= self._start_at_s:
+                self._start()
+            if self._process is None:
+                return
+        if not self._process.alive:
+            self._restart(Decision("player-died", "The player ended by itself.", "It is started again.", "error"))
+            return
+        try:
+            self._follow(self._ask({"op": "status"}))
+            self._misses = 0
+        except TimeoutError:
+            self._misses += 1
+            if self._misses >= MOST_MISSES:
+                self._restart(Decision("player-hung", "The player did not answer.", "It is started again.", "error"))
+        except (OSError, ValueError, KeyError):
+            self._disconnect()
+            self._misses += 1
+            if self._misses >= MOST_MISSES + 2:
+                self._restart(Decision("player-gone", "The player let nobody in.", "It is started again.", "error"))
+        except WorkError as error:
+            self._misses = 0
+            self._trouble(Decision(error.code, error.what, error.remedy, "error"))
+
+    def close(self) -> None:
+        """Black, and the player's end, for good."""
+        self._closed = True
+        self._disconnect()
+        if (process := self._process) is not None:
+            process.terminate()
+
+    # -- starting
+
+    def _start(self) -> None:
+        end_leftover(self._runtime)
+        try:
+            with_bundle = self._failed < STARTS_WITH_BUNDLE or self._failed % 10 == 0
+            self._process = PlayerProcess(self._runtime, self._settings(with_bundle))
+            if self._closed:
+                # While it was made ready: it would show its picture after the service's end.
+                self._process.terminate()
+                self._process = None
+                return
+            hello = self._process.wait_until_ready(READY_S)
+        except (VelaturaError, OSError) as error:
+            self._process = None
+            self._failed += 1
+            self._start_at_s = self._monotonic() + BACK_OFF_S[min(self._failed, len(BACK_OFF_S) - 1)]
+            what, remedy = (error.what, error.remedy) if isinstance(error, VelaturaError) else (str(error), "")
+            self._trouble(Decision("player-not-started", what, remedy or "It is tried again.", "error"))
+            return
+        self._started_at_s, self._misses, self._identified = self._monotonic(), 0, False
+        self._noticed, self._hello = None, hello
+        self._identities = {}
+        installed = self._settings(True).bundle
+        if hello.get("bundle") and installed is not None:
+            # The player may have gone back to the bundle before while it started; then the link has moved, too.
+            self._identities[str(hello["bundle"])] = installed.resolve()
+        self._tell(Decision("player-started", "The player runs."))
+
+    def _restart(self, why: Decision) -> None:
+        assert self._process is not None
+        self._tell(why)
+        self._disconnect()
+        if self._process.alive:
+            # It had its time to answer; SIGTERM would be one more thing that it does not hear.
+            os.kill(self._process.pid, signal.SIGKILL)
+        self._process.terminate()
+        self._process = None
+        healthy = self._monotonic() - self._started_at_s >= HEALTHY_S
+        self._failed = 0 if healthy else self._failed + 1
+        self._start_at_s = self._monotonic() + BACK_OFF_S[min(max(self._failed - 1, 0), len(BACK_OFF_S) - 1)]
+        self._view = replace(self._view, shown=None, problem=why, restarts=self._view.restarts + 1)
+        if self._monotonic() >= self._start_at_s:
+            self._start()
+
+    # -- showing
+
+    def _follow(self, status: dict[str, Any]) -> None:
+        path = self._identities.get(str(status["bundle"]))
+        name = status["appearance"] if status["showing"] == "appearance" else ""
+        shown = Showing(path, str(name)) if name else BLACK if status["showing"] == "black" else None
+        want = self.want
+        if self.identifying:
+            if not self._identified:
+                self._ask({"op": "identify"}, 3.0)
+                self._identified = True
+        elif want == BLACK and self.notice:
+            self._tell_all()
+        elif want is not None and (shown != want or self._identified or self._noticed is not None):
+            self._identified, self._noticed = False, None
+            self._put(want, path)
+            shown = want
+        if self._monotonic() - self._started_at_s >= HEALTHY_S:
+            self._failed = 0
+        if self._view.problem is not None:
+            self._tell(Decision("player-well", "The player shows what it should again."))
+        self._view = replace(self._view, shown=shown, problem=None, warning=self._warning(status))
+
+    def _warning(self, status: dict[str, Any]) -> Decision | None:
+        told = status.get("warning")
+        if told is None:
+            return None
+        warning = Decision(str(told["code"]), str(told["what"]), str(told["remedy"]), "warning")
+        if self._view.warning != warning:
+            self._tell(warning)
+        return warning
+
+    def _tell_all(self) -> None:
+        outputs = outputs_of(self._hello)
+        turn = int(self._monotonic() / NOTICE_TURN_S) % len(outputs)
+        if self._noticed == (turn, self.notice) and not self._identified:
+            return
+        sequence = put(Path(self._hello["inbox"]), outputs, notice(outputs, self.notice, turn))
+        self._ask({"op": "show", "sequence": sequence}, 3.0)
+        self._identified, self._noticed = False, (turn, self.notice)
+
+    def _put(self, want: Showing, loaded: Path | None) -> None:
+        if not want.appearance or want.bundle is None:
+            self._ask({"op": "stop"}, 3.0)
+            return
+        if loaded != want.bundle:
+            answer = self._ask({"op": "load-bundle", "path": str(want.bundle)}, 5.0)
+            self._identities[str(answer["bundle"])] = want.bundle
+        self._ask({"op": "play", "appearance": want.appearance}, 5.0)
+        self._tell(Decision("playing", f"The player shows {want.appearance}."))
+
+    def _trouble(self, problem: Decision) -> None:
+        if self._view.problem is None or self._view.problem.code != problem.code:
+            self._tell(problem)
+        self._view = replace(self._view, problem=problem, shown=None)
+
+    # -- the socket
+
+    def _ask(self, request: dict[str, Any], timeout_s: float = ANSWER_S) -> dict[str, Any]:
+        """Raises TimeoutError, OSError, ValueError, and WorkError for what the player refuses."""
+        if self._channel is None:
+            assert self._process is not None
+            self._channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            self._channel.settimeout(timeout_s)
+            self._channel.connect(str(self._process.socket))
+        self._numbers += 1
+        number, until_s = self._numbers, time.monotonic() + timeout_s
+        self._channel.settimeout(timeout_s)
+        self._channel.sendall(json.dumps({"id": number, **request}).encode() + b"\n")
+        waiting = b""
+        while True:
+            self._channel.settimeout(max(0.01, until_s - time.monotonic()))
+            data = self._channel.recv(1 << 16)
+            if not data:
+                raise ConnectionError
+            waiting += data
+            *lines, waiting = waiting.split(b"\n")
+            for line in lines:
+                answer = json.loads(line)
+                # An answer that came too late for an earlier question is passed over.
+                if answer.get("id") == number:
+                    return self._accepted(answer)
+
+    def _accepted(self, answer: dict[str, Any]) -> dict[str, Any]:
+        if answer["ok"]:
+            return answer
+        error = answer["error"]
+        if error["code"] == "superseded":
+            return answer
+        raise WorkError(str(error["code"]), what=str(error["what"]), remedy=str(error["remedy"]))
+
+    def _disconnect(self) -> None:
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None

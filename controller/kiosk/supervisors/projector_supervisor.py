@@ -1,0 +1,326 @@
+"""Keeps one projector lit or dark, as it is wanted: looks, compares, does the next thing, and never stops looking."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from controller.core.errors import VelaturaError
+from controller.kiosk.decide.interfaces import Condition, ProjectorView
+from controller.kiosk.store.event_log import Decision
+from controller.rig.lamp_faults import fatal_faults, faulty
+from controller.rig.lamp_guard import LampGuard
+from controller.rig.lamp_ledger import Clock, SystemClock
+from hal.deadline import Deadline, in_seconds
+from hal.errors import DeviceError, DeviceRefused
+from hal.values import Power, ProjectorStatus
+
+ANSWER_S: Final = 5.0
+PATIENCE_S: Final = 15.0
+"""A projector may be silent for so long before it counts as lost."""
+MOST_STRIKES: Final = 3
+"""Strikes in a row without light, after which the lamp is left alone until the next opening."""
+ASK_ANEW_S: Final = 120.0
+"""After so long a projector that reported a fault is opened anew: many tell of one unasked, and never of its end."""
+LIGHT_MARGIN_S: Final = 30.0
+_LOOKS: Final = {
+    Power.ON: Condition.LIT, Power.WARMING: Condition.LIGHTING, Power.COOLING: Condition.COOLING,
+    Power.OFF: Condition.DARK,
+}  # fmt: skip
+_REOPEN_S: Final = (2.0, 5.0, 15.0)
+"""Not longer: who has plugged a cable in again stands there and waits."""
+
+
+class ProjectorKeeper:
+    """One projector. ``step`` is called over and over by one thread; everything else may be asked by any.
+
+    Parameters
+    ----------
+    open_guard : opens the projector; raises DeviceError or VelaturaError while that can't be done
+    tell : hears what was noticed and decided
+    asleep : whether it has no mains now, or boots, so that its silence means nothing
+    unfed : what is wrong with the relays that it gets its mains through, which may be why it is silent
+    """
+
+    def __init__(
+        self,
+        name: str,
+        open_guard: Callable[[Deadline], LampGuard],
+        tell: Callable[[Decision], object],
+        *,
+        clock: Clock | None = None,
+        asleep: Callable[[], bool] | None = None,
+        unfed: Callable[[], Decision | None] | None = None,
+    ) -> None:
+        self.name = name
+        self._open_guard, self._tell = open_guard, tell
+        self._clock = clock or SystemClock()
+        self._asleep, self._unfed = asleep or (lambda: False), unfed or (lambda: None)
+        self._guard: LampGuard | None = None
+        self._want_lit: bool | None = None
+        self._view = ProjectorView(name)
+        self._stepping = self._closed = False
+        self._silent_since_s: float | None = None
+        self._reopen_at_s, self._reopened = 0.0, 0
+        self._struck_at_s: float | None = None
+        self._in_vain = 0
+        self._burning = False
+        self._faulty_since_s: float | None = None
+
+    @property
+    def view(self) -> ProjectorView:
+        return self._view
+
+    @property
+    def guard(self) -> LampGuard | None:
+        """The opened projector, for work that needs it; None while it can't be opened."""
+        return self._guard
+
+    @property
+    def may_light(self) -> bool:
+        """Whether the lamp may be lit, or a step that goes on now, and began when light was wanted, may light it."""
+        # In this order: what a step has done is in the view before the step ends.
+        return self._stepping or self._view.maybe_lit
+
+    @property
+    def want_lit(self) -> bool | None:
+        """None until somebody has said it: a lamp that burns when the service begins is left as it is until then."""
+        return self._want_lit
+
+    @want_lit.setter
+    def want_lit(self, wanted: bool | None) -> None:
+        if wanted and not self._want_lit:
+            # A lamp that was given up gets one more strike at every opening.
+            self._in_vain, self._faulty_since_s = min(self._in_vain, MOST_STRIKES - 1), float("-inf")
+        self._want_lit = wanted
+
+    def forgive(self) -> None:
+        """A technician has looked after the lamp: it gets all its strikes again, the first at once."""
+        self._in_vain, self._faulty_since_s = 0, float("-inf")
+
+    def step(self) -> None:
+        """Look once, and do what follows. Blocks for some answers at most; raises nothing that a device can cause."""
+        self._stepping = True
+        try:
+            self._step()
+        finally:
+            self._stepping = False
+
+    def _step(self) -> None:
+        if self._asleep():
+            self._silent_since_s = None
+            self._reopen_at_s, self._reopened = 0.0, 0
+            self._show(ProjectorView(self.name, Condition.DARK, Power.OFF, looked=True, hours=self._view.hours,
+                                     strikes=self._view.strikes, counter_hours=self._view.counter_hours))  # fmt: skip
+            return
+        try:
+            guard = self._opened()
+            if guard is None:
+                return
+            status = guard.status(deadline=in_seconds(ANSWER_S))
+            for code, sentence in guard.troubles():
+                self._tell(Decision(code, sentence, "", "warning"))
+        except (DeviceError, VelaturaError) as error:
+            self._silent(error)
+            return
+        self._silent_since_s, self._reopened = None, 0
+        # Not before: a line takes seconds to open, and a lamp that nobody wants any more must not be struck.
+        wanted = self._want_lit
+        try:
+            if wanted is None:
+                self._see(_LOOKS.get(status.power, Condition.BROKEN), status, None)
+            elif wanted:
+                self._light(guard, status)
+            else:
+                self._darken(guard, status)
+        except (DeviceError, VelaturaError) as error:
+            self._see(self._view.condition, status, _decision(error))
+
+    def close(self) -> None:
+        """Let go of the line, for good; the lamp stays as it is."""
+        self._closed = True
+        if self._guard is not None:
+            self._let_go(self._guard)
+
+    # -- the line
+
+    def _opened(self) -> LampGuard | None:
+        if self._guard is None:
+            if self._clock.now_s() < self._reopen_at_s:
+                return None
+            self._guard = self._open_guard(in_seconds(ANSWER_S))
+            if self._closed:
+                # While it was opened: nobody else would ever let go of the line, and the next service needs it.
+                self._let_go(self._guard)
+                self._guard = None
+        return self._guard
+
+    def _let_go(self, guard: LampGuard) -> None:
+        try:
+            guard.close()
+        except DeviceError as error:
+            self._tell(replace(_decision(error), level="warning"))
+
+    def _silent(self, error: DeviceError | VelaturaError) -> None:
+        now_s = self._clock.now_s()
+        if self._silent_since_s is None:
+            self._silent_since_s = now_s
+        guard = self._guard
+        if guard is not None and self._want_lit is False and guard.may_be_lit:
+            # Perhaps it hears, though it does not answer.
+            with contextlib.suppress(DeviceError, VelaturaError):
+                guard.switch_off(deadline=in_seconds(guard.switch_s))
+        limit_s = PATIENCE_S
+        if guard is not None and self._struck_at_s is not None:
+            # Many boot in silence.
+            limit_s = max(limit_s, self._struck_at_s + self._light_limit_s(guard) - self._silent_since_s)
+        if guard is None or now_s - self._silent_since_s >= limit_s:
+            self._lost(error)
+
+    def _lost(self, error: DeviceError | VelaturaError) -> None:
+        maybe_lit = self._guard.may_be_lit if self._guard is not None else self._view.maybe_lit
+        if self._guard is not None:
+            self._let_go(self._guard)
+            self._guard = None
+        self._reopen_at_s = self._clock.now_s() + _REOPEN_S[min(self._reopened, len(_REOPEN_S) - 1)]
+        self._reopened += 1
+        self._struck_at_s = None
+        problem, unfed = _decision(error), self._unfed()
+        if unfed is not None:
+            problem = replace(problem, reason=f"{problem.reason} {unfed.reason}", remedy=unfed.remedy)
+        self._show(replace(self._view, condition=Condition.LOST, power=Power.UNKNOWN, maybe_lit=maybe_lit, looked=True,
+                           problem=problem))  # fmt: skip
+
+    # -- lit
+
+    def _light(self, guard: LampGuard, status: ProjectorStatus) -> None:
+        if status.power is Power.FAULT or fatal_faults(status):
+            if status.power in (Power.ON, Power.WARMING):
+                guard.switch_off(deadline=in_seconds(guard.switch_s))
+            self._struck_at_s = None
+            self._see(Condition.BROKEN, status, _decision(faulty(self.name, status)))
+            self._ask_anew(guard)
+        elif status.power is Power.ON or not guard.capabilities.power:
+            self._struck_at_s, self._burning, self._faulty_since_s = None, True, None
+            if guard.stable_left_s() <= 0:
+                self._in_vain = 0
+            self._see(Condition.LIT, status, None)
+        elif status.power is Power.WARMING:
+            self._await_light(guard, status)
+        elif status.power is Power.COOLING:
+            self._went_dark(status)
+            self._see(Condition.COOLING, status, self._view.problem)
+        else:
+            self._strike(guard, status)
+
+    def _ask_anew(self, guard: LampGuard) -> None:
+        now_s = self._clock.now_s()
+        if self._faulty_since_s is None:
+            self._faulty_since_s = now_s
+        if self._in_vain >= MOST_STRIKES or now_s - self._faulty_since_s < ASK_ANEW_S:
+            return
+        self._in_vain, self._faulty_since_s, self._burning = self._in_vain + 1, now_s, False
+        guard.close()
+        self._guard = None
+
+    def _await_light(self, guard: LampGuard, status: ProjectorStatus) -> None:
+        if self._struck_at_s is None:
+            self._struck_at_s = self._clock.now_s()
+        if self._clock.now_s() - self._struck_at_s > self._light_limit_s(guard):
+            self._vain()
+            guard.switch_off(deadline=in_seconds(guard.switch_s))
+        self._see(Condition.LIGHTING, status, self._view.problem)
+
+    def _strike(self, guard: LampGuard, status: ProjectorStatus) -> None:
+        self._went_dark(status)
+        now_s = self._clock.now_s()
+        if self._struck_at_s is not None:
+            if now_s - self._struck_at_s <= self._light_limit_s(guard):
+                return self._see(Condition.LIGHTING, status, self._view.problem)
+            self._vain()
+        if self._in_vain >= MOST_STRIKES:
+            return self._see(Condition.BROKEN, status, _unlit(self.name))
+        try:
+            guard.switch_on(deadline=in_seconds(guard.switch_s))
+        except DeviceRefused as error:
+            if error.code in ("lamp-cooling", "lamp-resting"):
+                return self._see(Condition.COOLING, status, self._view.problem)
+            return self._see(Condition.BROKEN, status, _decision(error))
+        except VelaturaError as error:
+            # The strike can't be written down, so it was not made.
+            return self._see(Condition.BROKEN, status, _decision(error))
+        self._struck_at_s = now_s
+        self._tell(Decision("lamp-struck", f"The lamp of projector {self.name} is struck."))
+        return self._see(Condition.LIGHTING, status, self._view.problem)
+
+    def _went_dark(self, status: ProjectorStatus) -> None:
+        if self._burning:
+            self._burning = False
+            self._in_vain += 1
+            self._tell(Decision(
+                "lamp-went-off", f"The lamp of projector {self.name} went off by itself; it is {status.power.value}.",
+                "It is struck again when it has cooled; if it comes back, replace the lamp.", "warning",
+            ))  # fmt: skip
+
+    def _vain(self) -> None:
+        self._struck_at_s = None
+        self._in_vain += 1
+        self._tell(Decision(
+            "lamp-not-lit", f"The lamp of projector {self.name} was struck and gave no light.",
+            "It is tried again when it has rested." if self._in_vain < MOST_STRIKES else "It is left alone now.",
+            "warning",
+        ))  # fmt: skip
+
+    def _light_limit_s(self, guard: LampGuard) -> float:
+        return 2 * guard.capabilities.lamp_rules.warm_up_s + LIGHT_MARGIN_S
+
+    # -- dark
+
+    def _darken(self, guard: LampGuard, status: ProjectorStatus) -> None:
+        self._struck_at_s, self._burning = None, False
+        faults = status.power is Power.FAULT or bool(fatal_faults(status))
+        problem = _decision(faulty(self.name, status)) if faults else None
+        if not guard.capabilities.power:
+            self._see(Condition.DARK, status, None)
+        elif status.power in (Power.OFF, Power.COOLING):
+            resting = status.power is Power.COOLING or guard.rest_left_s() > 0
+            self._see(Condition.COOLING if resting else Condition.DARK, status, problem)
+        else:
+            # Until the next look shows it off; FAULT and UNKNOWN may hide a burning lamp.
+            self._see(Condition.BROKEN if faults else Condition.LIT, status, problem)
+            if not (faults and status.power is Power.FAULT and not guard.may_be_lit):
+                guard.switch_off(deadline=in_seconds(guard.switch_s))
+
+    # -- what is seen
+
+    def _see(self, condition: Condition, status: ProjectorStatus, problem: Decision | None) -> None:
+        guard = self._guard
+        assert guard is not None
+        use = guard.use()
+        self._show(ProjectorView(
+            self.name, condition, status.power, guard.stable_left_s(), guard.may_be_lit, use.hours, use.strikes,
+            status.lamp_hours, True, problem,
+        ))  # fmt: skip
+
+    def _show(self, view: ProjectorView) -> None:
+        before, self._view = self._view, view
+        code_before = before.problem.code if before.problem else ""
+        if view.problem is not None and view.problem.code != code_before:
+            self._tell(replace(view.problem, level="error"))
+        elif view.problem is None and before.problem is not None:
+            self._tell(Decision("projector-back", f"Projector {self.name} is well again ({view.condition.value})."))
+
+
+def _decision(error: DeviceError | VelaturaError) -> Decision:
+    return Decision(error.code, error.what, error.remedy, "error")
+
+
+def _unlit(name: str) -> Decision:
+    return Decision(
+        "lamp-given-up",
+        f"The lamp of projector {name} gave no light in {MOST_STRIKES} strikes and is left alone.",
+        "Replace the lamp, then press Start; until the next opening it is not struck again.",
+        "error",
+    )

@@ -1,0 +1,299 @@
+"""The values that a kiosk gives and takes: what the panel shows, the API answers, and the command line prints.
+
+Every text may hold what a device or a file said: it is hostile, and whoever shows it escapes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+RecalibrationKind = Literal["full", "quick"]
+Fit = Literal["fit", "fill", "crop"]
+EventLevel = Literal["info", "warning", "error"]
+Unsubscribe = Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True)
+class LiveValue:
+    """One value of a device in words: label "Lamp", text "1,204 h"."""
+
+    label: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceRow:
+    """One device. ``kind`` is "projector", "camera", "display", "relay", "sensor" or "buttons"; ``problem`` a
+    sentence or None.
+
+    ``remedy`` says what to do about the problem, or is empty.
+    """
+
+    name: str
+    kind: str
+    driver: str
+    values: tuple[LiveValue, ...] = ()
+    problem: str | None = None
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class JobStep:
+    """``done`` is the share of this step that is done, 0..1."""
+
+    title: str
+    done: float
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Work that is going on, or that ended last (``ended`` True).
+
+    ``number`` grows with every job; ``left_s`` None until it can be told; ``run`` the run's folder name where the job
+    makes one; ``outcome`` a sentence when it ended, with ``failed`` when it did not do what was asked; ``count`` how
+    many steps it will have, 0 until that is known, and ``steps`` those up to the present one
+    """
+
+    number: int
+    name: str
+    steps: tuple[JobStep, ...] = ()
+    left_s: float | None = None
+    cancellable: bool = True
+    run: str = ""
+    ended: bool = False
+    failed: bool = False
+    outcome: str = ""
+    count: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class NextEvent:
+    """The next thing that the schedule does: ``what`` "opens", "closes", "drift check", ...; ``at_unix_s`` seconds."""
+
+    what: str
+    at_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class BundleIdentity:
+    """The bundle that is installed: its version, its digest in hex, and when it was built."""
+
+    version: int
+    digest: str
+    built_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """``hours`` lit and ``strikes`` as counted; ``life_hours`` what the maker promises, or None."""
+
+    projector: str
+    hours: float
+    strikes: int
+    lit: bool
+    life_hours: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LampDay:
+    """A lamp at the end of one day (local date, "2026-12-24"): ``hours`` lit and ``strikes`` as counted by then."""
+
+    projector: str
+    day: str
+    hours: float
+    strikes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Grade:
+    """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False where the older one stayed.
+
+    ``delta_e`` is the largest of the newest median colour differences (CIEDE2000) of the appearances that were solved
+    on this calibration, None where none was photographed.
+    """
+
+    run: str
+    unix_s: float
+    kind: str
+    grade: str
+    kept: bool
+    delta_e: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class KioskState:
+    """Everything that the panel's first page shows, as of one moment.
+
+    ``state`` is a value of ``controller.run.state_machine.State``; ``reason`` one sentence; ``since_unix_s`` when it
+    began. ``warnings``: sentences on what is wrong with no device (light in the room); ``failures``: work that failed,
+    as the event log has it, until somebody has seen it. ``revision`` grows with every change, also over restarts of the
+    service. ``needs_setup`` is True while the stage has no valid stage.toml.
+    """
+
+    revision: int
+    stage: str
+    state: str
+    reason: str
+    since_unix_s: float
+    devices: tuple[DeviceRow, ...] = ()
+    job: Job | None = None
+    playing: str = ""
+    next_event: NextEvent | None = None
+    bundle: BundleIdentity | None = None
+    lamps: tuple[Lamp, ...] = ()
+    grades: tuple[Grade, ...] = ()
+    identifying: bool = False
+    needs_setup: bool = False
+    warnings: tuple[str, ...] = ()
+    failures: tuple[EventRow, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class EventRow:
+    """One line of the event log; numbers grow by one and never begin anew."""
+
+    number: int
+    unix_s: float
+    level: EventLevel
+    text: str
+    code: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """A solved appearance; ``preview`` is a PNG of how the object will look, or None. ``delta_e``: the newest of its
+    ``Comparison``, None where it was never photographed.
+    """
+
+    name: str
+    made_unix_s: float
+    delta_e: float | None = None
+    playing: bool = False
+    preview: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Achieved:
+    """How near a photograph of one appearance came to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
+    percentile of the colour difference (CIEDE2000), ``rmse`` of the target's white, ``sharpness`` 0..1.
+    """
+
+    run: str
+    unix_s: float
+    delta_e: float
+    delta_e_p95: float
+    rmse: float
+    sharpness: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What one installed appearance achieves: ``history`` newest first, at least one, and the newest one's pictures.
+
+    Names in use: "before", "target", "achieved", "error", "resolution"; files that the kiosk made itself (JPEG).
+    """
+
+    name: str
+    history: tuple[Achieved, ...]
+    pictures: dict[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduleRow:
+    """Opening hours of one weekday ("mon".."sun") or of one date ("2026-12-24", which takes precedence over weekdays).
+
+    ``opens`` and ``closes`` are local times "HH:MM"; both empty means closed. ``closes`` at or before ``opens`` is on
+    the next day. ``appearance`` empty: what was played last.
+    """
+
+    day: str
+    opens: str
+    closes: str
+    appearance: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """``time_zone`` is an IANA name ("Europe/Vienna"); ``drift_check`` the nightly check's local time, or empty."""
+
+    time_zone: str
+    rows: tuple[ScheduleRow, ...] = ()
+    drift_check: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One finding of the doctor."""
+
+    level: EventLevel
+    title: str
+    what: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorAim:
+    """``coverage`` the share of the object that this projector lights, 0..1; ``focus`` 0 (soft) to 1 (sharp)."""
+
+    projector: str
+    coverage: float
+    focus: float
+
+
+@dataclass(frozen=True, slots=True)
+class Aiming:
+    """What the aiming page shows. Shares are of the object's area in the camera's picture, 0..1.
+
+    ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing`` where nothing can be done;
+    ``camera_focus`` 0..1, and ``exposure`` the brightest hundredth's level, 0..1 of full scale: measured by test shots
+    alone, None without; ``hints`` sentences on
+    what to turn which way; ``source`` "test shots", "calibration", or empty where nothing was measured yet (there are
+    no projectors then); ``picture`` an overview that the kiosk drew (PNG), or None
+    """
+
+    projectors: tuple[ProjectorAim, ...] = ()
+    overlap: float = 0.0
+    too_dark: float = 0.0
+    too_grazing: float = 0.0
+    camera_focus: float | None = None
+    exposure: float | None = None
+    hints: tuple[str, ...] = ()
+    source: str = ""
+    measured_unix_s: float = 0.0
+    picture: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FoundDevice:
+    """A device that a search found: ``key`` names it to ``try_device``; ``table`` is its text for stage.toml."""
+
+    key: str
+    kind: str
+    driver: str
+    label: str
+    table: str
+
+
+@dataclass(frozen=True, slots=True)
+class TriedDevice:
+    """What came of trying a device: ``works``, and a sentence in either case (the remedy in it)."""
+
+    works: bool
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """Pictures of one run, as files the kiosk made itself (PNG or JPEG), by name.
+
+    Names in use: "before", "target", "achieved", "error", "resolution". ``figures`` are (label, value text).
+    """
+
+    run: str
+    grade: Grade | None
+    pictures: dict[str, Path] = field(default_factory=dict)
+    figures: tuple[tuple[str, str], ...] = ()

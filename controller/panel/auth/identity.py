@@ -1,0 +1,136 @@
+"""Who asks: by session cookie on pages, by token in the API. What a route needs, and what is answered when it is
+refused.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import secrets
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
+
+from controller.kiosk.store.accounts import Role
+from controller.panel.auth.sessions import Session
+from controller.panel.context import Panel
+
+Way = Literal["public", "session", "token"]
+
+
+@dataclass(frozen=True, slots=True)
+class Visitor:
+    """Somebody who may be here. ``session`` is there on pages; ``secret`` its cookie."""
+
+    name: str
+    role: Role
+    session: Session | None = None
+    secret: str = ""
+    must_change_password: bool = False
+
+
+Endpoint = Callable[[Request, Visitor], Awaitable[Response]]
+NOBODY: Final = Visitor("", Role.VIEWER)
+OPEN_TO_ONE_TIME: Final = frozenset({"/password", "/logout"})
+"""All that a one-time password opens."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One row of the table of routes. ``role`` None only for the few public ones."""
+
+    method: str
+    path: str
+    way: Way
+    role: Role | None
+    endpoint: Endpoint
+
+
+def cookie_name(panel: Panel) -> str:
+    """The prefix makes browsers insist on TLS, this host and the whole path."""
+    return "__Host-velatura" if panel.options.tls else "velatura"
+
+
+def visitor(panel: Panel, request: Request, way: Way) -> Visitor | None:
+    """Who asks, or None."""
+    if way == "token":
+        scheme, _, shown = request.headers.get("authorization", "").partition(" ")
+        token = panel.accounts.by_token(shown.strip()) if scheme.lower() == "bearer" and shown.isascii() else None
+        return None if token is None else Visitor(token.name, token.role)
+    secret = request.cookies.get(cookie_name(panel), "")
+    session = panel.sessions.get(secret) if secret else None
+    account = panel.accounts.get(session.account) if session else None
+    if account is None:
+        return None
+    return Visitor(account.name, account.role, session, secret, account.one_time)
+
+
+async def guarded(panel: Panel, entry: Entry, request: Request) -> Response:  # noqa: PLR0911 - one for each refusal
+    """Answer a route of the table, if its visitor may."""
+    if entry.way == "public":
+        return await entry.endpoint(request, NOBODY)
+    address = request.client.host if request.client else ""
+    if entry.way == "token" and (wait_s := panel.by_token.wait_s(address)) > 0:
+        return _too_many(wait_s)
+    who = visitor(panel, request, entry.way)
+    if who is None:
+        if entry.way == "session":
+            return RedirectResponse("/login", 303) if _navigates(request) else _denied(401)
+        if "authorization" in request.headers:
+            panel.by_token.failed(address)
+        return _api_error(401, "not-known", "No valid token came with this call.", "Send 'Authorization: Bearer ...'.")
+    # Deny by default: an entry without a role is a mistake in the table, not an open door.
+    if entry.role is None or who.role < entry.role:
+        if entry.way == "session":
+            return _denied(403)
+        return _api_error(403, "not-allowed", "This token may not do that.", "Ask a technician for a token that may.")
+    if who.must_change_password and request.url.path not in OPEN_TO_ONE_TIME:
+        return RedirectResponse("/password", 303) if _navigates(request) else _denied(403)
+    return await entry.endpoint(request, who)
+
+
+def _navigates(request: Request) -> bool:
+    return request.method == "GET" and "text/html" in request.headers.get("accept", "*/*").replace("*/*", "text/html")
+
+
+def _denied(status: int) -> Response:
+    text = "Log in first." if status == 401 else "Your role may not do that. A technician can change it."
+    return PlainTextResponse(text, status)
+
+
+def _api_error(status: int, code: str, what: str, remedy: str) -> Response:
+    headers = {"www-authenticate": "Bearer"} if status == 401 else None
+    return JSONResponse({"code": code, "what": what, "remedy": remedy}, status, headers)
+
+
+def _too_many(wait_s: float) -> Response:
+    answer = _api_error(429, "too-many-tries", "Too many wrong tokens came from this address.", "Wait, then try again.")
+    answer.headers["retry-after"] = str(int(wait_s) + 1)
+    return answer
+
+
+def same_origin(headers: Headers) -> bool:
+    """Does the browser say that one of our own pages sends this? A browser that says nothing must have the CSRF token
+    anyway.
+    """
+    if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
+        return False
+    origin = headers.get("origin")
+    return origin is None or urlsplit(origin).netloc.lower() == headers.get("host", "").lower()
+
+
+def form_pair(panel: Panel) -> tuple[str, str]:
+    """Cookie and form token of the log-in form, which has no session yet."""
+    cookie = secrets.token_urlsafe(24)
+    return cookie, form_token(panel, cookie)
+
+
+def form_token(panel: Panel, cookie: str) -> str:
+    digest = hmac.digest(panel.form_key, cookie.encode("utf-8", "replace"), hashlib.sha256)
+    return base64.urlsafe_b64encode(digest).decode()

@@ -1,0 +1,177 @@
+"""Logging in and out, passwords, accounts and tokens."""
+
+from __future__ import annotations
+
+import hmac
+from typing import Any
+
+import anyio
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, RedirectResponse, Response
+
+from controller.core.errors import UsageError
+from controller.kiosk.store.accounts import LONGEST_PASSWORD, Account, Role
+from controller.panel.auth.identity import Entry, Visitor, cookie_name, form_pair, form_token, same_origin
+from controller.panel.auth.sessions import LONGEST_S
+from controller.panel.context import Panel
+from controller.panel.pages.drawing import Drawing
+from controller.panel.pages.forms import Sent, checked
+from controller.panel.pages.routes import Pages
+
+_WRONG = "Name or password is wrong."
+
+
+class Entrance:
+    def __init__(self, panel: Panel, drawing: Drawing, pages: Pages) -> None:
+        self._panel, self._drawing, self._pages = panel, drawing, pages
+
+    def entries(self) -> list[Entry]:
+        forms = (
+            ("/logout", Role.VIEWER, self._logout),
+            ("/password", Role.VIEWER, self._password),
+            ("/accounts/add", Role.TECHNICIAN, self._add),
+            ("/accounts/role", Role.TECHNICIAN, self._role),
+            ("/accounts/remove", Role.TECHNICIAN, self._remove),
+            ("/tokens/add", Role.TECHNICIAN, self._add_token),
+            ("/tokens/remove", Role.TECHNICIAN, self._remove_token),
+        )
+        return [
+            Entry("GET", "/login", "public", None, self._login_page),
+            Entry("POST", "/login", "public", None, self._login),
+            *(Entry("POST", path, "session", role, checked(self._panel, handler)) for path, role, handler in forms),
+        ]
+
+    async def _login_page(self, _: Request, __: Visitor) -> Response:
+        return self._form("", 200)
+
+    def _form(self, problem: str, status: int) -> Response:
+        cookie, token = form_pair(self._panel)
+        page = HTMLResponse(self._drawing.page("login.html", {"csrf": token, "problem": problem}), status)
+        self._set_cookie(page, cookie_name(self._panel) + "-form", cookie, 3600)
+        return page
+
+    def _set_cookie(self, page: Response, name: str, value: str, max_age_s: int) -> None:
+        page.set_cookie(
+            name, value, max_age=max_age_s, path="/", secure=self._panel.options.tls, httponly=True, samesite="strict"
+        )
+
+    async def _login(self, request: Request, _: Visitor) -> Response:
+        panel = self._panel
+        form = await request.form(max_files=0, max_fields=5, max_part_size=4096)
+        name, password, token = (str(form.get(key, ""))[:LONGEST_PASSWORD] for key in ("name", "password", "csrf"))
+        cookie = request.cookies.get(cookie_name(panel) + "-form", "")
+        expected = form_token(panel, cookie)
+        if (
+            not cookie
+            or not same_origin(request.headers)
+            or not hmac.compare_digest(expected, token.encode().decode("ascii", "replace"))
+        ):
+            return self._form("This page was too old. Try again.", 403)
+        address = request.client.host if request.client else ""
+        wait_s = max(panel.by_address.wait_s(address), panel.by_account.wait_s(name))
+        if wait_s > 0:
+            page = self._form(f"Too many wrong passwords. Wait {int(wait_s) + 1} seconds.", 429)
+            page.headers["retry-after"] = str(int(wait_s) + 1)
+            return page
+        # Counted before it is known, so that many tries at once are all counted.
+        panel.by_address.failed(address)
+        panel.by_account.failed(name)
+        account = await anyio.to_thread.run_sync(panel.accounts.verify, name, password, limiter=panel.hashing)
+        if account is None:
+            return self._form(_WRONG, 403)
+        panel.by_address.succeeded(address)
+        panel.by_account.succeeded(name)
+        return self._enter(request, account)
+
+    def _enter(self, request: Request, account: Account) -> Response:
+        """A new session, never one that the browser brought along."""
+        panel = self._panel
+        panel.sessions.end(request.cookies.get(cookie_name(panel), ""))
+        secret, _ = panel.sessions.begin(account.name)
+        if panel.accounts.get(account.name) != account:
+            # Its password was changed while the old one was verified, and its sessions had been ended before this one.
+            panel.sessions.end(secret)
+            return self._form(_WRONG, 403)
+        first = "/setup" if panel.kiosk.snapshot().needs_setup and account.role is Role.TECHNICIAN else "/"
+        page = RedirectResponse("/password" if account.one_time else first, 303)
+        self._set_cookie(page, cookie_name(panel), secret, int(LONGEST_S))
+        page.delete_cookie(cookie_name(panel) + "-form", path="/", secure=panel.options.tls, httponly=True)
+        return page
+
+    async def _logout(self, _: Request, visitor: Visitor, __: Sent) -> Response:
+        self._panel.sessions.end(visitor.secret)
+        page = RedirectResponse("/login", 303)
+        page.delete_cookie(cookie_name(self._panel), path="/", secure=self._panel.options.tls, httponly=True)
+        page.headers["clear-site-data"] = '"cache"'
+        return page
+
+    async def _password(self, request: Request, visitor: Visitor, sent: Sent) -> Response:
+        panel, new = self._panel, sent.texts.get("new", "")
+        old = sent.texts.get("old", "")
+        address = request.client.host if request.client else ""
+        try:
+            if panel.by_address.wait_s(address) > 0:
+                raise UsageError("too-many-tries", what="Too many wrong passwords.", remedy="Wait a minute.")
+            if await anyio.to_thread.run_sync(panel.accounts.verify, visitor.name, old, limiter=panel.hashing) is None:
+                panel.by_address.failed(address)
+                raise UsageError("password-wrong", what="The old password is wrong.", remedy="Type it again.")
+            if new != sent.texts.get("again", ""):
+                raise UsageError("password-wrong", what="The two new ones differ.", remedy="Type them again.")
+            if new == old:
+                raise UsageError("password-weak", what="This is the old password.", remedy="Choose another one.")
+            await anyio.to_thread.run_sync(panel.accounts.set_password, visitor.name, new, limiter=panel.hashing)
+        except UsageError as error:
+            return await self._said(visitor, "/password", "error", f"{error.what} {error.remedy}")
+        panel.sessions.end_all(visitor.name, but=visitor.session)
+        page = "/setup" if panel.kiosk.snapshot().needs_setup and visitor.role is Role.TECHNICIAN else "/"
+        return await self._said(visitor, page, "good", "Your new password is in use.")
+
+    async def _said(self, visitor: Visitor, page: str, level: str, text: str) -> Response:
+        assert visitor.session is not None
+        visitor.session.notes.append((level, text))
+        return RedirectResponse(page, 303)
+
+    async def _changed(self, visitor: Visitor, change: Any, said: str) -> Response:
+        try:
+            await anyio.to_thread.run_sync(change, limiter=self._panel.hashing)
+        except UsageError as error:
+            return await self._said(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
+        return await self._said(visitor, "/accounts", "good", said)
+
+    async def _add(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
+        name, password, role = (sent.texts.get(key, "") for key in ("name", "password", "role"))
+        return await self._changed(
+            visitor, lambda: self._panel.accounts.add(name, Role.named(role), password), "The account is there."
+        )
+
+    async def _role(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
+        name, role = sent.texts.get("name", ""), sent.texts.get("role", "")
+
+        def change() -> None:
+            self._panel.accounts.set_role(name, Role.named(role))
+            if name != visitor.name:
+                self._panel.sessions.end_all(name)
+
+        return await self._changed(visitor, change, "The role is changed.")
+
+    async def _remove(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
+        name = sent.texts.get("name", "")
+
+        def change() -> None:
+            self._panel.accounts.remove(name)
+            self._panel.sessions.end_all(name)
+
+        return await self._changed(visitor, change, "The account is removed.")
+
+    async def _add_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
+        accounts = self._panel.accounts
+        try:
+            shown = accounts.add_token(sent.texts.get("name", ""), Role.named(sent.texts.get("role", "")))
+        except UsageError as error:
+            return await self._said(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
+        facts = {"accounts": accounts.all(), "tokens": accounts.tokens(), "shown": shown, "here": "/accounts"}
+        return await self._pages.show("accounts.html", visitor, facts)
+
+    async def _remove_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
+        name = sent.texts.get("name", "")
+        return await self._changed(visitor, lambda: self._panel.accounts.remove_token(name), "The token is removed.")

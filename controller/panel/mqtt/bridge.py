@@ -1,0 +1,190 @@
+"""Building control over MQTT: the kiosk's state is published, and it can be opened, closed, and told what to play."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import ssl
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import aiomqtt
+import anyio
+
+from controller.core.errors import UsageError
+from controller.core.files import read_text
+from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.fields import parse
+from controller.kiosk.operations.operation import Operation, Values
+from controller.kiosk.operations.table import OPERATIONS
+from controller.panel.answers import FAILURES
+from controller.panel.mqtt.options import BrokerOptions
+
+LONGEST_PAUSE_S: Final = 60.0
+MOST_COMMANDS_WAITING: Final = 20
+LONGEST_PAYLOAD: Final = 256
+AGAIN_S: Final = 1.0
+"""After a state that could not be found out."""
+LEAVE_S: Final = 2.0
+"""The longest that a stop waits for a broker to hear of it."""
+_LOG: Final = logging.getLogger("velatura.panel")
+
+
+class BuildingControl:
+    """One connection to a broker, made again for as long as it takes, each time after a longer pause.
+
+    Topics: ``T/available`` "online" or "offline" (retained; the broker's word when we vanish); ``T/state`` JSON
+    (retained); ``T/command/VERB`` for every operation that has a ``building_verb`` (open, close, play, identify): the
+    payload is its one value as text, or a JSON object where it has more; ``T/answer`` what came of it. Who may publish
+    to ``T/command`` is the broker's to decide. A broker that confirms nothing for ``patience_s`` is connected to anew.
+    """
+
+    def __init__(
+        self, kiosk: Kiosk, options: BrokerOptions, *, first_pause_s: float = 1.0, patience_s: float = 10.0,
+        operations: Sequence[Operation] = OPERATIONS,
+    ) -> None:  # fmt: skip
+        self._kiosk, self._options = kiosk, options
+        self._first_pause_s, self._patience_s = first_pause_s, patience_s
+        self._verbs = {one.building_verb: one for one in operations if one.building_verb}
+        self._changed = asyncio.Event()
+
+    async def run(self) -> None:
+        """Until cancelled. A broker that is not there costs nothing but tries."""
+        loop = asyncio.get_running_loop()
+
+        def tell() -> None:
+            loop.call_soon_threadsafe(self._changed.set)
+
+        unsubscribe = self._kiosk.subscribe(tell)
+        pause_s = self._first_pause_s
+        try:
+            while True:
+                began_s = loop.time()
+                try:
+                    await self._connected()
+                except* ValueError as errors:
+                    _LOG.warning("A password file that is no text, or a topic that can be none: %s", errors.exceptions)
+                except* (aiomqtt.MqttError, OSError):
+                    # The kiosk goes on without the building; whoever watches "available" sees that it is cut off.
+                    _LOG.debug("No broker at %s", self._options.host, exc_info=True)
+                except* Exception:  # noqa: BLE001 - neither the panel nor the next try ends with one connection
+                    _LOG.exception("The connection to the building's broker ended; it is made again.")
+                pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
+                await asyncio.sleep(pause_s)
+                pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
+        finally:
+            unsubscribe()
+
+    async def _connected(self) -> None:
+        options, topic = self._options, self._options.topic
+        password = await anyio.to_thread.run_sync(_password, options.password_file)
+        tls = ssl.create_default_context(cafile=str(options.certificates)) if options.certificates else None
+        will = aiomqtt.Will(f"{topic}/available", "offline", qos=1, retain=True)
+        async with aiomqtt.Client(
+            options.host,
+            options.port,
+            username=options.username,
+            password=password,
+            will=will,
+            tls_context=tls,
+            timeout=self._patience_s,
+            max_queued_incoming_messages=MOST_COMMANDS_WAITING,
+        ) as client:
+            await client.subscribe(f"{topic}/command/+", qos=1)
+            await client.publish(f"{topic}/available", "online", qos=1, retain=True)
+            try:
+                await self._both_ways(client)
+            finally:
+                # The broker says it of itself only when we vanish, not when we take our leave.
+                with anyio.move_on_after(LEAVE_S, shield=True), contextlib.suppress(aiomqtt.MqttError):
+                    await client.publish(f"{topic}/available", "offline", qos=1, retain=True)
+
+    async def _both_ways(self, client: aiomqtt.Client) -> None:
+        self._changed.set()
+        # A task group, because it cancels until it is obeyed: `asyncio.wait_for`, inside every publish, loses a
+        # cancellation that meets the broker's answer (Python 3.11), and whoever waited for that task waited for good.
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._publish, client)
+            async for message in client.messages:
+                await self._obey(client, message)
+
+    async def _publish(self, client: aiomqtt.Client) -> None:
+        last = ""
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            try:
+                now = json.dumps(await anyio.to_thread.run_sync(self._state))
+            except Exception:  # noqa: BLE001 - whatever it was, the next state may be told
+                # The building would see an old state for good: this task has nobody above it to start it again.
+                _LOG.exception("The state could not be told to the building; it is tried again.")
+                await asyncio.sleep(AGAIN_S)
+                self._changed.set()
+                continue
+            if now != last:
+                await client.publish(f"{self._options.topic}/state", now, qos=1, retain=True)
+                last = now
+            await asyncio.sleep(0.2)
+
+    def _state(self) -> dict[str, Any]:
+        now = self._kiosk.snapshot()
+        return {
+            "state": now.state,
+            "reason": now.reason,
+            "since_unix_s": now.since_unix_s,
+            "playing": now.playing,
+            "warnings": list(now.warnings),
+            "problems": [{"device": row.name, "problem": row.problem} for row in now.devices if row.problem],
+        }
+
+    async def _obey(self, client: aiomqtt.Client, message: aiomqtt.Message) -> None:
+        if message.retain:
+            return  # said long ago to somebody else: a restart must not open a closed house
+        word = str(message.topic).rsplit("/", 1)[-1]
+        payload = message.payload if isinstance(message.payload, bytes) else b""
+        command = self._command(word, payload)
+        if command is None:
+            answer = {"command": word[:40], "done": False, "code": "command-unknown"}
+        else:
+            try:
+                await anyio.to_thread.run_sync(command)
+                answer = {"command": word, "done": True}
+            except FAILURES as error:
+                answer = {
+                    "command": word,
+                    "done": False,
+                    "code": error.code,
+                    "what": error.what,
+                    "remedy": error.remedy,
+                }
+            except Exception:  # noqa: BLE001 - the panel's live pages must not end with one command
+                _LOG.exception("A command of the building failed.")
+                answer = {"command": word, "done": False, "code": "crash"}
+        await client.publish(f"{self._options.topic}/answer", json.dumps(answer), qos=1)
+
+    def _command(self, word: str, payload: bytes) -> Callable[[], object] | None:
+        operation = self._verbs.get(word)
+        if operation is None:
+            return None
+        return lambda: operation.of(self._kiosk, _values(operation, payload[:LONGEST_PAYLOAD]))
+
+
+def _values(operation: Operation, payload: bytes) -> Values:
+    """Raises UsageError as ``parse``."""
+    text, fields = payload.decode("utf-8", "replace"), operation.fields
+    if len(fields) < 2:
+        return parse(fields, {field.name: text for field in fields}, strings=True)
+    try:
+        sent = json.loads(text)
+    except (ValueError, RecursionError):
+        sent = None
+    if not isinstance(sent, Mapping):
+        raise UsageError("body-wrong", what="The payload is not a JSON object.", remedy="Send one object of fields.")
+    return parse(fields, sent, strings=False)
+
+
+def _password(file: Path | None) -> str | None:
+    return None if file is None else read_text(file).strip()

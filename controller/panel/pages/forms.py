@@ -1,0 +1,181 @@
+"""What the pages' forms do: every operation that has a page, with the token against forged requests."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import anyio
+from starlette.datastructures import FormData, UploadFile
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+
+from controller.core.errors import UsageError
+from controller.kiosk.operations.fields import parse
+from controller.kiosk.operations.operation import Answer, Operation, Values
+from controller.kiosk.operations.table import ROW
+from controller.panel import answers
+from controller.panel.auth.identity import Entry, Visitor, same_origin
+from controller.panel.context import Panel
+from controller.panel.pages.routes import Pages
+
+MOST_FIELDS = 2000
+LEADS_TO: Final = {
+    **dict.fromkeys(("recalibrate", "cancel", "start", "stop", "identify", "compute", "compare", "seen"), "/"),
+    **dict.fromkeys(("play", "remove-appearance"), "/appearances"),
+    **dict.fromkeys(("backup", "restore", "diagnostics"), "/care"),
+    "upload-target": "/appearances/new/{target}",
+    "set-schedule": "/schedule",
+    "test-shots": "/aiming",
+    "save-settings": "/settings",
+}
+"""The operations that have a form, and the page that it goes on to."""
+Handler = Callable[[Request, Visitor, "Sent"], Awaitable[Response]]
+
+
+@dataclass(slots=True)
+class Sent:
+    """What a form sent: texts by name, every name with all its texts, and at most one file."""
+
+    texts: dict[str, str] = field(default_factory=dict)
+    many: dict[str, list[str]] = field(default_factory=dict)
+    file: Path | None = None
+
+
+class Forms:
+    """The forms of one panel that are operations."""
+
+    def __init__(self, panel: Panel, pages: Pages) -> None:
+        self._panel, self._pages = panel, pages
+
+    def entries(self) -> list[Entry]:
+        return [
+            Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._operation(op)))
+            for op in self._panel.operations
+            if op.name in LEADS_TO
+        ] + [
+            Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._check))
+            for op in self._panel.operations
+            if op.name == "check-settings"
+        ]
+
+    def _operation(self, operation: Operation) -> Handler:
+        async def answer(_: Request, visitor: Visitor, sent: Sent) -> Response:
+            assert visitor.session is not None
+            values: Values = {}
+            try:
+                values = _values(operation, sent)
+                result = await answers.run(self._panel, operation, values)
+            except answers.FAILURES as error:
+                if operation.name == "save-settings":
+                    return await self._settings(visitor, sent, error)
+                visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
+                return RedirectResponse(_back(operation, sent), 303)
+            if operation.answer is Answer.FILE:
+                return answers.response(operation, result, values)
+            visitor.session.notes.append(("good", operation.sentence(values)))
+            return RedirectResponse(_then(operation, result), 303)
+
+        return answer
+
+    async def _check(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
+        text = sent.texts.get("text", "").replace("\r\n", "\n")
+        try:
+            await self._panel.ask(lambda: self._panel.kiosk.validate_settings(text))
+        except answers.FAILURES as error:
+            return await self._settings(visitor, sent, error)
+        assert visitor.session is not None
+        visitor.session.notes.append(("good", "These settings are right. They are not saved yet."))
+        return await self._settings(visitor, sent, None)
+
+    async def _settings(self, visitor: Visitor, sent: Sent, error: answers.Failure | None) -> Response:
+        """The page with what was typed: nobody types it twice."""
+        facts = {"text": sent.texts.get("text", ""), "problem": error, "here": "/settings"}
+        return await self._pages.show("settings.html", visitor, facts, 200 if error is None else 422)
+
+
+def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awaitable[Response]]:
+    """``handler``, called only with a form that our own page sent."""
+
+    async def answer(request: Request, visitor: Visitor) -> Response:
+        assert visitor.session is not None
+        if not same_origin(request.headers):
+            return refused()
+        form = await request.form(max_files=1, max_fields=MOST_FIELDS, max_part_size=2 << 20)
+        sent = Sent()
+        try:
+            token = form.get("csrf")
+            if not isinstance(token, str) or not visitor.session.matches(token):
+                return refused()
+            try:
+                await _read(form, sent, panel.options.folder / answers.INCOMING)
+            except OSError as error:
+                told = answers.not_kept(error)
+                return PlainTextResponse(f"{told.what} {told.remedy}", answers.status_of(told))
+            return await handler(request, visitor, sent)
+        finally:
+            if sent.file is not None:
+                sent.file.unlink(missing_ok=True)
+            await form.close()
+
+    return answer
+
+
+def refused() -> Response:
+    return PlainTextResponse("This form is too old or not ours. Load the page again.", 403)
+
+
+async def _read(form: FormData, sent: Sent, folder: Path) -> None:
+    for name, value in form.multi_items():
+        if isinstance(value, UploadFile):
+            sent.file = await anyio.to_thread.run_sync(answers.temporary, folder)
+            async with await anyio.open_file(sent.file, "wb") as file:
+                while block := await value.read(1 << 20):
+                    await file.write(block)
+        elif name != "csrf":
+            sent.texts[name] = value
+            sent.many.setdefault(name, []).append(value)
+
+
+def _values(operation: Operation, sent: Sent) -> Values:
+    if operation.name == "set-schedule":
+        return _schedule_values(operation, sent)
+    values = parse(answers.fields_from_path(operation), sent.texts, strings=True)
+    if operation.upload is not None:
+        values |= parse((operation.upload,), {operation.upload.name: sent.file} if sent.file else {}, strings=False)
+    return values
+
+
+def _schedule_values(operation: Operation, sent: Sent) -> Values:
+    """The rows of the form's table; one without a day is a row that was left empty.
+
+    Raises UsageError("form-cut") where a column is shorter than another: hours must not be lost, or moved to another
+    row, unseen.
+    """
+    columns = [sent.many.get(column.name, []) for column in ROW]
+    if len({len(column) for column in columns}) > 1:
+        raise UsageError("form-cut", what="The table of hours did not arrive whole.", remedy="Load the page again.")
+    rows = [
+        {column.name: text.strip() for column, text in zip(ROW, row, strict=True)}
+        for row in zip(*columns, strict=True)
+        if row[0].strip()
+    ]
+    others: dict[str, Any] = {name: sent.texts.get(name, "") for name in ("time_zone", "drift_check")}
+    return parse(operation.fields, others | {"rows": rows}, strings=True)
+
+
+def _then(operation: Operation, result: Any) -> str:
+    page = LEADS_TO[operation.name]
+    return page.replace("{target}", str(result.get("target", ""))) if isinstance(result, dict) else page
+
+
+def _back(operation: Operation, sent: Sent) -> str:
+    """Where a form that failed leads: the page on which it stands, made of nothing that was sent unchecked."""
+    if operation.name == "upload-target":
+        return "/appearances/new"
+    target = sent.texts.get("target", "")
+    if operation.name == "compute" and target.isascii() and target.isalnum():
+        return f"/appearances/new/{target}"
+    return LEADS_TO[operation.name]

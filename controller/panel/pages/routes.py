@@ -1,0 +1,167 @@
+"""The pages: each a question to the kiosk and a template."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response, StreamingResponse
+
+from controller.kiosk.operations.fields import parse
+from controller.kiosk.operations.operation import Answer, Operation
+from controller.kiosk.roles import Role
+from controller.panel import answers
+from controller.panel.auth.identity import Entry, Visitor
+from controller.panel.context import Panel
+from controller.panel.pages import calendar
+from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
+from controller.panel.pages.lamp_days import stories
+
+NAVIGATION: Final = (
+    ("/", "Now", Role.VIEWER),
+    ("/appearances", "Appearances", Role.VIEWER),
+    ("/schedule", "Schedule", Role.VIEWER),
+    ("/results", "Results", Role.VIEWER),
+    ("/lamps", "Lamps", Role.VIEWER),
+    ("/events", "Events", Role.VIEWER),
+    ("/doctor", "Doctor", Role.OPERATOR),
+    ("/aiming", "Aiming", Role.TECHNICIAN),
+    ("/settings", "Settings", Role.TECHNICIAN),
+    ("/care", "Backup", Role.TECHNICIAN),
+    ("/accounts", "Accounts", Role.TECHNICIAN),
+)
+_SEEN: Final = (Answer.PICTURE, Answer.JPEG, Answer.PAGE)
+
+Facts = Callable[[Request], dict[str, Any]]
+
+
+class Pages:
+    """All pages of one panel. What a page asks of the kiosk runs in a thread, once a page."""
+
+    def __init__(self, panel: Panel, drawing: Drawing) -> None:
+        self._panel, self._drawing = panel, drawing
+        self._least = {operation.name: operation.role for operation in panel.operations}
+
+    def entries(self) -> list[Entry]:
+        table: list[tuple[str, Role, str, Facts]] = [
+            ("/", Role.VIEWER, "now.html", self._now),
+            ("/appearances", Role.VIEWER, "appearances.html", self._appearances),
+            ("/schedule", Role.VIEWER, "schedule.html", self._schedule),
+            ("/results", Role.VIEWER, "results.html", self._results),
+            ("/results/{run}", Role.VIEWER, "results.html", self._results),
+            ("/events", Role.VIEWER, "events.html", self._events),
+            ("/lamps", Role.VIEWER, "lamps.html", self._lamps),
+            ("/password", Role.VIEWER, "password.html", lambda _: {}),
+            ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None}),
+            ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
+            ("/doctor", Role.OPERATOR, "doctor.html", lambda _: {"findings": list(self._panel.kiosk.doctor())}),
+            ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
+            (
+                "/settings",
+                Role.TECHNICIAN,
+                "settings.html",
+                lambda _: {"text": self._panel.kiosk.settings(), "problem": None},
+            ),
+            ("/care", Role.TECHNICIAN, "care.html", lambda _: {}),
+            ("/accounts", Role.TECHNICIAN, "accounts.html", self._accounts),
+            ("/setup", Role.TECHNICIAN, "setup.html", lambda _: {"found": None, "tried": {}, "name": "", "chosen": ()}),
+        ]
+        entries = [Entry("GET", path, "session", role, self._page(name, facts)) for path, role, name, facts in table]
+        entries += [
+            Entry("GET", "/see" + op.path, "session", op.role, self._picture(op))
+            for op in self._panel.operations
+            if not op.changes and op.answer in _SEEN
+        ]
+        return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]
+
+    async def show(self, template: str, visitor: Visitor, facts: dict[str, Any], status: int = 200) -> Response:
+        """A page with what stands on every page."""
+        return HTMLResponse(await self._panel.ask(lambda: self._drawn(template, visitor, facts)), status)
+
+    def _drawn(self, template: str, visitor: Visitor, facts: dict[str, Any]) -> str:
+        kiosk, session = self._panel.kiosk, visitor.session
+        assert session is not None, "pages with navigation are for those who have a session"
+        notes, session.notes = session.notes, []
+        common = {
+            "state": kiosk.snapshot(),
+            "visitor": visitor,
+            "csrf": session.csrf,
+            "notes": notes,
+            "navigation": [(path, label) for path, label, role in NAVIGATION if visitor.role >= role],
+            "may": lambda name: visitor.role >= self._least[name],
+        }
+        return self._drawing.page(template, common | facts)
+
+    def _page(self, template: str, facts: Facts) -> Callable[[Request, Visitor], Awaitable[Response]]:
+        async def answer(request: Request, visitor: Visitor) -> Response:
+            try:
+                found = await self._panel.ask(lambda: facts(request))
+                return await self.show(template, visitor, {"here": request.url.path} | found)
+            except answers.FAILURES as error:
+                return await self.show(
+                    "problem.html", visitor, {"here": request.url.path, "error": error}, answers.status_of(error)
+                )
+
+        return answer
+
+    def _picture(self, operation: Operation) -> Callable[[Request, Visitor], Awaitable[Response]]:
+        async def answer(request: Request, _: Visitor) -> Response:
+            try:
+                # A browser adds a number to load a picture anew; it means nothing here.
+                values = parse(operation.fields, request.path_params, strings=True)
+                return answers.response(operation, await answers.run(self._panel, operation, values), values)
+            except answers.FAILURES as error:
+                return answers.failure(error)
+
+        return answer
+
+    async def _live(self, _: Request, visitor: Visitor) -> Response:
+        def alive() -> bool:
+            return self._panel.sessions.get(visitor.secret, touch=False) is not None
+
+        return StreamingResponse(
+            self._panel.hub.stream(alive), media_type="text/event-stream", headers={"x-accel-buffering": "no"}
+        )
+
+    def _now(self, _: Request) -> dict[str, Any]:
+        return {"picture": self._panel.kiosk.camera_picture() is not None}
+
+    def _aiming(self, _: Request) -> dict[str, Any]:
+        kiosk = self._panel.kiosk
+        return {"aiming": kiosk.aiming(), "live": kiosk.camera_picture() is not None}
+
+    def _appearances(self, _: Request) -> dict[str, Any]:
+        return {"appearances": list(self._panel.kiosk.appearances())}
+
+    def _lamps(self, _: Request) -> dict[str, Any]:
+        kiosk = self._panel.kiosk
+        return {"stories": stories(kiosk.snapshot().lamps, kiosk.lamp_history(), kiosk.events())}
+
+    def _schedule(self, _: Request) -> dict[str, Any]:
+        schedule = self._panel.kiosk.schedule()
+        names = [appearance.name for appearance in self._panel.kiosk.appearances()]
+        return {"schedule": schedule, "days": calendar.days(schedule), "names": names, "zones": calendar.zones()}
+
+    def _results(self, request: Request) -> dict[str, Any]:
+        runs = list(self._panel.kiosk.runs())
+        name = request.path_params.get("run") or (runs[0] if runs else None)
+        compared = self._panel.kiosk.comparisons()
+        return {"runs": runs, "compared": compared, "results": self._panel.kiosk.results(name) if name else None}
+
+    def _events(self, request: Request) -> dict[str, Any]:
+        level = request.query_params.get("level", "")
+        words = request.query_params.get("words", "")[:100]
+        rows = [
+            row
+            for row in self._panel.kiosk.events()
+            if level in ("", row.level) and words.lower() in f"{row.text} {row.code}".lower()
+        ]
+        return {"rows": rows[-EVENTS_SHOWN:][::-1], "level": level, "words": words}
+
+    def _target(self, request: Request) -> dict[str, Any]:
+        self._panel.targets.path(request.path_params["target"])
+        return {"target": request.path_params["target"]}
+
+    def _accounts(self, _: Request) -> dict[str, Any]:
+        return {"accounts": self._panel.accounts.all(), "tokens": self._panel.accounts.tokens(), "shown": None}

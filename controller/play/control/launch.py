@@ -1,0 +1,202 @@
+"""Starts, watches and ends a player process; for the program that supervises it. Standard library only."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Self
+
+from controller.core.errors import WorkError
+
+SOCKET_NAME: Final = "player.sock"
+LOG_NAME: Final = "player.log"
+_READY_S: Final = 20.0
+_END_S: Final = 5.0
+_POLL_S: Final = 0.02
+_TOLD_BYTES: Final = 600
+_TAKEN: Final = "is already running"
+"""Part of a player's error when another one is already running (``storage.exclusive``)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlayerSettings:
+    """What a player is started with.
+
+    ``outputs``: (name, width_px, height_px) in stage order; ``frames``: the memory output's file, None for windows;
+    ``where``: connector or display serial number by output name, where that is another; ``trusted``, ``revoked``:
+    public key files; ``resume``: it goes on with what was playing when it was killed; ``suggested``: it begins with the
+    bundle's own playlist otherwise; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
+    """
+
+    outputs: Sequence[tuple[str, int, int]]
+    frames: Path | None
+    bundle: Path | None = None
+    trusted: Sequence[Path] = field(default=())
+    allow_unsigned: bool = False
+    rate_hz: float = 60.0
+    revoked: Sequence[Path] = field(default=())
+    where: Mapping[str, str] = field(default_factory=dict)
+    resume: bool = False
+    suggested: bool = False
+
+
+class PlayerProcess:
+    """A running player. Use as a context manager, or call ``terminate``; it goes on if its starter dies.
+
+    ``socket`` is where it serves.
+    """
+
+    def __init__(self, runtime: Path, settings: PlayerSettings) -> None:
+        self.socket = runtime / SOCKET_NAME
+        self.log = runtime / LOG_NAME
+        self._settings = settings
+        self._process = self._start()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        settings = self._settings
+        command = [sys.executable, "-m", "controller.play", "--socket", str(self.socket)]
+        command += ["--outputs", ",".join(f"{name}:{width}x{height}" for name, width, height in settings.outputs)]
+        command += ["--windows"] if settings.frames is None else ["--frames", str(settings.frames)]
+        command += [word for name, place in settings.where.items() for word in ("--where", f"{name}={place}")]
+        command += [] if settings.bundle is None else ["--bundle", str(settings.bundle)]
+        command += [word for key in settings.trusted for word in ("--trusted", str(key))]
+        command += [word for key in settings.revoked for word in ("--revoked", str(key))]
+        command += ["--allow-unsigned"] if settings.allow_unsigned else []
+        command += ["--resume"] if settings.resume else []
+        command += ["--suggested"] if settings.suggested else []
+        command += ["--rate", f"{settings.rate_hz:g}"]
+        with self.log.open("wb") as log:
+            # A session of its own: Ctrl-C is for the supervisor, which ends the player when the lamps are safe.
+            return subprocess.Popen(  # noqa: S603
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env=_environment()
+            )
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs (it may still be hung: ask it for its status)."""
+        return self._process.poll() is None
+
+    def wait_until_ready(self, timeout_s: float = _READY_S) -> dict[str, Any]:
+        """Return the player's answer to hello once it serves.
+
+        Raises WorkError("player-not-started") if it ends or stays silent; the sentence contains its output.
+        """
+        ends_s = time.monotonic() + timeout_s
+        while self.alive and time.monotonic() < ends_s:
+            try:
+                return self._hello(ends_s - time.monotonic())
+            except OSError:
+                time.sleep(_POLL_S)
+        log_tail = self.log.read_bytes()[-_TOLD_BYTES:].decode(errors="replace").strip()
+        silent = "it did not answer in time"
+        self.terminate()
+        raise WorkError(
+            "player-not-started",
+            what=f"The player did not start: {' '.join(log_tail.split()) or silent}",
+            remedy=f"Correct the cause and start again; the player's log is {self.log}.",
+        )
+
+    def _hello(self, timeout_s: float) -> dict[str, Any]:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
+            channel.settimeout(max(0.01, timeout_s))
+            channel.connect(str(self.socket))
+            channel.sendall(b'{"op":"hello"}\n')
+            line = channel.makefile("rb").readline()
+        answer = json.loads(line) if line.endswith(b"\n") else {}
+        # A player that served here before may be on its way out still.
+        if answer.get("pid") != self.pid:
+            raise ConnectionError
+        return dict(answer)
+
+    def terminate(self, timeout_s: float = _END_S) -> int:
+        """Ask the player to leave black and end; kill it if it does not in time. Returns its exit code."""
+        if self.alive:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(timeout_s)
+            except subprocess.TimeoutExpired:
+                os.kill(self.pid, signal.SIGKILL)
+        return self._process.wait()
+
+    def restart(self, timeout_s: float = _READY_S) -> dict[str, Any]:
+        """End the player, hung or not, and start it again with the same settings; returns its answer to hello."""
+        self.terminate(timeout_s=1.0)
+        self._process = self._start()
+        return self.wait_until_ready(timeout_s)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.terminate()
+
+
+def _environment() -> dict[str, str]:
+    # The player does no linear algebra; its threads would cost a fifth of the time that its imports take.
+    return {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+
+
+def end_leftover(runtime: Path, timeout_s: float = _END_S) -> bool:
+    """End the player that still serves ``runtime`` because its starter was killed; whether there was one.
+
+    For the holder of the stage's lock only: to anybody else that player may be of use. One that hangs is killed.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
+        channel.settimeout(1.0)
+        try:
+            channel.connect(str(runtime / SOCKET_NAME))
+            pid, _, _ = struct.unpack("3i", channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            process = os.pidfd_open(pid)
+        except OSError:
+            return False
+    try:
+        for number, patience_s in ((signal.SIGTERM, timeout_s), (signal.SIGKILL, 1.0)):
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(process, number)
+            if select.select([process], [], [], patience_s)[0]:
+                break
+    finally:
+        os.close(process)
+    return True
+
+
+def start_player(runtime: Path, settings: PlayerSettings, *, timeout_s: float = _READY_S) -> PlayerProcess:
+    """Start a player that serves ``runtime``/player.sock, and return once it has shown black and answers.
+
+    ``runtime`` must be private (``controller.core.storage.runtime_folder``). Raises WorkError("player-not-started").
+    """
+    player = PlayerProcess(runtime, settings)
+    player.wait_until_ready(timeout_s)
+    return player
+
+
+def replace_player(runtime: Path, settings: PlayerSettings, *, timeout_s: float = _READY_S) -> PlayerProcess:
+    """``start_player`` in the place of one that a killed starter left behind, as ``end_leftover`` and for whom it may.
+
+    One that was still loading when its starter was killed has no client yet, and takes the socket a moment later.
+    """
+    end_leftover(runtime)
+    try:
+        return start_player(runtime, settings, timeout_s=timeout_s)
+    except WorkError as error:
+        if _TAKEN not in error.what:
+            raise
+    until_s = time.monotonic() + timeout_s
+    while not end_leftover(runtime) and time.monotonic() < until_s:
+        time.sleep(_POLL_S)
+    return start_player(runtime, settings, timeout_s=timeout_s)

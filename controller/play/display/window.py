@@ -1,0 +1,194 @@
+"""One borderless window over all projectors, by pyglet: one context, one flip, so no projector is ahead of another."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyglet
+
+# Must be set before pyglet.window is imported: error checks after every call, and a hidden window, cost time.
+pyglet.options["debug_gl"] = False
+pyglet.options["shadow_window"] = False
+
+from pyglet import gl  # noqa: E402
+
+from controller.bundle.live_maps import LiveMaps  # noqa: E402
+from controller.core.errors import WorkError  # noqa: E402
+from controller.play.display.drawing import Canvas  # noqa: E402
+from controller.play.display.output_mapping import check_connectors, find_connectors, fits  # noqa: E402
+from controller.play.display.x11 import Connector, XServer  # noqa: E402
+from controller.play.frames import FrameSet, OutputSize  # noqa: E402
+from controller.play.live.gl import LiveRenderer  # noqa: E402
+
+
+class WindowOutput:
+    """Real outputs of an X server.
+
+    Outputs are found by their connector's name (``xrandr``: DP-1, HDMI-2) or their display's serial number. If none of
+    them is there, and none was asked for by ``where``, they lie side by side from the upper left corner, in stage
+    order. An output that goes away later, or changes its size, stays black; when it is back it shows what the others
+    show.
+    """
+
+    def __init__(self, sizes: Sequence[OutputSize], where: Mapping[str, str] | None = None) -> None:
+        """Open the window. ``where``: connector or serial number by the output's name, where that is another.
+
+        Raises WorkError("display-gone", "display-unfit", "output-gamma" or "output-range"), UsageError as
+        ``find_connectors`` and ``check_connectors``.
+        """
+        self._sizes, self._where = tuple(sizes), dict(where or {})
+        self._server = XServer()
+        found, connectors = self._find()
+        self._beside = not found and not self._where
+        if not self._beside:
+            check_connectors(sizes, self._where, found, connectors)
+            for connector in found.values():
+                self._server.make_plain(connector)
+        self._missing: tuple[str, ...] = ()
+        self._places = self._placed(found)
+        try:
+            self._window = _open_window(self._extent())
+        except (pyglet.display.xlib.NoSuchDisplayException, pyglet.window.NoSuchConfigException) as error:
+            raise WorkError(
+                "display-gone",
+                what="The player found no display with OpenGL 3.3 for its window.",
+                remedy="Start the X server and set DISPLAY, or use --frames on a machine without one.",
+            ) from error
+        self._server.keep_awake()
+        self._server.bypass_compositor(self._window._window)
+        self._window.switch_to()
+        self._window.set_vsync(True)
+        self._canvas = Canvas(sizes)
+        self._share = 0.0
+        self._live: LiveRenderer | None = None
+        self._damaged = False
+        self._window.push_handlers(on_expose=self._on_expose, on_draw=self._on_expose, on_close=_stay)
+
+    def _find(self) -> tuple[dict[str, Connector], tuple[Connector, ...]]:
+        connectors = self._server.connectors()
+        return find_connectors(self._sizes, self._where, connectors), connectors
+
+    def _placed(self, found: Mapping[str, Connector]) -> tuple[tuple[int, int] | None, ...]:
+        """Upper left corner of each output on the X screen, None for one that is not there as it should be."""
+        if self._beside:
+            return tuple((sum(s.width_px for s in self._sizes[:number]), 0) for number in range(len(self._sizes)))
+        connectors = [found.get(size.name) for size in self._sizes]
+        return tuple(
+            (connector.x, connector.y) if connector is not None and fits(size, connector) else None
+            for size, connector in zip(self._sizes, connectors, strict=True)
+        )
+
+    def _extent(self) -> tuple[int, int]:
+        """Width and height of the window that reaches from the screen's corner over all outputs."""
+        ends = [
+            (place[0] + size.width_px, place[1] + size.height_px)
+            for place, size in zip(self._places, self._sizes, strict=True)
+            if place is not None
+        ]
+        return max((x for x, _ in ends), default=1), max((y for _, y in ends), default=1)
+
+    def _on_expose(self) -> bool:
+        self._damaged = True
+        return True
+
+    def prepare(self, frames: FrameSet) -> None:
+        self._window.switch_to()
+        self._canvas.load(frames)
+        self._share = 0.0
+        self._draw()
+
+    def load_live(self, maps: LiveMaps) -> None:
+        """As ``live.LiveOutput``."""
+        self._window.switch_to()
+        if self._live is not None:
+            self._live.close()
+            self._live = None
+        self._live = LiveRenderer(maps)
+
+    def prepare_live(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
+        """As ``live.LiveOutput``; after ``load_live``."""
+        assert self._live is not None
+        self._window.switch_to()
+        self._live.render(target, brightness, self._canvas.pictures)
+        self._share = 0.0
+        self._draw()
+
+    def live_frames(self) -> FrameSet:
+        """As ``live.LiveOutput``."""
+        assert self._live is not None
+        self._window.switch_to()
+        return self._live.read_back(self._canvas.pictures)
+
+    def load_fade(self, before: FrameSet, after: FrameSet) -> None:
+        self._window.switch_to()
+        self._canvas.load_both(before, after)
+
+    def mix(self, share: float) -> None:
+        self._share = share
+        self._window.switch_to()
+        self._draw()
+
+    def _draw(self) -> None:
+        self._canvas.draw(self._places, self._window.get_framebuffer_size(), self._share)
+
+    def flip(self) -> float:
+        self._window.flip()
+        gl.glFinish()
+        return time.monotonic()
+
+    def missing(self) -> tuple[str, ...]:
+        return self._missing
+
+    def pump(self) -> None:
+        if self._server.changed() and not self._beside:
+            self._follow()
+        self._window.dispatch_events()
+        if self._damaged:
+            self._damaged = False
+            self._window.switch_to()
+            self._draw()
+            self._window.flip()
+
+    def _follow(self) -> None:
+        """Outputs came, went or moved: place the window and the pictures again."""
+        found, _ = self._find()
+        before, self._places = self._places, self._placed(found)
+        names = [size.name for size in self._sizes]
+        self._missing = tuple(name for name, place in zip(names, self._places, strict=True) if place is None)
+        for name, place in zip(names, self._places, strict=True):
+            if place is not None:
+                # A driver may give an output that returns its old gamma ramp back.
+                self._server.make_plain(found[name])
+        if self._places != before:
+            self._window.set_size(*self._extent())
+            self._window.set_location(0, 0)
+            self._server.keep_awake()
+            self._damaged = True
+
+    def close(self) -> None:
+        self._window.close()
+        self._server.close()
+
+
+def _stay() -> bool:
+    """A kiosk's window can't be closed from its frame."""
+    return True
+
+
+def _open_window(extent: tuple[int, int]) -> Any:
+    config = gl.Config(  # type: ignore[abstract]
+        double_buffer=True, red_size=8, green_size=8, blue_size=8, major_version=3, minor_version=3, depth_size=0
+    )
+    window = pyglet.window.Window(
+        *extent, caption="Velatura", style="borderless", vsync=True, visible=False, config=config
+    )
+    window.set_location(0, 0)
+    window.set_visible(True)
+    # A window manager may have moved it while it was mapped.
+    window.set_location(0, 0)
+    window.set_mouse_visible(False)
+    return window

@@ -1,0 +1,1 @@
+"""Live pictures from another process: `stream` reads them, `gl` and `shaders` compensate them on the GPU."""

@@ -1,0 +1,222 @@
+"""Live targets in shaders: OpenGL 3.3, in the context that is current; the player's window gives one.
+
+What is drawn differs from ``bundle.live_maps.compensate`` by at most one device value: where a driver's
+exponential rounds otherwise, a pixel on the edge of a dithering threshold falls on its other side.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from pyglet import gl
+
+from controller.bundle.live_maps import LiveMaps, OutputMaps, brightness_factor, light_table, sigma_table
+from controller.core.errors import WorkError
+from controller.play.frames import FrameSet, OutputSize
+from controller.play.live.shaders import FRAME, SCALE, VERTEX
+
+_FORMATS: Final[Mapping[tuple[str, int], tuple[int, int, int]]] = {
+    ("u1", 1): (gl.GL_R8UI, gl.GL_RED_INTEGER, gl.GL_UNSIGNED_BYTE),
+    ("u1", 3): (gl.GL_RGB8UI, gl.GL_RGB_INTEGER, gl.GL_UNSIGNED_BYTE),
+    ("u2", 2): (gl.GL_RG16UI, gl.GL_RG_INTEGER, gl.GL_UNSIGNED_SHORT),
+    ("u2", 3): (gl.GL_RGB16UI, gl.GL_RGB_INTEGER, gl.GL_UNSIGNED_SHORT),
+    ("f2", 3): (gl.GL_RGB16F, gl.GL_RGB, gl.GL_HALF_FLOAT),
+    ("f4", 1): (gl.GL_R32F, gl.GL_RED, gl.GL_FLOAT),
+}
+_KEPT: Final = (gl.GL_CURRENT_PROGRAM, gl.GL_DRAW_FRAMEBUFFER_BINDING, gl.GL_READ_FRAMEBUFFER_BINDING,
+                gl.GL_VERTEX_ARRAY_BINDING)  # fmt: skip
+
+
+class LiveRenderer:
+    """The maps of a bundle as textures, and the two programs that make frames of a target with them."""
+
+    def __init__(self, maps: LiveMaps) -> None:
+        """Raises WorkError("display-unfit") where the driver can not do it."""
+        self._maps = maps
+        width, height = maps.target_px
+        kept = _state()
+        self._scaling, self._framing = _Program(SCALE), _Program(FRAME)
+        self._target = _texture(np.zeros((height, width, 3), np.uint8))
+        self._maps_of_target = [_texture(values) for values in (maps.present, maps.gain, maps.offset)]
+        self._noise = _texture(maps.noise)
+        self._scale = _empty(width, height, gl.GL_RGBA32F)
+        self._outputs = [_OutputTextures(output) for output in maps.outputs]
+        self._buffer = _name(gl.glGenFramebuffers)
+        self._vertices = _name(gl.glGenVertexArrays)
+        _restore(kept)
+
+    def render(
+        self, target: npt.NDArray[np.uint8], brightness: float, into: Sequence[int] | None = None
+    ) -> Sequence[int]:
+        """Draw the frames for a target (height, width, 3) uint8 sRGB; returns the textures that hold them.
+
+        ``into``: textures of the outputs' sizes, RGB8 or RGBA8, row 0 the image's first; own ones otherwise. The
+        context's program, frame buffers and vertex array are left as they were. ValueError for a wrong size.
+        """
+        if target.shape != (*self._maps.gain.shape[:2], 3) or target.dtype != np.uint8:
+            raise ValueError(f"a target of {target.shape}, {target.dtype} instead of {self._maps.gain.shape}, uint8")
+        kept = _state()
+        viewport = (gl.GLint * 4)()
+        gl.glGetIntegerv(gl.GL_VIEWPORT, viewport)
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._buffer)
+        gl.glBindVertexArray(self._vertices)
+        self._draw_scale(np.ascontiguousarray(target), brightness)
+        textures = [output.frame for output in self._outputs] if into is None else into
+        for output, texture in zip(self._outputs, textures, strict=True):
+            self._draw_frame(output, texture)
+        _restore(kept)
+        gl.glViewport(*viewport)
+        return textures
+
+    def frames(self, target: npt.NDArray[np.uint8], brightness: float) -> FrameSet:
+        """As ``render``, read back to memory; slower, for outputs that are no windows, and for tests."""
+        return self.read_back(self.render(target, brightness))
+
+    def read_back(self, textures: Sequence[int]) -> FrameSet:
+        """What textures of the outputs' sizes hold."""
+        gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
+        gl.glActiveTexture(gl.GL_TEXTURE0)
+        found = FrameSet.black([OutputSize(output.name, *output.size_px) for output in self._maps.outputs])
+        for texture, image in zip(textures, found.pixels, strict=True):
+            gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
+            gl.glGetTexImage(gl.GL_TEXTURE_2D, 0, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, image.ctypes.data_as(ctypes.c_void_p))
+        return found
+
+    def close(self) -> None:
+        """Free the textures; the context must be current."""
+        textures = [self._target, *self._maps_of_target, self._noise, self._scale]
+        for output in self._outputs:
+            textures += [output.frame, *output.inputs.values()]
+        gl.glDeleteTextures(len(textures), (gl.GLuint * len(textures))(*textures))
+        gl.glDeleteFramebuffers(1, gl.GLuint(self._buffer))
+        gl.glDeleteVertexArrays(1, gl.GLuint(self._vertices))
+        for program in (self._scaling, self._framing):
+            gl.glDeleteProgram(program.number)
+
+    def _draw_scale(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
+        gl.glActiveTexture(gl.GL_TEXTURE0)
+        gl.glBindTexture(gl.GL_TEXTURE_2D, self._target)
+        _put(target, replace=True)
+        present, gain, offset = self._maps_of_target
+        program = self._scaling
+        program.use(target=self._target, present=present, gain=gain, offset=offset, tables=self._outputs[0].tables)
+        gl.glUniform1f(program.at("factor"), float(brightness_factor(self._maps, brightness)))
+        _draw_to(self._scale, *self._maps.target_px)
+
+    def _draw_frame(self, output: _OutputTextures, into: int) -> None:
+        program, values = self._framing, output.values
+        program.use(scale=self._scale, noise=self._noise, **output.inputs)
+        matrix = (gl.GLfloat * 9)(*values.unmix.ravel())
+        gl.glUniformMatrix3fv(program.at("unmix"), 1, gl.GL_TRUE, matrix)
+        gl.glUniform2f(program.at("range"), *values.base_range)
+        gl.glUniform2i(program.at("phase"), values.dither[1], values.dither[0])
+        _draw_to(into, *values.size_px)
+
+
+class _OutputTextures:
+    def __init__(self, values: OutputMaps) -> None:
+        self.values = values
+        self.tables = _texture(np.vstack([light_table(), sigma_table(), values.response]).astype(np.float32))
+        maps: dict[str, npt.NDArray[Any]] = {"base": values.base, "centre": values.centre, "shape": values.shape}
+        self.inputs = {"tables": self.tables, **{name: _texture(array) for name, array in maps.items()}}
+        self.frame = _empty(*values.size_px, gl.GL_RGBA8)
+
+
+class _Program:
+    def __init__(self, fragment: str) -> None:
+        self.number = int(gl.glCreateProgram())
+        for kind, text in ((gl.GL_VERTEX_SHADER, VERTEX), (gl.GL_FRAGMENT_SHADER, fragment)):
+            shader = gl.glCreateShader(kind)
+            lines = ctypes.cast(
+                ctypes.pointer(ctypes.c_char_p(text.encode())), ctypes.POINTER(ctypes.POINTER(gl.GLchar))
+            )
+            gl.glShaderSource(shader, 1, lines, None)
+            gl.glCompileShader(shader)
+            gl.glAttachShader(self.number, shader)
+        gl.glLinkProgram(self.number)
+        linked = gl.GLint()
+        gl.glGetProgramiv(self.number, gl.GL_LINK_STATUS, ctypes.byref(linked))
+        if not linked.value:
+            raise WorkError(
+                "display-unfit",
+                what="The graphics driver could not build the live mode's programs.",
+                remedy="Install the display's current graphics driver, or let the processor make live frames.",
+            )
+
+    def at(self, name: str) -> int:
+        return int(gl.glGetUniformLocation(self.number, name.encode()))
+
+    def use(self, **textures: int) -> None:
+        gl.glUseProgram(self.number)
+        for unit, (name, texture) in enumerate(textures.items()):
+            gl.glActiveTexture(gl.GL_TEXTURE0 + unit)
+            gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
+            gl.glUniform1i(self.at(name), unit)
+        gl.glActiveTexture(gl.GL_TEXTURE0)
+
+
+def _name(generate: Any) -> int:
+    name = gl.GLuint()
+    generate(1, ctypes.byref(name))
+    return int(name.value)
+
+
+def _texture(values: npt.NDArray[Any]) -> int:
+    name = _nearest()
+    _put(np.ascontiguousarray(values), replace=False)
+    return name
+
+
+def _empty(width: int, height: int, kind: int) -> int:
+    name = _nearest()
+    gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, kind, width, height, 0, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, None)
+    return name
+
+
+def _nearest() -> int:
+    name = _name(gl.glGenTextures)
+    gl.glActiveTexture(gl.GL_TEXTURE0)
+    gl.glBindTexture(gl.GL_TEXTURE_2D, name)
+    for parameter in (gl.GL_TEXTURE_MIN_FILTER, gl.GL_TEXTURE_MAG_FILTER):
+        gl.glTexParameteri(gl.GL_TEXTURE_2D, parameter, gl.GL_NEAREST)
+    return name
+
+
+def _put(values: npt.NDArray[Any], *, replace: bool) -> None:
+    """Give the bound texture its content."""
+    height, width = values.shape[:2]
+    channels = values.shape[2] if values.ndim == 3 else 1
+    inside, order, kind = _FORMATS[values.dtype.str[1:], channels]
+    pointer = values.ctypes.data_as(ctypes.c_void_p)
+    gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
+    if replace:
+        gl.glTexSubImage2D(gl.GL_TEXTURE_2D, 0, 0, 0, width, height, order, kind, pointer)
+    else:
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, inside, width, height, 0, order, kind, pointer)
+
+
+def _draw_to(texture: int, width: int, height: int) -> None:
+    gl.glFramebufferTexture2D(gl.GL_FRAMEBUFFER, gl.GL_COLOR_ATTACHMENT0, gl.GL_TEXTURE_2D, texture, 0)
+    gl.glViewport(0, 0, width, height)
+    gl.glDrawArrays(gl.GL_TRIANGLES, 0, 3)
+
+
+def _state() -> list[int]:
+    found = []
+    for what in _KEPT:
+        value = gl.GLint()
+        gl.glGetIntegerv(what, ctypes.byref(value))
+        found.append(int(value.value))
+    return found
+
+
+def _restore(kept: Sequence[int]) -> None:
+    program, drawing, reading, vertices = kept
+    gl.glUseProgram(program)
+    gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, drawing)
+    gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, reading)
+    gl.glBindVertexArray(vertices)

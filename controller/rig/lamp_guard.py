@@ -1,0 +1,322 @@
+"""The lamp rules, between every caller and the projectors. No other code holds a bare projector.
+
+- A lamp is never struck while it cools, nor before its minimum off time is over.
+- After a power cut, a kill, or a look at a lamp that went off by itself, it counts as hot from the moment of the look.
+- Strikes are counted before they happen, hours while they pass; both survive restarts.
+- A mains relay opens only after cooling; photometric work begins only when the lamp is stable.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from controller.core.errors import VelaturaError
+from controller.rig.lamp_faults import faulty
+from controller.rig.lamp_ledger import Clock, LampLedger, LampRecord, SystemClock
+from hal.deadline import Deadline
+from hal.errors import DeviceRefused
+from hal.interfaces import Projector, WatchedProjector
+from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
+
+SAVE_HOURS_EVERY_S = 60.0
+ANSWER_S = 10.0
+"""Wait at least so long for one answer, whatever the driver says."""
+
+
+@dataclass(frozen=True, slots=True)
+class LampUse:
+    """What a lamp has been through under our hands: strikes, and hours lit."""
+
+    strikes: int
+    hours: float
+
+
+class LampGuard:
+    """A ``Projector`` that keeps the lamp rules; wraps the driver's.
+
+    Parameters
+    ----------
+    name : the projector's name in stage.toml; its record in the ledger
+    at_least : rules of the stage that may be stricter than the device's own, never laxer
+    """
+
+    def __init__(
+        self,
+        name: str,
+        projector: Projector,
+        ledger: LampLedger,
+        *,
+        at_least: LampRules | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self.name = name
+        self._projector = projector
+        self._ledger = ledger
+        self._clock = clock or SystemClock()
+        self._known = projector.capabilities
+        self._rules = stricter(self._known.lamp_rules, at_least)
+        self._lock = threading.RLock()
+        self._record = self._remembered()
+        self._born_s = self._counted_s = self._clock.now_s()
+        self._unsaved_s = 0.0
+
+    # -- hal.interfaces.Projector
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        return replace(self._can, lamp_rules=self._rules)
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        return self._projector.identity(deadline=deadline)
+
+    def close(self) -> None:
+        """Release the line. The lamp stays as it is."""
+        with self._lock:
+            self._count()
+            if self._unsaved_s > 0:
+                self._write_quietly(self._record)
+        self._projector.close()
+
+    def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
+        self._projector.set_shutter(closed, deadline=deadline)
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        """As the device answers now; what is seen enters the lamp's record.
+
+        One that only a person can switch counts as on after ``switched_by_hand``, unless it tells otherwise.
+        """
+        with self._lock:
+            status = self._projector.status(deadline=deadline)
+            self._seen(status.power)
+            since_s = self._record.since_s
+            if self.by_hand and status.power is Power.UNKNOWN and self._record.lit:
+                burns = since_s is not None and self._now() >= since_s
+                return replace(status, power=Power.ON if burns else Power.WARMING)
+            return status
+
+    def troubles(self) -> list[tuple[str, str]]:
+        """As ``hal.interfaces.WatchedProjector``; empty where the driver tells none."""
+        return self._projector.troubles() if isinstance(self._projector, WatchedProjector) else []
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        """Strike the lamp if the rules allow; harmless when it is lit.
+
+        Raises DeviceRefused with code "lamp-cooling", "lamp-resting", "lamp-state-unknown" or "projector-fault" before
+        anything is sent, and WorkError if the strike can't be recorded (then nothing is sent either).
+        """
+        with self._lock:
+            status = self.status(deadline=deadline)
+            if status.power in (Power.ON, Power.WARMING):
+                return
+            self._refuse_unless_cold(status)
+            before = self._record
+            self._write(replace(before, lit=True, since_s=self._now(), boot=self._boot(), strikes=before.strikes + 1))
+            try:
+                self._projector.switch_on(deadline=deadline)
+            except DeviceRefused:
+                # Only a refusal proves that the lamp was not struck; after silence it counts as struck.
+                self._write(replace(before, lit_s=self._record.lit_s))
+                raise
+
+    def switch_off(self, *, deadline: Deadline) -> None:
+        """Ask for standby. Whatever a look at the lamp or the ledger raises, the command goes out.
+
+        What the look raised is not lost: ``power_down`` looks again afterwards, and so does the kiosk.
+        """
+        with self._lock:
+            power = Power.UNKNOWN
+            interrupted: KeyboardInterrupt | None = None
+            try:
+                power = self.status(deadline=deadline.within(deadline.left_s() / 3)).power
+            except BaseException as error:  # noqa: BLE001 - see above
+                interrupted = error if isinstance(error, KeyboardInterrupt) else None
+            self._projector.switch_off(deadline=deadline)
+            if interrupted is not None:
+                raise interrupted
+            if self._record.lit or power not in (Power.OFF, Power.COOLING):
+                self._went_off()
+
+    # -- projectors that only a person can switch
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether nobody knows the codes to switch this projector."""
+        return not self._can.power
+
+    def switched_by_hand(self, on: bool, *, in_s: float = 0.0) -> None:
+        """A technician was told to switch it, and is believed to have done so in ``in_s`` seconds."""
+        with self._lock:
+            if on and not self._record.lit:
+                strikes = self._record.strikes + 1
+                since_s = self._now() + in_s
+                self._write(replace(self._record, lit=True, since_s=since_s, boot=self._boot(), strikes=strikes))
+            elif not on and self._record.lit:
+                self._went_off()
+
+    # -- the rules
+
+    @property
+    def answer_s(self) -> float:
+        """How long to wait for one answer: as the driver says, and never less than ``ANSWER_S``."""
+        return max(ANSWER_S, self._can.answer_s)
+
+    @property
+    def switch_s(self) -> float:
+        """How long to wait until a switch is confirmed; some projectors answer nothing while they start."""
+        return max(ANSWER_S, self._can.switch_s)
+
+    @property
+    def may_be_lit(self) -> bool:
+        """Whether the lamp was struck, or seen on, and has not been seen off since."""
+        return self._record.lit
+
+    def rest_left_s(self) -> float:
+        """Seconds until the rules allow a strike, as far as time decides; 0 for a lamp that is lit or never seen."""
+        with self._lock:
+            if self._record.lit or self._record.since_s is None:
+                return 0.0
+            return max(0.0, self._record.since_s + self._rest_s() - self._now())
+
+    def stable_left_s(self) -> float:
+        """Seconds until photometric work is allowed; infinite while the lamp is not lit."""
+        with self._lock:
+            if not self._record.lit or self._record.since_s is None:
+                return float("inf")
+            return max(0.0, self._record.since_s + self._rules.stable_s - self._now())
+
+    def require_stable(self, *, deadline: Deadline) -> None:
+        """Raise DeviceRefused("lamp-not-stable") unless the lamp is on and has been for ``stable_s``."""
+        power = self.status(deadline=deadline).power
+        if power is Power.ON and self.stable_left_s() <= 0:
+            return
+        raise DeviceRefused(
+            "lamp-not-stable",
+            what=f"The lamp of projector {self.name} is {power.value} and its light is not yet steady.",
+            remedy=f"Measure after it has been on for {self._rules.stable_s:.0f} s.",
+        )
+
+    def may_open_mains(self, *, deadline: Deadline) -> bool:
+        """Whether the projector is in standby, and has been cooling for long enough, so that its mains may be cut."""
+        if self.status(deadline=deadline).power is not Power.OFF:
+            return False
+        with self._lock:
+            # A lamp without a record may have been switched off a moment before this program started.
+            off_since_s = self._born_s if self._record.since_s is None else self._record.since_s
+            return not self._record.lit and self._now() - off_since_s >= self._rules.cool_down_s
+
+    @contextlib.contextmanager
+    def unstruck(self) -> Iterator[None]:
+        """While it lasts no other thread strikes the lamp, and ``may_be_lit`` stays what it is."""
+        with self._lock:
+            yield
+
+    def use(self) -> LampUse:
+        """Strikes and hours so far."""
+        with self._lock:
+            return LampUse(self._record.strikes, (self._record.lit_s + self._unsaved_s) / 3600)
+
+    # -- inside
+
+    @property
+    def _can(self) -> ProjectorCapabilities:
+        """What the projector's driver can do; as it said last, if it fails to say it now: lamps go off by it."""
+        with contextlib.suppress(Exception):
+            self._known = self._projector.capabilities
+        return self._known
+
+    def _refuse_unless_cold(self, status: ProjectorStatus) -> None:
+        if status.power is Power.COOLING:
+            raise DeviceRefused(
+                "lamp-cooling",
+                what=f"The lamp of projector {self.name} is cooling and must not be struck.",
+                remedy=f"Wait about {self._rules.cool_down_s:.0f} s and start again.",
+            )
+        if status.power is Power.FAULT:
+            raise faulty(self.name, status)
+        if status.power is not Power.OFF:
+            raise DeviceRefused(
+                "lamp-state-unknown",
+                what=f"Projector {self.name} does not tell whether its lamp is hot.",
+                remedy="Switch it on by its own remote control, or check its profile in stage.toml.",
+            )
+        if (rest_s := self.rest_left_s()) > 0:
+            raise DeviceRefused(
+                "lamp-resting",
+                what=f"The lamp of projector {self.name} was on a moment ago and must rest.",
+                remedy=f"Wait {rest_s:.0f} s and start again.",
+            )
+
+    def _rest_s(self) -> float:
+        return max(self._rules.minimum_off_s, self._rules.cool_down_s)
+
+    def _remembered(self) -> LampRecord:
+        record = self._ledger.read(self.name)
+        if record is None:
+            return LampRecord()
+        if record.boot == self._boot() and record.since_s is not None:
+            return record
+        # Another boot's clock says nothing: whatever the lamp did, it counts as hot from now.
+        return replace(record, since_s=self._now(), boot=self._boot())
+
+    def _seen(self, power: Power) -> None:
+        self._count()
+        lit = self._record.lit
+        if power in (Power.ON, Power.WARMING) and not lit:
+            # Somebody else switched it on: it has been lit for at least no time at all.
+            self._write_quietly(replace(self._record, lit=True, since_s=self._now(), boot=self._boot()))
+        elif power in (Power.OFF, Power.COOLING) and lit:
+            self._went_off()
+        elif power is Power.COOLING and self._cooled_by_now():
+            # Somebody else had it on between two looks, or it takes longer to cool than its rules say.
+            self._went_off()
+
+    def _cooled_by_now(self) -> bool:
+        since_s = self._record.since_s
+        return since_s is None or self._now() - since_s > self._rules.cool_down_s
+
+    def _went_off(self) -> None:
+        self._count()
+        self._write_quietly(replace(self._record, lit=False, since_s=self._now(), boot=self._boot()))
+
+    def _count(self) -> None:
+        now_s = self._now()
+        if self._record.lit:
+            self._unsaved_s += now_s - self._counted_s
+        self._counted_s = now_s
+        if self._unsaved_s >= SAVE_HOURS_EVERY_S:
+            self._write_quietly(self._record)
+
+    def _write(self, record: LampRecord) -> None:
+        record = replace(record, lit_s=record.lit_s + self._unsaved_s)
+        self._ledger.write(self.name, record)
+        self._record, self._unsaved_s = record, 0.0
+
+    def _write_quietly(self, record: LampRecord) -> None:
+        """For what has happened already: remembered in any case, on disk if the disk lets us (the next write retries).
+
+        What the disk then holds is older, so after a restart the lamp counts as hot: the safe side.
+        """
+        self._record = record
+        with contextlib.suppress(VelaturaError):
+            self._write(record)
+
+    def _now(self) -> float:
+        return self._clock.now_s()
+
+    def _boot(self) -> str:
+        return self._clock.boot()
+
+
+def stricter(rules: LampRules, at_least: LampRules | None) -> LampRules:
+    """The longer of each time."""
+    if at_least is None:
+        return rules
+    return LampRules(
+        warm_up_s=max(rules.warm_up_s, at_least.warm_up_s),
+        stable_s=max(rules.stable_s, at_least.stable_s),
+        cool_down_s=max(rules.cool_down_s, at_least.cool_down_s),
+        minimum_off_s=max(rules.minimum_off_s, at_least.minimum_off_s),
+    )

@@ -1,0 +1,125 @@
+"""What is known of each lamp, kept so that a restart or a power cut never makes a hot lamp look cold."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+from controller.core.files import read_bytes
+from controller.core.storage import write_atomically
+from hal.deadline import Deadline
+
+
+class Clock(Protocol):
+    """Seconds since the machine's boot, and waiting."""
+
+    def now_s(self) -> float:
+        """Never runs backwards; comparable between processes of one boot."""
+
+    def boot(self) -> str:
+        """Names this boot; times of another boot mean nothing."""
+
+    def sleep(self, seconds: float, deadline: Deadline) -> None:
+        """As ``Deadline.sleep``."""
+
+
+class SystemClock:
+    """CLOCK_MONOTONIC, which on Linux counts from boot for every process alike."""
+
+    def now_s(self) -> float:
+        return time.monotonic()
+
+    def boot(self) -> str:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+
+    def sleep(self, seconds: float, deadline: Deadline) -> None:
+        deadline.sleep(seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class LampRecord:
+    """One lamp.
+
+    ``lit``: was struck, and has not been seen off since; ``since_s``: the clock at the strike (lit) or at the off (not
+    lit), None for "never seen"; ``boot``: the boot that ``since_s`` belongs to; ``strikes`` and ``lit_s``: for life.
+    """
+
+    lit: bool = False
+    since_s: float | None = None
+    boot: str = ""
+    strikes: int = 0
+    lit_s: float = 0.0
+
+
+class LampLedger(Protocol):
+    """Where lamp records survive."""
+
+    def read(self, name: str) -> LampRecord | None:
+        """The record of a lamp; None if it was never written."""
+
+    def write(self, name: str, record: LampRecord) -> None:
+        """Durable on return. Raises WorkError("no-space") and the like; the caller's lamp is then as it was."""
+
+
+_UNKNOWN: Final = ""
+
+
+class LampFile:
+    """A ledger in one JSON file of the stage folder. A damaged file makes every lamp of the stage count as hot.
+
+    Those that were not written since then count as hot after a restart too: an entry without a name says so.
+    """
+
+    NAME: Final = "lamps.json"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self.damaged = False
+        self._records = self._load()
+
+    def read(self, name: str) -> LampRecord | None:
+        record = self._records.get(name)
+        return LampRecord(lit=True) if record is None and self.damaged else record
+
+    def write(self, name: str, record: LampRecord) -> None:
+        with self._lock:
+            unknown = {_UNKNOWN: LampRecord(lit=True)} if self.damaged else {}
+            records = {**unknown, **self._records, name: record}
+            text = json.dumps({key: asdict(value) for key, value in sorted(records.items())}, indent=2)
+            write_atomically(self._path, text.encode() + b"\n")
+            self._records = records
+
+    def _load(self) -> Mapping[str, LampRecord]:
+        try:
+            content = json.loads(read_bytes(self._path))
+            records = {str(name): _record(fields) for name, fields in content.items()}
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError):
+            self.damaged = True
+            return {}
+        self.damaged = _UNKNOWN in records
+        return records
+
+
+def _record(fields: Mapping[str, object]) -> LampRecord:
+    lit, since_s, boot = fields["lit"], fields["since_s"], fields["boot"]
+    strikes, lit_s = fields["strikes"], fields["lit_s"]
+    if not (
+        isinstance(lit, bool)
+        and isinstance(since_s, float | int | None)
+        and isinstance(boot, str)
+        and isinstance(strikes, int)
+        and isinstance(lit_s, float | int)
+        and math.isfinite(lit_s)
+        and math.isfinite(since_s or 0.0)
+    ):
+        raise TypeError("a field of the wrong type")
+    return LampRecord(lit, since_s, boot, strikes, float(lit_s))

@@ -1,0 +1,223 @@
+"""All projectors on, all projectors off: the two procedures that need every lamp guard at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from controller.rig.lamp_faults import fatal_faults, faulty
+from controller.rig.lamp_guard import LampGuard
+from controller.rig.lamp_ledger import Clock, SystemClock
+from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, ProtocolError
+from hal.values import Power
+
+POLL_S = 1.0
+"""Between two looks at a projector; some lock up when they are asked more often while they boot."""
+BY_HAND_S = 60.0
+"""How long a technician may take to reach a projector that only a person can switch."""
+
+Advance = Callable[[float, str], None]
+"""Fraction of the whole (0..1) and what is waited for."""
+Tell = Callable[[str], None]
+"""A sentence for the technician."""
+
+
+@dataclass(frozen=True, slots=True)
+class PowerFailure:
+    """A projector that could not be switched off."""
+
+    projector: str
+    error: BaseException
+
+
+def power_up(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None) -> None:
+    """Switch every projector on and wait until every lamp is on and steady: ``light``, then ``steady``."""
+    light(guards, deadline=deadline, advance=lambda fraction, note: advance(0.2 * fraction, note), clock=clock)
+    steady(guards, deadline=deadline, advance=lambda fraction, note: advance(0.2 + 0.8 * fraction, note), clock=clock)
+
+
+def light(
+    guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None,
+    tell: Tell = lambda sentence: None,
+) -> None:  # fmt: skip
+    """Strike every lamp and wait until each projector says that it is on.
+
+    Lamps that must rest are waited for. Every projector is looked at before any lamp is struck, and all are struck
+    before any is waited for. The technician is told to switch those that only a person can switch, and has
+    ``BY_HAND_S`` for it.
+
+    Raises
+    ------
+    DeviceRefused("projector-fault")  a projector reports a fault, at any time
+    DeviceTimeout("lamps-not-lit")  the deadline passed
+    Cancelled  the lamps are then as they were: call ``power_down``
+    and what a driver raises on the first look, so that a silent projector is named at once
+    """
+    clock = clock or SystemClock()
+    for guard in guards:
+        _check(guard, deadline)
+    for guard in guards:
+        _strike(guard, deadline, advance, clock, tell)
+    while waiting := [guard.name for guard in guards if not _is_on(guard, deadline)]:
+        names = ", ".join(waiting)
+        advance(1 - len(waiting) / len(guards), f"waiting for the light of {names}")
+        deadline.check(
+            "lamps-not-lit",
+            what=f"The lamp of {names} was not on when the time was over.",
+            remedy="Look at the projector: is it powered, is its cover closed? Then start again.",
+        )
+        clock.sleep(POLL_S, deadline)
+
+
+def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None) -> None:
+    """Wait until every lamp has been on for its ``stable_s``, and watch for faults meanwhile.
+
+    Raises DeviceRefused("projector-fault", "lamp-went-off"), DeviceTimeout("lamps-not-stable") and Cancelled.
+    """
+    clock = clock or SystemClock()
+    wait_s = max((guard.stable_left_s() for guard in guards), default=0.0)
+    while True:
+        for guard in guards:
+            if not _is_on(guard, deadline) and not guard.may_be_lit:
+                raise DeviceRefused(
+                    "lamp-went-off",
+                    what=f"The lamp of projector {guard.name} went off while it warmed up.",
+                    remedy="Let it cool for some minutes and start again; if it comes back, replace the lamp.",
+                )
+        left_s = max((guard.stable_left_s() for guard in guards), default=0.0)
+        if left_s <= 0:
+            return
+        advance(max(0.0, 1 - left_s / wait_s), f"the lamps become steady, {left_s:.0f} s")
+        deadline.check(
+            "lamps-not-stable",
+            what="The lamps were not yet steady when the time was over.",
+            remedy="Give them a longer power_up_s under [safety] in stage.toml.",
+        )
+        clock.sleep(min(POLL_S, max(left_s, 0.01)), deadline)
+
+
+def power_down(
+    guards: Sequence[LampGuard], *, within_s: float = 60.0, clock: Clock | None = None
+) -> tuple[PowerFailure, ...]:
+    """Switch every projector off, all at once, each tried until it is seen cooling or off, or ``within_s`` is over.
+
+    Is not stopped by a cancelled or overdue run: it has its own time. A failing projector never keeps the others lit.
+    Those that only a person can switch are left to the technician, whom the caller must tell.
+    Returns the failures, empty when every lamp is off or cooling; raises nothing.
+    """
+    if not guards:
+        return ()
+    the_clock = clock or SystemClock()
+
+    def attempt(guard: LampGuard) -> PowerFailure | None:
+        try:
+            if guard.by_hand:
+                guard.switched_by_hand(False)
+                return None
+            _switch_off(guard, in_seconds(within_s), the_clock)
+        except BaseException as error:  # noqa: BLE001 - returned; one broken driver must not keep the other lamps lit
+            return PowerFailure(guard.name, error)
+        return None
+
+    with ThreadPoolExecutor(len(guards), thread_name_prefix="power-down") as pool:
+        return tuple(failure for failure in pool.map(attempt, guards) if failure is not None)
+
+
+def cool_all(
+    guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None
+) -> tuple[PowerFailure, ...]:
+    """``power_down``, then wait until every lamp that went off is cool enough for its mains to be cut.
+
+    Raises DeviceTimeout("lamps-not-cool") when the deadline passes and Cancelled when stopped; by then every projector
+    has been told to switch off.
+    """
+    clock = clock or SystemClock()
+    failures = power_down(guards, clock=clock)
+    failed = {failure.projector for failure in failures}
+    cooling = [guard for guard in guards if guard.name not in failed and not guard.by_hand]
+    while hot := [
+        guard.name for guard in cooling if not guard.may_open_mains(deadline=deadline.within(guard.answer_s))
+    ]:
+        advance(1 - len(hot) / len(cooling), f"cooling {', '.join(hot)}")
+        deadline.check(
+            "lamps-not-cool",
+            what=f"The lamp of {', '.join(hot)} was still cooling when the time was over.",
+            remedy="Leave the mains on until its fans stand still.",
+        )
+        clock.sleep(POLL_S, deadline)
+    return failures
+
+
+def _check(guard: LampGuard, deadline: Deadline) -> None:
+    status = guard.status(deadline=deadline.within(guard.answer_s))
+    if status.power is Power.FAULT or fatal_faults(status):
+        raise faulty(guard.name, status)
+
+
+def _strike(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock, tell: Tell) -> None:
+    if guard.by_hand:
+        return _by_hand(guard, deadline, advance, clock, tell)
+    while True:
+        try:
+            return guard.switch_on(deadline=deadline.within(guard.switch_s))
+        except DeviceRefused as error:
+            if error.code not in ("lamp-resting", "lamp-cooling"):
+                raise
+            deadline.check(error.code, what=error.what, remedy=error.remedy)
+            _rest(guard, guard.rest_left_s(), deadline, advance, clock)
+
+
+def _by_hand(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock, tell: Tell) -> None:
+    """Also told of one that should be on: since a run that was killed somebody may have switched it off."""
+    while (left_s := guard.rest_left_s()) > 0:
+        _rest(guard, left_s, deadline, advance, clock)
+    within = "" if guard.may_be_lit else f" It is taken to burn in {BY_HAND_S:.0f} s."
+    tell(f"Switch projector {guard.name} on by its own remote control, if it is not: nobody else can.{within}")
+    guard.switched_by_hand(True, in_s=BY_HAND_S)
+
+
+def _rest(guard: LampGuard, left_s: float, deadline: Deadline, advance: Advance, clock: Clock) -> None:
+    advance(0.0, f"the lamp of {guard.name} rests for {left_s:.0f} s")
+    deadline.check(
+        "lamp-resting",
+        what=f"The lamp of projector {guard.name} still rested when the time was over.",
+        remedy="Start again in some minutes.",
+    )
+    clock.sleep(POLL_S, deadline)
+
+
+def _is_on(guard: LampGuard, deadline: Deadline) -> bool:
+    """Whether the lamp is on. A projector that boots may be silent or talk nonsense: that is not yet a failure."""
+    try:
+        status = guard.status(deadline=deadline.within(guard.answer_s))
+    except (DeviceTimeout, DeviceBusy, ProtocolError):
+        return False
+    if status.power is Power.FAULT or fatal_faults(status):
+        raise faulty(guard.name, status)
+    return status.power is Power.ON
+
+
+def _switch_off(guard: LampGuard, deadline: Deadline, clock: Clock) -> None:
+    """Ask until the lamp is seen off or cooling; a projector that warms up may refuse for a while.
+
+    One that was never seen lit is asked once: a silent projector must not hold up the end of a run that it spoilt.
+    """
+    last: Exception | None = None
+    while True:
+        try:
+            guard.switch_off(deadline=deadline.within(guard.switch_s))
+            if guard.status(deadline=deadline.within(guard.answer_s)).power in (Power.OFF, Power.COOLING):
+                return
+        except Cancelled:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever it is, the lamp must go off; told when time is over
+            last = error
+        if deadline.passed or (last is not None and not guard.may_be_lit):
+            raise last or DeviceTimeout(
+                "lamp-not-off",
+                what=f"Projector {guard.name} was told to switch off and is still on.",
+                remedy="Switch it off by its own remote control, and do not cut its mains before its fans stand still.",
+            )
+        clock.sleep(POLL_S, deadline)

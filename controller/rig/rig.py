@@ -1,0 +1,71 @@
+"""The opened stage as the steps of a run see it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from controller.capture.acquire import Acquirer
+from controller.core.arrays import ByteImage
+from controller.rig.ambient_light import Darkness
+from controller.rig.lamp_faults import faulty
+from controller.rig.lamp_guard import LampGuard
+from controller.rig.mains_relays import Circuit
+from hal.deadline import Deadline
+from hal.errors import DeviceRefused
+from hal.interfaces import Camera, Display
+from hal.values import Power
+
+
+@dataclass(frozen=True, slots=True)
+class RigProjector:
+    """A projector with its picture: ``size_px`` (width, height) of the output it hangs on."""
+
+    name: str
+    output: str
+    size_px: tuple[int, int]
+    guard: LampGuard
+
+    def black(self) -> ByteImage:
+        """(rows, columns, 3) uint8 zeros."""
+        return np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Everything that is switched, shown or photographed. Made by ``controller.stage.open`` alone."""
+
+    stage: Path
+    projectors: tuple[RigProjector, ...]
+    camera: Camera
+    display: Display
+    acquirer: Acquirer
+    circuits: tuple[Circuit, ...] = ()
+    darkness: Darkness | None = None
+
+    @property
+    def guards(self) -> tuple[LampGuard, ...]:
+        return tuple(projector.guard for projector in self.projectors)
+
+    def check_light(self, *, deadline: Deadline) -> None:
+        """Look at every projector: a photograph counts only if each lamp is on and steady.
+
+        Raises DeviceRefused("projector-fault" or "lamp-went-off"), and what the drivers raise.
+        """
+        for guard in self.guards:
+            status = guard.status(deadline=deadline.within(guard.answer_s))
+            if status.power is Power.FAULT:
+                raise faulty(guard.name, status)
+            if status.power is not Power.ON or guard.stable_left_s() > 0:
+                raise DeviceRefused(
+                    "lamp-went-off",
+                    what=f"The lamp of projector {guard.name} went off during the work.",
+                    remedy="See whether somebody switched it off, or it overheated; then start again.",
+                )
+
+    def on_outputs(self, frames: Mapping[str, ByteImage]) -> dict[str, ByteImage]:
+        """Frames by output from frames by projector; every projector that is not named shows black."""
+        return {projector.output: frames.get(projector.name, projector.black()) for projector in self.projectors}

@@ -1,0 +1,191 @@
+"""Runs steps in order: each once, until a deadline, stoppable at any moment, and going on where the journal ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from controller.core.errors import VelaturaError, WorkError
+from controller.run.journal import Artefact, Journal
+from controller.run.progress import Level, Reporter, Silent, Tracker
+from controller.run.state_machine import Event, Machine
+from controller.run.step_id import StepId, input_name
+from hal.deadline import Cancelled, Deadline
+from hal.errors import DeviceError
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a step's ``run`` gets.
+
+    ``folder`` where artefacts go; ``results`` the artefacts of earlier steps. ``advance`` is also where a stop takes
+    hold, so a long step calls it often.
+    """
+
+    folder: Path
+    journal: Journal
+    deadline: Deadline
+    reporter: Reporter
+    results: Mapping[StepId, tuple[Artefact, ...]]
+    _advance: Callable[[float, str], None] = field(repr=False)
+
+    def advance(self, fraction: float, note: str = "") -> None:
+        """Report progress. Raises Cancelled, or WorkError("run-too-slow") once the deadline has passed."""
+        self.check()
+        self._advance(fraction, note)
+
+    def check(self) -> None:
+        """Raise Cancelled, or WorkError("run-too-slow") once the deadline has passed."""
+        check(self.deadline)
+
+    def paths(self, step: StepId) -> tuple[Path, ...]:
+        """The artefacts of an earlier step, in the order in which it returned them."""
+        return tuple(artefact.path for artefact in self.results[step])
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One piece of work with artefacts at its end.
+
+    Parameters
+    ----------
+    id : its identity in the journal, unique in its run
+    run : does the work, writes its artefacts atomically (``controller.core.storage``) and returns their paths
+    inputs : name -> hash of everything outside the run that the result depends on: settings, files, code version
+    after : earlier steps whose artefacts it reads; their hashes become inputs too
+    weight : expected cost relative to the other steps; seconds on the reference machine
+    title : what the technician reads; the identity if empty
+    enter, leave : machine events when the work begins and when it is done; neither happens for a skipped step
+    always : run it even if an earlier run did. For steps that bring hardware into a state, which is never restored
+        from the journal but probed anew
+    """
+
+    id: StepId
+    run: Callable[[Context], Sequence[Path]]
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    after: tuple[StepId, ...] = ()
+    weight: float = 1.0
+    title: str = ""
+    enter: Event | None = None
+    leave: Event | None = None
+    always: bool = False
+
+    @property
+    def heading(self) -> str:
+        """What the technician reads of it."""
+        return self.title or str(self.id)
+
+
+class Runner:
+    """Runs a list of steps against one journal.
+
+    Parameters
+    ----------
+    machine : told of ``Step.enter`` and ``Step.leave``; of CANCEL when the run is stopped; of FAIL, with the reason,
+        when a device fails (work that fails for other reasons is a CANCEL with the reason: the lamps are well)
+    """
+
+    def __init__(
+        self,
+        steps: Sequence[Step],
+        journal: Journal,
+        *,
+        reporter: Reporter | None = None,
+        machine: Machine | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._steps = tuple(steps)
+        _check_order(self._steps)
+        self._journal = journal
+        self._reporter = reporter or Silent()
+        self._machine = machine
+        self._clock = clock
+
+    def run(self, name: str, *, deadline: Deadline) -> dict[StepId, tuple[Artefact, ...]]:
+        """Run, or go on with, the steps; return the artefacts of each.
+
+        Raises whatever a step raises, after journalling it; Cancelled when ``deadline.cancel`` is set, and
+        WorkError("run-too-slow") when the deadline passes, in both cases between two steps or at a step's ``advance``.
+        """
+        titles = [step.heading for step in self._steps]
+        tracker = Tracker(titles, [step.weight for step in self._steps], self._reporter, self._clock)
+        results: dict[StepId, tuple[Artefact, ...]] = {}
+        with self._journal.run(name):
+            try:
+                for index, step in enumerate(self._steps):
+                    check(deadline)
+                    results[step.id] = self._one(index, step, results, tracker, deadline)
+            except BaseException as error:
+                self._failed(error)
+                raise
+        return results
+
+    def _one(
+        self,
+        index: int,
+        step: Step,
+        results: Mapping[StepId, tuple[Artefact, ...]],
+        tracker: Tracker,
+        deadline: Deadline,
+    ) -> tuple[Artefact, ...]:
+        inputs = self._inputs(step, results)
+        if not step.always and (done := self._journal.done(step.id, inputs)) is not None:
+            tracker.skip(index)
+            return done
+        tracker.begin(index)
+        self._tell(step.enter, step.heading)
+        began_at_s = time.time()
+        context = Context(self._journal.folder, self._journal, deadline, self._reporter, dict(results), tracker.advance)
+        paths = step.run(context)
+        artefacts = self._journal.complete(step.id, inputs, paths, began_at_s=began_at_s)
+        self._tell(step.leave, step.heading)
+        tracker.end()
+        return artefacts
+
+    def _inputs(self, step: Step, results: Mapping[StepId, tuple[Artefact, ...]]) -> dict[str, str]:
+        made = {
+            input_name(earlier, number): artefact.sha256
+            for earlier in step.after
+            for number, artefact in enumerate(results[earlier])
+        }
+        return {**step.inputs, **made}
+
+    def _tell(self, event: Event | None, reason: str) -> None:
+        if self._machine is not None and event is not None:
+            self._machine.handle(event, reason)
+
+    def _failed(self, error: BaseException) -> None:
+        """Journal the failure and tell the machine; what fails here must not hide ``error``."""
+        stopped = isinstance(error, Cancelled)
+        broken = isinstance(error, DeviceError) and not stopped
+        code = error.code if isinstance(error, VelaturaError | DeviceError) else type(error).__name__
+        text = error.what if isinstance(error, VelaturaError | DeviceError) else str(error)
+        try:
+            self._journal.record(code, text, Level.INFO if stopped else Level.ERROR)
+            event = Event.FAIL if broken else Event.CANCEL
+            if self._machine is not None and self._machine.allows(event):
+                self._machine.handle(event, text)
+        except VelaturaError as second:
+            error.add_note(f"It could not be journalled either: {second}")
+
+
+def check(deadline: Deadline) -> None:
+    """Raise Cancelled if the run is to stop, WorkError("run-too-slow") if its time is over."""
+    if deadline.cancel is not None and deadline.cancel.is_set():
+        raise Cancelled
+    if deadline.passed:
+        raise WorkError(
+            "run-too-slow",
+            what="The run did not end within the time it was given.",
+            remedy="Start it again: it goes on from the last finished step.",
+        )
+
+
+def _check_order(steps: Sequence[Step]) -> None:
+    seen: set[StepId] = set()
+    for step in steps:
+        if step.id in seen or not seen.issuperset(step.after):
+            raise ValueError(f"step {str(step.id)!r} is there twice, or stands before a step that it reads from")
+        seen.add(step.id)

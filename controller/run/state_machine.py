@@ -1,0 +1,186 @@
+"""The stage's state machine: an enum of states and a pure table. Work runs outside transitions."""
+
+from __future__ import annotations
+
+import enum
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from controller.core.errors import WorkError
+
+
+class State(enum.Enum):
+    """What the stage is doing."""
+
+    OFF = "off"
+    POWERING = "powering"
+    WARMING = "warming"
+    READY = "ready"
+    CALIBRATING = "calibrating"
+    SOLVING = "solving"
+    PUBLISHING = "publishing"
+    PLAYING = "playing"
+    COOLING = "cooling"
+    DEGRADED = "degraded"
+    FAULT = "fault"
+
+
+class Event(enum.Enum):
+    """What happened to the stage, or was asked of it."""
+
+    START = "start"
+    LAMPS_LIT = "lamps lit"
+    LAMPS_STABLE = "lamps stable"
+    RECALIBRATE = "recalibrate"
+    CALIBRATED = "calibrated"
+    SOLVE = "solve"
+    SOLVED = "solved"
+    PUBLISH = "publish"
+    PUBLISHED = "published"
+    PLAY = "play"
+    PAUSE = "pause"
+    CANCEL = "cancel"
+    DEGRADE = "degrade"
+    RECOVERED = "recovered"
+    FAIL = "fail"
+    STOP = "stop"
+    COOLED = "cooled"
+
+
+TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
+    (State.OFF, Event.START): State.POWERING,
+    (State.POWERING, Event.LAMPS_LIT): State.WARMING,
+    (State.WARMING, Event.LAMPS_STABLE): State.READY,
+    (State.READY, Event.RECALIBRATE): State.CALIBRATING,
+    (State.READY, Event.SOLVE): State.SOLVING,
+    (State.READY, Event.PUBLISH): State.PUBLISHING,
+    (State.READY, Event.PLAY): State.PLAYING,
+    (State.CALIBRATING, Event.CALIBRATED): State.READY,
+    (State.SOLVING, Event.SOLVED): State.READY,
+    (State.PUBLISHING, Event.PUBLISHED): State.READY,
+    (State.PLAYING, Event.PAUSE): State.READY,
+    (State.PLAYING, Event.RECALIBRATE): State.CALIBRATING,
+    # Work that is stopped on request leaves the lamps as they are; what was done is in the journal.
+    (State.CALIBRATING, Event.CANCEL): State.READY,
+    (State.SOLVING, Event.CANCEL): State.READY,
+    (State.PUBLISHING, Event.CANCEL): State.READY,
+    # A stage that lost something goes on with the rest, and says so.
+    (State.READY, Event.DEGRADE): State.DEGRADED,
+    (State.CALIBRATING, Event.DEGRADE): State.DEGRADED,
+    (State.PLAYING, Event.DEGRADE): State.DEGRADED,
+    (State.DEGRADED, Event.RECOVERED): State.READY,
+    (State.DEGRADED, Event.RECALIBRATE): State.CALIBRATING,
+    # Stopping is allowed wherever a lamp may be lit, and always goes through cooling.
+    (State.POWERING, Event.STOP): State.COOLING,
+    (State.WARMING, Event.STOP): State.COOLING,
+    (State.READY, Event.STOP): State.COOLING,
+    (State.CALIBRATING, Event.STOP): State.COOLING,
+    (State.SOLVING, Event.STOP): State.COOLING,
+    (State.PUBLISHING, Event.STOP): State.COOLING,
+    (State.PLAYING, Event.STOP): State.COOLING,
+    (State.DEGRADED, Event.STOP): State.COOLING,
+    (State.FAULT, Event.STOP): State.COOLING,
+    (State.COOLING, Event.COOLED): State.OFF,
+    (State.POWERING, Event.FAIL): State.FAULT,
+    (State.WARMING, Event.FAIL): State.FAULT,
+    (State.READY, Event.FAIL): State.FAULT,
+    (State.CALIBRATING, Event.FAIL): State.FAULT,
+    (State.SOLVING, Event.FAIL): State.FAULT,
+    (State.PUBLISHING, Event.FAIL): State.FAULT,
+    (State.PLAYING, Event.FAIL): State.FAULT,
+    (State.DEGRADED, Event.FAIL): State.FAULT,
+    (State.COOLING, Event.FAIL): State.FAULT,
+    # After mending, lamps are probed again: one that is still lit is not struck, one that is hot is waited for.
+    (State.FAULT, Event.START): State.POWERING,
+}
+
+
+class TransitionError(WorkError):
+    """The event makes no sense in the present state."""
+
+
+def next_state(state: State, event: Event) -> State:
+    """The state after ``event``; pure. Raises TransitionError("state-not-allowed") for a pair not in the table."""
+    try:
+        return TRANSITIONS[state, event]
+    except KeyError:
+        allowed = ", ".join(repr(name.value) for name in allowed_events(state))
+        raise TransitionError(
+            "state-not-allowed",
+            what=f"'{event.value}' is not possible while the stage is {state.value}.",
+            remedy=f"Possible now: {allowed}.",
+        ) from None
+
+
+def allowed_events(state: State) -> tuple[Event, ...]:
+    """The events that ``state`` accepts, in the order of their definition."""
+    return tuple(event for event in Event if (state, event) in TRANSITIONS)
+
+
+def mermaid() -> str:
+    """The table as a Mermaid state diagram."""
+    lines = ["stateDiagram-v2", f"    [*] --> {State.OFF.name}"]
+    lines += [f"    {before.name} --> {after.name}: {event.value}" for (before, event), after in TRANSITIONS.items()]
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One transition that took place. ``reason`` is a sentence for the technician, or empty."""
+
+    before: State
+    event: Event
+    after: State
+    reason: str
+
+
+Listener = Callable[[Change], None]
+
+
+class Machine:
+    """The present state with the reason beside it. Safe to use from several threads.
+
+    Listeners are told after the state has changed, one change at a time and in order; the first is usually
+    ``Journal.record_change``. When a listener fails the others are still told, then its error is raised: the state has
+    changed all the same.
+    """
+
+    def __init__(self, *listeners: Listener, state: State = State.OFF) -> None:
+        self._lock = threading.RLock()
+        self._state = state
+        self._reason = ""
+        self._listeners = list(listeners)
+
+    @property
+    def state(self) -> State:
+        return self._state
+
+    @property
+    def reason(self) -> str:
+        """Why the stage is in this state, as given with the last event."""
+        return self._reason
+
+    def listen(self, listener: Listener) -> None:
+        """Tell ``listener`` of every change from now on."""
+        with self._lock:
+            self._listeners.append(listener)
+
+    def allows(self, event: Event) -> bool:
+        return (self._state, event) in TRANSITIONS
+
+    def handle(self, event: Event, reason: str = "") -> State:
+        """Go to the next state and return it. Raises TransitionError and changes nothing if not allowed."""
+        with self._lock:
+            change = Change(self._state, event, next_state(self._state, event), reason)
+            self._state, self._reason = change.after, reason
+            failure: Exception | None = None
+            for listener in tuple(self._listeners):
+                try:
+                    listener(change)
+                except Exception as error:  # noqa: BLE001 - raised below, when every listener has been told
+                    failure = failure or error
+            if failure is not None:
+                raise failure
+            return change.after

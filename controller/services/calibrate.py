@@ -1,0 +1,214 @@
+"""What the command line and the kiosk ask for, each a run on a stage: calibrate, make appearances, play."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.grade import is_graded, passes
+from controller.artefacts.modes import DotOptions, dot_options
+from controller.bundle.install import current
+from controller.bundle.signing import Trust, load_signing_key
+from controller.core.errors import UsageError
+from controller.rig.ambient_light import dark_after
+from controller.rig.rig import Rig
+from controller.run.journal import Journal
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Runner, Step
+from controller.run.state_machine import Event
+from controller.stage.calibrations import (
+    finished_calibration,
+    finished_calibrations,
+    output_sizes,
+    stage_trust,
+    worst_grade,
+)
+from controller.stage.check import Checked, check_stage
+from controller.stage.run import LONGEST_RUN_S, marker
+from controller.stage.session import StageSession
+from controller.steps import costs
+from controller.steps.appearance.cluster_solve import answering_on
+from controller.steps.appearance.publishing import publish_step
+from controller.steps.appearance.rendering import scene_wish
+from controller.steps.appearance.requests import wishes_of
+from controller.steps.appearance.solving import SolveOptions, base_choice, solve_steps
+from controller.steps.calibrate.dots import dot_steps
+from controller.steps.calibrate.full import calibration_steps
+from controller.steps.calibrate.grade import (
+    accept,
+    below_grade,
+    compare_with_last,
+    gate_step,
+    grade_figures,
+    verify_step,
+)
+from controller.steps.capture.lens_check import lens_check
+from hal.deadline import in_seconds
+
+KEY_FILE = "keys/stage.key"
+"""The stage's signing key, where there is one."""
+
+
+def calibrate(
+    *,
+    session: StageSession,
+    reporter: Reporter,
+    cancel: threading.Event,
+    mode: str = "fast",
+    dot_spacing: str | None = None,
+    accept_grade: bool = False,
+) -> Mapping[str, Any]:
+    """Calibrate the stage, going on with an unfinished calibration; returns where the results lie.
+
+    ``mode`` and ``dot_spacing``, and what is raised for wrong ones: see ``artefacts.modes.dot_options``.
+    """
+    options = dot_options(mode, dot_spacing)
+    checked = check_stage(session.stage)
+    prior = checked.prior
+    last = next(iter(finished_calibrations(checked.stage.folder)), None)
+    run = session.run(
+        checked,
+        lambda rig, run: calibrating(rig, run, checked=checked, options=options),
+        name="calibrate",
+        reporter=reporter,
+        cancel=cancel,
+        dark=True,
+        before=lambda rig: lens_check(rig, prior),
+    )
+    tell_grade(checked, run, last, reporter, accept_grade=accept_grade)
+    return {"run": str(run), **grade_figures(run)}
+
+
+def calibrating(
+    rig: Rig, run: Path, *, checked: Checked, options: DotOptions | None = None, calibrated: Calibrated | None = None
+) -> Sequence[Step]:
+    """The calibration's steps, its grading the last, between their state markers.
+
+    ``calibrated``: what reads the calibration of ``run``, where the caller needs it too.
+    """
+    longest_s = checked.stage.tables.capture.longest_exposure_s
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+             *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s)]  # fmt: skip
+    return [
+        marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
+        *steps,
+        verify_step(calibrated or Calibrated(run, checked.names), [step.id for step in steps], scale),
+        *dark_after(rig.darkness, rig.display),
+        marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
+    ]
+
+
+def make_appearances(
+    *,
+    session: StageSession,
+    names: Sequence[str],
+    scenes: Sequence[str] = (),
+    reporter: Reporter,
+    cancel: threading.Event,
+    accept_grade: bool = False,
+    base: str | None = None,
+    scheduler: str | None = None,
+    quick: bool = False,
+) -> Mapping[str, Any]:
+    """Solve appearances of stage.toml on the last calibration, and install them as the stage's bundle.
+
+    ``scenes``: Blender scenes to render besides ``names``, or alone if no names are given.
+    ``accept_grade``: publish whatever the calibration's grade. ``base``: the base image, instead of stage.toml's.
+    ``scheduler``: of a Dask cluster, on whose workers the appearances are solved. ``quick``: by base times scale
+    alone, whatever stage.toml says; without it the next run solves them as stage.toml says.
+
+    No device is touched: the projectors may be off, or playing.
+    Raises what ``usable_calibration``, ``wishes_of``, ``answering_on`` and the steps raise.
+    """
+    chosen = None if base is None else base_choice(base)
+    checked = check_stage(session.stage)
+    folder = checked.stage.folder
+    with session.locked():
+        run = usable_calibration(checked, reporter, accept_grade=accept_grade)
+        calibrated = Calibrated(run, checked.names)
+        wishes = wishes_of(checked.stage, calibrated, names) if names or not scenes else []
+        wishes += [scene_wish(calibrated, scene, folder=Path.cwd()) for scene in scenes]
+        table = checked.stage.tables.solve
+        kept = base_choice(table.base)
+        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or kept, table.adapt)
+        if quick:
+            # a high-pass base would be solved anew for each
+            options = replace(options, mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
+        outputs = output_sizes(checked)
+        scale = costs.scale(size for _, size in outputs.values())
+        with answering_on(scheduler, calibrated, wishes) as answering, Journal(run) as journal:
+            steps = [
+                *([] if is_graded(run) else [verify_step(calibrated, (), scale)]),
+                gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
+                *solve_steps(calibrated, wishes, options, (), scale, answering=answering),
+                publish_step(folder, outputs, [wish.name for wish in wishes],
+                             stage=checked.stage.tables.stage.name, calibration=run.name, key=signing_key(checked)),
+            ]  # fmt: skip
+            Runner(steps, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
+    return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(wish.name for wish in wishes)}
+
+
+def signing_key(checked: Checked) -> Path | None:
+    """The stage's own key. Without one, bundles stay unsigned, which stage.toml must allow in so many words.
+
+    Raises UsageError("no-signing-key", or "signing-key-refused" for one whose bundles the stage would not play).
+    """
+    key = checked.stage.path(KEY_FILE)
+    if key.exists():
+        _check_own_key(key, stage_trust(checked.stage))
+        return key
+    if checked.stage.tables.bundle.allow_unsigned:
+        return None
+    raise UsageError(
+        "no-signing-key",
+        what=f"The stage has no signing key in {KEY_FILE}.",
+        remedy="Make one with `velatura keys STAGE`, which also tells which line to add to stage.toml.",
+    )
+
+
+def _check_own_key(path: Path, trust: Trust) -> None:
+    # Before the work: otherwise the player alone would tell, once everything is solved.
+    public = bytes(load_signing_key(path).verify_key)
+    if public in trust.revoked:
+        problem, remedy = "is revoked", f"Move {path} away, make a new key with `velatura keys STAGE`, and trust that."
+    elif public not in trust.keys and (trust.keys or not trust.allow_unsigned):
+        problem, remedy = "is not trusted", f'Add "{public.hex()}" to trusted_keys under [bundle] in stage.toml.'
+    else:
+        return
+    raise UsageError("signing-key-refused", what=f"The stage's own signing key {problem} by stage.toml.", remedy=remedy)
+
+
+def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bool = False) -> Path:
+    """The newest calibration, if it passes the gate.
+
+    An older one is never taken in its stead: the stage may have changed since. ``accept_grade`` lets it pass, loudly.
+    Raises UsageError("not-calibrated") and CalibrationError("calibration-below-grade").
+    """
+    run, worst = finished_calibration(checked.stage.folder), worst_grade(checked)
+    if accept_grade:
+        accept(run, reporter, worst)
+    if not passes(run, worst):
+        raise below_grade(run, worst)
+    return run
+
+
+def tell_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:
+    """After a calibration: say it when it is worse than the last one, or not good enough to publish."""
+    worst = worst_grade(checked)
+    compare_with_last(run, last, reporter)
+    if accept_grade:
+        accept(run, reporter, worst)
+    if not passes(run, worst):
+        error = below_grade(run, worst)
+        reporter.say(f"{error.what} {error.remedy}", Level.WARNING)
+
+
+__all__ = [
+    "KEY_FILE", "calibrate", "calibrating", "finished_calibration", "finished_calibrations", "make_appearances",
+    "output_sizes", "signing_key", "stage_trust", "tell_grade", "usable_calibration", "worst_grade",
+]  # fmt: skip

@@ -1,0 +1,99 @@
+"""What the command line and the kiosk ask for: photographs of what is installed, compared with its targets."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.comparison import COMPARE, compared_in
+from controller.artefacts.solved import is_solved
+from controller.bundle.install import current
+from controller.bundle.reader import Bundle
+from controller.core.errors import UsageError
+from controller.report.comparison import picture_steps, write_comparison_report
+from controller.rig.ambient_light import dark_after
+from controller.rig.rig import Rig
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Step
+from controller.stage.calibrations import finished_calibrations, stage_trust
+from controller.stage.check import Checked, check_stage
+from controller.stage.session import StageSession
+from controller.steps.appearance.compare import compare_steps
+
+
+@dataclass(frozen=True, slots=True)
+class Installed:
+    """The appearances of the installed bundle that can be compared, and the run that holds their targets."""
+
+    bundle: str
+    run: Path
+    names: tuple[str, ...]
+
+
+def photograph(
+    *, session: StageSession, names: Sequence[str], reporter: Reporter, cancel: threading.Event
+) -> Mapping[str, Any]:
+    """Light the projectors, show each appearance of the installed bundle (or ``names``), photograph and compare it.
+
+    Goes on with an unfinished run of the same day. Raises as ``installed``, and what the devices raise.
+    """
+    checked = check_stage(session.stage)
+    found = installed(checked, names, reporter)
+    calibrated = Calibrated(found.run, checked.names)
+
+    def steps(rig: Rig, _: Path) -> Sequence[Step]:
+        longest_s = checked.stage.tables.capture.longest_exposure_s
+        taken = compare_steps(rig, calibrated, found.names, bundle=found.bundle, longest_exposure_s=longest_s)
+        drawn = picture_steps(calibrated, found.names)
+        # Each with its pictures at once: whoever stops the run sees what was photographed until then.
+        both = [step for pair in zip(taken, drawn, strict=True) for step in pair]
+        return [*both, *dark_after(rig.darkness, rig.display)]
+
+    run = session.run(checked, steps, name=COMPARE, reporter=reporter, cancel=cancel, dark=True)
+    html = comparison_report(run, checked)
+    rows = [
+        {"name": one.name, "delta_e00_median": one.delta_e00_median, "delta_e00_p95": one.delta_e00_p95,
+         "rmse": one.rmse, "sharpness_lambda": one.sharpness_lambda}
+        for one in compared_in(run) if one.name in found.names
+    ]  # fmt: skip
+    return {"run": str(run), "report": str(html), "appearances": rows}
+
+
+def installed(checked: Checked, names: Sequence[str], reporter: Reporter) -> Installed:
+    """What is to be photographed: ``names`` in their order, or all that have a target here.
+
+    Raises UsageError("nothing-installed", "appearance-unknown", "targets-missing"), and BundleError for a bundle that
+    the stage would not play.
+    """
+    folder = checked.stage.folder
+    file = current(folder / "bundles")
+    if file is None:
+        raise UsageError("nothing-installed", what="No bundle is installed on this stage.",
+                         remedy="Run `velatura appearance` on it first.")  # fmt: skip
+    with Bundle.open_trusted(file, stage_trust(checked.stage)) as bundle:
+        index = bundle.index
+    held = [one.name for one in index.appearances]
+    for name in names:
+        if name not in held:
+            raise UsageError("appearance-unknown", what=f"The installed bundle has no appearance {name[:64]!r}.",
+                             remedy=f"It has {', '.join(held) or 'none'}.")  # fmt: skip
+    wanted = tuple(dict.fromkeys(names)) or tuple(held)
+    # A bundle may come from elsewhere, so what it names is looked for among the runs that are here.
+    run = next((one for one in finished_calibrations(folder) if one.name == index.calibration), None)
+    known = () if run is None else tuple(name for name in wanted if is_solved(run, name))
+    missing = [name for name in wanted if name not in known]
+    if run is None or not known or (names and missing):
+        raise UsageError("targets-missing", what=f"This stage holds no target of {', '.join(missing) or 'anything'}.",
+                         remedy="Run `velatura appearance` on it: that solves and installs them anew.")  # fmt: skip
+    if missing:
+        reporter.say(f"Nothing is known of the target of {', '.join(missing)}: left out.", Level.WARNING)
+    return Installed(file.stem, run, known)
+
+
+def comparison_report(run: Path, checked: Checked, out: Path | None = None) -> Path:
+    """As ``write_comparison_report``, for a run of this stage."""
+    return write_comparison_report(run, checked.stage.tables.stage.name, out)

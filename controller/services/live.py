@@ -1,0 +1,273 @@
+"""``velatura live``: a folder, a video or a running render shown on a calibrated stage as it comes."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from controller.artefacts.calibrated import Calibrated
+from controller.bundle.install import CURRENT, current
+from controller.bundle.live_maps import LiveMaps
+from controller.bundle.reader import Bundle
+from controller.core.arrays import FloatImage
+from controller.core.errors import BundleError
+from controller.core.storage import runtime_folder
+from controller.live.sources import LiveSource, open_source
+from controller.play.frames import FrameFile, FrameSet, OutputSize
+from controller.play.live.stream import TARGET
+from controller.rig.rig import Rig
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Context, Step
+from controller.run.state_machine import Event
+from controller.run.step_id import StepId
+from controller.services.calibrate import stage_trust, usable_calibration
+from controller.services.live_frame_file import FileSource, holds_frames
+from controller.solve.feasibility import choose_exposure
+from controller.solve.scaling.interactive import Interactive
+from controller.stage.check import Checked, check_stage
+from controller.stage.session import StageSession
+from controller.steps.appearance.live import FrameMaker, Frames, LiveFigures, Maker, TargetMaker, run_live
+from controller.steps.appearance.live_parts import live_maps, target_px
+from controller.steps.appearance.publishing import bundle_display
+from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.errors import DeviceError, DeviceRefused
+from hal.values import LiveStatus
+
+FRAMES_FILE: Final = "live.frame"
+TARGETS_FILE: Final = "live-targets.frame"
+"""In the stage's runtime folder: what the player shows live."""
+NO_SHADERS: Final = {"live-no-shaders", "display-unfit", "bundle-not-live", "bundle-none"}
+"""What a player refuses targets with where it would take finished frames."""
+LAST_S: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """What is worked out before the lamps are lit. ``shaded``: the installed bundle has the maps for shaders."""
+
+    maps: LiveMaps
+    brightness: float
+    shaded: bool
+
+
+def live(
+    *,
+    session: StageSession,
+    source: Path,
+    rate_hz: float,
+    loop: bool,
+    seconds: float | None,
+    reporter: Reporter,
+    cancel: threading.Event,
+) -> Mapping[str, Any]:
+    """Light the projectors and show ``source`` until it ends, ``seconds`` have passed or it is stopped.
+
+    Raises UsageError "live-source-unreadable" or "live-file-unfit", WorkError "base-not-solved", what
+    ``usable_calibration`` raises, and what devices raise.
+    """
+    checked = check_stage(session.stage)
+    calibrated = _calibrated(checked, reporter)
+    open_it = partial(_opened, source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
+    open_it().close()
+    ready = _ready(checked, calibrated, reporter)
+    told: dict[str, Any] = {}
+
+    def steps(rig: Rig, _: Path) -> Sequence[Step]:
+        def show(context: Context) -> Sequence[Path]:
+            told.update(_show(rig, context, ready, open_it, rate_hz=rate_hz, seconds=seconds))
+            return ()
+
+        return [
+            Step(StepId("live"), show, title=f"Live: {source.name}", enter=Event.PLAY, leave=Event.PAUSE, always=True)
+        ]
+
+    session.run(checked, steps, name="live", reporter=reporter, cancel=cancel)
+    return told
+
+
+def _opened(source: Path, target_px: tuple[int, int], *, loop: bool, rate_hz: float) -> LiveSource:
+    if holds_frames(source):
+        return FileSource(source, OutputSize(TARGET, *target_px))
+    return open_source(source, loop=loop, rate_hz=rate_hz)
+
+
+def _calibrated(checked: Checked, reporter: Reporter) -> Calibrated:
+    return Calibrated(usable_calibration(checked, reporter), checked.names)
+
+
+def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> Ready:
+    """The maps, and the brightest white that the stated share of the object can show."""
+    maps = live_maps(calibrated, {table.name: table.output for table in checked.stage.tables.projectors})
+    black = calibrated.calibration.black
+    white: FloatImage = np.ones_like(black)
+    share = checked.stage.tables.solve.exposure_share
+    brightness = choose_exposure(calibrated.transport, white, black, share=share, drive=calibrated.drive)
+    reporter.say(f"A target's white is a radiance of {brightness:.7g}.")
+    return Ready(maps, brightness, _in_bundle(checked, calibrated.folder.name))
+
+
+def _in_bundle(checked: Checked, calibration: str) -> bool:
+    """Whether the installed bundle has a live section of this calibration."""
+    file = current(checked.stage.folder / "bundles")
+    with contextlib.suppress(BundleError):
+        if file is not None:
+            with Bundle.open_trusted(file, stage_trust(checked.stage)) as bundle:
+                return bundle.index.live is not None and bundle.index.calibration == calibration
+    return False
+
+
+def _show(
+    rig: Rig,
+    context: Context,
+    ready: Ready,
+    open_it: Callable[[], LiveSource],
+    *,
+    rate_hz: float,
+    seconds: float | None,
+) -> dict[str, Any]:
+    display = bundle_display(rig)
+    status: LiveStatus | None = None
+
+    def tell(figures: LiveFigures) -> None:
+        nonlocal status
+        status = display.playing(deadline=context.deadline.within(20)).live or status
+        made_hz = figures.made / max(figures.seconds, 1e-3)
+        context.advance(
+            0.0 if seconds is None else min(figures.seconds / seconds, 1.0),
+            f"{made_hz:.1f} pictures a second, {figures.late} late, {figures.bad} bad",
+        )
+
+    try:
+        with way_to_light(rig, context, ready) as way:
+            figures = run_live(open_it(), way.maker, way.write, rate_hz=rate_hz, seconds=seconds, tell=tell)
+            # the last one is shown at the next tick of the player's clock
+            context.deadline.sleep(LAST_S)
+            tell(figures)
+    finally:
+        # The lamps shine on for a while: black. A player that is gone is black as soon as it is back.
+        with contextlib.suppress(DeviceError):
+            display.stop(deadline=in_seconds(20))
+    if figures.bad:
+        context.reporter.say(f"{figures.bad} pictures could not be shown; the last: {figures.trouble}", Level.WARNING)
+    return figures.told() | _told(figures, status)
+
+
+def _told(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any]:
+    """What the player made of it; pictures that it did not get to show were replaced by newer ones."""
+    if status is None:
+        return {"shown": 0, "by": None, "shown_after_p50_ms": None, "shown_after_p99_ms": None}
+    p50_ms, p99_ms = (None if s is None else 1e3 * s for s in (status.delay_p50_s, status.delay_p99_s))
+    late = figures.late + max(figures.made - status.shown, 0)
+    return {"shown": status.shown, "late": late, "by": status.by,
+            "shown_after_p50_ms": p50_ms, "shown_after_p99_ms": p99_ms}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How pictures become light: targets to the player's shaders, or finished frames."""
+
+    maker: Maker
+    write: Callable[[Frames], object]
+
+
+@contextlib.contextmanager
+def way_to_light(rig: Rig, context: Context, ready: Ready) -> Iterator[Way]:
+    """Ask the player for live pictures, in the way that it can, and let it go at the end; the picture stays.
+
+    Raises what devices raise.
+    """
+    display, folder = bundle_display(rig), runtime_folder(rig.stage)
+    deadline = context.deadline.within(60)
+    if ready.shaded:
+        size = OutputSize(TARGET, *ready.maps.target_px)
+        with _fresh(folder / TARGETS_FILE, [size]) as file:
+            if _takes_targets(rig, file.path, ready.brightness, deadline):
+                yield Way(TargetMaker(ready.maps.target_px), _target_writer(file))
+                return
+    outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in display.outputs(deadline=deadline)]
+    with _fresh(folder / FRAMES_FILE, outputs) as file:
+        display.live(file.path, deadline=deadline)
+        yield Way(FrameMaker(Interactive(ready.maps), ready.brightness), _writer(file, outputs, ready.maps))
+
+
+def _takes_targets(rig: Rig, path: Path, white: float, deadline: Deadline) -> bool:
+    display = bundle_display(rig)
+    display.load_bundle(rig.stage / "bundles" / CURRENT, deadline=deadline)
+    try:
+        display.live(path, white=white, deadline=deadline)
+    except DeviceRefused as error:
+        if error.code not in NO_SHADERS:
+            raise
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _fresh(path: Path, outputs: Sequence[OutputSize]) -> Iterator[FrameFile]:
+    """A frame file without an old picture in it, removed again on leaving."""
+    path.unlink(missing_ok=True)
+    file = FrameFile(path, outputs)
+    try:
+        yield file
+    finally:
+        file.close()
+        path.unlink(missing_ok=True)
+
+
+def _writer(file: FrameFile, outputs: Sequence[OutputSize], maps: LiveMaps) -> Callable[[Frames], object]:
+    """Writes frames in the maps' order to a file of ``outputs``; those without a projector stay black."""
+    black = {output.name: image for output, image in zip(outputs, FrameSet.black(outputs).pixels, strict=True)}
+    names = [output.name for output in maps.outputs]
+
+    def write(frames: Frames) -> None:
+        found = black | dict(zip(names, frames, strict=True))
+        file.write(FrameSet(tuple(found[output.name] for output in outputs)))
+
+    return write
+
+
+def feed(
+    *,
+    stage: Path,
+    source: Path,
+    into: Path,
+    targets: bool,
+    rate_hz: float,
+    loop: bool,
+    seconds: float | None,
+    reporter: Reporter,
+    cancel: threading.Event,
+) -> Mapping[str, Any]:
+    """Write what ``source`` shows to the frame file ``into``, for a player that is asked elsewhere to show it live.
+
+    Finished frames, or with ``targets`` those of the bundle's live section. No device is touched. Ends with the source,
+    after ``seconds``, or when it is stopped; the file stays, with its last picture.
+    """
+    checked = check_stage(stage)
+    calibrated = _calibrated(checked, reporter)
+    pictures = _opened(source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
+    ready = _ready(checked, calibrated, reporter)
+    outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in checked.stage.tables.display.outputs]
+    if targets:
+        outputs = [OutputSize(TARGET, *ready.maps.target_px)]
+    with contextlib.closing(FrameFile(into, outputs)) as file:
+        maker = TargetMaker(ready.maps.target_px) if targets else FrameMaker(Interactive(ready.maps), ready.brightness)
+        write = _target_writer(file) if targets else _writer(file, outputs, ready.maps)
+
+        def tell(figures: LiveFigures) -> None:
+            if cancel.is_set():
+                raise Cancelled
+
+        figures = run_live(pictures, maker, write, rate_hz=rate_hz, seconds=seconds, tell=tell)
+    return {"white": ready.brightness, **figures.told()}
+
+
+def _target_writer(file: FrameFile) -> Callable[[Frames], object]:
+    return lambda frames: file.write(FrameSet(tuple(frames)))

@@ -1,0 +1,216 @@
+"""What the command line and the kiosk ask for: playing the installed bundle's appearances on a stage."""
+
+from __future__ import annotations
+
+import threading
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from controller.bundle.format import Index
+from controller.bundle.install import current
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import Trust
+from controller.core.errors import UsageError
+from controller.core.files import read_text
+from controller.rig.rig import Rig
+from controller.run.progress import Reporter
+from controller.run.runner import Context, Step
+from controller.run.state_machine import Event
+from controller.run.step_id import StepId
+from controller.services.bundle import check_outputs
+from controller.services.calibrate import stage_trust
+from controller.stage.check import Checked, check_stage
+from controller.stage.run import LONGEST_RUN_S
+from controller.stage.session import StageSession
+from controller.steps.appearance.publishing import bundle_display
+from hal.deadline import in_seconds
+
+SHOWN_S: Final = 10.0
+"""How long one of several appearances stays, unless told otherwise."""
+_KEYS: Final = {"appearance", "seconds", "fade_s"}
+
+
+@dataclass(frozen=True, slots=True)
+class Programme:
+    """Appearances in turn: (name, seconds, fade_s) each; ``repeat`` rounds, 0: for ever.
+
+    ``for_s``: black after so many seconds; None: after the rounds.
+    """
+
+    items: tuple[tuple[str, float, float], ...]
+    repeat: int = 0
+    for_s: float | None = None
+
+    @property
+    def whole_s(self) -> float:
+        """How long it goes on, at most as long as a run may."""
+        rounds_s = self.repeat * sum(seconds for _, seconds, _ in self.items) or LONGEST_RUN_S
+        return min(rounds_s if self.for_s is None else self.for_s, LONGEST_RUN_S)
+
+
+def play(
+    *,
+    session: StageSession,
+    names: Sequence[str],
+    sequence: Path | None,
+    seconds: float | None,
+    fade_s: float,
+    repeat: int,
+    reporter: Reporter,
+    cancel: threading.Event,
+) -> Mapping[str, Any]:
+    """Light the projectors and show appearances of the installed bundle.
+
+    Nothing named: the playlist that the bundle suggests. One name: for ``seconds``, or until stopped. Several, or
+    ``sequence`` (a file, see ``read_programme``): each for ``seconds``, coming in over ``fade_s`` of them, ``repeat``
+    rounds, or for ever if 0. Raises UsageError("nothing-installed", "nothing-to-play", "played-twice",
+    "sequence-file-wrong", "fade-too-long" or "appearance-unknown"), and BundleError for a bundle that
+    the stage does not trust or that was made for other outputs: all of them before a lamp is struck.
+    """
+    checked = check_stage(session.stage)
+    installed = current(checked.stage.folder / "bundles")
+    if installed is None:
+        raise UsageError(
+            "nothing-installed",
+            what="No bundle is installed on this stage.",
+            remedy="Run `velatura appearance` on it first.",
+        )
+    if names or sequence is not None:
+        programme = _programme(names, sequence, seconds, fade_s, repeat)
+    else:
+        programme = suggested_programme(installed, stage_trust(checked.stage), repeat, seconds)
+    index = _checked_index(installed, checked, programme)
+    session.run(
+        checked,
+        lambda rig, _: _playing(rig, programme, index),
+        name="play",
+        reporter=reporter,
+        cancel=cancel,
+        plays=True,
+    )
+    played = list(dict.fromkeys(name for name, _, _ in programme.items))
+    return {"played": played[0] if len(played) == 1 else played}
+
+
+def _checked_index(bundle: Path, checked: Checked, programme: Programme) -> Index:
+    """The index of a bundle that the stage trusts, that fits its outputs and has what is to be played."""
+    with Bundle.open_trusted(bundle, stage_trust(checked.stage)) as opened:
+        index = opened.index
+    held = [appearance.name for appearance in index.appearances]
+    for name, _, _ in programme.items:
+        if name not in held:
+            raise UsageError(
+                "appearance-unknown",
+                what=f"The installed bundle has no appearance '{name[:64]}'.",
+                remedy=f"It has {', '.join(held) or 'none'}.",
+            )
+    outputs = checked.stage.tables.display.outputs
+    check_outputs(index, {(output.name, output.width_px, output.height_px) for output in outputs})
+    return index
+
+
+def _programme(
+    names: Sequence[str], sequence: Path | None, seconds: float | None, fade_s: float, repeat: int
+) -> Programme:
+    if names and sequence is not None:
+        raise UsageError(
+            "played-twice",
+            what="Appearances and a sequence were given.",
+            remedy="Name the appearances to show, or give --sequence FILE.",
+        )
+    if sequence is not None:
+        return read_programme(sequence)
+    if len(names) == 1:
+        # The last picture of a sequence stays, so how long its item lasts does not matter.
+        return Programme(((names[0], max(fade_s, 1.0), fade_s),), 1, LONGEST_RUN_S if seconds is None else seconds)
+    each_s = SHOWN_S if seconds is None else seconds
+    if fade_s > each_s:
+        raise UsageError(
+            "fade-too-long",
+            what=f"A fade of {fade_s:g} s does not fit into the {each_s:g} s that an appearance is shown.",
+            remedy="Give a shorter --fade or longer --seconds.",
+        )
+    return Programme(tuple((name, each_s, fade_s) for name in names), repeat)
+
+
+def suggested_programme(bundle: Path, trust: Trust, repeat: int, seconds: float | None) -> Programme:
+    """The playlist that a bundle suggests. ``seconds``: each for so long instead, its fade at most that.
+
+    Raises UsageError("nothing-to-play") for one that suggests none, and BundleError as ``Bundle.open``.
+    """
+    with Bundle.open_trusted(bundle, trust) as opened:
+        hints = opened.index.schedule
+    if not hints:
+        raise UsageError(
+            "nothing-to-play",
+            what="Neither appearances nor a sequence were given, and the installed bundle suggests no playlist.",
+            remedy="Name the appearances to show, or give --sequence FILE.",
+        )
+    lasting = [(hint.appearance, seconds or hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints]
+    return Programme(tuple((name, shown_s, min(fade_s, shown_s)) for name, shown_s, fade_s in lasting), repeat)
+
+
+def read_programme(path: Path) -> Programme:
+    """Read a sequence from a TOML file: ``repeat`` (0: for ever), and a table [[item]] for each appearance.
+
+    An item has ``appearance``, ``seconds`` and, if it is to fade in, ``fade_s``, at most its seconds. Raises
+    UsageError("sequence-file-wrong").
+    """
+    try:
+        tables = tomllib.loads(read_text(path))
+    except OSError as error:
+        raise _wrong(path, f"it can not be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise _wrong(path, f"it is not TOML ({error})") from error
+    items, repeat = tables.get("item"), tables.get("repeat", 0)
+    if tables.keys() - {"item", "repeat"} or not isinstance(items, list) or not items:
+        raise _wrong(path, "it has something else than repeat and tables [[item]], or none of these")
+    if type(repeat) is not int or repeat < 0:
+        raise _wrong(path, "repeat is not a whole number from 0")
+    return Programme(tuple(_item(path, number, table) for number, table in enumerate(items, start=1)), repeat)
+
+
+def _item(path: Path, number: int, table: Any) -> tuple[str, float, float]:
+    if not isinstance(table, dict) or table.keys() - _KEYS or not isinstance(table.get("appearance"), str):
+        raise _wrong(path, f"item {number} has not just appearance, seconds and fade_s")
+    seconds, fade_s = table.get("seconds", SHOWN_S), table.get("fade_s", 0.0)
+    if any(type(value) not in (int, float) for value in (seconds, fade_s)) or not 0 <= fade_s <= seconds or not seconds:
+        raise _wrong(path, f"in item {number} seconds is not a number above 0, or fade_s not one from 0 to seconds")
+    return table["appearance"], float(seconds), float(fade_s)
+
+
+def _wrong(path: Path, detail: str) -> UsageError:
+    return UsageError(
+        "sequence-file-wrong",
+        what=f"The sequence {path} can not be used: {detail}.",
+        remedy='Write repeat = 0, and for each appearance [[item]], appearance = "...", seconds = 10, fade_s = 1.',
+    )
+
+
+def _playing(rig: Rig, programme: Programme, index: Index) -> Sequence[Step]:
+    shown = bundle_display(rig).outputs(deadline=in_seconds(20))
+    check_outputs(index, {(output.name, output.width_px, output.height_px) for output in shown})
+    title = " and ".join(dict.fromkeys(name for name, _, _ in programme.items))
+    return [
+        Step(StepId("play"), partial(_show, rig, programme), title=f"Playing {title}",
+             enter=Event.PLAY, leave=Event.PAUSE, always=True)
+    ]  # fmt: skip
+
+
+def _show(rig: Rig, programme: Programme, context: Context) -> Sequence[Path]:
+    display = bundle_display(rig)
+    display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
+    # A fade answers when it is over.
+    patience_s = 20 + programme.items[0][2]
+    display.play_sequence(programme.items, repeat=programme.repeat, deadline=context.deadline.within(patience_s))
+    whole_s = programme.whole_s
+    until = in_seconds(whole_s)
+    while not until.passed:
+        context.advance(0.0 if whole_s >= LONGEST_RUN_S else 1 - until.left_s() / whole_s)
+        context.deadline.sleep(min(0.5, until.left_s()))
+    display.stop(deadline=context.deadline.within(20))
+    return ()

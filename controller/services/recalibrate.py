@@ -1,0 +1,134 @@
+"""What keeps a calibration true: the drift check, and the recalibration that repeats only what has changed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.drift import read_drift_figures
+from controller.artefacts.grade import passes
+from controller.artefacts.kinds import CALIBRATED, StepKind
+from controller.artefacts.modes import MODES, CalibrationMode, DotOptions, mode_of
+from controller.core.errors import UsageError
+from controller.rig.ambient_light import dark_after
+from controller.rig.rig import Rig
+from controller.run.journal import Journal
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Context, Step
+from controller.run.state_machine import Event
+from controller.run.step_id import StepId
+from controller.stage.calibrations import finished_calibration, worst_grade
+from controller.stage.check import Checked, check_stage
+from controller.stage.run import marker
+from controller.stage.session import StageSession
+from controller.steps.calibrate.dots import dot_steps
+from controller.steps.calibrate.drift import drift_steps
+from controller.steps.calibrate.full import calibration_steps
+from controller.steps.calibrate.grade import accept, below_grade, compare_with_last, grade_figures
+from controller.steps.calibrate.quick import quick_steps
+from controller.steps.calibrate.single_projector import one_projector_steps
+
+CHECKS = (StepKind.DRIFT_PHOTOGRAPHS, StepKind.VERIFICATION_PHOTOGRAPHS)
+"""The photographs of the check before and of the grade."""
+
+
+def check_drift(
+    *, session: StageSession, details: bool, reporter: Reporter, cancel: threading.Event
+) -> Mapping[str, Any]:
+    """Photograph the stage N + 2 times and tell what has changed since its calibration; ``details``: every figure.
+
+    Raises UsageError("not-calibrated"), and what the devices raise.
+    """
+    checked = check_stage(session.stage)
+    calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
+
+    def steps(rig: Rig, _: Path) -> Sequence[Step]:
+        return drift_steps(rig, calibrated, longest_exposure_s=_longest_s(checked))
+
+    run = session.run(checked, steps, name="drift", reporter=reporter, cancel=cancel)
+    content = read_drift_figures(run)
+    for sentence in content["sentences"]:
+        reporter.say(sentence, Level.INFO if content["advice"] == "nothing" else Level.WARNING)
+    with Journal(run) as journal:
+        content["seconds"] = journal.steps()[StepId(StepKind.DRIFT_PHOTOGRAPHS)]
+    return {"run": str(run), **(content if details else {"advice": content["advice"]})}
+
+
+def recalibrate(
+    *,
+    session: StageSession,
+    reporter: Reporter,
+    cancel: threading.Event,
+    accept_grade: bool = False,
+    projector: str | None = None,
+) -> Mapping[str, Any]:
+    """Bring the last calibration up to date, repeating only what has changed; goes on with an unfinished one.
+
+    ``projector``: all of that one is measured anew, whatever has changed, and nothing of the others but one photograph
+    each for the grade.
+    Raises UsageError("not-calibrated", "projector-unknown"), CalibrationError("projector-dark"),
+    CalibrationError("calibration-below-grade") for a result that may not replace the last calibration, and what the
+    devices raise.
+    """
+    checked = check_stage(session.stage)
+    check_name(checked, projector)
+    last = finished_calibration(checked.stage.folder)
+    calibrated = Calibrated(last, checked.names)
+
+    def steps(rig: Rig, run: Path) -> Sequence[Step]:
+        longest_s = _longest_s(checked)
+        mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
+        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+                *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
+        repeated = (
+            quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)
+            if projector is None
+            else one_projector_steps(rig, run, calibrated, full, projector, longest_exposure_s=longest_s)
+        )
+        return [
+            marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
+            *repeated,
+            *dark_after(rig.darkness, rig.display),
+            _take_over_step(worst_grade(checked), reporter, accept_grade=accept_grade),
+            marker("recalibrated", "Recalibrated", leave=Event.CALIBRATED),
+        ]
+
+    name = "recalibrate" if projector is None else "projector"
+    run = session.run(checked, steps, name=name, reporter=reporter, cancel=cancel, dark=True)
+    compare_with_last(run, last, reporter)
+    if not passes(run, worst_grade(checked)):
+        raise below_grade(run, worst_grade(checked))
+    with Journal(run) as journal:
+        seconds = sum(value for step, value in journal.steps().items() if step.kind in CHECKS)
+        shots = journal.shot_count()
+    advice = "projector" if projector is not None else read_drift_figures(run)["advice"]
+    return {"run": str(run), **grade_figures(run), "advice": advice, "photographs": shots,
+            "check_and_grade_seconds": seconds}  # fmt: skip
+
+
+def check_name(checked: Checked, projector: str | None) -> None:
+    """Raises UsageError("projector-unknown"), before a lamp is struck."""
+    if projector is not None and projector not in checked.names:
+        raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
+                         remedy=f"It is one of {', '.join(checked.names)}.")  # fmt: skip
+
+
+def _take_over_step(worst: float, reporter: Reporter, *, accept_grade: bool) -> Step:
+    """Only a result that passes the gate counts as a finished calibration, and takes the last one's place."""
+
+    def run(context: Context) -> Sequence[Path]:
+        if accept_grade:
+            accept(context.folder, reporter, worst)
+        if passes(context.folder, worst):
+            context.journal.complete(CALIBRATED, {}, (), began_at_s=time.time())
+        return ()
+
+    return Step(StepId("take-over"), run, title="Comparing the grade with what is asked", weight=0.01, always=True)
+
+
+def _longest_s(checked: Checked) -> float:
+    return checked.stage.tables.capture.longest_exposure_s

@@ -1,0 +1,193 @@
+"""Compensation images by a global, bounded, smooth least-squares solve (paper 2.2-2.4, eqs 2 and 3).
+
+Minimise  sum_u w_u |T p + K - C|^2  +  s sum over adjacent pixels of alpha^2 (p_i - p_j)^2   subject to 0 <= p <= 1
+by accelerated projected gradient, one projector after the other (``descent``, docs/decisions/0022, 0025). T is (nearly)
+non-negative, so the row sums |T_n|' w |T_n| 1 majorise the data part of the Hessian of projector n, and give every one
+of its pixels a step of its own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from controller.core.arrays import FloatImage
+from controller.core.errors import UsageError
+from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.solve.bounded.gradient import add_smoothness, inner, weighted_residual
+from controller.solve.bounded.initial_estimate import initial_estimate
+from controller.solve.bounded.problem import Problem
+from controller.solve.bounded.smoothness import squared_edge_weights
+from controller.transport import LightTransport
+from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
+
+SMOOTHNESS: Final = 0.001
+"""Default strength of smoothness, relative to the mean diagonal of the data's majoriser. On a disturbed synthetic stage
+the edges kept (eq. 9) peak between 0.003 and 0.01; colour noise falls up to 0.03, at the cost of detail."""
+TOLERANCE: Final = 3e-5
+"""Default KKT residual: the objective is within about 1e-3 of its limit there, within 1e-2 at 3e-4."""
+MOST_ITERATIONS: Final = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """What a solve found.
+
+    ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
+    ``light`` (camera rows, columns, 3) float32: T p, what the frames add to the black image
+    ``objective``: weighted squared residual plus smoothness, in camera units squared
+    ``kkt``: rms of the last projected, scaled gradient step, in units of projector light; 0 at the optimum
+    ``converged``: the KKT residual fell below the tolerance before the cap on iterations
+    """
+
+    frames: tuple[FloatImage, ...]
+    light: FloatImage
+    objective: float
+    kkt: float
+    iterations: int
+    seconds: float
+    converged: bool
+
+
+def check_target(transport: LightTransport, target: FloatImage) -> None:
+    """Raise UsageError "image-wrong-size" or "target-not-finite" unless ``target`` can be a camera image here."""
+    if target.shape != (*transport.camera_shape, 3):
+        raise UsageError(
+            "image-wrong-size",
+            what=f"The target is {' x '.join(map(str, target.shape))} instead of {transport.camera_shape[0]} x "
+            f"{transport.camera_shape[1]} x 3.",
+            remedy="Make the target as large as this stage's camera image.",
+        )
+    if not np.isfinite(target).all():
+        raise UsageError(
+            "target-not-finite",
+            what="The target has pixels that are not finite numbers.",
+            remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
+        )
+
+
+def solve_bounded(
+    transport: LightTransport,
+    target: FloatImage,
+    black: FloatImage,
+    *,
+    smoothness: float = SMOOTHNESS,
+    weights: FloatImage | None = None,
+    start: Sequence[FloatImage] | None = None,
+    tolerance: float = TOLERANCE,
+    most_iterations: int = MOST_ITERATIONS,
+    progress: Callable[[int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Solution:
+    """Find the projectors' images that make the camera see ``target``.
+
+    Parameters
+    ----------
+    target, black : (rows, columns, 3) linear camera units; the target is raised to ``black`` where it is darker
+    smoothness : >= 0, relative to the mean of the data's majorising diagonal
+    weights : (rows, columns) >= 0, how much each camera pixel counts; default 1 everywhere
+    start : frames to start from, for example those of a similar target
+    tolerance : stop when the rms scaled projected gradient step falls below it
+    progress : called with (iteration, kkt); ``cancelled`` : asked once an iteration
+
+    Raises
+    ------
+    UsageError  "image-wrong-size", "target-not-finite", "solve-arguments"
+    WorkError   "solve-cancelled"
+    """
+    began = time.perf_counter()
+    check_target(transport, target)
+    problem = build_problem(transport, target, black, smoothness, weights)
+    if start is None:
+        x = initial_point(problem)
+    else:
+        x = np.clip(frame_planes(start), 0, 1)
+        if x.shape != problem.majoriser.shape:
+            raise _wrong("the frames to start from are not of the projectors' sizes")
+    x[problem.majoriser == 0] = 0
+    x, kkt, iterations = block_coordinate_descent(
+        problem, x, IterationControl(tolerance, most_iterations, progress, cancelled)
+    )
+    light = transport.forward_planes(x)
+    objective = weighted_residual(light, problem.target, problem.weights, np.empty_like(light)) + smoothness_term(
+        problem, x
+    )
+    frames = tuple(plane_frames(x, transport.sizes))
+    seconds = time.perf_counter() - began
+    return Solution(frames, plane_image(light), objective, kkt, iterations, seconds, kkt <= tolerance)
+
+
+def _wrong(what: str) -> UsageError:
+    return UsageError("solve-arguments", what=f"The solve can't start: {what}.", remedy="Correct it and solve again.")
+
+
+def build_problem(
+    transport: LightTransport, target: FloatImage, black: FloatImage, smoothness: float, weights: FloatImage | None
+) -> Problem:
+    """The equations of a solve, checked; the parameters are those of ``solve_bounded``."""
+    if black.shape != target.shape or not np.isfinite(black).all():
+        raise _wrong("the black image is not finite or not of the target's size")
+    if not 0 <= smoothness < np.inf:
+        raise _wrong(f"a smoothness of {smoothness} is not a number of at least 0")
+    counted = transport.object_mask.astype(np.float32)
+    if weights is not None:
+        if weights.shape != counted.shape or not np.isfinite(weights).all() or weights.min(initial=0) < 0:
+            raise _wrong("the weights are not finite numbers of at least 0, one a camera pixel")
+        counted *= weights
+    return build_problem_from_planes(transport, image_planes(np.maximum(target - black, 0)), counted, smoothness)
+
+
+def build_problem_from_planes(
+    transport: LightTransport, target: FloatImage, counted: FloatImage, smoothness: float
+) -> Problem:
+    """The equations for planes ``target`` (3, rows, columns) and weights (rows, columns) that are 0 off the object."""
+    diagonal, scale = _majoriser(transport, counted)
+    across, down = squared_edge_weights(transport, target)
+    data = diagonal.copy()
+    for n, (rows, columns) in enumerate(transport.sizes):
+        add_smoothness(data, across, down, smoothness * scale, transport.span(n).start, rows, columns, diagonal)
+    return Problem(transport, target, counted, across, down, diagonal)
+
+
+def _majoriser(transport: LightTransport, counted: FloatImage) -> tuple[FloatImage, float]:
+    """The data's part of each projector's own majoriser, and the mean diagonal of that of all together."""
+    magnitude = transport.with_absolute_mixing()
+    ones = np.ones((3, transport.pixels), np.float32)
+    diagonal = np.zeros_like(ones)
+    light, reach, zero = (transport.sensor_buffer() for _ in range(3))
+    weighted = np.empty_like(light)
+    for n in range(len(transport.sizes)):
+        light[:] = 0
+        magnitude.accumulate_forward(n, ones, light)
+        reach += light
+        magnitude.normal_residual(light, counted, zero, weighted)
+        magnitude.adjoint_of_buffer(n, weighted, diagonal)
+    magnitude.normal_residual(reach, counted, zero, weighted)
+    pixels = max(int(np.count_nonzero(diagonal > 0)), 1)
+    # 1' T' w T 1 is the sum of all row sums
+    return diagonal, inner(reach, weighted) / pixels
+
+
+def _frame_view(transport: LightTransport, n: int, planes: FloatImage) -> FloatImage:
+    return planes[:, transport.span(n)].reshape(3, *transport.sizes[n])
+
+
+def initial_point(problem: Problem) -> FloatImage:
+    """(3, pixels): the best frames for light that is smooth (``initial_estimate``); 0 where a pixel lights nothing."""
+    x = initial_estimate(problem.transport, problem.target)
+    x[problem.majoriser == 0] = 0
+    return x
+
+
+def smoothness_term(problem: Problem, x: FloatImage) -> float:
+    """What the smoothness equations add to the objective at ``x`` (3, pixels)."""
+    total = 0.0
+    for n in range(len(problem.transport.sizes)):
+        frame, across, down = (_frame_view(problem.transport, n, v) for v in (x, problem.across, problem.down))
+        total += float((across[:, :, :-1] * np.diff(frame, axis=2) ** 2).sum(dtype=np.float64))
+        total += float((down[:, :-1] * np.diff(frame, axis=1) ** 2).sum(dtype=np.float64))
+    return total

@@ -1,0 +1,61 @@
+"""How hard the projectors must be driven for a light: brightness and colour in reach at each camera pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from controller.core.arrays import FloatImage, Mask
+from controller.core.jit import compiled
+from controller.transport import LightTransport
+from controller.transport.planes import image_planes
+
+
+class DriveLevels:
+    """Turns light at a camera pixel into the colour that all projectors would show alike to make it.
+
+    At a pixel, B = sum over n of diag(W_n) M_n is the light of the three channels, all projectors together. A light is
+    surely within reach where B^-1 light lies in [0, 1]: brightness and the crosstalk of the colours in one. (Where the
+    primaries of the projectors differ, a little more can be reached by unequal frames.)
+    """
+
+    def __init__(self, transport: LightTransport) -> None:
+        self.mask: Mask = transport.object_mask
+        pixels = sum(rows * columns for rows, columns in transport.sizes)
+        ones = np.ones((3, pixels), np.float32)
+        self._light = np.zeros((3, 3, *transport.camera_shape), np.float32)
+        for n, mixing in enumerate(transport.mixing):
+            white = transport.forward_planes(ones, projectors=(n, n + 1))
+            for channel in range(3):
+                for colour in range(3):
+                    self._light[channel, colour] += mixing[channel, colour] * white[channel]
+
+    def of(self, light: FloatImage) -> FloatImage:
+        """(rows, columns, 3) float32 for a light of that shape, without the black image; 0 outside the object.
+
+        Infinite where the projectors' colours are not independent.
+        """
+        out = np.zeros((*self.mask.shape, 3), np.float32)
+        _solve(self._light, image_planes(light), self.mask, out)
+        return out
+
+
+@compiled(parallel=True)
+def _solve(B: FloatImage, light: FloatImage, mask: Mask, out: FloatImage) -> None:
+    """Cramer's rule at each pixel of ``mask``."""
+    rows, columns = mask.shape
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            a, b, c = B[0, 0, y, x], B[0, 1, y, x], B[0, 2, y, x]
+            d, e, f = B[1, 0, y, x], B[1, 1, y, x], B[1, 2, y, x]
+            g, h, i = B[2, 0, y, x], B[2, 1, y, x], B[2, 2, y, x]
+            r, s, t = light[0, y, x], light[1, y, x], light[2, y, x]
+            det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+            if det == 0.0:
+                out[y, x] = np.inf
+                continue
+            out[y, x, 0] = (r * (e * i - f * h) - b * (s * i - f * t) + c * (s * h - e * t)) / det
+            out[y, x, 1] = (a * (s * i - f * t) - r * (d * i - f * g) + c * (d * t - s * g)) / det
+            out[y, x, 2] = (a * (e * t - s * h) - b * (d * t - s * g) + r * (d * h - e * g)) / det

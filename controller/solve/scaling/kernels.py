@@ -1,0 +1,221 @@
+"""The loops of ``solve.scaling.interactive``.
+
+The scale image is kept flat, four floats a block (the fourth is 0 or of no account), with ``MARGIN`` blocks of zeros
+around it, so that no window ends outside.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from controller.bundle.live_maps import MOST_CORRELATION, MOST_RADIUS_PX, REACH, TILE
+from controller.core.arrays import ByteImage, FloatImage
+from controller.core.jit import compiled
+from controller.transport.simd.scaling import SIDE, STEPS, scale_of_four, scale_of_one, window_steps
+
+MARGIN: Final = SIDE
+LEVELS: Final = STEPS + 1
+
+_REACH, _RADIUS, _CORRELATION = np.float32(REACH), np.float32(MOST_RADIUS_PX), np.float32(MOST_CORRELATION)
+
+Used = npt.NDArray[np.int32]
+
+
+@compiled(parallel=True)
+def scale_twos(
+    picture: FloatImage, gain: FloatImage, offset: FloatImage, used: Used, columns: int, side: int, scale: FloatImage
+) -> bool:
+    """The scale of blocks of two by two pixels of a radiance of ``columns`` a row; whether what was used is finite."""
+    rows, wide = used.shape[0], columns // 2
+    good = np.ones(rows, np.bool_)
+    for y in prange(rows):
+        a, b = 6 * y * columns, 6 * y * columns + 3 * columns
+        into = (y + MARGIN) * side + MARGIN
+        total = np.float32(0)
+        for x in range(np.int64(used[y, 0]), np.int64(used[y, 1])):
+            light = scale_of_four(picture, a + 6 * x, b + 6 * x, gain, offset, y * wide + x, scale, into + x)
+            total += light * np.float32(0)
+        for x in range(np.int64(used[y, 0])):
+            k = 6 * x
+            for c in range(6):
+                total += (picture[a + k + c] + picture[b + k + c]) * np.float32(0)
+        for k in range(6 * np.int64(used[y, 1]), 3 * columns):
+            total += (picture[a + k] + picture[b + k]) * np.float32(0)
+        good[y] = total == 0
+    return bool(good.all())
+
+
+@compiled(parallel=True)
+def scale_plainly(
+    picture: FloatImage, block: int, gain: FloatImage, offset: FloatImage, used: Used, side: int, scale: FloatImage
+) -> bool:
+    """The scale of a radiance (rows, columns, 3) of the targets' size, in blocks; whether all is finite."""
+    rows, columns, _ = picture.shape
+    high, wide = -(-rows // block), -(-columns // block)
+    good = np.ones(high, np.bool_)
+    share = np.float32(1 / block**2)
+    for row in prange(high):
+        total = np.float32(0)
+        for x in range(wide):
+            k = 4 * ((row + MARGIN) * side + MARGIN + x)
+            for c in range(3):
+                found = np.float32(0)
+                for v in range(row * block, min((row + 1) * block, rows)):
+                    for u in range(x * block, min((x + 1) * block, columns)):
+                        i = 3 * (v * columns + u) + c
+                        total += picture[v, u, c] * np.float32(0)
+                        found += max(picture[v, u, c] * gain[i] - offset[i], np.float32(0))
+                scale[k + c] = found * share
+        good[row] = total == 0
+    return bool(good.all())
+
+
+@compiled(parallel=True)
+def _reduced(picture: FloatImage, factor: int, out: FloatImage) -> None:
+    """Means over blocks of ``factor`` pixels, the edge repeated."""
+    rows, columns, _ = picture.shape
+    share = np.float32(1 / factor**2)
+    for y in prange(out.shape[0]):
+        for x in range(out.shape[1]):
+            for c in range(3):
+                light = np.float32(0)
+                for j in range(factor):
+                    for i in range(factor):
+                        light += picture[min(y * factor + j, rows - 1), min(x * factor + i, columns - 1), c]
+                out[y, x, c] = light * share
+
+
+def scale_blocks(
+    picture: FloatImage,
+    factor: int,
+    block: int,
+    gain: FloatImage,
+    offset: FloatImage,
+    used: Used,
+    side: int,
+    scale: FloatImage,
+) -> bool:
+    """The same for a radiance that is ``factor`` times the targets' size."""
+    rows, columns, _ = picture.shape
+    small = np.empty((-(-rows // factor), -(-columns // factor), 3), np.float32)
+    _reduced(picture, factor, small)
+    return scale_plainly(small, block, gain, offset, used, side, scale)
+
+
+@compiled(parallel=True)
+def scale_picture(
+    picture: ByteImage,
+    light: FloatImage,
+    block: int,
+    gain: FloatImage,
+    offset: FloatImage,
+    used: Used,
+    side: int,
+    scale: FloatImage,
+) -> None:
+    """The scale of a picture (rows, columns, 3) of the targets' size; ``light`` (256,): radiance of its values."""
+    rows, columns, _ = picture.shape
+    high, wide = -(-rows // block), -(-columns // block)
+    share = np.float32(1 / block**2)
+    for row in prange(high):
+        into = (row + MARGIN) * side + MARGIN
+        if block == 1:
+            for x in range(np.int64(used[row, 0]), np.int64(used[row, 1])):
+                r, g, b = light[picture[row, x, 0]], light[picture[row, x, 1]], light[picture[row, x, 2]]
+                scale_of_one(r, g, b, gain, offset, row * columns + x, scale, into + x)
+            continue
+        for x in range(wide):
+            for c in range(3):
+                found = np.float32(0)
+                for v in range(row * block, min((row + 1) * block, rows)):
+                    for u in range(x * block, min((x + 1) * block, columns)):
+                        i = 3 * (v * columns + u) + c
+                        found += max(light[picture[v, u, c]] * gain[i] - offset[i], np.float32(0))
+                scale[4 * (into + x) + c] = found * share
+
+
+@compiled(parallel=True)
+def show(
+    scale: FloatImage,
+    side: int,
+    at: npt.NDArray[np.int32],
+    shares: ByteImage,
+    gain: FloatImage,
+    unmix: FloatImage,
+    levels: npt.NDArray[np.uint16],
+    noise: ByteImage,
+    columns: int,
+    out: ByteImage,
+) -> None:
+    """Each pixel's mean of the scale, times its base, unmixed, through the response, dithered. All arrays flat."""
+    for y in prange(at.size // columns):
+        tile = np.int64(y & (TILE - 1)) * (3 * TILE)
+        for x in range(columns):
+            # indices without a sign: numba looks at the others, whether they count from the end
+            i, k = np.uint64(y * columns + x), np.uint64(tile + 3 * (x & (TILE - 1)))
+            first = np.int64(at[i])
+            r = g = b = np.int64(0)
+            if first >= 0:
+                r, g, b = window_steps(scale, first, side, shares, np.int64(i), gain, unmix)
+            j, bits = np.uint64(3) * i, np.uint32(8)
+            green, blue = np.uint64(g) + np.uint64(LEVELS), np.uint64(b) + np.uint64(2 * LEVELS)
+            out[j] = (np.uint32(levels[np.uint64(r)]) + np.uint32(noise[k])) >> bits
+            out[j + np.uint64(1)] = (np.uint32(levels[green]) + np.uint32(noise[k + np.uint64(1)])) >> bits
+            out[j + np.uint64(2)] = (np.uint32(levels[blue]) + np.uint32(noise[k + np.uint64(2)])) >> bits
+
+
+@compiled(parallel=True)
+def shares_of(
+    centre: FloatImage,
+    shape: ByteImage,
+    sigmas: FloatImage,
+    block: int,
+    size: tuple[int, int],
+    side: int,
+    at: npt.NDArray[np.int32],
+    shares: ByteImage,
+) -> None:
+    """Each pixel's Gaussian (``bundle.live_maps``) by blocks: the window's first block, and sixteen shares of 255."""
+    height, width = size
+    for i in prange(at.size):
+        at[i] = -1
+        if shape[i, 0] == 0:
+            continue
+        x, y = centre[i, 0], centre[i, 1]
+        sx, sy = sigmas[shape[i, 0]], sigmas[shape[i, 1]]
+        r = min(max((np.float32(shape[i, 2]) - np.float32(128)) / np.float32(127), -_CORRELATION), _CORRELATION)
+        left = int(np.floor((x + np.float32(0.5)) / block - np.float32(0.5))) - (SIDE // 2 - 1)
+        top = int(np.floor((y + np.float32(0.5)) / block - np.float32(0.5))) - (SIDE // 2 - 1)
+        reach_x = min(max(_REACH * sx, np.float32(0.5)), _RADIUS)
+        reach_y = min(max(_REACH * sy, np.float32(0.5)), _RADIUS)
+        found = np.zeros(SIDE * SIDE, np.float32)
+        for v in range(max(top * block, 0), min((top + SIDE) * block, height)):
+            for u in range(max(left * block, 0), min((left + SIDE) * block, width)):
+                dx, dy = (u - x), (v - y)
+                if abs(dx) > reach_x or abs(dy) > reach_y:
+                    continue
+                dx, dy = dx / sx, dy / sy
+                share = np.exp(-0.5 * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r))
+                found[(v // block - top) * SIDE + u // block - left] += share
+        most = found.max()
+        if most > 0:
+            at[i] = (top + MARGIN) * side + left + MARGIN
+            for k in range(SIDE * SIDE):
+                shares[i, k] = np.uint8(np.float32(255) * found[k] / most + np.float32(0.5))
+
+
+@compiled(parallel=True)
+def sums_of(present: FloatImage, side: int, at: npt.NDArray[np.int32], shares: ByteImage, out: FloatImage) -> None:
+    """Each pixel's sum of its shares times ``present``, a number a block."""
+    for i in prange(at.size):
+        if at[i] < 0:
+            continue
+        total = np.float32(0)
+        for row in range(SIDE):
+            for k in range(SIDE):
+                total += np.float32(shares[i, row * SIDE + k]) * present[at[i] + row * side + k]
+        out[i] = total

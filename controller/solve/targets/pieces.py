@@ -1,0 +1,41 @@
+"""Objects that stand apart in the camera's image, so that each gets a target of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage
+
+from controller.core.arrays import FloatImage, Mask
+from controller.solve.targets.values import Target
+
+LEAST_SHARE = 0.04
+"""A part smaller than this share of the whole is not an object of its own, but belongs to the nearest one."""
+
+
+def pieces(mask: Mask) -> list[Mask]:
+    """Split ``mask`` (rows, columns) into objects that do not touch in the image, the largest first.
+
+    Slivers and islands (shadows cut them off) go to the nearest object. The masks are disjoint and cover ``mask``.
+    """
+    labels, count = ndimage.label(mask, structure=np.ones((3, 3)))
+    if count == 0:
+        return []
+    sizes = np.bincount(labels.ravel())[1:]
+    order = np.argsort(-sizes, kind="stable") + 1
+    large = [int(label) for label in order if sizes[label - 1] >= LEAST_SHARE * mask.sum()] or [int(order[0])]
+    nearest = ndimage.distance_transform_edt(~np.isin(labels, large), return_distances=False, return_indices=True)
+    owner = labels[tuple(nearest)]
+    return [mask & (owner == label) for label in large]
+
+
+def on_each(mask: Mask, make: Callable[[Mask], Target]) -> Target:
+    """The targets that ``make`` gives for each object of ``mask``, side by side in one."""
+    image: FloatImage = np.zeros((*mask.shape, 3), np.float32)
+    said: Mask = np.zeros(mask.shape, np.bool_)
+    for piece in pieces(mask):
+        part = make(piece)
+        image[piece] = part.image[piece]
+        said |= part.mask & piece
+    return Target(image, said)

@@ -1,0 +1,44 @@
+"""What every run on a stage shares: the stage's lock, its folder among the runs, marker steps."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+
+from controller.core.storage import exclusive
+from controller.run.journal import Journal
+from controller.run.runner import Step
+from controller.run.state_machine import Event
+from controller.run.step_id import StepId
+
+LONGEST_RUN_S = 12 * 3600.0
+LOCK = "run/lock"
+"""Held by whoever works on the stage."""
+
+
+def marker(kind: str, title: str, *, enter: Event | None = None, leave: Event | None = None) -> Step:
+    """A step that only moves the state machine; never skipped, so that a resumed run is in the right state too."""
+    return Step(StepId(kind), lambda _: (), title=title, weight=0.01, enter=enter, leave=leave, always=True)
+
+
+def stage_lock(folder: Path) -> contextlib.AbstractContextManager[None]:
+    """The lock of whoever works on the stage. Raises UsageError("already-running")."""
+    return exclusive(folder / LOCK, what_is_running="Velatura")
+
+
+def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:
+    """The newest run folder of ``name`` whose work was begun and not finished, or a new one, not yet made.
+
+    ``finished``: the newest one, finished or not. For the holder of the stage's lock.
+    """
+    runs = stage / "runs"
+    for folder in sorted(runs.glob(f"*-{name}"), reverse=True):
+        if (folder / Journal.FILE).exists():
+            with Journal(folder) as journal:
+                outcomes = journal.outcomes()
+            if finished or not outcomes or outcomes[-1][1] != "done":
+                return folder
+            break
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    return runs / f"{stamp}-{name}"

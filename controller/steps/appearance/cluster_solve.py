@@ -1,0 +1,64 @@
+"""A run's appearances made on other machines, each still a step of its own."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+
+from controller.artefacts.calibrated import Calibrated
+from controller.cluster.appearances import SpreadAppearances
+from controller.cluster.connect import Cluster, connected
+from controller.cluster.tasks import StageData
+from controller.run.runner import Context
+from controller.solve.request import AppearanceResult, SolveOptions
+from controller.steps.appearance.solving import Answering, Wish
+
+
+class Spreading:
+    """Answers like ``steps.appearance.solving`` does: the first question sends those that come after it along.
+
+    Wishes with a step before their solving (Blender's) are sent when it is their turn.
+    """
+
+    def __init__(self, cluster: Cluster, calibrated: Calibrated, wishes: Sequence[Wish]) -> None:
+        self._cluster, self._calibrated, self._wishes = cluster, calibrated, tuple(wishes)
+        self._spread: SpreadAppearances | None = None
+
+    def __call__(self, wish: Wish, options: SolveOptions, context: Context) -> AppearanceResult:
+        """The answer to one wish."""
+        context.advance(0.0, f"{self._cluster.workers} workers")
+        spread = self._spread or self._opened()
+        names = [one.name for one in self._wishes]
+        for other in self._wishes[names.index(wish.name) :]:
+            if other.name == wish.name or other.prepare is None:
+                context.check()
+                spread.begin(other.name, other.target(), options)
+        return spread.answer(wish.name, context.check)
+
+    def _opened(self) -> SpreadAppearances:
+        base, calibration = self._calibrated.base, self._calibrated.calibration
+        stage = StageData(self._calibrated.transport, base.image, base.solution, calibration.black)
+        self._spread = SpreadAppearances(self._cluster, stage)
+        return self._spread
+
+    def cancel(self) -> None:
+        """Let go of what is still under way."""
+        if self._spread is not None:
+            self._spread.cancel()
+
+
+@contextlib.contextmanager
+def answering_on(scheduler: str | None, calibrated: Calibrated, wishes: Sequence[Wish]) -> Iterator[Answering | None]:
+    """What makes the appearances on the cluster behind ``scheduler``; None, and nothing is connected, without one.
+
+    Raises what ``cluster.connect.connected`` raises.
+    """
+    if scheduler is None:
+        yield None
+        return
+    with connected(scheduler) as cluster:
+        spreading = Spreading(cluster, calibrated, wishes)
+        try:
+            yield spreading
+        finally:
+            spreading.cancel()

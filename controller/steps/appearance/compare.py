@@ -1,0 +1,99 @@
+"""The steps that show what is installed, photograph it, and compare each photograph with its stored target."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.camera import inherit_camera
+from controller.artefacts.comparison import Compared, ComparedImages, write_compared
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.solved import Solved, read_solved, solved_figures_path
+from controller.core.arrays import Mask
+from controller.core.storage import sha256_of
+from controller.rig.rig import Rig
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.solve.metrics import compare, sharpness_windows
+from controller.steps import costs
+from controller.steps.appearance.publishing import PLAYED, bundle_display, photograph_hdr
+
+WINDOWS: Final = 48
+"""Windows of the resolution map along the camera picture's longer side."""
+LEAST_WINDOW_PX: Final = 16
+
+
+def compare_steps(
+    rig: Rig, calibrated: Calibrated, names: Sequence[str], *, bundle: str, longest_exposure_s: float
+) -> list[Step]:
+    """A step for each appearance, which leaves ``compared-NAME.npz`` and ``.json`` (``artefacts.comparison``).
+
+    ``bundle``: what identifies the installed bundle; the appearances were solved on ``calibrated``. What was
+    photographed on another day is not gone on with: the figures are those of the day on which they are asked for.
+    """
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    inputs = {"bundle": bundle, "calibration": calibrated.folder.name, "day": time.strftime("%Y-%m-%d"),
+              "longest_exposure_s": repr(longest_exposure_s)}  # fmt: skip
+    return [
+        Step(
+            StepId(StepKind.COMPARE, item=name),
+            partial(_compare, rig, calibrated, name, (bundle, longest_exposure_s)),
+            inputs=inputs | {"target": sha256_of(solved_figures_path(calibrated.folder, name))},
+            title=f"Photographing {name}",
+            weight=3 * costs.shot_s(scale) + costs.VERIFY_S * scale,
+        )
+        for name in names
+    ]
+
+
+def compared_mask(calibrated: Calibrated, solved: Solved) -> Mask:
+    """Where photograph and target are compared, (rows, columns): on the object, where the target can be reached."""
+    return solved.reachable & calibrated.calibration.object_mask
+
+
+def window_px(shape: tuple[int, ...]) -> int:
+    """The side of the resolution map's windows for a camera picture of this shape."""
+    return max(LEAST_WINDOW_PX, round(max(shape[:2]) / WINDOWS))
+
+
+def _compare(
+    rig: Rig, calibrated: Calibrated, name: str, settings: tuple[str, float], context: Context
+) -> Sequence[Path]:
+    bundle, longest_s = settings
+    inherit_camera(calibrated.folder, context.folder)
+    solved = read_solved(calibrated.folder, name, calibrated.projectors)
+    display = bundle_display(rig)
+    display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
+    shown = display.play(name, deadline=context.deadline.within(20))
+    # The day is of the photograph's settings as well: yesterday's are not taken for today's.
+    of = {"bundle": bundle, "appearance": name, "day": time.strftime("%Y-%m-%d")}
+    photographed_s = time.time()
+    picture = photograph_hdr(rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of)
+    context.advance(0.7, "comparing with the target")
+    mask, size_px = compared_mask(calibrated, solved), window_px(picture.shape)
+    found = compare(picture, solved.target, calibrated.calibration.camera_to_xyz, solved.exposure, mask)
+    local, _ = sharpness_windows(picture, solved.target, solved.exposure, mask, size_px)
+    one = Compared(
+        run=context.folder.name,
+        name=name,
+        title=str(solved.figures.get("title", name)),
+        calibration=calibrated.folder.name,
+        photographed_unix_s=photographed_s,
+        delta_e00_median=found.delta_e00_median,
+        delta_e00_p95=found.delta_e00_p95,
+        rmse=found.rmse,
+        sharpness_lambda=found.sharpness_lambda,
+        reachable_share=_number(solved.figures.get("reachable_share")),
+        window_px=size_px,
+    )
+    return write_compared(context.folder, one, ComparedImages(picture, found.error_map.astype(np.float16), local))
+
+
+def _number(value: object) -> float | None:
+    return None if value is None else float(str(value))

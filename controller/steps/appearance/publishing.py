@@ -1,0 +1,321 @@
+"""The steps from solved frames to a signed, installed bundle, and from there to photographs of what plays."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.photographs import Taken
+from controller.artefacts.published import BUNDLE, BundleFigures, write_photograph, write_playback
+from controller.artefacts.solved import is_solved, read_solved
+from controller.bundle.format import Index, PlaylistEntry
+from controller.bundle.install import current, install, revision_floor
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import ANY_SIGNER, Trust, load_signing_key, unsigned_warning
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.capture.brackets import merge_brackets
+from controller.config import load_stage
+from controller.config.loader import FILE
+from controller.core.arrays import FloatImage
+from controller.core.errors import BundleError, UsageError
+from controller.core.storage import sha256_of
+from controller.rig.rig import Rig
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Context, Step
+from controller.run.step_id import ShotId, StepId
+from controller.steps import costs
+from controller.steps.appearance.live_parts import live_arrays
+from controller.steps.appearance.thumbnails import Thumbnails
+from controller.steps.capture.patterns import bracket
+from controller.steps.capture.photographs import kept_if_lit, take_photograph
+from hal.deadline import Deadline
+from hal.interfaces import BundleDisplay
+
+PLAYED = "played"
+"""The kind of the photographs of appearances."""
+PHOTO_BRACKET = (0.7, 5.0)
+"""Exposures of an appearance's photograph, relative to the one at which its target's white fills the scale."""
+PLAYBACK_RATE_HZ = 60.0
+METADATA = ("title", "mode", "exposure", "reachable_share", "fine_detail")
+"""Figures of the solving that a bundle tells; none of them differs between two solvings of the same."""
+SHOWN_MS = (15_000, 1_000)
+"""For how long the bundle's playlist suggests to show what stage.toml does not name, and to fade into it."""
+
+
+def bundle_display(rig: Rig) -> BundleDisplay:
+    """The rig's display as one that plays bundles. Raises UsageError("display-plays-no-bundles")."""
+    if not isinstance(rig.display, BundleDisplay):
+        raise UsageError(
+            "display-plays-no-bundles",
+            what="This stage's display driver shows pictures but plays no bundles.",
+            remedy='Use the driver "player" under [display] in stage.toml.',
+        )
+    return rig.display
+
+
+Outputs = Mapping[str, tuple[str, tuple[int, int]]]
+"""Output name and (width, height) by projector name."""
+
+
+def publish_step(
+    stage_folder: Path, outputs: Outputs, names: Sequence[str], *, stage: str, calibration: str, key: Path | None
+) -> Step:
+    """Write, sign and install the bundle of these appearances; its artefacts are the bundle and its figures.
+
+    The bundle holds what else is solved on the calibration, too: see ``kept_names``. Publishing is cheap, and what it
+    holds depends on more than its own steps, so it is done in every run; nothing new gives the same bytes.
+
+    ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle.
+    """
+    return Step(
+        StepId(StepKind.PUBLISH),
+        partial(_publish, stage_folder, dict(outputs), tuple(names), (stage, calibration), key),
+        inputs={"names": " ".join(names), "key": "" if key is None else sha256_of(key)},
+        after=tuple(StepId(StepKind.APPEARANCE, item=name) for name in names),
+        title="Publishing the signed bundle",
+        weight=1,
+        always=True,
+    )
+
+
+def _publish(
+    folder: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    identity: tuple[str, str],
+    key: Path | None,
+    context: Context,
+) -> Sequence[Path]:
+    built, slots = context.folder / BUNDLE, folder / "bundles"
+    names = kept_names(folder, context.folder, names)
+    _tell_dropped(slots, names, context.reporter)
+    trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
+    if (warning := unsigned_warning(trusted[0] if trusted else None, Trust(trusted, not trusted))) is not None:
+        context.reporter.say(f"{warning.what} {warning.remedy}", Level.WARNING)
+    index = publish_solved(
+        built, context.folder, outputs, names, stage=identity[0], calibration=identity[1], key=key, slots=slots,
+        live=_holds_live(slots), hints_ms=hints_ms(folder),
+    )  # fmt: skip
+    installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
+    raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
+    stored = sum(blob.length for one in index.appearances for blobs in one.stripes.values() for blob in blobs)
+    figures = BundleFigures(built.stat().st_size, raw / stored, installed.name, names)
+    return [figures.write(context.folder), built]
+
+
+def _tell_dropped(slots: Path, names: Sequence[str], reporter: Reporter) -> None:
+    """Say which appearances of the installed bundle the new one lacks, since they belong to another calibration."""
+    dropped = [one.name for index in _installed(slots) for one in index.appearances if one.name not in names]
+    if dropped:
+        several = len(dropped) > 1
+        reporter.say(
+            f"The bundle no longer holds {', '.join(dropped)}: {'they were' if several else 'it was'} made for an"
+            f" earlier calibration. `velatura appearance STAGE` makes {'them' if several else 'it'} again.",
+            Level.WARNING,
+        )
+
+
+def kept_names(stage_folder: Path, run: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """``names``, and what else the folder ``run`` holds solved that stage.toml or the installed bundle names.
+
+    In stage.toml's order, then as installed, then as given. What was solved on another calibration is not kept: its
+    frames are for other light.
+    """
+    listed = []
+    if (stage_folder / FILE).exists():
+        listed += [table.name for table in load_stage(stage_folder).tables.appearances]
+    listed += [appearance.name for index in _installed(stage_folder / "bundles") for appearance in index.appearances]
+    solved = [name for name in listed if name in names or is_solved(run, name)]
+    return tuple(dict.fromkeys([*solved, *names]))
+
+
+def hints_ms(stage_folder: Path) -> dict[str, tuple[int, int]]:
+    """(shown, fade) in milliseconds of each appearance of the stage.toml in this folder; empty if there is none."""
+    if not (stage_folder / FILE).exists():
+        return {}
+    return {table.name: table.hint_ms for table in load_stage(stage_folder).tables.appearances}
+
+
+def _installed(slots: Path) -> list[Index]:
+    """What the current bundle of the folder ``slots`` holds; empty where there is none that can be read."""
+    file = current(slots)
+    with contextlib.suppress(BundleError):
+        if file is not None:
+            with Bundle.open_trusted(file, ANY_SIGNER) as bundle:
+                return [bundle.index]
+    return []
+
+
+def _holds_live(slots: Path) -> bool:
+    return any(index.live is not None for index in _installed(slots))
+
+
+def publish_solved(
+    path: Path,
+    run: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    *,
+    stage: str,
+    calibration: str,
+    key: Path | None,
+    slots: Path,
+    trust: Trust = ANY_SIGNER,
+    live: bool = False,
+    hints_ms: Mapping[str, tuple[int, int]] | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> Index:
+    """Write the appearances that the folder ``run`` holds solved as a bundle at ``path``, signed with the key file.
+
+    Where the folder ``slots`` has the same bundle installed, the file is that one, byte for byte. Else its revision is
+    one more than those installed bundles that ``trust`` lets pass. ``live``: with what the live mode needs.
+    ``hints_ms``: (shown, fade) by name for the playlist that the bundle suggests, else ``SHOWN_MS``.
+    ``check`` is called before each appearance, to stop the work by raising.
+    Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then as it was, or sound.
+    """
+    thumbnails = Thumbnails(run, tuple(outputs))
+
+    def appearance(name: str) -> NewAppearance:
+        check()
+        solved = read_solved(run, name, tuple(outputs))
+        frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
+        metadata = {key: solved.figures[key] for key in METADATA if key in solved.figures}
+        return NewAppearance(name, frames, thumbnails.of(name), metadata)
+
+    arrays = live_arrays(run, outputs) if live else None
+
+    def write(revision: int) -> Index:
+        return write_bundle(
+            path,
+            stage=stage,
+            calibration=calibration,
+            created_unix_s=created_unix_s(run),
+            outputs=[(output, *size) for output, size in outputs.values()],
+            appearances=(appearance(name) for name in names),
+            key=None if key is None else load_signing_key(key),
+            revision=revision,
+            schedule=[PlaylistEntry(name, *(hints_ms or {}).get(name, SHOWN_MS)) for name in names],
+            live=arrays,
+        )
+
+    floor = revision_floor(slots, trust)
+    if floor >= 0:
+        index = write(floor)
+        if (slots / f"{sha256_of(path)}.vel").exists():
+            return index
+    return write(floor + 1)
+
+
+def created_unix_s(run: Path) -> int:
+    """When the calibration in the folder ``run`` was begun, so that publishing again gives the same bytes.
+
+    The environment's SOURCE_DATE_EPOCH goes before it; 0 where neither tells.
+    """
+    given = os.environ.get("SOURCE_DATE_EPOCH", "")
+    if given.isascii() and given.isdigit() and int(given) <= 2**53:
+        return int(given)
+    try:
+        return max(0, int(time.mktime(time.strptime(run.name[:15], "%Y%m%d-%H%M%S"))))
+    except (ValueError, OverflowError):
+        return 0
+
+
+def photograph_step(rig: Rig, names: Sequence[str], *, longest_exposure_s: float) -> Step:
+    """Play each appearance of the installed bundle and photograph it in HDR."""
+    return Step(
+        StepId(StepKind.PHOTOGRAPH),
+        partial(_photograph, rig, tuple(names), longest_exposure_s),
+        after=(StepId(StepKind.PUBLISH),),
+        title="Photographing what plays",
+        weight=photographs_s(rig, names),
+    )
+
+
+def photographs_s(rig: Rig, names: Sequence[str]) -> float:
+    """What showing and photographing these appearances costs (``steps.costs``)."""
+    return 3 * len(names) * costs.shot_s(costs.scale(projector.size_px for projector in rig.projectors))
+
+
+def _photograph(rig: Rig, names: Sequence[str], longest_s: float, context: Context) -> Sequence[Path]:
+    display = bundle_display(rig)
+    bundle = display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
+    projectors = [projector.name for projector in rig.projectors]
+    paths = []
+    for number, name in enumerate(names):
+        context.advance(number / len(names), name)
+        exposure = read_solved(context.folder, name, projectors).exposure
+        shown = display.play(name, deadline=context.deadline.within(20))
+        of = {"bundle": bundle, "appearance": name}
+        picture = photograph_hdr(rig, context, PLAYED, name, exposure, longest_s, shown_at_s=shown.at_s, of=of)
+        paths.append(write_photograph(context.folder, StepKind.PHOTOGRAPH, name, picture))
+    return paths
+
+
+def photograph_hdr(
+    rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
+    of: Mapping[str, str],
+) -> FloatImage:  # fmt: skip
+    """Photograph what is shown now in HDR: (rows, columns, 3) float32, full scales per second.
+
+    ``kind`` and ``name`` identify the photographs, each of which has its number besides. ``white`` is the radiance of
+    the target's white; ``of`` names what is shown, for the journal.
+    """
+    _, merged = take_hdr(rig, context, kind, name, white, longest_s, shown_at_s=shown_at_s, of=of)
+    return np.asarray(np.nan_to_num(merged), np.float32)
+
+
+def take_hdr(
+    rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
+    of: Mapping[str, str],
+) -> tuple[list[Taken], FloatImage]:  # fmt: skip
+    """As ``photograph_hdr``: the photographs, and what they tell together, NaN where it is too bright for all."""
+    exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
+    with kept_if_lit(rig, context) as row:
+        for number, exposure_s in enumerate(exposures_s):
+            identity = ShotId(kind, f"{name}-{number}")
+            row.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
+    taken = row.taken
+    merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
+    return taken, merged
+
+
+def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:
+    """Swap the appearances as fast as a display does, and measure how evenly they come."""
+    return Step(
+        StepId(StepKind.PLAYBACK),
+        partial(_playback, rig, tuple(names), seconds),
+        title="Swapping appearances 60 times a second",
+        weight=seconds + 0.5,
+        always=True,
+    )
+
+
+def _playback(rig: Rig, names: Sequence[str], seconds: float, context: Context) -> Sequence[Path]:
+    display = bundle_display(rig)
+    deadline: Deadline = context.deadline.within(seconds + 60)
+    display.load_bundle(rig.stage / "bundles" / "current", deadline=deadline)
+    items = [(name, 1 / PLAYBACK_RATE_HZ) for name in names]
+    rounds = max(1, round(seconds * PLAYBACK_RATE_HZ / len(names)))
+    before = display.playing(deadline=deadline)
+    began = display.play_sequence(items, repeat=rounds, rate_hz=PLAYBACK_RATE_HZ, deadline=deadline)
+    while (now := display.playing(deadline=deadline)).running:
+        context.advance(min(0.99, (now.swaps - before.swaps) / (rounds * len(names))))
+        deadline.sleep(0.2)
+    display.stop(deadline=deadline)
+    swaps = now.swaps - before.swaps
+    figures = {
+        "swaps": swaps,
+        "swaps_per_s": (swaps - 1) / max(now.presented_at_s - began.at_s, 1e-9),
+        "interval_p50_ms": None if now.interval_p50_s is None else 1000 * now.interval_p50_s,
+        "interval_p99_ms": None if now.interval_p99_s is None else 1000 * now.interval_p99_s,
+        "late": now.late,
+        "rss_bytes": now.rss_bytes,
+    }
+    return [write_playback(context.folder, figures)]

@@ -1,0 +1,81 @@
+"""Appearances that Blender renders, as a step of a run: shown progress, stopped at once, not repeated on resuming."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.geometry import read_geometry
+from controller.artefacts.solved import read_target, render_folder, write_target
+from controller.blender.job import BUILTIN, RenderSettings, as_seen, write_job
+from controller.blender.run import find_blender, render
+from controller.core.errors import UsageError
+from controller.core.storage import sha256_of
+from controller.run.runner import Context
+from controller.solve.targets.files import read_picture
+from controller.solve.targets.values import Target
+from controller.steps.appearance.solving import Wish
+
+PREFIX: Final = "builtin:"
+RENDER_S: Final = 40.0
+"""At the small size on the reference machine."""
+
+
+def blender_wish(
+    name: str, calibrated: Calibrated, options: Mapping[str, Any], inputs: Mapping[str, str], *, folder: Path
+) -> Wish:
+    """A wish whose target is rendered from ``options``: ``scene``, ``builtin:NAME`` (the default is marble) or a .blend
+    file relative to ``folder``; ``samples`` and ``seed``.
+
+    Raises UsageError with code "blender-missing", "blender-scene-unknown" or "target-missing".
+    """
+    scene = str(options.get("scene", "builtin:marble"))
+    builtin, file = _scene(scene, folder)
+    blender = find_blender()
+    usual = RenderSettings()
+    settings = RenderSettings(int(options.get("samples", usual.samples)), int(options.get("seed", usual.seed)))
+    told = dict(inputs) if file is None else {**inputs, "file": sha256_of(file)}
+
+    def prepare(context: Context) -> Sequence[Path]:
+        work = render_folder(context.folder, name)
+        work.mkdir(exist_ok=True)
+        geometry, mask = read_geometry(calibrated.folder, calibrated.projectors), calibrated.transport.object_mask
+        write_job(
+            work, geometry, mask, calibrated.transport.reach(), builtin=builtin, scene_file=file, settings=settings
+        )
+        picture = render(blender, work, context.advance)
+        return [write_target(context.folder, name, as_seen(read_picture(picture), geometry.camera, mask))]
+
+    def target() -> Target:
+        return read_target(calibrated.folder, name)
+
+    return Wish(name, f"{name}, rendered by Blender", target, told, prepare, RENDER_S)
+
+
+def scene_wish(calibrated: Calibrated, scene: str, *, folder: Path) -> Wish:
+    """The wish of a scene given on the command line; ``builtin:marble`` is called marble, a file by its name."""
+    name = scene.removeprefix(PREFIX) if scene.startswith(PREFIX) else Path(scene).stem
+    return blender_wish(name, calibrated, {"scene": scene}, {"kind": "blender", "scene": scene}, folder=folder)
+
+
+def _scene(scene: str, folder: Path) -> tuple[str | None, Path | None]:
+    if scene.startswith(PREFIX):
+        builtin = scene.removeprefix(PREFIX)
+        if builtin not in BUILTIN:
+            raise UsageError(
+                "blender-scene-unknown",
+                what=f"There is no scene {scene!r}.",
+                remedy=f"Choose one of {', '.join(PREFIX + known for known in BUILTIN)}, or give a .blend file.",
+            )
+        return builtin, None
+    file = folder / os.fspath(scene)
+    if not file.is_file():
+        raise UsageError(
+            "target-missing",
+            what=f"The scene {file} is not there.",
+            remedy="Put it there, or correct `scene`; paths are relative to the stage's folder.",
+        )
+    return None, file

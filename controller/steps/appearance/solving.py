@@ -1,0 +1,181 @@
+"""The steps from a calibration to frames: transport, the base, and every appearance."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import get_args
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.solved import Solved, SolvedBase
+from controller.calibrate.values import Calibration
+from controller.capture.patterns import Pattern, PatternKind, plan_patterns
+from controller.core.arrays import ByteImage, FloatImage
+from controller.core.errors import UsageError
+from controller.run.progress import Level
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.solve.appearance import BaseChoice, base_image, solve_base
+from controller.solve.request import AppearanceResult, SolveOptions, solve_appearance
+from controller.solve.scaling.dither import to_device
+from controller.solve.targets.values import Target
+from controller.steps import costs
+
+BASE = StepId(StepKind.BASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """An appearance to be made: ``target`` gives its picture, reflectance-like, and where it says something.
+
+    ``inputs`` are the hashes of what the target is made from; ``prepare``, where there is one, is a step's work before
+    the solving, for targets that take long, and ``prepare_s`` what it costs.
+    """
+
+    name: str
+    title: str
+    target: Callable[[], Target]
+    inputs: dict[str, str]
+    prepare: Callable[[Context], Sequence[Path]] | None = None
+    prepare_s: float = 0.0
+
+
+def base_choice(name: str) -> BaseChoice:
+    """The base image that a person typed. Raises UsageError("base-unknown")."""
+    known: tuple[BaseChoice, ...] = get_args(BaseChoice)
+    for choice in known:
+        if choice == name:
+            return choice
+    raise UsageError(
+        "base-unknown", what=f"There is no base image called {name}.", remedy=f"Choose one of {', '.join(known)}."
+    )
+
+
+def solve_steps(
+    calibrated: Calibrated,
+    wishes: Sequence[Wish],
+    options: SolveOptions,
+    after: Sequence[StepId],
+    scale: float = 1.0,
+    *,
+    answering: Answering | None = None,
+) -> list[Step]:
+    """Solve the base, then each wish.
+
+    ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``steps.costs``; ``answering``
+    makes the appearances elsewhere.
+    """
+    steps = [
+        Step(
+            BASE,
+            partial(_solve_base, calibrated, options),
+            inputs=options.base_inputs(),
+            after=tuple(after),
+            title="Solving the base image",
+            weight=costs.BASE_S * scale,
+        ),
+    ]
+    for wish in wishes:
+        before = (*after, BASE)
+        if wish.prepare is not None:
+            rendered = StepId(StepKind.TARGET, item=wish.name)
+            steps.append(
+                Step(
+                    rendered,
+                    wish.prepare,
+                    inputs=wish.inputs,
+                    after=tuple(after),
+                    title=f"Rendering {wish.title}",
+                    weight=wish.prepare_s * scale,
+                )
+            )
+            before = (*before, rendered)
+        steps.append(
+            Step(
+                StepId(StepKind.APPEARANCE, item=wish.name),
+                partial(_solve_appearance, calibrated, wish, options, answering),
+                inputs={**options.inputs(), **wish.inputs},
+                after=before,
+                title=f"Solving {wish.title}",
+                weight=costs.APPEARANCE_S * scale,
+            )
+        )
+    return steps
+
+
+def random_pattern(size_px: tuple[int, int]) -> Pattern:
+    """The pattern on which a calibration is graded."""
+    return plan_patterns(size_px).of_kind(PatternKind.RANDOM)[0]
+
+
+def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context) -> Sequence[Path]:
+    black = calibrated.calibration.black
+    image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
+    base = solve_base(
+        calibrated.transport, image, black, smoothness=options.smoothness, progress=_watched(context)
+    )  # fmt: skip
+    calibrated.keep_base(base)
+    return SolvedBase(image, base.solution).write(context.folder, calibrated.projectors)
+
+
+def _watched(context: Context) -> Callable[[int, float], None]:
+    """Tells the run how far a solve is, whose end is not known; a stop takes hold in it."""
+
+    def progress(iteration: int, kkt: float) -> None:
+        context.advance(1 - 1 / (1 + iteration / 60), f"iteration {iteration}")
+
+    return progress
+
+
+Answering = Callable[[Wish, SolveOptions, Context], AppearanceResult]
+"""Makes an appearance, here or elsewhere."""
+
+
+def _answer_here(calibrated: Calibrated, wish: Wish, options: SolveOptions, context: Context) -> AppearanceResult:
+    return solve_appearance(
+        calibrated.transport,
+        calibrated.base,
+        calibrated.calibration.black,
+        wish.target(),
+        options,
+        drive=calibrated.drive,
+        progress=_watched(context),
+    )
+
+
+def _solve_appearance(
+    calibrated: Calibrated, wish: Wish, options: SolveOptions, answering: Answering | None, context: Context
+) -> Sequence[Path]:
+    began_s = time.perf_counter()
+    made = (answering or partial(_answer_here, calibrated))(wish, options, context)
+    if made.figures["advice"] is not None:
+        context.reporter.say(f"{wish.title}: {made.figures['advice']}", Level.WARNING)
+    figures: dict[str, object] = {
+        "name": wish.name,
+        "title": wish.title,
+        **made.figures,
+        "seconds_with_target": time.perf_counter() - began_s,
+    }
+    solved = Solved(
+        frames=device_frames(calibrated.calibration, made.frames),
+        linear=dict(zip(calibrated.projectors, made.frames, strict=True)),
+        target=made.target,
+        reachable=made.reachable,
+        figures=figures,
+    )
+    return solved.write(context.folder, wish.name)
+
+
+def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dict[str, ByteImage]:
+    """8-bit frames by projector name, dithered, each projector at another place of the dither's tile."""
+    return {
+        part.name: to_device(values, part.radiometry, phase=(17 * n, 29 * n))
+        for n, (part, values) in enumerate(zip(calibration.projectors, frames, strict=True))
+    }
+
+
+__all__ = ["SolveOptions", "Wish", "device_frames", "solve_steps"]

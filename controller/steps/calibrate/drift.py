@@ -1,0 +1,115 @@
+"""The steps of a drift check: N + 2 photographs, compared with what the calibration predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.camera import inherit_camera
+from controller.artefacts.drift import write_drift
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.photographs import DRIFT as TAKEN
+from controller.artefacts.photographs import PATTERN as PATTERN_NAME
+from controller.calibrate.verify.drift import DriftPhotographs, find_drift
+from controller.capture.patterns import Pattern, PatternKind, device_frame, frame
+from controller.core.arrays import ByteImage, FloatImage
+from controller.rig.rig import Rig
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+from controller.steps.capture.patterns import bracket
+from controller.steps.capture.photographs import Planned, take_all
+
+PATTERN = Pattern("drift", PatternKind.RANDOM, seed=17)
+"""Not the one on which a calibration is graded."""
+FULL_SHARE = 0.7
+"""Of full scale, for the brightest places: room for light that came in since."""
+BLACK_TIMES = 8.0
+"""The black photograph's exposure over that of white."""
+
+
+def drift_steps(rig: Rig, calibrated: Calibrated, *, longest_exposure_s: float) -> list[Step]:
+    """Photograph, then judge; the result is ``drift.json`` in the run's folder (``artefacts.drift``)."""
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    inputs = {"calibration": calibrated.folder.name, "longest_exposure_s": repr(longest_exposure_s)}
+    return [
+        Step(
+            StepId(StepKind.DRIFT_PHOTOGRAPHS),
+            partial(_photograph, rig, calibrated, longest_exposure_s),
+            inputs=inputs,
+            title="Photographing what may have changed",
+            weight=costs.shot_s(scale) * (len(rig.projectors) + 2),
+        ),
+        Step(
+            StepId(StepKind.DRIFT),
+            partial(_judge, calibrated),
+            inputs=inputs,
+            after=(StepId(StepKind.DRIFT_PHOTOGRAPHS),),
+            title="Comparing with the calibration",
+            weight=costs.VERIFY_S * scale * 3,
+        ),
+    ]
+
+
+def exposure_for(light: FloatImage, available_s: Sequence[float], longest_s: float) -> float:
+    """The longest exposure that keeps an expected picture (full scales per second) below full scale."""
+    brightest = float(np.percentile(light.max(axis=2), 99.9))
+    wanted_s = FULL_SHARE / max(brightest, 1e-9)
+    usable = [value for value in available_s if value <= min(wanted_s, longest_s)]
+    return max(usable, default=min(available_s))
+
+
+def shown_frames(calibrated: Calibrated, pattern: Pattern) -> dict[str, ByteImage]:
+    """``pattern`` on each projector, in device values, by its measured response."""
+    found = {}
+    for part in calibrated.calibration.projectors:
+        rows, columns = part.metapixels.valid.shape
+        found[part.name] = device_frame(pattern, (columns, rows), part.radiometry.response)
+    return found
+
+
+def _photograph(rig: Rig, calibrated: Calibrated, longest_s: float, context: Context) -> Sequence[Path]:
+    inherit_camera(calibrated.folder, context.folder)
+    calibration, available = calibrated.calibration, rig.acquirer.exposures_s()
+    frames = shown_frames(calibrated, PATTERN)
+    plan = []
+    for part in calibration.projectors:
+        exposure_s = exposure_for(part.white + calibration.black, available, longest_s)
+        shown = partial(_one, part.name, frames[part.name])
+        plan.append(Planned(PATTERN_NAME, shown, exposure_s, projector=part.name))
+    lit = sum((part.white for part in calibration.projectors), start=calibration.black)
+    white_s = exposure_for(lit, available, longest_s)
+    whites = {name: np.full_like(image, 255) for name, image in frames.items()}
+    plan.append(Planned("white", lambda: whites, white_s))
+    (black_s,) = bracket(white_s, (BLACK_TIMES,), available, longest_s)
+    plan.append(Planned("black", dict, black_s))
+    return take_all(rig, context, plan, into=TAKEN)
+
+
+def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
+    return {name: image}
+
+
+def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
+    calibration = calibrated.calibration
+    taken = TAKEN.read(context.folder)
+    alone = TAKEN.by_projector(context.folder)
+    together = {one.name: one for one in taken if one.projector is None}
+    seen = DriftPhotographs(
+        black=together["black"].per_second(),
+        white=together["white"].per_second(),
+        patterns={part.name: alone[part.name].per_second() for part in calibration.projectors},
+    )
+    context.advance(0.2)
+    drift = find_drift(calibrated.transport, calibration, linear_frames(calibrated, PATTERN), seen)
+    return [write_drift(context.folder, drift, calibration=calibrated.folder.name, photographs=len(taken))]
+
+
+def linear_frames(calibrated: Calibrated, pattern: Pattern) -> list[FloatImage]:
+    """What ``shown_frames`` sends out: (rows, columns, 3) linear light a projector."""
+    sizes = [part.metapixels.valid.shape for part in calibrated.calibration.projectors]
+    return [frame(pattern, (columns, rows)) for rows, columns in sizes]

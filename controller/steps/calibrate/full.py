@@ -1,0 +1,140 @@
+"""The steps from photographs to a calibration: radiometry, correspondences and metapixels, geometry, grade."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from controller.artefacts.calibration import merge_photographs, read_black, read_captures, read_correspondence
+from controller.artefacts.geometry import write_geometry
+from controller.artefacts.kinds import StepKind, of_projectors
+from controller.artefacts.photographs import Developed, light_of, white_bracket
+from controller.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
+from controller.calibrate.correspondence.decode import decode
+from controller.calibrate.geometry.self_calibration import reconstruct
+from controller.calibrate.geometry.values import CameraPrior
+from controller.calibrate.metapixels.from_phase import fit_pixels
+from controller.calibrate.photometry.radiometry import measure_radiometry
+from controller.capture.patterns import PatternPlan, plan_patterns
+from controller.capture.raw import CAMERA_BLUR_PX
+from controller.core.errors import CalibrationError
+from controller.rig.rig import Rig, RigProjector
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+from controller.steps.capture.camera import camera_step
+from controller.steps.capture.patterns import capture_steps, code_step
+
+
+def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float) -> list[Step]:
+    """Everything from the first photograph to metapixels and geometry."""
+    steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
+    steps.append(camera_step(rig))
+    names = [projector.name for projector in rig.projectors]
+    for projector in rig.projectors:
+        steps.append(_radiometry_step(projector))
+        steps.append(code_step(rig, projector))
+        steps.append(_pixels_step(projector))
+    steps.append(
+        Step(
+            StepId(StepKind.GEOMETRY),
+            lambda context: _reconstruct(rig, prior, context),
+            inputs={"prior": repr(prior)},
+            after=of_projectors(names, StepKind.PIXELS),
+            title="Reconstructing the object and the poses",
+            weight=costs.geometry_s(costs.scale(projector.size_px for projector in rig.projectors)),
+        )
+    )
+    return steps
+
+
+def _radiometry_step(projector: RigProjector) -> Step:
+    plan = plan_patterns(projector.size_px)
+    return Step(
+        StepId(StepKind.RADIOMETRY, projector.name),
+        lambda context: _radiometry(projector, plan, context),
+        after=(StepId(StepKind.BLACK), StepId(StepKind.LIGHT, projector.name), StepId(StepKind.CAMERA)),
+        title=f"Measuring the response of {projector.name}",
+        weight=costs.RADIOMETRY_S * costs.scale([projector.size_px]),
+    )
+
+
+def _pixels_step(projector: RigProjector) -> Step:
+    plan = plan_patterns(projector.size_px)
+    return Step(
+        StepId(StepKind.PIXELS, projector.name),
+        lambda context: _pixels(projector, plan, context),
+        after=(StepId(StepKind.BLACK), *of_projectors([projector.name], StepKind.RADIOMETRY, StepKind.CODES)),
+        title=f"Decoding {projector.name} and fitting its metapixels",
+        weight=costs.PIXELS_S * costs.scale([projector.size_px]),
+    )
+
+
+def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+    black = read_black(context.folder)
+    taken = light_of(projector.name).by_name(context.folder)
+    bracket = white_bracket(list(taken.values()))
+    white = merge_photographs(bracket)
+    context.advance(0.5)
+    captures = Developed(taken, {"black": black, "white": white})
+    radiometry, report = measure_radiometry(captures, plan)
+    matrix = bracket[0].read().camera_to_xyz
+    light = Light(
+        response=radiometry.response,
+        mixing=radiometry.mixing,
+        white=np.maximum(white - black, 0).astype(np.float32),
+        black=black,
+        camera_to_xyz=_SRGB_TO_XYZ if matrix is None else matrix,
+    )
+    figures = write_radiometry_figures(context.folder, projector.name, asdict(report))
+    return [light.write(context.folder, projector.name), figures]
+
+
+_SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+"""IEC 61966-2-1; for a camera that does not tell its own colours."""
+
+
+def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+    light = Light.read(context.folder, projector.name)
+    taken = read_captures(context.folder, projector.name)
+    captures = Developed(taken, {"black": light.black, "white": light.white + light.black})
+    correspondence = decode(captures, plan, camera_blur_px=float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5))
+    if not correspondence.valid.any():
+        raise CalibrationError(
+            "projector-reaches-nothing",
+            what=f"No pixel of projector {projector.name} was found on the object.",
+            remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
+        )
+    context.advance(0.4, "correspondences")
+    fitted = fit_pixels(captures, plan, correspondence)
+    metapixels = fitted.metapixels
+    pixels = Pixels(
+        projector_px=correspondence.projector_px,
+        modulation=correspondence.modulation,
+        seen=correspondence.valid,
+        centre_px=metapixels.centre_px,
+        covariance_px2=metapixels.covariance_px2,
+        valid=metapixels.valid,
+        shown_px=fitted.phase_map.projector_px,
+        spread_px2=fitted.phase_map.spread_px2,
+        mosaic=fitted.mosaic,
+    )
+    valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
+    figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen))
+    return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name)]
+
+
+def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Path]:
+    correspondences = [read_correspondence(context.folder, projector.name) for projector in rig.projectors]
+    rows, columns = correspondences[0].valid.shape
+    found = reconstruct(
+        correspondences,
+        (columns, rows),
+        [projector.size_px for projector in rig.projectors],
+        prior,
+        progress=lambda fraction: context.advance(fraction, "geometry"),
+    )
+    return write_geometry(context.folder, [projector.name for projector in rig.projectors], found)

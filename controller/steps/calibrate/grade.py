@@ -1,0 +1,183 @@
+"""The grade of a run's calibration, where it is bad and why, and the gate before anything that uses it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.camera import Exposures
+from controller.artefacts.grade import (
+    PICTURE,
+    ErrorMaps,
+    graded,
+    passes,
+    read_grade_figures,
+    worst_of,
+    write_accepted,
+    write_grade,
+)
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.photographs import PATTERN, VERIFICATION, Taken, codes_of
+from controller.bundle.export import png
+from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
+from controller.calibrate.verify.grade import Verification, verify
+from controller.capture.patterns import Pattern, frame
+from controller.core.arrays import ByteImage
+from controller.core.errors import CalibrationError
+from controller.rig.rig import Rig
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+from controller.steps.appearance.solving import random_pattern
+from controller.steps.calibrate.drift import shown_frames
+from controller.steps.capture.photographs import Planned, take_all
+
+WORSE = 1.25
+"""A calibration this many times worse than the one before it is told of, though it passes the gate."""
+
+
+def verify_step(calibrated: Calibrated, after: Sequence[StepId], scale: float) -> Step:
+    """Predict each projector's random pattern and compare with its photograph."""
+    return Step(
+        StepId(StepKind.VERIFY),
+        partial(_verify, calibrated),
+        after=tuple(after),
+        title="Grading the calibration",
+        weight=costs.VERIFY_S * scale,
+    )
+
+
+def verification_photographs_step(rig: Rig, calibrated: Calibrated, after: Sequence[StepId]) -> Step:
+    """Photograph the random pattern anew, for a calibration that was corrected."""
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    return Step(
+        StepId(StepKind.VERIFICATION_PHOTOGRAPHS),
+        partial(_photograph, rig, calibrated),
+        after=tuple(after),
+        title="Photographing the pattern to grade by",
+        weight=costs.shot_s(scale) * len(rig.projectors),
+    )
+
+
+def _photograph(rig: Rig, calibrated: Calibrated, context: Context) -> Sequence[Path]:
+    exposures = Exposures.read(context.folder)
+    plan = []
+    for projector in rig.projectors:
+        image = shown_frames(calibrated, random_pattern(projector.size_px))[projector.name]
+        shown = partial(_one, projector.name, image)
+        plan.append(Planned(PATTERN, shown, exposures[projector.name].base_s, projector=projector.name))
+    return take_all(rig, context, plan, into=VERIFICATION)
+
+
+def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
+    return {name: image}
+
+
+def _taken(folder: Path, projector: str, pattern: Pattern) -> Taken:
+    if VERIFICATION.index(folder).exists():
+        return VERIFICATION.by_projector(folder)[projector]
+    return codes_of(projector).by_name(folder)[pattern.name]
+
+
+def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
+    calibration, transport = calibrated.calibration, calibrated.transport
+    figures, pictures = {}, []
+    maps: dict[str, ErrorMaps] = {}
+    for n, part in enumerate(calibration.projectors):
+        context.advance(n / len(calibration.projectors), part.name)
+        rows, columns = part.metapixels.valid.shape
+        pattern = random_pattern((columns, rows))
+        shown = frame(pattern, (columns, rows))
+        light = transport.forward_part(n, shown)
+        taken = _taken(context.folder, part.name, pattern)
+        seen = taken.per_second()
+        found = verify(light + calibration.black, seen, calibration.black, transport.lit[n])
+        why = attribute_error(transport, calibration, n, shown, seen, exposure_s=taken.exposure_s)
+        figures[part.name] = _figures(found, why)
+        maps[part.name] = ErrorMaps(found.error_map, why.labels)
+        pictures.append(attribution_picture(why, calibration, part.name))
+    return write_grade(context.folder, figures, maps, png(np.concatenate(pictures, axis=0)))
+
+
+def _figures(found: Verification, why: ErrorAttribution) -> dict[str, object]:
+    return {
+        "relative_rms": found.relative_rms,
+        "without_gain_rms": found.without_gain_rms,
+        "gain": found.gain,
+        "grade": found.grade.value,
+        "reasons": ranked(why),
+    }
+
+
+def grade_figures(folder: Path) -> dict[str, str]:
+    """For a command's result: each projector's error, and the map of where it is bad."""
+    figures = graded(folder) or {}
+    text = ", ".join(f"{name} {percent:.2f} %" for name, percent in figures.items())
+    return {"error": text, "map": str(folder / PICTURE)} if figures else {}
+
+
+def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
+    """Let a calibration below the set grade pass, and say so loudly; harmless for one that passes anyway."""
+    worst = worst_of(folder)
+    if worst is None or passes(folder, worst_grade):
+        return
+    write_accepted(folder, *worst)
+    reporter.say(
+        f"ACCEPTED ON REQUEST although it is below the set grade: {worst[0]} is predicted with {worst[1]:.1f} % error, "
+        f"and {worst_grade:g} % is the limit. What is made from it will look wrong where {PICTURE} shows colour.",
+        Level.WARNING,
+    )
+
+
+def below_grade(folder: Path, worst_grade: float) -> CalibrationError:
+    """The error for a calibration that does not pass."""
+    name, percent = worst_of(folder) or ("", float("nan"))
+    reasons = read_grade_figures(folder)[name].get("reasons", [])
+    because = f" {reasons[0]['sentence']}" if reasons else ""
+    return CalibrationError(
+        "calibration-below-grade",
+        what=f"The calibration {folder.name} is not good enough to be published: projector {name} is predicted with "
+        f"{percent:.1f} % error, and {worst_grade:g} % is the limit (worst_grade under [calibration]).{because}",
+        remedy=f"Look at {folder / PICTURE}, mend what it shows and calibrate again; or publish all the same with "
+        "--accept-grade.",
+    )
+
+
+def gate_step(worst_grade: float, *, accepted: bool, reporter: Reporter | None = None) -> Step:
+    """Refuse to go on with a calibration below the set grade. Raises CalibrationError("calibration-below-grade")."""
+
+    def run(context: Context) -> Sequence[Path]:
+        require(context.folder, worst_grade, accepted=accepted, reporter=reporter or context.reporter)
+        return ()
+
+    return Step(StepId("gate"), run, title="Comparing the grade with what is asked", weight=0.01, always=True)
+
+
+def require(folder: Path, worst_grade: float, *, accepted: bool, reporter: Reporter) -> None:
+    """The gate itself. Raises CalibrationError("calibration-below-grade")."""
+    if accepted:
+        accept(folder, reporter, worst_grade)
+    if not passes(folder, worst_grade):
+        raise below_grade(folder, worst_grade)
+
+
+def compare_with_last(folder: Path, last: Path | None, reporter: Reporter) -> None:
+    """Say it when a new calibration is worse than the one that it replaces."""
+    now, then = worst_of(folder), None if last is None else worst_of(last)
+    if last is not None and now is not None and then is not None and now[1] > WORSE * then[1]:
+        reporter.say(
+            f"This calibration is worse than the last: {now[1]:.1f} % error ({now[0]}) against {then[1]:.1f} % "
+            f"({then[0]}) in {last.name}. {PICTURE} in {folder.name} shows where.",
+            Level.WARNING,
+        )
+
+
+__all__ = [
+    "accept", "below_grade", "compare_with_last", "gate_step", "grade_figures", "random_pattern", "require",
+    "verification_photographs_step", "verify_step",
+]  # fmt: skip

@@ -1,0 +1,202 @@
+"""The steps of a quick recalibration: look what has changed, repeat that, keep the rest of the last calibration.
+
+A projector that turned about its lens, or whose light changed, is corrected without codes: its white image is
+photographed anew, its correspondences and metapixels are moved. One that moved otherwise gets new codes. If camera or
+object moved, everything is measured again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import os
+import shutil
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.calibration import read_black
+from controller.artefacts.camera import Exposures
+from controller.artefacts.drift import read_drift
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.modes import mode_of
+from controller.artefacts.photographs import DRIFT, white_again_of
+from controller.artefacts.projectors import Light, Pixels
+from controller.calibrate.verify.drift import Drift, ProjectorDrift
+from controller.calibrate.verify.drift_report import advice, sentences
+from controller.calibrate.verify.homography_update import update_positions, update_radiometry
+from controller.capture.brackets import merge_brackets
+from controller.core.arrays import ByteImage
+from controller.core.errors import CalibrationError
+from controller.rig.rig import Rig, RigProjector
+from controller.run.journal import Journal
+from controller.run.progress import Level
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+from controller.steps.calibrate.drift import drift_steps
+from controller.steps.calibrate.grade import verification_photographs_step, verify_step
+from controller.steps.capture.photographs import Planned, take_all
+
+
+class Way(enum.Enum):
+    """What a quick recalibration does with a step of the full one."""
+
+    RUN = "run"
+    KEEP = "keep"
+    CORRECT = "correct"
+
+
+def quick_steps(
+    rig: Rig, run: Path, last: Calibrated, full: Sequence[Step], *, longest_exposure_s: float
+) -> list[Step]:
+    """From the drift check to the grade.
+
+    ``last``: the calibration that is brought up to date; ``full``: the steps of a full calibration, in the order and
+    with the options of ``last``; each is run, kept or corrected once the drift is known
+    """
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    steps = drift_steps(rig, last, longest_exposure_s=longest_exposure_s)
+    steps.append(
+        Step(
+            StepId(StepKind.PLAN),
+            _tell,
+            after=(StepId(StepKind.DRIFT),),
+            title="Choosing what to repeat",
+            weight=0.01,
+            always=True,
+        )
+    )
+    steps += [chosen(rig, last, step) for step in full]
+    now = Calibrated(run, last.projectors)
+    done = [step.id for step in full]
+    steps.append(verification_photographs_step(rig, now, done))
+    steps.append(verify_step(now, [*done, steps[-1].id], scale))
+    return steps
+
+
+def _tell(context: Context) -> Sequence[Path]:
+    """Say what was found. Raises CalibrationError("projector-dark") where no calibration would help."""
+    drift = read_drift(context.folder)
+    found = sentences(drift)
+    for sentence in found[:-1] or found:
+        context.reporter.say(sentence)
+    if advice(drift) == "look":
+        for taken in DRIFT.read(context.folder):
+            taken.path.unlink(missing_ok=True)  # the same command looks again, once the projector has been seen to
+        raise CalibrationError("projector-dark", what=found[0], remedy=found[-1])
+    if advice(drift) == "full":
+        context.reporter.say("All of it is measured again: nothing of the last calibration holds.", Level.WARNING)
+    context.journal.record("drift", " ".join(found))
+    return ()
+
+
+def chosen(rig: Rig, last: Calibrated, step: Step) -> Step:
+    """The step, run, kept or corrected as the drift will say."""
+
+    def run(context: Context) -> Sequence[Path]:
+        way = way_of(step.id, read_drift(context.folder), mode_of(last.folder))
+        if way is Way.RUN:
+            return step.run(context)
+        kept = keep(last.folder, step.id, context)
+        if kept is None:  # the last calibration had no such step
+            return step.run(context)
+        return kept if way is Way.KEEP else _correct(rig, last, step.id, kept, context)
+
+    return dataclasses.replace(step, run=run, after=(*step.after, StepId(StepKind.DRIFT)), weight=0.1 * step.weight)
+
+
+def way_of(step: StepId, drift: Drift, mode: str = "fast") -> Way:
+    """What becomes of a step of the full calibration. ``mode``: how the last one measured its metapixels."""
+    if advice(drift) == "full":
+        return Way.RUN
+    if drift.nothing:
+        return Way.KEEP
+    if step.kind == StepKind.BLACK:
+        return Way.RUN
+    if step.kind == StepKind.GEOMETRY:
+        return Way.RUN if drift.moved else Way.KEEP
+    for one in drift.projectors:
+        if step.projector == one.name:
+            return _way_of(step.kind, one, mode)
+    return Way.KEEP
+
+
+def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
+    if not one.known or (one.moved and not (one.turned_only and mode == "fast")):
+        return Way.RUN
+    if kind == StepKind.RADIOMETRY:
+        return Way.CORRECT  # black has been photographed anew
+    if kind == StepKind.LIGHT:
+        return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
+    return Way.CORRECT if kind == StepKind.PIXELS and one.moved else Way.KEEP
+
+
+def keep(last: Path, step: StepId, context: Context) -> list[Path] | None:
+    """The artefacts of the last calibration's step, in this run's folder; None if it had no such step."""
+    with Journal(last) as journal:
+        artefacts = journal.latest(step)
+    if artefacts is None:
+        return None
+    paths = []
+    for artefact in artefacts:
+        path = context.folder / artefact.path.relative_to(last.resolve())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        try:
+            os.link(artefact.path, path)  # every writer replaces files and never changes them
+        except OSError:
+            shutil.copy2(artefact.path, path)
+        paths.append(path)
+    return paths
+
+
+def _correct(rig: Rig, last: Calibrated, step: StepId, kept: list[Path], context: Context) -> Sequence[Path]:
+    name = step.projector
+    assert name is not None
+    one = next(one for one in read_drift(context.folder).projectors if one.name == name)
+    if step.kind == StepKind.LIGHT:
+        projector = next(projector for projector in rig.projectors if projector.name == name)
+        return [*kept, *_photograph_white(rig, projector, context)]
+    if step.kind == StepKind.PIXELS:
+        _shift_pixels(context.folder, name, one)
+    else:
+        _correct_light(context.folder, name, one)
+    return kept
+
+
+def _shift_pixels(folder: Path, name: str, one: ProjectorDrift) -> None:
+    pixels = Pixels.read(folder, name)
+    dataclasses.replace(pixels, **update_positions(pixels.arrays(), one.motion.matrix)).write(folder, name)
+
+
+def _correct_light(folder: Path, name: str, one: ProjectorDrift) -> None:
+    light = Light.read(folder, name)
+    light = dataclasses.replace(light, black=read_black(folder))
+    if one.moved or one.dimmed:
+        taken = white_again_of(name).read(folder)
+        white = merge_brackets([t.read().measured() for t in taken], [t.exposure_s for t in taken]).radiance
+        light = dataclasses.replace(light, white=np.maximum(white - light.black, 0).astype(np.float32))
+    if one.dimmed:
+        light = dataclasses.replace(light, mixing=update_radiometry(light.radiometry, one.gain).mixing)
+    light.write(folder, name)
+
+
+def _photograph_white(rig: Rig, projector: RigProjector, context: Context) -> list[Path]:
+    exposures = Exposures.read(context.folder)[projector.name].white_s
+    white = np.full_like(projector.black(), 255)
+    plan = [
+        Planned(str(number), partial(_one, projector.name, white), exposure_s)
+        for number, exposure_s in enumerate(exposures)
+    ]
+    return take_all(rig, context, plan, into=white_again_of(projector.name))
+
+
+def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
+    return {name: image}
+
+
+__all__ = ["Way", "chosen", "keep", "quick_steps", "way_of"]

@@ -1,0 +1,87 @@
+"""The steps that calibrate one projector anew and keep what the last calibration knows of the others.
+
+The others' photographs are not taken again, so nothing in them can tell that camera or object has moved since. The
+pattern of the grade is therefore photographed on every projector, one photograph each: if one of the others is
+predicted badly now, the gate keeps the old calibration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.calibration import read_black
+from controller.artefacts.camera import Exposures
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.projectors import Light
+from controller.rig.rig import Rig
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+from controller.steps.calibrate.grade import verification_photographs_step, verify_step
+from controller.steps.calibrate.quick import Way, keep
+from controller.steps.capture.patterns import capture_steps
+
+ANEW = (StepKind.BLACK, StepKind.GEOMETRY, StepKind.EDGE_TERMS)
+"""Kinds of steps that concern every projector, and depend on what is measured anew."""
+EXPOSURE = StepId(StepKind.EXPOSURE)
+
+
+def one_projector_steps(
+    rig: Rig, run: Path, last: Calibrated, full: Sequence[Step], projector: str, *, longest_exposure_s: float
+) -> list[Step]:
+    """From the exposure of ``projector`` to the grade of all.
+
+    ``last`` and ``full`` as for ``steps.calibrate.quick.quick_steps``; ``projector``: the name of one of the rig's.
+    """
+    own = tuple(one for one in rig.projectors if one.name == projector)
+    alone = capture_steps(dataclasses.replace(rig, projectors=own), longest_exposure_s=longest_exposure_s)
+    exposing = next(step for step in alone if step.id == EXPOSURE)
+    # A run that goes on, for another projector or from another calibration, must not take these steps as done.
+    inputs = {"only": projector, "calibration": last.folder.name}
+    steps = [
+        dataclasses.replace(step, run=partial(_exposure, last, exposing) if step.id == EXPOSURE else step.run)
+        if (way := way_of(step.id, projector)) is Way.RUN
+        else dataclasses.replace(step, run=partial(_kept, last, step, way), weight=0.01)
+        for step in full
+    ]
+    steps = [dataclasses.replace(step, inputs={**step.inputs, **inputs}) for step in steps]
+    now = Calibrated(run, last.projectors)
+    done = [step.id for step in steps]
+    steps.append(verification_photographs_step(rig, now, done))
+    scale = costs.scale(one.size_px for one in rig.projectors)
+    steps.append(verify_step(now, [*done, steps[-1].id], scale))
+    return steps
+
+
+def way_of(step: StepId, projector: str) -> Way:
+    """What becomes of a step of the full calibration."""
+    if step.kind in ANEW or step == EXPOSURE or step.projector == projector:
+        return Way.RUN
+    return Way.CORRECT if step.kind == StepKind.RADIOMETRY else Way.KEEP
+
+
+def _exposure(last: Calibrated, exposing: Step, context: Context) -> Sequence[Path]:
+    """The last calibration's exposures, that of the one projector found anew."""
+    exposing.run(context)
+    found = Exposures.read(context.folder)
+    return [Exposures.write(context.folder, {**Exposures.read(last.folder), **found})]
+
+
+def _kept(last: Calibrated, step: Step, way: Way, context: Context) -> Sequence[Path]:
+    kept = keep(last.folder, step.id, context)
+    if kept is None:  # the last calibration had no such step
+        return step.run(context)
+    if way is Way.CORRECT:
+        name = step.id.projector
+        assert name is not None
+        # The room's light has been photographed anew, and counts for every projector.
+        light = dataclasses.replace(Light.read(context.folder, name), black=read_black(context.folder))
+        light.write(context.folder, name)
+    return kept
+
+
+__all__ = ["one_projector_steps", "way_of"]

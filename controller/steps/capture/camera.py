@@ -1,0 +1,226 @@
+"""The steps that measure the camera itself: the stage's delay, a JPEG camera's response, noise, limits, bad pixels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.artefacts.camera import Delay, Exposures, write_camera_figures, write_response_figures
+from controller.artefacts.kinds import StepKind, of_projectors
+from controller.artefacts.names import CAPTURES
+from controller.artefacts.photographs import BLACK, CAMERA_RESPONSE, Taken, light_of, white_bracket
+from controller.capture.acquire import Shot
+from controller.capture.jpeg_response import measure_response, nominal_response
+from controller.capture.latency import LONGEST_S, measure_latency
+from controller.capture.linearity import (
+    RawExposure,
+    black_offset,
+    check_series,
+    common_limit,
+    find_hot,
+    true_exposures,
+)
+from controller.capture.noise import measure_noise
+from controller.capture.profile import CameraProfile
+from controller.capture.raw import RawMosaic, is_jpeg, read_jpeg_values, read_mosaic, read_photograph
+from controller.core.arrays import ByteImage, FloatImage
+from controller.rig.rig import Rig
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+from controller.steps.capture.photographs import Planned, take_all
+
+RESPONSE_STOPS = (-6, -5, -4, -3, -2, -1, 0, 1, 2)
+"""Exposures of a JPEG camera's bracket series, relative to the one at which white is well exposed."""
+BRIGHTNESS_OF_ALL = 0.7
+"""White of all projectors together is exposed so much shorter than their number asks for: nothing may clip."""
+
+
+def delay_step(rig: Rig) -> Step:
+    """``delay.json``: how long after its presentation a picture is photographed whole; the acquirer waits as long.
+
+    After ``exposure``, of which it takes the shortest.
+    """
+    return Step(
+        StepId(StepKind.DELAY),
+        partial(_measure_delay, rig),
+        after=(StepId(StepKind.EXPOSURE),),
+        title="Measuring how late pictures appear",
+        weight=6 * LONGEST_S,
+    )
+
+
+def response_steps(rig: Rig) -> list[Step]:
+    """The step ``camera-response`` of a camera without RAW; none for another."""
+    if rig.camera.capabilities.raw:
+        return []
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    return [
+        Step(
+            StepId(StepKind.CAMERA_RESPONSE),
+            partial(_photograph_response, rig),
+            after=(StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY)),
+            title="Measuring the camera's response",
+            weight=costs.shot_s(scale) * len(RESPONSE_STOPS),
+        )
+    ]
+
+
+def camera_step(rig: Rig) -> Step:
+    """``camera.npz`` and ``camera.json``: what black and the projectors' whites tell of the camera."""
+    names = [projector.name for projector in rig.projectors]
+    response = () if rig.camera.capabilities.raw else (StepId(StepKind.CAMERA_RESPONSE),)
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    return Step(
+        StepId(StepKind.CAMERA),
+        partial(_measure_camera, names),
+        after=(StepId(StepKind.BLACK), *of_projectors(names, StepKind.LIGHT), *response),
+        title="Measuring the camera's noise and limits",
+        weight=0.3 * scale,
+    )
+
+
+def _exposure_of_all(rig: Rig, context: Context) -> float:
+    """At which white of all projectors together is surely not clipped."""
+    shortest = min(one.base_s for one in Exposures.read(context.folder).values())
+    wanted = BRIGHTNESS_OF_ALL * shortest / len(rig.projectors)
+    available = rig.acquirer.exposures_s()
+    return max((value for value in available if value <= wanted), default=min(available))
+
+
+def _measure_delay(rig: Rig, context: Context) -> Sequence[Path]:
+    exposure_s = _exposure_of_all(rig, context)
+    flats = [_flat(rig, 0), _flat(rig, 255)]
+    shown: list[tuple[bool, float]] = []
+    count = 0
+
+    def look(white: bool, delay_s: float) -> FloatImage:
+        """Each picture follows the other one, which has been shown for long enough to be there."""
+        nonlocal count
+        context.advance(min(count / 10, 0.9), "display and camera")
+        if not shown or shown[-1][0] == white:
+            shown.append((not white, rig.acquirer.show(flats[not white], deadline=context.deadline)))
+        context.deadline.sleep(max(0.0, shown[-1][1] + LONGEST_S - time.monotonic()))
+        shot = Shot(f"delay-{count}", flats[white], exposure_s)
+        file, _ = rig.acquirer.take(shot, context.folder / CAPTURES, deadline=context.deadline, wait_s=delay_s)
+        shown.append((white, time.monotonic()))
+        count += 1
+        image = _provisional(file.path)
+        file.path.unlink()
+        return image
+
+    found = measure_latency(look)
+    rig.check_light(deadline=context.deadline)
+    path = Delay(found.wait_s, found.delay_s, found.tries, exposure_s).write(context.folder)
+    rig.acquirer.set_delay(found.wait_s)
+    return [path]
+
+
+def _provisional(path: Path) -> FloatImage:
+    """A photograph by the nominal response, before the camera's own is known."""
+    return read_photograph(path, response=nominal_response()).measured()
+
+
+def _flat(rig: Rig, value: int) -> dict[str, ByteImage]:
+    return rig.on_outputs({p.name: np.full_like(p.black(), value) for p in rig.projectors})
+
+
+def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
+    """The bracket series of everything that the projectors light."""
+    whites: Mapping[str, ByteImage] = {p.name: np.full_like(p.black(), 255) for p in rig.projectors}
+    middle = _exposure_of_all(rig, context)
+    available = rig.acquirer.exposures_s()
+    wanted = {min(available, key=lambda value: abs(np.log2(value / middle) - stop)) for stop in RESPONSE_STOPS}
+    plan = [Planned(str(number), lambda: whites, value) for number, value in enumerate(sorted(wanted))]
+    paths = take_all(rig, context, plan, into=CAMERA_RESPONSE)
+    taken = CAMERA_RESPONSE.read(context.folder)
+    images = [read_jpeg_values(one.path) for one in taken]
+    found = measure_response(images, [one.exposure_s for one in taken])
+    saved = CameraProfile(response=found.table).save(context.folder)
+    content = {"misfit": found.misfit, "seen": found.seen, "black": found.black, "photographs": len(images)}
+    figures = write_response_figures(context.folder, content)
+    return [*paths, saved, figures]
+
+
+def _measure_camera(projectors: Sequence[str], context: Context) -> Sequence[Path]:
+    black = BLACK.read(context.folder)
+    series = [white_bracket(light_of(name).read(context.folder)) for name in projectors]
+    measure = _of_jpeg if is_jpeg(black[0].path) else _of_raw
+    profile, figures = measure(black, series, context)
+    path = write_camera_figures(context.folder, figures)
+    return [profile.save(context.folder), path]
+
+
+def _of_raw(
+    black: Sequence[Taken], whites: Sequence[Sequence[Taken]], context: Context
+) -> tuple[CameraProfile, dict[str, object]]:
+    dark = [_exposed(one) for one in black]
+    levels = dark[0][0].levels
+    offset = black_offset([one for _, one in dark], levels)
+    hot = find_hot([one for _, one in dark], levels)
+    profile = CameraProfile(black_offset=offset, bad_px=hot)
+    levels = replace(levels, black=levels.black + offset)
+    found, ratios = [], []
+    pairs = [tuple(_samples(one, profile) for one in black[:2])] if len(black) > 1 else []
+    for number, series in enumerate(whites):
+        context.advance(0.2 + 0.6 * number / len(whites), "linearity")
+        if len(series) < 2:
+            continue
+        checked = check_series([_exposed(one)[1] for one in series], levels)
+        found.append(checked)
+        ratios.append((sorted(one.exposure_s for one in series), checked.ratios))
+        ordered = sorted(series, key=lambda one: one.exposure_s)
+        pairs.append((_samples(ordered[0], profile), _samples(ordered[1], profile)))
+    clip = common_limit([one.clip for one in found])
+    noise = measure_noise([(first, second) for first, second in pairs])
+    profile = replace(profile, clip=clip, exposures=true_exposures(ratios))
+    if noise is not None:
+        profile = replace(profile, noise=noise.noise)
+    figures = {
+        "kind": "raw",
+        "black_offset_steps": offset.tolist(),
+        "hot_pixels": len(hot),
+        "clip": [[None if np.isinf(value) else float(value) for value in row] for row in clip],
+        "exposure_ratios": [[one.nominal, one.ratios] for one in found],
+        "worst_nonlinearity": max((one.worst for one in found), default=0.0),
+        "noise": {"shot": profile.noise.shot, "read": profile.noise.read, "measured": noise is not None},
+    }
+    return profile, figures
+
+
+def _exposed(taken: Taken) -> tuple[RawMosaic, RawExposure]:
+    raw = read_mosaic(taken.path)
+    return raw, RawExposure(raw.samples, taken.exposure_s)
+
+
+def _samples(taken: Taken, profile: CameraProfile) -> FloatImage:
+    """Raw samples in full scale, NaN where clipped."""
+    linear, clipped = read_mosaic(taken.path, profile=profile).linear()
+    linear[clipped] = np.nan
+    return linear
+
+
+def _of_jpeg(
+    black: Sequence[Taken], whites: Sequence[Sequence[Taken]], context: Context
+) -> tuple[CameraProfile, dict[str, object]]:
+    """Only the noise is left to measure: the response was before, and a JPEG has no black level and no mosaic."""
+    profile = black[0].profile or CameraProfile()
+    pairs = []
+    for series in whites:
+        ordered = sorted(series, key=lambda one: one.exposure_s)
+        if len(ordered) > 1:
+            first, second = (one.read().measured()[:, :, 1] for one in ordered[:2])
+            pairs.append((first, second))
+    noise = measure_noise(pairs)
+    if noise is not None:
+        profile = replace(profile, noise=noise.noise)
+    figures: dict[str, object] = {
+        "kind": "jpeg",
+        "noise": {"shot": profile.noise.shot, "read": profile.noise.read, "measured": noise is not None},
+    }
+    return profile, figures

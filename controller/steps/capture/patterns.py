@@ -1,0 +1,196 @@
+"""The steps that photograph patterns: exposure, black, white, Gray code and mosaics, then what needs the response."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from controller.artefacts.camera import Exposures
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.names import CAPTURES
+from controller.artefacts.photographs import BLACK, WHITE, codes_of, light_of, white_name
+from controller.artefacts.projectors import Light
+from controller.capture.acquire import Shot
+from controller.capture.brackets import choose_brackets, choose_exposure
+from controller.capture.jpeg_response import nominal_response
+from controller.capture.latency import LONGEST_S
+from controller.capture.patterns import CELL_PX, Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
+from controller.capture.raw import read_photograph
+from controller.core.arrays import ByteImage, Float64
+from controller.core.errors import CalibrationError
+from controller.rig.rig import Rig, RigProjector
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+from controller.steps.capture.camera import delay_step, response_steps
+from controller.steps.capture.photographs import Planned, take_all
+
+FIRST_EXPOSURE_S = 1 / 30
+EXPOSURE_TRIES = 8
+WHITE_EXPOSURES = 3
+"""At most as many photographs for one HDR white image."""
+BLACK_BRACKET = (8.0, 32.0)
+"""Exposures of the HDR black image, relative to the one at which white is well exposed."""
+
+
+def plans_of(rig: Rig) -> dict[str, PatternPlan]:
+    """The pattern plan of each projector by name."""
+    return {projector.name: plan_patterns(projector.size_px) for projector in rig.projectors}
+
+
+def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
+    """All capture steps but the sinusoids, which wait for the radiometry (see ``code_step``)."""
+    inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
+    plans = plans_of(rig)
+    a_shot_s = _shot_s(rig)
+    steps = [
+        Step(
+            StepId(StepKind.EXPOSURE),
+            lambda context: _find_exposures(rig, context, longest_exposure_s),
+            inputs=inputs,
+            title="Finding the exposure",
+            weight=2 * len(rig.projectors) * a_shot_s,
+        ),
+        delay_step(rig),
+        *response_steps(rig),
+        Step(
+            StepId(StepKind.BLACK),
+            lambda context: _photograph_black(rig, context, longest_exposure_s),
+            inputs=inputs,
+            after=(StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY)),
+            title="Photographing black",
+            weight=3 * a_shot_s,
+        ),
+    ]
+    for projector in rig.projectors:
+        plan = plans[projector.name]
+        steps.append(
+            Step(
+                StepId(StepKind.LIGHT, projector.name),
+                partial(_photograph_light, rig, projector, plan),
+                inputs={**inputs, "patterns": _patterns(plan)},
+                after=(StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY)),
+                title=f"Photographing the light of {projector.name}",
+                weight=a_shot_s * (WHITE_EXPOSURES + len(_before_response(plan))),
+            )
+        )
+    return steps
+
+
+def code_step(rig: Rig, projector: RigProjector) -> Step:
+    """The step that photographs the sinusoids and the random pattern, after its radiometry."""
+    plan = plan_patterns(projector.size_px)
+    coded = [pattern for pattern in plan if pattern.needs_response]
+    return Step(
+        StepId(StepKind.CODES, projector.name),
+        lambda context: _photograph_codes(rig, projector, plan, coded, context),
+        inputs={"sizes": _sizes(rig), "patterns": _patterns(plan)},
+        after=(StepId(StepKind.EXPOSURE), StepId(StepKind.RADIOMETRY, projector.name)),
+        title=f"Photographing the patterns of {projector.name}",
+        weight=_shot_s(rig) * len(coded),
+    )
+
+
+def _shot_s(rig: Rig) -> float:
+    return costs.shot_s(costs.scale(projector.size_px for projector in rig.projectors))
+
+
+def bracket(base_s: float, factors: Sequence[float], available_s: Sequence[float], longest_s: float) -> list[float]:
+    """Distinct exposures of the camera, each the nearest to ``base_s`` times a factor, none above ``longest_s``."""
+    usable = [value for value in available_s if value <= longest_s] or [min(available_s)]
+    return sorted({min(usable, key=lambda value: abs(math.log(value / (base_s * factor)))) for factor in factors})
+
+
+def _find_exposures(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
+    found = {}
+    for number, projector in enumerate(rig.projectors):
+        context.advance(number / len(rig.projectors), projector.name)
+        found[projector.name] = _find_exposure(rig, projector, context, longest_s)
+    return [Exposures.write(context.folder, found)]
+
+
+def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> Exposures:
+    """Photograph white until it is well exposed. These photographs are tries: they are not journalled."""
+    white = device_frame(_named(plan_patterns(projector.size_px), WHITE), projector.size_px)
+    available = [value for value in rig.acquirer.exposures_s() if value <= longest_s]
+    exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_s)[0]
+    for number in range(EXPOSURE_TRIES):
+        context.check()
+        shot = Shot(f"try-{number}", rig.on_outputs({projector.name: white}), exposure_s)
+        # How late pictures appear is not known yet: the first photograph of this white waits for as long as any takes.
+        file, confirmed_s = rig.acquirer.take(
+            shot, context.folder / CAPTURES, deadline=context.deadline, wait_s=LONGEST_S if number == 0 else None
+        )
+        image = read_photograph(file.path, response=nominal_response()).measured()
+        file.path.unlink()
+        choice = choose_exposure(image, confirmed_s, available)
+        if choice.settled:
+            brackets = choose_brackets(image, confirmed_s, available, most=WHITE_EXPOSURES)
+            if brackets.settled:
+                return Exposures(choice.exposure_s, brackets.exposures_s)
+        exposure_s = choice.exposure_s
+    rig.check_light(deadline=context.deadline)  # a dead lamp is not a matter of exposure
+    raise CalibrationError(
+        "exposure-not-found",
+        what=f"No exposure was found at which the white of projector {projector.name} is well exposed.",
+        remedy="Check that it shines on the object, that the room is dark, and the camera's aperture and ISO.",
+    )
+
+
+def _photograph_black(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
+    base_s = max(found.base_s for found in Exposures.read(context.folder).values())
+    exposures = bracket(base_s, BLACK_BRACKET, rig.acquirer.exposures_s(), longest_s)
+    plan = [Planned(str(number), dict, exposure_s) for number, exposure_s in enumerate(exposures)]
+    return take_all(rig, context, plan, into=BLACK)
+
+
+def _photograph_light(rig: Rig, projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+    exposures = Exposures.read(context.folder)[projector.name]
+    planned = [
+        _planned(projector, _named(plan, WHITE), exposure_s, None, name=white_name(number))
+        for number, exposure_s in enumerate(exposures.white_s)
+    ]
+    planned += [_planned(projector, pattern, exposures.base_s, None) for pattern in _before_response(plan)]
+    return take_all(rig, context, planned, into=light_of(projector.name))
+
+
+def _before_response(plan: PatternPlan) -> tuple[Pattern, ...]:
+    """What the response is measured with: the Gray code finds the mosaics' tiles."""
+    return plan.of_kind(PatternKind.GRAY) + plan.of_kind(PatternKind.COLOUR_TILES)
+
+
+def _photograph_codes(
+    rig: Rig, projector: RigProjector, plan: PatternPlan, coded: Sequence[Pattern], context: Context
+) -> Sequence[Path]:
+    response = Light.read(context.folder, projector.name).response
+    base_s = Exposures.read(context.folder)[projector.name].base_s
+    planned = [_planned(projector, pattern, base_s, response) for pattern in coded]
+    return take_all(rig, context, planned, into=codes_of(projector.name))
+
+
+def _planned(
+    projector: RigProjector, pattern: Pattern, exposure_s: float, response: Float64 | None, *, name: str = ""
+) -> Planned:
+    def frames() -> Mapping[str, ByteImage]:
+        return {projector.name: device_frame(pattern, projector.size_px, response)}
+
+    return Planned(name or pattern.name, frames, exposure_s)
+
+
+def _named(plan: PatternPlan, name: str) -> Pattern:
+    return next(pattern for pattern in plan if pattern.name == name)
+
+
+def _patterns(plan: PatternPlan) -> str:
+    """Tells plans apart: a run that was begun with other patterns takes these anew."""
+    return hashlib.sha256(f"{CELL_PX} {plan}".encode()).hexdigest()[:16]
+
+
+def _sizes(rig: Rig) -> str:
+    return " ".join(f"{p.name}:{p.output}:{p.size_px[0]}x{p.size_px[1]}" for p in rig.projectors)
+
+
+__all__ = ["bracket", "capture_steps", "code_step", "plans_of"]

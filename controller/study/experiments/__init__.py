@@ -1,0 +1,1 @@
+"""One module or package per experiment; `controller.study.catalogue` lists them."""

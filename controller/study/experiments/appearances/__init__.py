@@ -1,0 +1,1 @@
+"""Appearances against what the paper reports: `experiment`, and the targets it uses."""

@@ -1,0 +1,121 @@
+"""Beyond the paper: error against number of photographs, for the fast mode and for dots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from controller.artefacts.modes import DotOptions
+from controller.study.lab.subject import StageControl, Subject
+from controller.study.lab.trial import trial
+from controller.study.output.drawing import Line, plotted
+from controller.study.values import Criterion, Experiment, Figure, Result, ResultTable
+
+SPACINGS_PX: Final = (4, 6, 8, 12)
+WIDEST_PX: Final = 16
+"""The paper's; 256 more photographs a projector."""
+FAST: Final = "fast"
+
+
+@dataclass(frozen=True, slots=True)
+class EffortResult:
+    """One calibration: photographs a projector, its grade in percent (worst projector), and an appearance's error."""
+
+    way: str
+    photographs: float
+    grade_percent: float
+    delta_e: float
+    rmse: float
+
+
+def effort(subject: Subject) -> Result:
+    """Calibrate again, with the fast mode and with dots at growing distances; photograph an appearance with each."""
+    spacings = (*SPACINGS_PX, WIDEST_PX) if subject.size != "small" else SPACINGS_PX
+    hand: StageControl = subject.parts.hand
+    ways: list[tuple[str, DotOptions]] = [(FAST, DotOptions())]
+    ways += [(f"dots, r = {spacing}", DotOptions("paper", spacing)) for spacing in spacings]
+    results = []
+    for number, (way, options) in enumerate(ways):
+        subject.advance(number / len(ways), way)
+        key = way.replace(", r = ", "-")
+        again = hand.again(key, options)
+        made = trial(again.subject, key)
+        projectors = len(subject.calibration.projectors)
+        results.append(
+            EffortResult(
+                way, again.photographs / projectors, again.worst_percent, made.quality.delta_e, made.quality.rmse
+            )
+        )
+    return Result(_criteria(results), (_table(results),), _figures(results), TEXT)
+
+
+def _criteria(results: Sequence[EffortResult]) -> tuple[Criterion, ...]:
+    fast, dots = results[0], results[1:]
+    best = min(dots, key=lambda result: result.delta_e)
+    holds = fast.delta_e <= best.delta_e + 0.1
+    return (
+        Criterion(
+            "the fast way is as good as the best dots, within 0.1 CIEDE2000",
+            f"{fast.delta_e:.2f} with {fast.photographs:.0f} photographs a projector; "
+            f"{best.way}: {best.delta_e:.2f} with {best.photographs:.0f}",
+            holds,
+            "" if holds else "Dots measure the shape of each pixel separately; the fast way smooths it.",
+        ),
+        Criterion(
+            "and takes fewer photographs than any dots",
+            f"{fast.photographs:.0f} a projector against {min(result.photographs for result in dots):.0f}",
+            fast.photographs < min(result.photographs for result in dots),
+        ),
+    )
+
+
+def _table(results: Sequence[EffortResult]) -> ResultTable:
+    columns = ("calibrated by", "photographs a projector", "grade, worst projector (%)", "CIEDE2000 median", "RMSE")
+    rows = tuple(
+        (
+            result.way,
+            round(result.photographs, 1),
+            round(result.grade_percent, 2),
+            round(result.delta_e, 2),
+            round(result.rmse, 4),
+        )
+        for result in results
+    )
+    return ResultTable("effort", "Error by number of photographs", columns, rows)
+
+
+def _figures(results: Sequence[EffortResult]) -> tuple[Figure, ...]:
+    dots = results[1:]
+    lines = [
+        Line("dots", [result.photographs for result in dots], [result.grade_percent for result in dots]),
+        Line("fast", [results[0].photographs], [results[0].grade_percent], "D"),
+    ]
+    errors = [
+        Line("dots", [result.photographs for result in dots], [result.delta_e for result in dots]),
+        Line("fast", [results[0].photographs], [results[0].delta_e], "D"),
+    ]
+    return (
+        Figure("grade", "Error of a predicted random pattern, worst projector, by photographs a projector.",
+               plotted(lines, x="photographs a projector", y="error of the prediction (%)")),
+        Figure("error", "Median CIEDE2000 of a photographed appearance, by photographs a projector.",
+               plotted(errors, x="photographs a projector", y="CIEDE2000")),
+    )  # fmt: skip
+
+
+TEXT = """\
+The same stage is calibrated from the beginning several times: with the fast mode, and with dots r pixels apart. Dots
+need r x r photographs a projector in addition to those of the fast mode, which locate them. The grade is the error of
+a random pattern that was predicted and photographed. Photographs include all brackets. Dots that are too near to each
+other overlap where the picture is blurred; dots farther apart cost photographs. A fast calibration with fewer
+photographs is not shown: its patterns depend on each other, and none can be left out alone."""
+
+EFFORT = Experiment(
+    name="effort",
+    title="Error by number of photographs",
+    paper="Beyond the paper: error against number of captures",
+    shows="the fast way reaches what dots reach, with far fewer photographs.",
+    scene="painted",
+    run=effort,
+    cost_s=600.0,
+)

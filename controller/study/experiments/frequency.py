@@ -1,0 +1,255 @@
+"""Fig. 12: the finest sinusoid that one and that all projectors can make, and which part of it the base has to hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.report.pictures import crop_around
+from controller.solve.appearance import scale_frames, solve_base
+from controller.solve.bounded.solver import solve_bounded
+from controller.solve.targets.values import Target, through_camera
+from controller.study.experiments.residual import brightest_first
+from controller.study.lab.subject import ReachableTarget, Subject
+from controller.study.lab.trial import live_frames
+from controller.study.output.drawing import LabelledPicture, Line, plotted, screen, strip
+from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
+from controller.transport import build_transport
+
+BANDS = 18
+LOWEST, HIGHEST = 0.15, 1.25
+"""Frequencies, in cycles a pixel of one projector as the camera sees it; one projector's pixels end at 0.5."""
+MEAN, FAINT, BOLD = 0.5, 0.1, 0.25
+"""Grey of the waves, and their amplitudes. For bold waves the bounds cut off the light that sharpening needs; faint
+ones show the resolution alone."""
+KEPT = 0.5
+"""F is the frequency up to which the photograph keeps this part of the target's contrast."""
+ASKED = 1.5
+MIDDLE = 0.6
+"""Of the object's width: farther out the surface turns away, its pixels are narrower and would blur the figure."""
+GREEN = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """The target and where its waves are: one frequency a band of rows, rising downwards.
+
+    ``frequency`` (bands,) cycles a camera pixel; ``band`` (rows, columns) its number, -1 where nothing is measured;
+    ``phase`` (rows, columns) radians; ``pitch_px`` camera pixels a projector pixel
+    """
+
+    target: Target
+    frequency: Float64
+    band: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    phase: Float64
+    pitch_px: float
+
+
+def rising_sinusoid(subject: Subject) -> Result:
+    """Make waves of two contrasts with one and with all projectors, then the faint ones by base times scale."""
+    order = brightest_first(subject)
+    every, black = list(range(len(order))), subject.calibration.black
+    alone = build_transport(subject.with_projectors(order[:1]))
+    pictures: dict[str, FloatImage] = {}
+    contrast: dict[str, Float64] = {}
+    for number, amplitude in enumerate((BOLD, FAINT)):
+        waves = make_waves(subject, order[0], amplitude=amplitude)
+        wanted = subject.wanted(waves.target, transport=alone)
+        for which in (order[:1], every):
+            name = _by(len(which), amplitude)
+            subject.advance(0.25 * number + 0.12 * (len(which) > 1), name)
+            transport = alone if len(which) == 1 else subject.transport
+            frames = subject.frames_of(which, solve_bounded(transport, wanted.radiance, black).frames)
+            pictures[name] = subject.light.photograph(f"{len(which)}-{number}", frames, white=wanted.white)
+            contrast[name] = kept_contrast(pictures[name], wanted, waves)
+    first = last_kept(waves.frequency, contrast[_by(1, FAINT)])
+    for number, (name, base) in enumerate(bases(wanted, black, subject.mask, first).items()):
+        subject.advance(0.5 + 0.16 * number, name)
+        solved = solve_base(subject.transport, base, black)
+        ways: dict[str, Sequence[FloatImage]] = {name: scale_frames(subject.transport, solved, wanted.radiance, black)}
+        if name == HIGH:
+            ways[NARROWER] = live_frames(subject, solved, wanted.radiance)
+        for way, made in ways.items():
+            pictures[way] = subject.light.photograph(f"base-{len(pictures)}", made, white=wanted.white)
+            contrast[way] = kept_contrast(pictures[way], wanted, waves)
+    limit = {name: last_kept(waves.frequency, kept) for name, kept in contrast.items()}
+    return Result(
+        _criteria(limit, len(every)), (_table(waves, contrast), _limits(waves, limit)),
+        _figures(subject, wanted, waves, pictures, contrast, limit),
+    )  # fmt: skip
+
+
+HIGH, LOWER = "base high-passed at F_1, times scale", "base high-passed at F_1 / 4, times scale"
+NARROWER, LOW = "base high-passed at F_1, narrower means", "base low-passed at F_1, times scale"
+
+
+def _by(count: int, amplitude: float) -> str:
+    return f"{count} projector{'s' * (count > 1)}, contrast {amplitude / MEAN:.0%}"
+
+
+def make_waves(subject: Subject, n: int, *, amplitude: float = FAINT) -> Waves:
+    """Bands of upright waves over the object's middle, their frequency in pixels of projector ``n``."""
+    mask = subject.mask
+    box = crop_around(mask, margin=0.0)
+    pitch = _pitch_px(subject, n, box)
+    frequency = np.linspace(LOWEST, HIGHEST, BANDS) / pitch
+    rows, columns = np.arange(mask.shape[0]), np.arange(mask.shape[1])
+    height = (box.rows.stop - box.rows.start) / BANDS
+    number = np.clip(((rows - box.rows.start) / height).astype(np.int64), 0, BANDS - 1)
+    middle = 0.5 * (box.columns.start + box.columns.stop)
+    phase = 2 * np.pi * frequency[number][:, None] * (columns - middle)
+    image = np.where(mask[..., None], (MEAN + amplitude * np.cos(phase))[..., None], 0).astype(np.float32)
+    image = np.repeat(image, 3, axis=2)
+    # The rim of a band has its neighbour's waves in its blur.
+    inner = np.abs((rows - box.rows.start) / height - number - 0.5) < 0.35
+    near = np.abs(columns - middle) < 0.5 * MIDDLE * (box.columns.stop - box.columns.start)
+    band = np.where(mask & inner[:, None] & near, number[:, None], -1)
+    return Waves(through_camera(Target(image, mask)), frequency, band, np.asarray(phase), pitch)
+
+
+def _pitch_px(subject: Subject, n: int, box: object) -> float:
+    """Camera pixels along a row that a pixel of projector ``n`` takes, median over the object's middle."""
+    metapixels = subject.calibration.projectors[n].metapixels
+    centre = np.where(metapixels.valid[..., None], metapixels.centre_px, np.nan).astype(np.float64)
+    across = np.diff(centre, axis=1)[..., 0]
+    known = np.isfinite(across)
+    middle = np.nanmedian(centre[..., 0])
+    span = np.nanpercentile(centre[..., 0], 97) - np.nanpercentile(centre[..., 0], 3)
+    known &= np.abs(centre[:, 1:, 0] - middle) < 0.5 * MIDDLE * span
+    return float(np.median(np.abs(across[known])))
+
+
+def kept_contrast(picture: FloatImage, wanted: ReachableTarget, waves: Waves) -> Float64:
+    """(bands,): the wave's amplitude in phase with the target's, over the target's, in the green channel."""
+    kept = np.full(waves.frequency.size, np.nan)
+    for number in range(waves.frequency.size):
+        inside = (waves.band == number) & wanted.mask
+        if inside.sum() < 200:
+            continue
+        ours, theirs = (_amplitude(image[..., GREEN][inside], waves, inside) for image in (picture, wanted.radiance))
+        kept[number] = ours / theirs
+    return kept
+
+
+def _amplitude(values: FloatImage, waves: Waves, inside: Mask) -> float:
+    """Least squares of cosine, sine and a slow change; what is not in phase counts as lost."""
+    phase = waves.phase[inside]
+    x = np.nonzero(inside)[1].astype(np.float64)
+    x = (x - x.mean()) / max(float(np.ptp(x)), 1.0)
+    parts = np.stack([np.cos(phase), np.sin(phase), np.ones_like(x), x, x * x, x**3], axis=1)
+    return float(np.linalg.lstsq(parts, values.astype(np.float64), rcond=None)[0][0])
+
+
+def last_kept(frequency: Float64, kept: Float64, *, share: float = KEPT) -> float:
+    """The first frequency at which the contrast falls below ``share``, between bands by a straight line."""
+    known = np.isfinite(kept)
+    frequency, kept = frequency[known], kept[known]
+    below = np.flatnonzero(kept < share)
+    if not below.size:
+        return float(frequency[-1])
+    i = int(below[0])
+    if i == 0:
+        return float(frequency[0])
+    part = (kept[i - 1] - share) / (kept[i - 1] - kept[i])
+    return float(frequency[i - 1] + part * (frequency[i] - frequency[i - 1]))
+
+
+def bases(wanted: ReachableTarget, black: FloatImage, mask: Mask, limit: float) -> dict[str, FloatImage]:
+    """Base images for the target: even with its detail above a frequency, or only what is below it.
+
+    ``limit``: F_1 in cycles a camera pixel. The filter is a Gaussian that halves the amplitude there, over the object
+    alone.
+    """
+    light = np.maximum(wanted.radiance - black, 0)
+    even = np.float32(MEAN * wanted.white)
+
+    def below(frequency: float) -> FloatImage:
+        sigma = float(np.sqrt(2 * np.log(2))) / (2 * np.pi * frequency)
+        weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma)
+        blurred = cv2.GaussianBlur(np.where(mask[..., None], light, 0).astype(np.float32), (0, 0), sigma)
+        return np.where(mask[..., None], blurred / np.maximum(weight, 1e-6)[..., None], 0).astype(np.float32)
+
+    def high_passed(frequency: float) -> FloatImage:
+        low = below(frequency)
+        detail = np.divide(light, low, out=np.zeros_like(light), where=low > 0)
+        return np.asarray(black + even * detail, np.float32)
+
+    low_passed = np.asarray(black + below(limit), np.float32)
+    return {HIGH: high_passed(limit), LOWER: high_passed(0.25 * limit), LOW: low_passed}
+
+
+def _criteria(limit: dict[str, float], count: int) -> tuple[Criterion, ...]:
+    first, every = limit[_by(1, FAINT)], limit[_by(count, FAINT)]
+    bold = limit[_by(count, BOLD)] / limit[_by(1, BOLD)]
+    high, lower, low = limit[HIGH], limit[LOWER], limit[LOW]
+    ratio = f"F_{count} / F_1 at least {ASKED}, at"
+    keeps = f"keeps F_{count}, within 10 %"
+    rows = (
+        (f"{ratio} {FAINT / MEAN:.0%} contrast", every / first >= ASKED, f"{every / first:.2f}"),
+        (f"{ratio} {BOLD / MEAN:.0%} contrast", bold >= ASKED, f"{bold:.2f}"),
+        (f"a base high-passed at F_1 {keeps}", high >= 0.9 * every, f"{high / every:.2f} of it"),
+        (f"a base high-passed at F_1 / 4 {keeps}", lower >= 0.9 * every, f"{lower / every:.2f} of it"),
+        ("a base low-passed at F_1 falls to F_1, within 15 %", low <= 1.15 * first, f"{low / first:.2f} of it"),
+    )
+    return tuple(Criterion(asked, reached, holds) for asked, holds, reached in rows)
+
+
+def _table(waves: Waves, contrast: dict[str, Float64]) -> ResultTable:
+    columns = ("cycles a projector pixel", "cycles a camera pixel", *contrast)
+    rows: list[tuple[Cell, ...]] = [
+        (float(f * waves.pitch_px), float(f), *(float(kept[k]) for kept in contrast.values()))
+        for k, f in enumerate(waves.frequency)
+    ]
+    return ResultTable("contrast", "Contrast kept, of the target's", columns, tuple(rows))
+
+
+def _limits(waves: Waves, limit: dict[str, float]) -> ResultTable:
+    rows = tuple((name, f * waves.pitch_px, f) for name, f in limit.items())
+    return ResultTable(
+        "limits",
+        "F: where half of the contrast is left",
+        ("way", "cycles a projector pixel", "cycles a camera pixel"),
+        rows,
+    )
+
+
+def _figures(
+    subject: Subject,
+    wanted: ReachableTarget,
+    waves: Waves,
+    pictures: dict[str, FloatImage],
+    contrast: dict[str, Float64],
+    limit: dict[str, float],
+) -> tuple[Figure, ...]:
+    whole = crop_around(subject.mask)
+    matrix = subject.calibration.camera_to_xyz
+    named: Sequence[tuple[str, FloatImage]] = [("target", wanted.radiance), *pictures.items()]
+    panels = [LabelledPicture(name, screen(image, matrix, wanted.white, whole)) for name, image in named]
+    lines = [Line(f"{name}: F = {limit[name] * waves.pitch_px:.2f}", waves.frequency * waves.pitch_px, kept)
+             for name, kept in contrast.items()]  # fmt: skip
+    return (
+        Figure(
+            "curves",
+            "Contrast that the photograph keeps of the target's, by frequency; F is where it falls below a half.",
+            plotted(
+                lines, x="cycles per pixel of one projector", y="contrast kept",
+                marks={"half": ("y", KEPT), "one projector's pixels end": ("x", 0.5)}, y_range=(-0.1, 1.15),
+            ),
+        ),
+        Figure("photographs", "The target, frequency rising downwards, and the photographs.", strip(panels, columns=3)),
+    )  # fmt: skip
+
+
+FREQUENCY = Experiment(
+    name="frequency",
+    title="The finest sinusoid",
+    paper="Paper 3.3, 6, Fig. 12",
+    shows="F_3 / F_1 >= 1.5; a base high-passed keeps F_3, one low-passed falls to F_1.",
+    scene="curved",
+    run=rising_sinusoid,
+    cost_s=60.0,
+)

@@ -1,0 +1,1 @@
+"""Projectors put where `velatura plan` says: `experiment`, and what is measured."""

@@ -1,0 +1,1 @@
+"""Solve times: `experiment`, and the times that other papers report (`quoted`)."""

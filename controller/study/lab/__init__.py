@@ -1,0 +1,1 @@
+"""What experiments work with: the calibrated stage (`subject`), disturbances, photographs, figures of merit."""

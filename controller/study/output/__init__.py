@@ -1,0 +1,1 @@
+"""What a study leaves: figures, tables, pages and the files they are kept in."""

@@ -1,0 +1,105 @@
+"""Texts of the pages: what an experiment shows and what it does not, and why it misses a criterion.
+
+Apart from the experiments, so that a better sentence does not make an experiment be done again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+DESCRIPTIONS: Final[Mapping[str, str]] = {
+    "ablation": """\
+The same target, solved with more and more parts of the method, and photographed. *Naive inverse*: the light of
+photographed dots, inverted without bounds (LSMR) and clipped afterwards. *Gaussian metapixels*: fitted
+to the same dots, without any correction of their centres. *Regularisation*: centres moved in order of priority,
+gaps filled. *Smoothness*: eq. 3 at its default strength. *Quadrilaterals* replace the Gaussians; everything else is
+as in the step before. Rows of each light transport are scaled so that all pixels at white give the white image
+(decision 1). The paper does not scale them, so the early steps are better here than in the paper.""",
+    "regions": """\
+A piece of the camera's picture of one target, solved in four phases of regions (paper 3.2; they overlap by 25
+%), and globally. Differences are over the piece without a border of half of the largest region. Times are wall
+times of this piece on a busy machine. They show which variant is slower, not how long the paper's would take here;
+`benchmarks/README.md` has times of the whole picture.""",
+    "residual": """\
+A checkerboard on a pale curved shell, at an exposure that one projector alone can reach, so that more
+projectors add resolution and degrees of freedom, not only light. *Normalised residual*: rms difference of photograph
+and target in a region of 16x16 camera pixels, over the target's white; the mean is over regions. The paper
+says neither what it normalises by nor whether its figures are from the solve or from photographs; both are given here.
+Pixels that one projector cannot make bright enough are left out for all. With smaller squares, more regions contain
+an edge, and every figure is larger.""",
+    "sharpness": """\
+lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels
+(eq. 9), in windows; edges are Canny's, at the target's own threshold. *Naive* is the light of photographed
+dots, inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated
+shares. All four make the same target at an exposure that one projector can reach. The number of windows that
+count as best varies: at size small and seed 1, two solves with the same residual gave 86 % and 92 %, and 0.825 and
+0.843 over the whole object.""",
+    "frequency": """\
+Bands of upright waves around a grey, faint and bold, their frequency rising downwards, over the middle of a
+pale shell, at an exposure that one projector can reach. *Contrast kept* is the amplitude in phase with the
+target's wave, in the photograph's green channel, over the target's own as the camera sees it; light at
+another phase or frequency counts as lost. F is the frequency where it first falls below a half. The paper says
+neither which contrast nor which criterion it used. The bases, for the faint waves, contain the target's detail above
+a frequency, or only the detail below it, and are multiplied by the remaining scale (eqs 4-6).""",
+    "earlier": """\
+The same target at an exposure that the best projector can reach alone, so that brightness makes no difference.
+*One projector* divides at each pixel (Nayar 2003, Grossberg 2004). *Feathered* lights each point with its brightest
+projector and blends the seams, in the spirit of Raskar 2001. *Unconstrained inverse* inverts the light of
+photographed dots and clips afterwards, in the spirit of Wetzstein and Bimber 2007. *Bounded, no pixel model*
+keeps the bounds inside the solve on the same dots. These are our own implementations on our calibration, which
+is better than theirs was; none of their code was run.""",
+    "live": """\
+One target by base times scale: base and scale are multiplied projector pixel by projector pixel, which takes
+milliseconds where a solve takes seconds. By *eq. 6* a pixel's scale is the mean over its light; shown, the pixel
+blurs it a second time. *Narrower means* are used by `velatura live`: means over a Gaussian 0.4 times as wide
+(decision 33), in 8-bit frames; those of eq. 6 are dithered from floating point. The base *white* cancels
+the object's own pattern at full resolution; *minimum* leaves that to the scale. With either mean it shows
+speckles where it has almost no light itself, mostly at depth edges. The seconds include work that is done once: maps
+and compiled code.""",
+}
+SIX_PROJECTORS_DESCRIPTION: Final = f"""\
+{DESCRIPTIONS["residual"]} The projectors are ordered by how much of the picture they light, so the first three are not
+those of the other page. Six projectors are no better than four, at size small (0.01688 and 0.01686, seed 1) and at
+medium."""
+
+MISS_REASONS: Final[Mapping[tuple[str, str], str]] = {
+    ("ablation", "+ Gaussian metapixels"): """\
+The raw light beats the Gaussians here. Its dots are photographed up to 16 times longer than white and its rows
+are scaled, so it contains the pixels' true shape with little noise. A Gaussian has neither their nearly square
+shape nor the paint's edges inside a pixel. Our shares reach the same error without any photograph of dots.
+Fainter dots were not tried.""",
+    ("ablation", "+ regularisation"): """\
+It moves the few centres that dots located badly, so the large errors become smaller (RMSE) and the median hardly
+changes.""",
+    ("ablation", "+ smoothness"): """\
+Smoothness removes noise from the frames, and a little detail, too. This calibration leaves little noise.""",
+    ("earlier", "ours is better than: bounded, no pixel model"): """\
+Dots photographed as well as here are as good a light transport as our shares, at the price of 49 and more
+photographs a projector (see the ablation); the smoothness of ours costs a little SSIM.""",
+    ("residual-six", "falls with each projector"): """\
+The fifth and sixth projector light the shell from similar directions as others. By the model they reduce the
+residual by 0.0001 (size medium, seed 1), but the errors of their own calibration add more than that: in regions
+without an edge it rises from 0.0043 to 0.0046.""",
+    ("frequency", "F_3 / F_1"): """\
+The projectors' blur. At size medium and seed 1, the calibration measures a standard deviation of 0.53, 0.58 and
+0.64 projector pixels on this shell (medians; 0.60 to 0.70 at size small); such pixels carry 13 to 25 % of a wave's
+contrast at 0.5 cycles a pixel and 2 to 7 % at 0.7, where F_3 would have to be, and superposition adds positions
+of light, not contrast. Smoothness reduces it, too: without it the model gives F_3 = 0.60 instead of 0.57 for faint
+waves (size small).""",
+    ("frequency", "a base high-passed at F_1 keeps"): """\
+The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
+well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) reach
+0.52 of it at size medium, seed 1; with the base's limit at a quarter of F_1 nothing is lost.""",
+}
+"""Why a criterion of an experiment is missed, by the experiment's name and the beginning of what is asked."""
+
+
+def description(name: str) -> str:
+    """The paragraph of an experiment, or nothing."""
+    return SIX_PROJECTORS_DESCRIPTION if name == "residual-six" else DESCRIPTIONS.get(name, "")
+
+
+def miss_reason(name: str, asked: str) -> str:
+    """Why the criterion is missed, as far as it was found; nothing where nothing was written down."""
+    return " ".join(text for (one, begins), text in MISS_REASONS.items() if one == name and asked.startswith(begins))

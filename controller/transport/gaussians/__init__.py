@@ -1,0 +1,1 @@
+"""The transport with one Gaussian per projector pixel. Entry: `transport.PatchTransport`."""

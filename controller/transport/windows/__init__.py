@@ -1,0 +1,1 @@
+"""The transport by small windows of camera samples. Entry: `transport.WindowTransport`, built by `build`."""

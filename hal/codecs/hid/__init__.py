@@ -1,0 +1,1 @@
+"""Reports of USB HID devices: relay boards and light sensors."""

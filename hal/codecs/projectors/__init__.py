@@ -1,0 +1,1 @@
+"""Projector protocols: PJLink, serial control tables and the profiles that describe them."""

@@ -1,0 +1,229 @@
+"""Codec of PJLink class 1, and the simple part of class 2: bytes in, values out, and back. It does no I/O.
+
+Source: "PJLink Specifications" 1.04 (class 1) and 2.10 (class 2) of JBMIA: TCP port 4352, lines of at most 136 bytes
+that end in CR, a greeting first, answers within 2 s, closed after 30 s idle.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, Literal
+
+from hal.errors import ProtocolError
+from hal.escapes import escaped
+from hal.values import Power
+
+PORT: Final = 4352
+TERMINATOR: Final = b"\r"
+LONGEST_LINE: Final = 7 + 128 + 1
+MOST_LAMPS: Final = 8
+MOST_INPUTS: Final = 50
+LONGEST_PASSWORD: Final = 32
+
+PjClass = Literal[1, 2]
+_ANSWER: Final = re.compile(rb"%([12])([A-Za-z0-9]{4})=([^\r]{0,128})\r")
+_GREETING: Final = re.compile(rb"PJLINK (?:0|1 ([0-9A-Z]{1,64})|(ERRA)) *\r", re.IGNORECASE)
+_SECOND_LEVEL: Final = re.compile(rb"PJLINK 2 ([0-9A-F]{32}) *\r", re.IGNORECASE)
+ASK_SECOND_LEVEL: Final = b"PJLINK 2\r"
+"""Asks for the random number of the SHA-256 password check (version 2.10)."""
+SALT_BYTES: Final = 16
+_COMMAND: Final = re.compile(r"[A-Z0-9]{4}")
+_LAMP: Final = re.compile(r"(\d{1,5}) ([01])")
+_POWERS: Final = {"0": Power.OFF, "1": Power.ON, "2": Power.COOLING, "3": Power.WARMING}
+_TROUBLES: Final = {
+    "fan": "fan-failed",
+    "lamp": "lamp-failed",
+    "temperature": "over-temperature",
+    "cover": "cover-open",
+    "filter": "filter-clogged",
+    "other": "other-failure",
+}
+
+
+class Failure(Enum):
+    """The error answers of the specification, 2.2."""
+
+    UNDEFINED = "ERR1"
+    PARAMETER = "ERR2"
+    UNAVAILABLE = "ERR3"
+    FAILURE = "ERR4"
+
+
+@dataclass(frozen=True, slots=True)
+class Greeting:
+    """The projector's first line. ``random`` is the salt of the password, or None where none is asked for."""
+
+    random: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class LampStatus:
+    """One lamp: burning hours, and whether it is lit."""
+
+    hours: int
+    lit: bool
+
+
+@dataclass(frozen=True, slots=True)
+class MuteStatus:
+    """What is blocked: the picture, the sound."""
+
+    video: bool
+    audio: bool
+
+
+def parse_greeting(line: bytes) -> Greeting | None:
+    """Read the line that the projector sends first; None for ``PJLINK ERRA`` (the password was wrong).
+
+    The specification's random number has 8 hex digits and its line nothing else; projectors are seen to differ.
+    """
+    match = _GREETING.fullmatch(bare(line))
+    if match is None:
+        raise _broken(line, "a greeting")
+    if match[2] is not None:
+        return None
+    return Greeting(match[1].decode("ascii") if match[1] is not None else None)
+
+
+def bare(line: bytes) -> bytes:
+    """A line without what some projectors send before it: NUL, blanks, the rest of an ending such as CR LF ``>``."""
+    return line.lstrip(b"\0 \n>")
+
+
+def parse_second_level(line: bytes) -> bytes | None:
+    """The random number (16 bytes) of the answer to ``ASK_SECOND_LEVEL``; None for any other line."""
+    match = _SECOND_LEVEL.fullmatch(bare(line))
+    return None if match is None else bytes.fromhex(match[1].decode("ascii"))
+
+
+def second_level_digest(theirs: bytes, ours: bytes, password: str) -> bytes:
+    """What goes before the first command after ``PJLINK 2``: our random number, then the SHA-256 digest, both in hex.
+
+    ``theirs`` and ``ours``: 16 bytes each; the digest is of both xor-ed, in hex, and the password. The specification
+    2.10 could not be had; three clients and emulators of other authors agree on this.
+    """
+    mixed = bytes(a ^ b for a, b in zip(theirs, ours, strict=True)).hex()
+    return (ours.hex() + hashlib.sha256((mixed + password).encode("utf-8")).hexdigest()).encode("ascii")
+
+
+def digest(random: str, password: str) -> bytes:
+    """What goes before the first command when the greeting has a random number: md5, 32 hex digits (5.1)."""
+    return hashlib.md5((random + password).encode("utf-8"), usedforsecurity=False).hexdigest().encode("ascii")
+
+
+def command(name: str, parameter: str = "?", *, pj_class: PjClass = 1) -> bytes:
+    """The bytes of a command, e.g. ``%1POWR ?\\r``. ProtocolError (ours) for what the specification does not allow."""
+    if not _COMMAND.fullmatch(name) or not 0 < len(parameter) <= 128 or not parameter.isascii() or "\r" in parameter:
+        raise ProtocolError(
+            "pjlink-command-wrong",
+            what=f"{name!r} with {parameter!r} is not a PJLink command.",
+            remedy="This is a mistake in the driver; report it.",
+            theirs=False,
+        )
+    return f"%{pj_class}{name} {parameter}\r".encode("ascii")
+
+
+def parse_answer(line: bytes, name: str, *, pj_class: PjClass = 1) -> str | Failure:
+    """The text after ``=`` of the answer to ``name``, or the failure that it tells.
+
+    Raises ProtocolError for an answer to another command, of another class, too long, or no answer at all.
+    """
+    match = _ANSWER.fullmatch(line)
+    if match is None or match[2].decode("ascii").upper() != name or int(match[1]) != pj_class:
+        raise _broken(line, f"an answer to {name}")
+    # Names may be UTF-8 (class 2); a byte that is not must not stop the rest.
+    text = match[3].decode("utf-8", "replace")
+    failures = {failure.value: failure for failure in Failure}
+    return failures.get(text.upper(), text)
+
+
+def is_refusal(line: bytes) -> bool:
+    """Whether a line says that the password was wrong."""
+    return line.strip(b"\0 \r\n>").upper() == b"PJLINK ERRA"
+
+
+def accepted(text: str) -> None:
+    """Check the answer to a setting: it must be OK."""
+    if text.upper() != "OK":
+        raise _broken(text.encode(), "an acceptance")
+
+
+def parse_power(text: str) -> Power:
+    """POWR: 0 standby, 1 on, 2 cooling, 3 warm-up (4.2)."""
+    if text not in _POWERS:
+        raise _broken(text.encode(), "a power state")
+    return _POWERS[text]
+
+
+def parse_errors(text: str) -> tuple[str, ...]:
+    """ERST: six digits for fan, lamp, temperature, cover, filter, other; 0 fine, 1 warning, 2 error (4.7).
+
+    Returns words of trouble as in ``hal.codecs.projectors.profiles``, e.g. ``("fan-warning", "over-temperature")``.
+    """
+    if not re.fullmatch(r"[012]{6}", text, re.ASCII):
+        raise _broken(text.encode(), "an error status")
+    told = []
+    for part, digit in zip(_TROUBLES, text, strict=True):
+        if digit == "1":
+            told.append(f"{part}-warning")
+        elif digit == "2":
+            told.append(_TROUBLES[part])
+    return tuple(told)
+
+
+def parse_lamps(text: str) -> tuple[LampStatus, ...]:
+    """LAMP: pairs of hours and 0 or 1, at most eight, e.g. ``1200 1 80 0`` (4.8)."""
+    words = text.split(" ")
+    pairs = [" ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
+    lamps = [match for pair in pairs if (match := _LAMP.fullmatch(pair)) is not None and pair.isascii()]
+    if len(lamps) != len(pairs) or len(lamps) > MOST_LAMPS:
+        raise _broken(text.encode(), "a lamp status")
+    return tuple(LampStatus(int(match[1]), match[2] == "1") for match in lamps)
+
+
+def parse_input(text: str) -> str:
+    """INPT: kind 1 to 6 and number, e.g. ``31`` the first digital input (4.4)."""
+    if not re.fullmatch(r"[1-6][1-9A-Z]", text, re.ASCII):
+        raise _broken(text.encode(), "an input")
+    return text
+
+
+def parse_inputs(text: str) -> tuple[str, ...]:
+    """INST: the inputs there are, e.g. ``11 12 31`` (4.9)."""
+    words = text.split(" ")
+    if len(words) > MOST_INPUTS:
+        raise _broken(text.encode(), "a list of inputs")
+    return tuple(parse_input(word) for word in words)
+
+
+def parse_mute(text: str) -> MuteStatus:
+    """AVMT: 11 picture, 21 sound, 31 both, 30 none (4.6); some projectors say 10 or 20 for none."""
+    if not re.fullmatch(r"[123][01]", text, re.ASCII):
+        raise _broken(text.encode(), "a mute status")
+    on = text[1] == "1"
+    return MuteStatus(video=on and text[0] in "13", audio=on and text[0] in "23")
+
+
+def parse_text(text: str) -> str:
+    """NAME, INF1, INF2, INFO, SNUM, SVER: free text; control characters are dropped, it may be empty."""
+    return "".join(character for character in text if character.isprintable()).strip()
+
+
+def parse_class(text: str) -> PjClass:
+    """CLSS: 1 or 2 (4.14)."""
+    if text == "1":
+        return 1
+    if text == "2":
+        return 2
+    raise _broken(text.encode(), "a class")
+
+
+def _broken(line: bytes, wanted: str) -> ProtocolError:
+    return ProtocolError(
+        "pjlink-garbage",
+        what=f'The projector sent "{escaped(line[:80])}" where PJLink has {wanted}.',
+        remedy="Check that the address is the projector's PJLink port, and update the projector's firmware.",
+    )

@@ -1,0 +1,106 @@
+"""Codec of what PJLink class 2 sends by UDP: the search for projectors, and their notifications. It does no I/O.
+
+Source: "PJLink Specifications" 2.10 of JBMIA, 3.2 and 3.3: UDP port 4352 on both sides. A controller broadcasts
+``%2SRCH``; every projector answers within 10 s, at a moment of its own, with its MAC address. A projector tells the
+controllers that are registered in its menu when it comes up, and when its errors, power or input change.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+from hal.codecs.projectors.pjlink import parse_errors, parse_input, parse_power
+from hal.errors import ProtocolError
+from hal.escapes import escaped
+from hal.values import Power
+
+SEARCH: Final = b"%2SRCH\r"
+LONGEST_DATAGRAM: Final = 1024
+_LINE: Final = re.compile(rb"%2(ACKN|LKUP|ERST|POWR|INPT)=([ -~]{0,64})", re.IGNORECASE)
+_MAC: Final = re.compile(r"[0-9a-f]{2}(?::[0-9a-f]{2}){5}|[0-9a-f]{12}")
+
+
+@dataclass(frozen=True, slots=True)
+class Here:
+    """A projector answers a search. ``mac`` as ``00:11:22:aa:bb:cc``."""
+
+    mac: str
+
+
+@dataclass(frozen=True, slots=True)
+class CameUp:
+    """A projector's network came up: it has just started, and takes commands now."""
+
+    mac: str
+
+
+@dataclass(frozen=True, slots=True)
+class TroubleChanged:
+    """Its errors are these now; words as of ``hal.codecs.projectors.pjlink.parse_errors``, none: all is well again."""
+
+    trouble: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PowerChanged:
+    power: Power
+
+
+@dataclass(frozen=True, slots=True)
+class InputChanged:
+    """The input is this now, e.g. ``31``."""
+
+    input: str
+
+
+Told = Here | CameUp | TroubleChanged | PowerChanged | InputChanged
+
+
+def parse_datagram(data: bytes) -> tuple[Told, ...]:
+    """Read a datagram: one line or several, each with its CR.
+
+    Raises ProtocolError for anything else; nothing of a datagram counts then.
+    """
+    lines = data[: LONGEST_DATAGRAM + 1].rstrip(b"\0").split(b"\r")
+    if len(data) > LONGEST_DATAGRAM or len(lines) < 2 or lines.pop() != b"":
+        raise _garbage(data)
+    return tuple(_told(line) for line in lines)
+
+
+def is_notification(line: bytes) -> bool:
+    """Whether a line is a notification: some projectors send them to the TCP connection too, before an answer."""
+    match = _LINE.match(line.lstrip(b"\0"))
+    # ERST, POWR and INPT are questions of class 1 and 2 as well: only these two can never be an answer.
+    return match is not None and match[1].upper() in (b"ACKN", b"LKUP")
+
+
+def _told(line: bytes) -> Told:
+    match = _LINE.fullmatch(line)
+    if match is None:
+        raise _garbage(line)
+    name, value = match[1].upper(), match[2].decode("ascii")
+    if name == b"ERST":
+        return TroubleChanged(parse_errors(value))
+    if name == b"POWR":
+        return PowerChanged(parse_power(value))
+    if name == b"INPT":
+        return InputChanged(parse_input(value))
+    return Here(_mac(value)) if name == b"ACKN" else CameUp(_mac(value))
+
+
+def _mac(text: str) -> str:
+    plain = text.lower()
+    if not _MAC.fullmatch(plain):
+        raise _garbage(text.encode())
+    digits = plain.replace(":", "")
+    return ":".join(digits[i : i + 2] for i in range(0, 12, 2))
+
+
+def _garbage(data: bytes) -> ProtocolError:
+    return ProtocolError(
+        "pjlink-garbage",
+        what=f'A datagram "{escaped(data[:80])}" is nothing that PJLink sends.',
+        remedy="Nothing needs to be done; something else on the network uses UDP port 4352.",
+    )

@@ -1,0 +1,225 @@
+"""Codec of table-driven serial projectors: bytes in, values out, and back, as a profile says. It does no I/O.
+
+Source: the command tables of ``firmware_configs/projectors``, each of which names its documents.
+"""
+
+from __future__ import annotations
+
+import enum
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+from hal.codecs.projectors.serial_table import Frame, Query, SerialTable
+from hal.errors import ProtocolError
+from hal.escapes import escaped
+from hal.values import Power
+
+MOST_HOURS: Final = 99_999
+_LONGEST_VALUE: Final = 64
+_SHAPE_PARTS: Final = re.compile(r"\{value\}|\{any\}|\?\*\d+|\?| |[^{?]+|.", re.DOTALL)
+
+
+class Reply(enum.Enum):
+    """What a line means when it is neither an answer nor a notice. NOTHING: an echo, a prompt, a line to ignore."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    COOLING = "cooling"
+    NOTHING = "nothing"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer to a question: the text where the profile has ``{value}``, or the word that it stands for.
+
+    In binary frames it is hexadecimal, unless the question says how it reads.
+    """
+
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A line that the projector sent unasked. Either ``power`` or ``trouble`` is told."""
+
+    power: Power | None
+    trouble: str | None
+
+
+def command_bytes(table: SerialTable, name: str, address: str) -> bytes:
+    """The bytes of a command of the profile, e.g. ``power_on``."""
+    return _filled(table, table.commands[name], address)
+
+
+def query_bytes(table: SerialTable, query: Query, address: str) -> bytes:
+    """The bytes of a question."""
+    return _filled(table, query.send, address)
+
+
+def _filled(table: SerialTable, template: str, address: str) -> bytes:
+    return bytes.fromhex(template) if table.binary else template.replace("{address}", address).encode("latin-1")
+
+
+def head_bytes(frame: Frame) -> int:
+    """How many bytes of a frame must be there to know its length."""
+    return frame.count_at + (2 if frame.hexadecimal else 1)
+
+
+def rest_bytes(frame: Frame, head: bytes, *, longest: int) -> int:
+    """How many bytes follow the first ``head_bytes`` of a frame. ProtocolError for a count that cannot be."""
+    digits = head[frame.count_at :]
+    if frame.hexadecimal and not re.fullmatch(rb"[0-9A-Fa-f]{2}", digits):
+        raise _garbage(head)
+    length = frame.overhead + (int(digits, 16) if frame.hexadecimal else digits[0])
+    if not len(head) <= length <= longest:
+        raise _garbage(head)
+    return length - len(head)
+
+
+def parse_line(
+    table: SerialTable, line: bytes, query: Query | None = None, *, sent: bytes = b""
+) -> Answer | Notice | Reply:
+    """Read one line or frame of the projector as the answer to ``query`` (None: a command).
+
+    ``line`` may have its terminator or not; ``sent``: what was sent last, to know its echo.
+
+    Raises
+    ------
+    ProtocolError("projector-garbage")  for a line that the profile does not know
+    """
+    text = _text(table, line, sent)
+    if table.notices.prefix and text.startswith(table.notices.prefix):
+        return _notice(table, text)
+    if (refusal := _reply(table, text, ((table.cooling, Reply.COOLING), (table.refused, Reply.REFUSED)))) is not None:
+        return refusal
+    if query is not None:
+        for shape in query.answers:
+            if (match := _pattern(shape, _flags(table), table.binary).fullmatch(text)) is not None:
+                return _answer(table, query, match[1], line)
+    if (reply := _reply(table, text, ((table.accepted, Reply.ACCEPTED), (table.ignored, Reply.NOTHING)))) is not None:
+        return reply
+    if not text and (table.quirks.prompt or table.quirks.echo):
+        return Reply.NOTHING
+    raise _garbage(line)
+
+
+def _reply(table: SerialTable, text: str, meanings: Sequence[tuple[tuple[str, ...], Reply]]) -> Reply | None:
+    for shapes, reply in meanings:
+        if any(_pattern(shape, _flags(table), table.binary).fullmatch(text) for shape in shapes):
+            return reply
+    return None
+
+
+def _flags(table: SerialTable) -> int:
+    return re.IGNORECASE if table.quirks.any_case else 0
+
+
+def _text(table: SerialTable, line: bytes, sent: bytes) -> str:
+    """What a line says: without terminator, prompt and echo; a binary frame as hexadecimal without its checksum."""
+    if table.binary:
+        if table.frame is not None and table.frame.checksum:
+            if len(line) < 2 or sum(line[:-1]) & 0xFF != line[-1]:
+                raise _garbage(line)
+            line = line[:-1]
+        return line.hex().upper()
+    bare = line.removesuffix(table.terminator) if table.terminator else line
+    text = bare.strip(b"\r\n\0 ").decode("latin-1")
+    if table.quirks.prompt:
+        text = text.lstrip(table.quirks.prompt + "\r\n ")
+    echo = sent.strip(b"\r\n\0 ").decode("latin-1")
+    if table.quirks.echo and echo:
+        while text.startswith(echo):
+            text = text.removeprefix(echo).lstrip(table.quirks.prompt + "\r\n ")
+    return text
+
+
+def _notice(table: SerialTable, text: str) -> Notice:
+    code = text.removeprefix(table.notices.prefix).strip()
+    if code in table.notices.power:
+        return Notice(table.notices.power[code], None)
+    if (word := table.notices.trouble.get(code)) is not None:
+        return Notice(None, word)
+    for begins, word in table.notices.trouble.items():
+        if not begins.isdigit() and code.startswith(begins):
+            return Notice(None, word)
+    if not (len(code) <= 4 and code.isascii() and code.isalnum()):
+        raise _garbage(text.encode("latin-1"))
+    # A code that the manual does not list is worth a look, and no reason to stop.
+    return Notice(None, f"notice-{code.lower()}-warning")
+
+
+def _answer(table: SerialTable, query: Query, value: str, line: bytes) -> Answer | Reply:
+    value = _read(query, value)
+    known, wanted = query.values, value
+    if table.quirks.any_case:
+        known, wanted = {name.upper(): word for name, word in known.items()}, value.upper()
+    if wanted in query.absent:
+        return Reply.REFUSED
+    if wanted in query.unknown:
+        return Answer(Power.UNKNOWN.value)
+    if not known:
+        return Answer(value)
+    if wanted not in known:
+        raise _garbage(line)
+    return Answer(known[wanted])
+
+
+def _read(query: Query, value: str) -> str:
+    """A value of a binary frame as the text that it stands for."""
+    if query.reads == "text":
+        return value
+    data = bytes.fromhex(value)
+    if query.reads == "ascii":
+        text = data.partition(b"\0")[0].decode("latin-1")
+        return "".join(character for character in text if " " <= character <= "~").strip()
+    return str(int.from_bytes(data, "little" if query.reads == "little-endian" else "big"))
+
+
+@lru_cache(maxsize=512)
+def _pattern(shape: str, flags: int, binary: bool) -> re.Pattern[str]:
+    byte = "[0-9A-F]{2}"
+    meanings = {"{any}": f"[ -~]{{0,{4 * _LONGEST_VALUE}}}", "{value}": f"([ -~]{{1,{_LONGEST_VALUE}}}?)"}
+    if binary:
+        meanings = {"{value}": f"((?:{byte}){{1,{_LONGEST_VALUE}}})", " ": "", "?": byte}
+    parts = []
+    for part in _SHAPE_PARTS.findall(shape):
+        if binary and part.startswith("?*"):
+            parts.append(f"(?:{byte}){{{int(part[2:])}}}")
+        elif binary and part not in meanings:
+            parts.append(part.replace(" ", "").upper())
+        else:
+            parts.append(meanings.get(part) or ("" if part in meanings else re.escape(part)))
+    return re.compile("".join(parts), flags)
+
+
+def parse_power(value: str) -> Power:
+    """The power state that an answer's value names. Raises ProtocolError for any other word."""
+    try:
+        return Power(value)
+    except ValueError:
+        raise _garbage(value.encode("latin-1", "replace")) from None
+
+
+def parse_hours(value: str, per_hour: int = 1) -> int:
+    """Lamp hours of an answer in units of ``per_hour`` an hour, e.g. "01200".
+
+    Raises ProtocolError for anything but digits, and for more than 99,999 hours.
+    """
+    digits = value.strip()
+    if not (digits.isascii() and digits.isdigit() and len(digits) <= 10):
+        raise _garbage(value.encode("latin-1", "replace"))
+    hours = int(digits) // per_hour
+    if hours > MOST_HOURS:
+        raise _garbage(value.encode("latin-1", "replace"))
+    return hours
+
+
+def _garbage(line: bytes) -> ProtocolError:
+    return ProtocolError(
+        "projector-garbage",
+        what=f'The projector sent "{escaped(line[:64])}", which its protocol does not have.',
+        remedy="Check the baud rate, the cable, and that the profile in stage.toml is the one of this model.",
+    )

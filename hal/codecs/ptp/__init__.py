@@ -1,0 +1,3 @@
+"""Picture Transfer Protocol: `values` and `datasets`, its transports (`ip`, `usb`) and Canon's extensions
+(`eos`).
+"""

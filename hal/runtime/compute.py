@@ -1,0 +1,181 @@
+"""How compiled numeric code runs on this machine: which CPUs it may use, how its threads wait, where it is kept.
+
+Shared by the controller and the emulated bench, whose kernels are compiled by numba. Importing this module loads
+nothing beyond the standard library and changes nothing.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import math
+import os
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from hal.runtime.caches import cache_folder, temporary
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+PACKAGES: Final = ("controller", "plugins", "hal", "benchmarks", "tests")
+"""Whose kernels are kept in the cache."""
+LOCATORS: Final = "hal.runtime.compute.KernelFolder,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
+_IMPORT: Final = re.compile(
+    rf"^[ \t]*from[ \t]+((?:{'|'.join(PACKAGES)})[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)", re.MULTILINE
+)
+
+
+def usable_cpus(groups: Path = Path("/sys/fs/cgroup"), membership: Path = Path("/proc/self/cgroup")) -> int:
+    """CPUs that this process may keep busy, at least 1: its affinity, and the quotas of its control groups.
+
+    Args:
+        groups: Where control groups are mounted, version 1 or 2.
+        membership: The file that names this process's groups.
+    """
+    quotas = [math.ceil(quota) for quota in _quotas(groups, membership)]
+    return max(1, min([affinity(), *quotas]))
+
+
+def affinity() -> int:
+    """CPUs that the scheduler may run this process on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def prepare_threads() -> None:
+    """Set, in the environment, what numba and its OpenMP library read before the first kernel runs.
+
+    OpenMP's threads spin while they wait. Beside other busy programs each then spins for a thread that has no CPU, and
+    a solve takes up to 40 times as long (docs/decisions/0035). A variable that the user has set is kept.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    if usable_cpus() < affinity():  # numba knows the affinity, and no control groups
+        os.environ.setdefault("NUMBA_NUM_THREADS", str(usable_cpus()))
+    os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)
+
+
+def kernel_folder() -> Path:
+    """Where compiled kernels are kept: in ``hal.runtime.caches.cache_folder``."""
+    return cache_folder() / "kernels"
+
+
+class KernelFolder:
+    """Tells numba where a kernel's machine code is kept: a folder named after the contents of its sources.
+
+    The sources are the kernel's file and every file of this project that it imports, because numba compiles called
+    kernels and constants into their caller. Copies of one version share a folder, so a checkout, an installed package
+    and parallel tests compile each kernel once. Interface: ``numba.core.caching._CacheLocator``.
+    """
+
+    def __init__(self, source: Path, line: int, folder: Path) -> None:
+        self._source = source
+        self._line = line
+        self._folder = folder
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> KernelFolder | None:
+        """For ``function`` in ``file``; None where the file is not this project's.
+
+        Where no folder of the user's can be written, the kernels of this process are kept until it ends.
+        """
+        source = Path(file).resolve()
+        if not source.is_relative_to(ROOT) or source.relative_to(ROOT).parts[0] not in PACKAGES:
+            return None
+        name = f"{source.stem}-{digest_of(source)}"
+        for parent in (kernel_folder, _folder_until_exit):
+            try:
+                locator = cls(source, function.__code__.co_firstlineno, parent() / name)
+                locator.ensure_cache_path()
+            except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
+                continue
+            return locator
+        return None
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder, for this user alone: what lies in it is executed. Raises ``OSError``."""
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if self._folder.stat().st_uid != os.geteuid() or not os.access(self._folder, os.W_OK):
+            raise PermissionError(f"{self._folder} belongs to another user or cannot be written")
+
+    def get_cache_path(self) -> str:
+        """The folder."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        """What the sources were when the kernel was compiled."""
+        return digest_of(self._source)
+
+    def get_disambiguator(self) -> str:
+        """Tells kernels of one name in one file apart: the line."""
+        return str(self._line)
+
+
+@cache
+def _folder_until_exit() -> Path:
+    stack = contextlib.ExitStack()
+    atexit.register(stack.close)
+    return stack.enter_context(temporary())
+
+
+@cache
+def digest_of(source: Path) -> str:
+    """A digest, 16 hexadecimal digits, of ``source`` and of all files of this project that it imports."""
+    found, waiting = {source}, [source]
+    while waiting:
+        new = _imported(waiting.pop()) - found
+        found |= new
+        waiting += new
+    content = hashlib.sha256()
+    for path in sorted(found):
+        content.update(f"{path.relative_to(ROOT)}\0".encode())
+        content.update(hashlib.sha256(path.read_bytes()).digest())
+    return content.hexdigest()[:16]
+
+
+@cache
+def _imported(source: Path) -> frozenset[Path]:
+    """Files of this project that ``source`` imports itself, at its top or inside its functions."""
+    named = set()
+    for module, names in _IMPORT.findall(source.read_text(encoding="utf-8")):
+        named |= {module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))}
+    return frozenset(path for name in named if (path := _file_of(name)) is not None)
+
+
+@cache
+def _file_of(module: str) -> Path | None:
+    stem = ROOT.joinpath(*module.split("."))
+    return next((path for path in (stem.with_suffix(".py"), stem / "__init__.py") if path.is_file()), None)
+
+
+def _quotas(groups: Path, membership: Path) -> list[float]:
+    """CPUs that each control group of this process, and each group above it, may use."""
+    try:
+        lines = membership.read_text().splitlines()
+    except OSError:
+        return []
+    found = []
+    for controllers, name in (line.split(":", 2)[1:] for line in lines if line.count(":") >= 2):
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        mount = groups if not controllers else groups / controllers
+        path = mount / name.lstrip("/")
+        for group in (path, *path.parents):
+            if not group.is_relative_to(mount):
+                break
+            quota = _quota_of(group)
+            if quota is not None:
+                found.append(quota)
+    return found
+
+
+def _quota_of(group: Path) -> float | None:
+    """Version 2 has ``cpu.max`` ("quota period" or "max period"), version 1 a file for each, quota -1 for none."""
+    try:
+        if (group / "cpu.max").is_file():
+            quota, period = (group / "cpu.max").read_text().split()
+        else:
+            quota, period = ((group / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+        return float(quota) / float(period) if quota != "max" and float(quota) > 0 else None
+    except (OSError, ValueError, ZeroDivisionError):
+        return None

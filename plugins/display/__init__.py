@@ -1,0 +1,1 @@
+"""The player as a display device. Entry: `player.DRIVER`."""

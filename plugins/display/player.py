@@ -1,0 +1,180 @@
+"""The display through the player process (docs/reference/player-protocol.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hal.deadline import Deadline
+from hal.errors import DeviceRefused, PluginError
+from hal.registry import Driver, OpenContext
+from hal.values import DeviceIdentity, LiveStatus, OutputInfo, PlaybackStatus, Presented
+from plugins.display.link import PlayerLink, broken
+
+
+class PlayerDisplay:
+    """A running player as a display. Connects again by itself after the player was restarted.
+
+    It is a ``hal.interfaces.BundleDisplay``, and has ``status`` beyond that. Not for several threads at once.
+    """
+
+    def __init__(self, path: Path, expected: tuple[OutputInfo, ...] | None) -> None:
+        self._link = PlayerLink(path, expected)
+
+    # --- hal.interfaces.Display ---------------------------------------------------------------------------------
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        """The player's name and the protocol that it speaks; its process number stands for the serial number."""
+        hello = self._link.ask({"op": "hello"}, deadline)
+        return DeviceIdentity(
+            "Velatura", str(hello["player"]), serial=str(hello["pid"]), firmware=f"protocol {hello['protocol']}"
+        )
+
+    def outputs(self, *, deadline: Deadline) -> tuple[OutputInfo, ...]:
+        """The outputs in stage order, as the player that runs now has them."""
+        self._link.connect(deadline)
+        return self._link.outputs
+
+    def show(self, frames: Mapping[str, npt.NDArray[np.uint8]], *, deadline: Deadline) -> Presented:
+        """Show one frame an output; see ``hal.interfaces.Display.show``."""
+        self._link.connect(deadline)
+        assert self._link.inbox is not None
+        self._check(frames)
+        return _presented(self._link.ask({"op": "show", "sequence": self._link.inbox.put(frames)}, deadline))
+
+    def play(self, appearance: str, *, deadline: Deadline) -> Presented:
+        """Show an appearance of the player's bundle; see ``hal.interfaces.Display.play``."""
+        return _presented(self._link.ask({"op": "play", "appearance": appearance}, deadline))
+
+    def close(self) -> None:
+        """Let go of the player; it goes on showing what it shows."""
+        self._link.close()
+
+    # --- hal.interfaces.BundleDisplay -------------------------------------------------------------------------------
+
+    def play_sequence(
+        self,
+        items: Sequence[tuple[str, float] | tuple[str, float, float]],
+        *,
+        deadline: Deadline,
+        repeat: int = 0,
+        rate_hz: float | None = None,
+    ) -> Presented:
+        """Show appearances in turn; see ``hal.interfaces.BundleDisplay.play_sequence``.
+
+        ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds; None: at the player's own rate.
+        """
+        request = {"op": "sequence", "items": [list(item) for item in items], "repeat": repeat, "rate_hz": rate_hz}
+        return _presented(self._link.ask(request, deadline))
+
+    def stop(self, *, deadline: Deadline) -> Presented:
+        """Show black."""
+        return _presented(self._link.ask({"op": "stop"}, deadline))
+
+    def live(self, file: Path, *, deadline: Deadline, white: float | None = None) -> None:
+        """Show what is written to a shared frame file as it comes; see ``hal.interfaces.BundleDisplay.live``."""
+        self._link.ask({"op": "live", "file": str(file.resolve()), "white": white}, deadline)
+
+    def identify(self, *, deadline: Deadline) -> Presented:
+        """Show each output's number, name and size."""
+        return _presented(self._link.ask({"op": "identify"}, deadline))
+
+    def status(self, *, deadline: Deadline) -> dict[str, Any]:
+        """What the player shows and how evenly: the keys of "status" in docs/reference/player-protocol.md."""
+        return self._link.ask({"op": "status"}, deadline)
+
+    def playing(self, *, deadline: Deadline) -> PlaybackStatus:
+        """What is shown now, and how evenly; see ``hal.interfaces.BundleDisplay.playing``."""
+        answer = self.status(deadline=deadline)
+        try:
+            return PlaybackStatus(
+                swaps=int(answer["swaps"]),
+                presented_at_s=float(answer["presented_at"]),
+                running=bool(answer["sequence_running"]),
+                late=int(answer["late"]),
+                appearance=answer["appearance"],
+                bundle=answer["bundle"],
+                interval_p50_s=answer["interval_p50_s"],
+                interval_p99_s=answer["interval_p99_s"],
+                rss_bytes=int(answer["rss_bytes"]),
+                live=_live(answer.get("live")),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise broken("its status lacks something") from error
+
+    def load_bundle(self, path: Path, *, deadline: Deadline) -> str:
+        """Let the player use another bundle from now on; returns the bundle's identity (hex)."""
+        return str(self._link.ask({"op": "load-bundle", "path": str(path.resolve())}, deadline)["bundle"])
+
+    def _check(self, frames: Mapping[str, npt.NDArray[np.uint8]]) -> None:
+        shapes = {output.name: (output.height_px, output.width_px, 3) for output in self._link.outputs}
+        for name, frame in frames.items():
+            if name not in shapes:
+                raise DeviceRefused(
+                    "display-no-output",
+                    what=f"The player has no output {name!r}; it has {', '.join(shapes)}.",
+                    remedy="Use the names of [[display.outputs]] in stage.toml.",
+                )
+            if frame.shape != shapes[name] or frame.dtype != np.uint8:
+                raise DeviceRefused(
+                    "display-frame-unfit",
+                    what=f"A frame of shape {frame.shape}, {frame.dtype} does not fit output {name}, "
+                    f"which takes {shapes[name]}, uint8.",
+                    remedy="Make frames of the size that stage.toml gives for this output.",
+                )
+
+
+def _presented(answer: Mapping[str, Any]) -> Presented:
+    sequence, at_s = answer.get("sequence"), answer.get("presented_at")
+    if not isinstance(sequence, int) or not isinstance(at_s, float):
+        raise broken("an answer of it does not say when it presented")
+    return Presented(sequence, at_s)
+
+
+def _live(told: Mapping[str, Any] | None) -> LiveStatus | None:
+    if told is None:
+        return None
+    return LiveStatus(
+        int(told["shown"]), told["source"] == "there", str(told["by"]), told["delay_p50_s"], told["delay_p99_s"]
+    )
+
+
+def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PlayerDisplay:
+    path = context.stage / settings["socket"] if "socket" in settings else None
+    if path is None and context.runtime is not None:
+        path = context.runtime / "player.sock"
+    if path is None:
+        raise PluginError(
+            "player-socket-unknown",
+            what="Neither stage.toml nor the command says where the player's socket is.",
+            remedy='Set socket = "..." in [display].',
+        )
+    try:
+        tables = settings.get("outputs")
+        expected = tables and tuple(OutputInfo(t["name"], int(t["width_px"]), int(t["height_px"])) for t in tables)
+    except (KeyError, TypeError, ValueError) as error:
+        raise PluginError(
+            "player-outputs-wrong",
+            what="An output in [[display.outputs]] lacks its name, width_px or height_px.",
+            remedy='Give each output all three, e.g. name = "P1", width_px = 1400, height_px = 1050.',
+        ) from error
+    display = PlayerDisplay(path, expected)
+    display.outputs(deadline=deadline)
+    return display
+
+
+DRIVER = Driver(
+    kind="display",
+    name="player",
+    summary="all projector outputs together, through Velatura's player process",
+    open=_open,
+    settings={
+        "outputs": "list of tables with name, width_px and height_px, in stage order",
+        "frames": "file, relative to the stage, in which the player shows frames instead of windows (memory output)",
+        "socket": "the player's socket, relative to the stage; default: player.sock in the stage's runtime folder",
+    },
+)

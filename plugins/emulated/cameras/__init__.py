@@ -1,0 +1,1 @@
+"""Emulated PTP cameras, over TCP and USB. Entry: `camera`, `usb_camera`."""

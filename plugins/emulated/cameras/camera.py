@@ -1,0 +1,288 @@
+"""An emulated camera on PTP/IP: two ports on loopback, one computer at a time, faults on request."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import struct
+import threading
+import time
+import uuid
+from types import TracebackType
+from typing import Final, Literal, Self
+
+from hal.errors import DeviceError
+from plugins.emulated.cameras.body import JPEG, CameraFaults, CameraNames, EmulatedBody
+from plugins.emulated.cameras.eos import EmulatedEosBody, EmulatedOldEosBody
+from plugins.emulated.cameras.generic import EmulatedGenericBody
+from plugins.emulated.cameras.shot import Expose
+from plugins.emulated.cameras.wire import (
+    CANCEL,
+    EVENT,
+    INIT_COMMAND,
+    INIT_COMMAND_ACK,
+    INIT_EVENT,
+    INIT_EVENT_ACK,
+    INIT_FAIL,
+    PING,
+    PONG,
+    REQUEST,
+    RESPONSE,
+    Gone,
+    PtpOutcome,
+    receive,
+    receive_data,
+    send,
+    send_data,
+)
+
+Flavour = Literal["generic", "eos-new", "eos-old"]
+BODIES: Final = {"generic": EmulatedGenericBody, "eos-new": EmulatedEosBody, "eos-old": EmulatedOldEosBody}
+NAMES: Final = {
+    "generic": CameraNames(),
+    "eos-new": CameraNames("Canon Inc.", "Canon EOS 1300D", "0320010001", "3-1.1.0"),
+    "eos-old": CameraNames("Canon Inc.", "Canon EOS 400D DIGITAL", "0320010002", "3-1.1.1"),
+}
+_TAKEOVER_S: Final = 0.5
+
+
+class EmulatedPtpCamera:
+    """Serves one camera from ``start`` to ``stop``; also a context.
+
+    Parameters
+    ----------
+    expose : makes the files of an exposure; called from the camera's shutter thread
+    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D)
+    command_port, event_port : 0 takes a free one; both the same non-zero number: one port for both, as real ones do
+    names : identity; by default one that fits the flavour
+    time_scale : real seconds for each second of exposure
+    card_bytes : size of the memory card
+    raw : False for a camera that makes JPEG files only
+    faults : knobs that may be turned while it runs
+    """
+
+    def __init__(
+        self,
+        expose: Expose,
+        *,
+        flavour: Flavour = "generic",
+        host: str = "127.0.0.1",
+        command_port: int = 0,
+        event_port: int = 0,
+        names: CameraNames | None = None,
+        time_scale: float = 1.0,
+        card_bytes: int = 4 << 30,
+        raw: bool = True,
+        faults: CameraFaults | None = None,
+    ) -> None:
+        self.faults = faults or CameraFaults()
+        self.names = names or NAMES[flavour]
+        self._body: EmulatedBody = BODIES[flavour](
+            expose,
+            names=self.names,
+            time_scale=time_scale,
+            card_bytes=card_bytes,
+            faults=self.faults,
+        )
+        if not raw:
+            self._body.capture_formats = (JPEG,)
+        self._body.power_on()
+        self._body.on_event = self._send_event
+        self._body.on_drop = self.drop_connection
+        self._host = host
+        self._ports = (command_port, event_port)
+        self._listeners: list[socket.socket] = []
+        self._lock = threading.Lock()
+        self._command: socket.socket | None = None
+        self._events: socket.socket | None = None
+        self._connection = 0
+
+    @property
+    def address(self) -> str:
+        """``ptpip:HOST:COMMANDPORT:EVENTPORT``, once started."""
+        return f"ptpip:{self._host}:{self._ports[0]}:{self._ports[1]}"
+
+    @property
+    def body(self) -> EmulatedBody:
+        """What is behind the connection: card, battery, settings."""
+        return self._body
+
+    @property
+    def exposures(self) -> int:
+        """How often the shutter has opened."""
+        return self._body.exposures
+
+    @property
+    def pictures_on_card(self) -> int:
+        return sum(bool(stored.data) for stored in self._body.card.objects.values())
+
+    @property
+    def battery_percent(self) -> int:
+        return self._body.battery_percent
+
+    @battery_percent.setter
+    def battery_percent(self, percent: int) -> None:
+        self._body.battery_percent = percent
+
+    def start(self) -> Self:
+        """Listen. Raises DeviceError("port-in-use")."""
+        command = self._listen(self._ports[0])
+        port = command.getsockname()[1]
+        if self._ports[1] and self._ports[1] == self._ports[0]:
+            self._ports = (port, port)
+        else:
+            self._ports = (port, self._listen(self._ports[1]).getsockname()[1])
+        self._body.stopped.clear()
+        for listener in self._listeners:
+            threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
+        return self
+
+    def stop(self) -> None:
+        """Switch off: refuse connections and end the open one. ``start`` switches on again, with the same card."""
+        self._body.stopped.set()
+        for listener in self._listeners:
+            _end(listener)
+        self._listeners.clear()
+        self.drop_connection()
+
+    def drop_connection(self) -> None:
+        """End the connection as a pulled cable does: without goodbye."""
+        with self._lock:
+            ending = (self._command, self._events)
+        for connection in ending:
+            if connection is not None:
+                _end(connection)
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _listen(self, port: int) -> socket.socket:
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((self._host, port))
+            listener.listen()
+        except OSError as error:
+            listener.close()
+            self.stop()
+            raise DeviceError(
+                "port-in-use",
+                what=f"The emulated camera can't use port {port} on {self._host}: {error.strerror}.",
+                remedy="End the program that uses it, or give the camera another port (0 chooses a free one).",
+            ) from error
+        self._listeners.append(listener)
+        return listener
+
+    def _accept(self, listener: socket.socket) -> None:
+        while True:
+            try:
+                connection, _ = listener.accept()
+            except OSError:
+                return
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            threading.Thread(target=self._welcome, args=(connection,), daemon=True).start()
+
+    def _welcome(self, connection: socket.socket) -> None:
+        """The first packet says which of the two connections this is."""
+        with contextlib.suppress(Gone, struct.error), contextlib.closing(connection):
+            kind, body = receive(connection)
+            if kind == INIT_COMMAND:
+                self._serve_commands(connection)
+            elif kind == INIT_EVENT and struct.unpack_from("<I", body)[0] == self._connection:
+                self._serve_events(connection)
+            else:
+                send(connection, INIT_FAIL, struct.pack("<I", 1))
+
+    def _serve_commands(self, connection: socket.socket) -> None:
+        if not self._take_over(connection):
+            send(connection, INIT_FAIL, struct.pack("<I", 2))
+            return
+        try:
+            guid = uuid.uuid5(uuid.NAMESPACE_OID, self._body.names.serial).bytes
+            name = (self._body.names.model + "\0").encode("utf-16-le")
+            send(connection, INIT_COMMAND_ACK, struct.pack("<I", self._connection) + guid + name + b"\0\0\1\0")
+            while True:
+                self._serve_request(connection)
+        finally:
+            with self._lock:
+                events, self._command, self._events = self._events, None, None
+            self._body.disconnected()
+            if events is not None:
+                _end(events)
+
+    def _take_over(self, connection: socket.socket) -> bool:
+        """One computer at a time; one that has just left may take a moment to be noticed."""
+        until = time.monotonic() + _TAKEOVER_S
+        while True:
+            with self._lock:
+                if self._command is None:
+                    self._command = connection
+                    self._connection += 1
+                    return True
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.01)
+
+    def _serve_events(self, connection: socket.socket) -> None:
+        with self._lock:
+            self._events = connection
+        send(connection, INIT_EVENT_ACK)
+        while True:
+            if receive(connection)[0] == PING:
+                send(connection, PONG)
+
+    def _serve_request(self, connection: socket.socket) -> None:
+        kind, body = receive(connection)
+        if kind == PING:
+            send(connection, PONG)
+        if kind in (PING, PONG, CANCEL):
+            return
+        if kind != REQUEST:
+            raise Gone
+        phase, code, transaction = struct.unpack_from("<IHI", body)
+        parameters = struct.unpack_from(f"<{(len(body) - 10) // 4}I", body, 10)
+        data = receive_data(connection) if phase == 2 else b""
+        self._hold_back()
+        if self.faults.take("garbage"):
+            connection.sendall(os.urandom(64))
+            return
+        self._reply(connection, transaction, self._body.answer(code, parameters, data))
+
+    def _hold_back(self) -> None:
+        """Slow and silent cameras; a silent one goes on once it may speak again."""
+        if self.faults.slow_s:
+            self._body.stopped.wait(self.faults.slow_s)
+        while self.faults.silent and not self._body.stopped.is_set():
+            time.sleep(0.01)
+
+    def _reply(self, connection: socket.socket, transaction: int, outcome: PtpOutcome) -> None:
+        if outcome.data is not None:
+            large = len(outcome.data) > 1000
+            wrong = 7 if large and self.faults.take("wrong_lengths") else 0
+            if large and self.faults.take("drop_in_transfer"):
+                half = outcome.data[: len(outcome.data) // 2]
+                send_data(connection, transaction, half, announce=len(outcome.data))
+                raise Gone
+            send_data(connection, transaction, outcome.data, announce=len(outcome.data) + wrong)
+        answer = struct.pack(f"<HI{len(outcome.parameters)}I", outcome.code, transaction, *outcome.parameters)
+        send(connection, RESPONSE, answer)
+
+    def _send_event(self, code: int, parameters: tuple[int, ...]) -> None:
+        with self._lock:
+            events = self._events
+        if events is not None:
+            with contextlib.suppress(Gone):
+                send(events, EVENT, struct.pack(f"<HI{len(parameters)}I", code, 0, *parameters))
+
+
+def _end(connection: socket.socket) -> None:
+    """Close a socket that another thread may be waiting on."""
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
+    connection.close()

@@ -1,0 +1,1 @@
+"""The optical model: what a camera sees of an object under projectors' light. Entry: `world`, `render`."""

@@ -1,0 +1,233 @@
+"""The object on the stage: triangles for the rays, and its albedo at any point that a ray hits."""
+
+from __future__ import annotations
+
+import functools
+import io
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hal.errors import DeviceError
+from hal.runtime.files import LARGEST_MESH, require_regular
+from plugins.emulated.optics.shapes import Floats, Rgb, bust, paint_bust, paint_solid, paint_vase, vase
+
+HEIGHT_M: Final = 0.30
+WIDTH_M: Final = 0.36
+SHARPEST_CREASE: Final = 0.6
+"""Cosine; where a face leans farther than this from its corner's mean normal, it is shaded flat."""
+DARKEST, BRIGHTEST = 0.05, 0.85
+SMALLEST, LARGEST = 1e-9, 1e9
+"""Of a mesh, in whatever unit its file has."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageObject:
+    """Triangles in the world's frame, in metres, with what is needed to look up their colour.
+
+    ``vertices`` (V, 3) float32; ``faces`` (F, 3) int32; ``normals`` (F, 3, 3) float32: unit, one a face's corner;
+    ``paint``: ``vase-and-bust``, ``solid``, ``corners`` (colours at the corners) or ``texture``;
+    ``corner_values``: (F, 3, 3) linear RGB for ``corners``, (F, 3, 2) texture coordinates for ``texture``, else empty;
+    ``texture``: (rows, columns, 3) linear RGB for ``texture``, else empty; ``parts``: first face of each painted part
+    """
+
+    vertices: npt.NDArray[np.float32]
+    faces: npt.NDArray[np.int32]
+    normals: npt.NDArray[np.float32]
+    paint: str
+    corner_values: npt.NDArray[np.float32]
+    texture: npt.NDArray[np.float32]
+    parts: npt.NDArray[np.int32]
+
+    def albedo(self, points: Floats, faces: npt.NDArray[np.int32], weights: npt.NDArray[np.float32]) -> Rgb:
+        """Linear RGB (N, 3) float32 at points (N, 3) on ``faces`` (N,), with corner weights (N, 3) that sum to 1."""
+        if self.paint == "vase-and-bust":
+            local = points * (1.0, -1.0, -1.0) + (0.0, 0.5 * HEIGHT_M, 0.0)
+            on_vase = faces < self.parts[1]
+            colours = np.empty((len(points), 3), dtype=np.float32)
+            colours[on_vase] = paint_vase(local[on_vase])
+            colours[~on_vase] = paint_bust(local[~on_vase])
+            return colours
+        if self.paint == "solid":
+            return paint_solid(points)
+        at = np.einsum("nk,nkc->nc", weights, self.corner_values[faces])
+        if self.paint == "texture":
+            rows, columns = self.texture.shape[:2]
+            x = (at[:, 0] % 1.0) * columns - 0.5
+            y = (1.0 - at[:, 1] % 1.0) * rows - 0.5
+            at = _sampled(self.texture, x, y)
+        return np.asarray(np.clip(at, DARKEST, BRIGHTEST), dtype=np.float32)
+
+    def save(self, path: Path) -> None:
+        """Write as a NumPy archive, in one step."""
+        data = io.BytesIO()
+        np.savez(data, **{name: np.asarray(getattr(self, name)) for name in self.__slots__})  # type: ignore[arg-type]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(path.name + ".part")
+        temporary.write_bytes(data.getvalue())
+        temporary.replace(path)
+
+    @classmethod
+    def read(cls, path: Path) -> StageObject:
+        """Read what ``save`` wrote. Raises DeviceError ``object-unreadable``."""
+        try:
+            require_regular(path)
+            with np.load(path, allow_pickle=False) as archive:
+                values = {name: archive[name] for name in cls.__slots__}
+        # A damaged archive may be taken for any of numpy's formats, each of which has errors of its own.
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise _unreadable(path, getattr(error, "strerror", None) or str(error)) from error
+        return cls(**(values | {"paint": str(values["paint"])}))
+
+
+@functools.cache
+def default_object() -> StageObject:
+    """The vase and the bust side by side as one mesh."""
+    (vase_points, vase_faces), (bust_points, bust_faces) = vase(), bust()
+    points = np.concatenate([vase_points, bust_points])
+    faces = np.concatenate([vase_faces, bust_faces + len(vase_points)]).astype(np.int32)
+    world = (points - (0.0, 0.5 * HEIGHT_M, 0.0)) * (1.0, -1.0, -1.0)
+    return _assembled(world, faces, "vase-and-bust", parts=np.array([0, len(vase_faces)], dtype=np.int32))
+
+
+def load_object(path: Path) -> StageObject:
+    """Read a mesh (.obj, .ply and whatever trimesh reads), upright along +y and facing +z, and fit it to the stage.
+
+    Its texture or vertex colours (taken as sRGB) become its albedo; without either it is painted procedurally.
+    Raises DeviceError ``object-unreadable``, ``object-no-faces`` or ``object-no-size``.
+    """
+    import trimesh
+
+    try:
+        require_regular(path, LARGEST_MESH)
+        mesh: Any = trimesh.load(path, force="mesh", process=False)
+        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32)
+    except OSError as error:
+        raise _unreadable(path, error.strerror or str(error)) from error
+    # Every format's reader has its own errors, and there are thirty of them: to the technician they are one.
+    except Exception as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    if faces.ndim != 2 or len(faces) == 0:
+        raise DeviceError(
+            "object-no-faces",
+            what=f"{path} contains no faces, so there is no surface to light.",
+            remedy="Export the object as a triangle mesh (.obj or .ply), not as a point cloud.",
+        )
+    if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        raise _unreadable(path, "its coordinates or face indices are not valid numbers")
+    vertices = _fitted(_with_size(path, vertices, faces), faces)
+    colour = _corner_colours(mesh.visual, faces)
+    return _assembled(vertices, faces, **colour)
+
+
+def _with_size(path: Path, vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
+    """The vertices, if their faces have an area, and one that numbers of 32 bits can tell from nothing."""
+    corners = vertices[faces]
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.ptp(corners.reshape(-1, 3), axis=0).max()
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    if not (np.isfinite(area) and SMALLEST < size < LARGEST and area > 1e-9 * size**2):
+        raise DeviceError(
+            "object-no-size",
+            what=f"The faces of {path} have no area, or are too small or too large to count with.",
+            remedy="Export the object as a surface, in metres, centimetres or millimetres.",
+        )
+    return vertices
+
+
+def _fitted(vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
+    """Scaled to the stage's room and centred; y up becomes y down."""
+    used = vertices[np.unique(faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    extent = np.maximum(high - low, 1e-12)
+    scale = min(HEIGHT_M / extent[1], WIDTH_M / extent[0], HEIGHT_M / extent[2])
+    return np.asarray((vertices - 0.5 * (low + high)) * scale * (1.0, -1.0, -1.0))
+
+
+def _corner_colours(visual: Any, faces: npt.NDArray[np.int32]) -> dict[str, Any]:
+    """What of ``StageObject`` describes the colour of a mesh that trimesh read."""
+    if getattr(visual, "kind", None) == "vertex":
+        colours = _linear(np.asarray(visual.vertex_colors)[:, :3])
+        return {"paint": "corners", "corner_values": colours[faces]}
+    if getattr(visual, "kind", None) == "texture" and visual.uv is not None:
+        material = visual.material
+        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+        if image is not None and min(image.size) > 2:  # trimesh makes up a few grey pixels for a missing file
+            texture = _linear(np.asarray(image.convert("RGB")))
+            return {"paint": "texture", "corner_values": np.asarray(visual.uv, np.float32)[faces], "texture": texture}
+    return {"paint": "solid"}
+
+
+def _assembled(
+    vertices: Floats,
+    faces: npt.NDArray[np.int32],
+    paint: str,
+    *,
+    corner_values: npt.NDArray[np.float32] | None = None,
+    texture: npt.NDArray[np.float32] | None = None,
+    parts: npt.NDArray[np.int32] | None = None,
+) -> StageObject:
+    empty = np.zeros(0, dtype=np.float32)
+    return StageObject(
+        vertices=vertices.astype(np.float32),
+        faces=faces,
+        normals=corner_normals(vertices, faces),
+        paint=paint,
+        corner_values=empty if corner_values is None else corner_values,
+        texture=empty if texture is None else texture,
+        parts=np.zeros(1, dtype=np.int32) if parts is None else parts,
+    )
+
+
+def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
+    """Unit normals (F, 3, 3): the mean of the faces that meet at a point by their angles, or flat at sharp creases."""
+    corners = vertices[faces]
+    flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    # Files split vertices along texture seams; the surface is smooth there all the same.
+    _, place = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    total = np.zeros((int(place.max()) + 1, 3))
+    for corner in range(3):
+        sides = [_unit(corners[:, (corner + step) % 3] - corners[:, corner]) for step in (1, 2)]
+        angle = np.arccos(np.clip(np.sum(sides[0] * sides[1], axis=1), -1.0, 1.0))
+        for axis in range(3):
+            total[:, axis] += np.bincount(place[faces[:, corner]], weights=angle * flat[:, axis], minlength=len(total))
+    smooth = _unit(total)[place][faces]
+    creased = np.einsum("fkc,fc->fk", smooth, flat) < SHARPEST_CREASE
+    return np.where(creased[..., None], flat[:, None], smooth).astype(np.float32)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30))
+
+
+def _linear(srgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """sRGB bytes to linear light in 0..1 (IEC 61966-2-1)."""
+    value = np.arange(256) / 255.0
+    table = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.asarray(table[srgb])
+
+
+def _sampled(image: npt.NDArray[np.float32], x: Floats, y: Floats) -> Rgb:
+    """Bilinear samples (N, 3); wraps round."""
+    chunk = 16384  # cv2.remap takes maps of at most 32767 columns
+    out = np.empty((len(x), 3), dtype=np.float32)
+    for start in range(0, len(x), chunk):
+        part = slice(start, start + chunk)
+        maps = x[None, part].astype(np.float32), y[None, part].astype(np.float32)
+        out[part] = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)[0]
+    return out
+
+
+def _unreadable(path: Path, why: str) -> DeviceError:
+    return DeviceError(
+        "object-unreadable",
+        what=f"The object {path} can't be read as a mesh ({why}).",
+        remedy="Check the file, or export it again as .obj or .ply.",
+    )

@@ -1,0 +1,234 @@
+"""Rays through the static stage, cast once: what every camera subsample sees, and where each projector lights it.
+
+The light on a surface point from a projector whose image plane is evenly lit (each pixel the same irradiance on a
+plane facing the lens) is, at depth z along the axis, ``cos(surface) / (z^2 cos(axis))``: inverse square and Lambert,
+with the 1/cos^3 by which a flat screen's corners are reached by less dense but wider pixels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+
+from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.truth import BenchTruth, Lens, Pose, ProjectorTruth
+from plugins.emulated.tables import dump
+
+CACHE: Final = "rays.npz"
+VERSION: Final = 2
+ROWS_AT_ONCE: Final = 1 << 20
+SHADOW_BIAS_M: Final = 2e-4
+SIGMA_STEP_PX: Final = 1.0 / 64.0
+"""Blur is stored in these steps, in a byte: up to 4 px."""
+BEYOND_PX: Final = 4.0
+"""Blur spreads light beyond the projected image: points this far outside are still lit."""
+
+Floats = npt.NDArray[np.float64]
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Camera subsamples that hit the object, in camera pixel order; N of them in P pixels.
+
+    ``pixels`` (P,) int32: flat camera pixel; ``starts`` (P + 1,) int32: its first sample;
+    ``albedo`` (N, 3) float32, already divided by the S * S subsamples of a pixel;
+    ``at_px`` (projectors, N, 2) float32: x, y in projector pixels;
+    ``gain`` (projectors, N) float32: light on the point per linear light 1, 0 in shadow;
+    ``blur`` (projectors, N) uint8: in SIGMA_STEP_PX
+    ``gloss`` (projectors, N) float32: what highlights add to the albedo, divided by S * S too; (projectors, 0) without
+    """
+
+    pixels: npt.NDArray[np.int32]
+    starts: npt.NDArray[np.int32]
+    albedo: npt.NDArray[np.float32]
+    at_px: npt.NDArray[np.float32]
+    gain: npt.NDArray[np.float32]
+    blur: npt.NDArray[np.uint8]
+    gloss: npt.NDArray[np.float32]
+
+
+def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None, progress: Progress) -> Samples:
+    """The stage's samples, from ``cache`` (a folder) when they were cast for this very truth and object.
+
+    ``progress`` is called with the share that is done, 0..1.
+    """
+    key = _key(truth, stage_object)
+    path = None if cache is None else cache / CACHE
+    found = None if path is None else _read(path, key)
+    if found is None:
+        found = cast(truth, stage_object, progress)
+        if path is not None:
+            _write(path, key, found)
+    progress(1.0)
+    return found
+
+
+def cast(truth: BenchTruth, stage_object: StageObject, progress: Progress) -> Samples:
+    """Cast every ray of the stage."""
+    scene = rtcore_scene.EmbreeScene(robust=True)
+    TriangleMesh(scene, stage_object.vertices, stage_object.faces)
+    width, height = truth.camera.lens.size_px
+    rows = max(1, ROWS_AT_ONCE // (width * truth.subsamples**2))
+    blocks = []
+    for first in range(0, height, rows):
+        blocks.append(_cast_rows(truth, stage_object, scene, first, min(first + rows, height)))
+        progress(min(first + rows, height) / height)
+    counts = np.concatenate([block["counts"] for block in blocks])
+    pixels = np.flatnonzero(counts).astype(np.int32)
+    starts = np.concatenate(([0], np.cumsum(counts[pixels]))).astype(np.int32)
+    return Samples(
+        pixels=pixels,
+        starts=starts,
+        albedo=np.concatenate([block["albedo"] for block in blocks]),
+        at_px=np.concatenate([block["at_px"] for block in blocks], axis=1),
+        gain=np.concatenate([block["gain"] for block in blocks], axis=1),
+        blur=np.concatenate([block["blur"] for block in blocks], axis=1),
+        gloss=np.concatenate([block["gloss"] for block in blocks], axis=1),
+    )
+
+
+def project(pose: Pose, lens: Lens, points: Floats) -> tuple[Floats, Floats]:
+    """Pixels (N, 2) and points in the device's frame (N, 3) of world points (N, 3) in metres."""
+    local = (points - pose.position_m) @ pose.rotation.T
+    flat = local[:, :2] / local[:, 2:]
+    square = np.sum(flat**2, axis=1, keepdims=True)
+    bent = flat * (1.0 + square * (lens.distortion[0] + square * lens.distortion[1]))
+    return bent * lens.focal_px + lens.centre_px, local
+
+
+def directions(pose: Pose, lens: Lens, x: Floats, y: Floats) -> Floats:
+    """World directions (N, 3), unit, of the rays through pixels (x, y)."""
+    bent = (np.stack((x, y), axis=-1) - lens.centre_px) / lens.focal_px
+    flat = bent.copy()
+    for _ in range(8):  # converges within 1e-9 for the mild distortion of a photographic lens
+        square = np.sum(flat**2, axis=1, keepdims=True)
+        flat = bent / (1.0 + square * (lens.distortion[0] + square * lens.distortion[1]))
+    local = np.concatenate((flat, np.ones((len(flat), 1))), axis=1)
+    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    return np.asarray(local @ pose.rotation)
+
+
+def _cast_rows(
+    truth: BenchTruth, stage_object: StageObject, scene: Any, first: int, last: int
+) -> dict[str, npt.NDArray[Any]]:
+    camera, s = truth.camera, truth.subsamples
+    width = camera.lens.size_px[0]
+    within = (np.arange(s) + 0.5) / s - 0.5
+    y, x, dy, dx = np.meshgrid(np.arange(first, last), np.arange(width), within, within, indexing="ij")
+    at_x, at_y = np.asarray(x + dx, np.float64).ravel(), np.asarray(y + dy, np.float64).ravel()
+    ray = directions(camera.pose, camera.lens, at_x, at_y)
+    origin = np.broadcast_to(np.asarray(camera.pose.position_m, np.float32), ray.shape).copy()
+    found = scene.run(origin, ray.astype(np.float32), output=1)
+    hit = found["primID"] >= 0
+    counts = hit.reshape(-1, s * s).sum(axis=1)
+    ray, faces = ray[hit], found["primID"][hit]
+    weights = np.stack((1.0 - found["u"][hit] - found["v"][hit], found["u"][hit], found["v"][hit]), axis=-1)
+    points = np.einsum("nk,nkc->nc", weights.astype(np.float64), stage_object.vertices[stage_object.faces[faces]])
+    normals = np.einsum("nk,nkc->nc", weights, stage_object.normals[faces]).astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals *= _facing(found["Ng"][hit].astype(np.float64), normals, ray)[:, None]
+    lit = [_lit(projector, scene, points, normals) for projector in truth.projectors]
+    gloss = [_highlight(truth, projector, points, normals, ray) / (s * s) for projector in truth.projectors]
+    return {
+        "counts": counts,
+        "albedo": (stage_object.albedo(points, faces, weights) / (s * s)).astype(np.float32),
+        "at_px": np.stack([at for at, _, _ in lit]),
+        "gain": np.stack([gain for _, gain, _ in lit]),
+        "blur": np.stack([blur for _, _, blur in lit]),
+        "gloss": np.stack(gloss).astype(np.float32),
+    }
+
+
+def _facing(geometric: Floats, normals: Floats, ray: Floats) -> Floats:
+    """+1 or -1 for each shading normal: a mesh may be inside out, and what the camera sees is the outside."""
+    same_side = np.sum(geometric * normals, axis=1) >= 0.0
+    towards_camera = np.sum(geometric * ray, axis=1) <= 0.0
+    return np.where(same_side == towards_camera, 1.0, -1.0)
+
+
+def _lit(
+    projector: ProjectorTruth, scene: Any, points: Floats, normals: Floats
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+    """Where a projector lights points, how strongly, and how blurred."""
+    light, size = projector.light, np.asarray(projector.lens.size_px)
+    at, local = project(projector.pose, projector.lens, points)
+    distance = np.linalg.norm(local, axis=1)
+    z = local[:, 2]
+    towards = (np.asarray(projector.pose.position_m) - points) / np.maximum(distance, 1e-9)[:, None]
+    cosine = np.sum(normals * towards, axis=1)
+    reach = (z > 0.01) & (cosine > 0.0) & np.all((at > -BEYOND_PX) & (at < size - 1 + BEYOND_PX), axis=1)
+    reach[reach] = ~_in_shadow(projector, scene, points[reach], distance[reach])
+    corner = np.sum(((at - 0.5 * (size - 1)) / (0.5 * size)) ** 2, axis=1) / 2.0
+    gain = light.brightness * light.reference_m**2 * cosine * distance / np.maximum(z, 0.01) ** 3
+    gain *= np.maximum(1.0 - light.vignetting * corner, 0.0)
+    focus = projector.focus
+    sigma = np.hypot(focus.sharpest_px, focus.slope_px_per_m * (z - focus.distance_m))
+    blur = np.clip(np.round(sigma / SIGMA_STEP_PX), 1, 255).astype(np.uint8)
+    return at.astype(np.float32), np.where(reach, gain, 0.0).astype(np.float32), blur
+
+
+def _highlight(truth: BenchTruth, projector: ProjectorTruth, points: Floats, normals: Floats, ray: Floats) -> Floats:
+    """What a highlight adds to the albedo at points, in the direction of the camera; nothing (0,) without gloss."""
+    strength, exponent = truth.object.gloss, truth.object.gloss_exponent
+    if strength <= 0.0:
+        return np.zeros(0)
+    towards = np.asarray(projector.pose.position_m) - points
+    half = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9) - ray
+    half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
+    cosine = np.clip(np.sum(half * normals, axis=1), 0.0, 1.0)
+    return np.asarray(strength * (exponent + 8.0) / 8.0 * cosine**exponent)
+
+
+def _in_shadow(projector: ProjectorTruth, scene: Any, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:
+    """Rays from the lens: in shadow when something is hit clearly before the point itself."""
+    lens = np.asarray(projector.pose.position_m)
+    ray = ((points - lens) / distance[:, None]).astype(np.float32)
+    origin = np.broadcast_to(lens.astype(np.float32), ray.shape).copy()
+    if not len(points):
+        return np.zeros(0, dtype=np.bool_)
+    return np.asarray(scene.run(origin, ray, output=1)["tfar"] < distance - SHADOW_BIAS_M)
+
+
+def _key(truth: BenchTruth, stage_object: StageObject) -> str:
+    digest = hashlib.sha256(f"{VERSION}\n".encode())
+    projectors = [part for p in truth.projectors for part in (p.pose, p.lens, p.focus, p.light)]
+    for part in (truth.camera.pose, truth.camera.lens, *projectors):
+        digest.update(dump(part).encode())
+    digest.update(
+        f"{truth.subsamples} {stage_object.paint} {truth.object.gloss} {truth.object.gloss_exponent}".encode()
+    )
+    for name in ("vertices", "faces", "normals", "corner_values", "texture", "parts"):
+        digest.update(np.ascontiguousarray(getattr(stage_object, name)).tobytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path, key: str) -> Samples | None:
+    """Samples cast before; a cache that is absent, damaged or of another stage counts as none."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if str(archive["key"]) != key:
+                return None
+            return Samples(**{field.name: archive[field.name] for field in fields(Samples)})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, key: str, samples: Samples) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("wb") as file:
+            np.savez(file, key=np.array(key), **{f.name: getattr(samples, f.name) for f in fields(Samples)})
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

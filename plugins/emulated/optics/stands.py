@@ -1,0 +1,130 @@
+"""Where the projectors of a new stage stand: at default positions round the camera, or at given ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from hal.errors import PluginError
+from hal.escapes import toml_value
+from hal.runtime.files import read_text
+from plugins.emulated.optics.truth import Lens, Pose, ProjectorTruth, Three, Two
+from plugins.emulated.tables import Between, load
+
+PLACES: Final = (
+    ("left", -29.0, 6.0),
+    ("right", 27.0, 3.0),
+    ("above", 2.0, 27.0),
+    ("far-left", -50.0, 14.0),
+    ("far-right", 48.0, 12.0),
+    ("high", -16.0, 38.0),
+)
+"""Name, degrees to the right of the camera and above it, as seen from the object."""
+DEFAULT: Final = 3
+
+
+LUX_OF_LIGHT: Final = 9000.0
+"""Illuminance by which the bench calls the light on a surface 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """A projector put up as planned. World and device frames as in ``truth``; lens and light as data sheets have them.
+
+    ``throw_ratio``: distance by picture width; ``centre_share``: the axis' place in the picture, in its width and
+    height from the upper left corner; ``focus_m``: the depth of best focus; ``lumens`` of a white picture; ``pupil_m``
+    """
+
+    name: str
+    position_m: Annotated[Three, Between(-100.0, 100.0)]
+    rotation_vector: Annotated[Three, Between(-10.0, 10.0)]
+    throw_ratio: Annotated[float, Between(0.05, 100.0)]
+    centre_share: Annotated[Two, Between(-10.0, 10.0)]
+    focus_m: Annotated[float, Between(0.01, 100.0)]
+    lumens: Annotated[float, Between(1.0, 1e6)]
+    pupil_m: Annotated[float, Between(0.0, 1.0)]
+
+    def lens(self, size_px: tuple[int, int]) -> Lens:
+        width, height = size_px
+        centre = (self.centre_share[0] * width - 0.5, self.centre_share[1] * height - 0.5)
+        return Lens(size_px, self.throw_ratio * width, centre, (0.0, 0.0))
+
+    def light_at_focus(self, size_px: tuple[int, int]) -> float:
+        """Of a white picture on a plane facing the lens: the picture there is focus by throw ratio wide."""
+        wide_m = self.focus_m / self.throw_ratio
+        return self.lumens / (wide_m * wide_m * size_px[1] / size_px[0]) / LUX_OF_LIGHT
+
+
+@dataclass(frozen=True, slots=True)
+class Stands:
+    """How many projectors, or where each of them; ``placed`` empty: the first ``count`` of ``PLACES``."""
+
+    count: int = DEFAULT
+    placed: tuple[Stand, ...] = ()
+
+    @property
+    def places(self) -> Sequence[tuple[str, float, float]]:
+        if self.placed:
+            return [(stand.name, *PLACES[0][1:]) for stand in self.placed]
+        return PLACES[: self.count]
+
+    def put(self, index: int, projector: ProjectorTruth) -> ProjectorTruth:
+        """``projector`` (of this index) at its given position; unchanged where none was given."""
+        if not self.placed:
+            return projector
+        stand, size = self.placed[index], projector.lens.size_px
+        lens = stand.lens(size)
+        # near its focus a lens' disc grows in proportion to the depth; its sigma is a quarter of its width
+        slope = 0.25 * stand.pupil_m * lens.focal_px / stand.focus_m**2
+        return dataclasses.replace(
+            projector,
+            pose=Pose(stand.position_m, stand.rotation_vector),
+            lens=lens,
+            focus=dataclasses.replace(projector.focus, distance_m=stand.focus_m, slope_px_per_m=slope),
+            light=dataclasses.replace(
+                projector.light, reference_m=stand.focus_m, brightness=stand.light_at_focus(size)
+            ),
+        )
+
+
+SETTINGS: Final = {
+    "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}; if omitted: {DEFAULT}",
+    "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
+    " throw_ratio, centre_share, focus_m, lumens and pupil_m",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    stands: tuple[Stand, ...]
+
+
+def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
+    """From the settings of the bench; a file's path is relative to ``folder``.
+
+    Raises PluginError("setting-wrong"), DeviceError as ``tables.load``.
+    """
+    count, file = settings.get("projectors", DEFAULT), settings.get("stands")
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(PLACES):
+        raise _wrong("projectors", count)
+    if file is None:
+        return Stands(count)
+    try:
+        text = read_text(folder / str(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise _wrong("stands", str(file)) from error
+    stands = load(text, _File, file=str(file)).stands
+    if len({stand.name for stand in stands}) != len(stands):
+        raise _wrong("stands", [stand.name for stand in stands])
+    return Stands(len(stands), stands)
+
+
+def _wrong(key: str, value: object) -> PluginError:
+    return PluginError(
+        "setting-wrong",
+        what=f"The bench's '{key}' = {toml_value(value)} is wrong.",
+        remedy=f"'{key}' is {SETTINGS[key]}.",
+    )

@@ -1,0 +1,208 @@
+"""What the emulated stage really is: ``bench.toml``. Only the bench reads it; nothing in it reaches the controller.
+
+World: metres, right-handed, origin in the middle of the object, x to the right, y down, z away from the audience.
+A device's own frame is that of its lens: x right, y down, z along the optical axis. Pixel centres at whole numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from hal.errors import DeviceError
+from hal.runtime.files import read_text
+from plugins.emulated.tables import Between, dump, load
+
+Two: TypeAlias = tuple[float, float]
+Three: TypeAlias = tuple[float, float, float]
+Matrix: TypeAlias = tuple[Three, Three, Three]
+FILE_NAME: Final = "bench.toml"
+FOLDER: Final = "bench"
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a device stands: x_device = R(rotation_vector) (x_world - position_m), Rodrigues vector in radians."""
+
+    position_m: Three
+    rotation_vector: Three
+
+    @property
+    def rotation(self) -> npt.NDArray[np.float64]:
+        """(3, 3) world to device."""
+        return np.asarray(Rotation.from_rotvec(self.rotation_vector).as_matrix(), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Pinhole with two radial terms: x_px = focal_px * x (1 + k1 r^2 + k2 r^4) + centre, x = X/Z."""
+
+    size_px: Annotated[tuple[int, int], Between(1, 16384)]
+    focal_px: Annotated[float, Between(1.0, 1e6)]
+    centre_px: Annotated[Two, Between(-1e5, 1e5)]
+    distortion: Annotated[Two, Between(-1.0, 1.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A 12-bit Bayer sensor (RGGB). ``electrons_per_light_s``: photo-electrons of linear light 1 in 1 s at f/8;
+
+    ``electrons_per_step``: of one raw step at ISO 100; ``contrast``: how far the JPEG tone curve leaves sRGB.
+    """
+
+    electrons_per_light_s: Annotated[float, Between(1.0, 1e9)]
+    electrons_per_step: Annotated[float, Between(0.01, 1e4)]
+    full_well_e: Annotated[float, Between(100.0, 1e7)]
+    read_noise_e: Annotated[float, Between(0.0, 1e3)]
+    black_level: Annotated[int, Between(0, 1023)]
+    white_level: Annotated[int, Between(1024, 4095)]
+    contrast: Annotated[float, Between(0.0, 0.9)] = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTruth:
+    """The camera. ``vignetting``: share of light lost in the image's corners; ``raw``: False makes JPEG files only."""
+
+    pose: Pose
+    lens: Lens
+    sensor: Sensor
+    serial_number: str
+    command_port: Annotated[int, Between(0, 65535)]
+    event_port: Annotated[int, Between(0, 65535)]
+    psf_sigma_px: Annotated[float, Between(0.0, 10.0)]
+    vignetting: Annotated[float, Between(0.0, 0.95)]
+    raw: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Focus:
+    """Blur in projector pixels: sqrt(sharpest^2 + (slope (z - distance))^2), z along the axis."""
+
+    distance_m: Annotated[float, Between(0.01, 100.0)]
+    sharpest_px: Annotated[float, Between(0.0, 3.0)]
+    slope_px_per_m: Annotated[float, Between(0.0, 1000.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class LightTruth:
+    """Lamp and panel.
+
+    ``brightness``: linear light of white on a white plane facing the lens at ``reference_m``;
+    ``mixing``: camera channel (row) by projector channel (column), lamp colour included;
+    ``gamma``, ``s_curve``: response per channel, see ``render.response``; ``black_level``: share of white at value 0
+    """
+
+    brightness: Annotated[float, Between(0.0, 1e3)]
+    reference_m: Annotated[float, Between(0.01, 100.0)]
+    black_level: Annotated[float, Between(0.0, 0.5)]
+    vignetting: Annotated[float, Between(0.0, 0.95)]
+    fill_factor: Annotated[float, Between(0.01, 1.0)]
+    gamma: Annotated[Three, Between(0.5, 4.0)]
+    s_curve: Annotated[Three, Between(0.0, 0.5)]
+    mixing: Annotated[Matrix, Between(0.0, 2.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class LampTruth:
+    """Seconds from strike to full light, from strike to stable light, and from off to cool."""
+
+    warm_up_s: Annotated[float, Between(0.0, 3600.0)]
+    stable_s: Annotated[float, Between(0.0, 3600.0)]
+    cool_down_s: Annotated[float, Between(0.0, 3600.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorTruth:
+    """A projector; ``port`` and ``profile`` are relative to the stage folder."""
+
+    name: str
+    output: str
+    port: str
+    profile: str
+    pose: Pose
+    lens: Lens
+    focus: Focus
+    light: LightTruth
+    lamp: LampTruth
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectTruth:
+    """``kind`` is ``vase-and-bust`` (``seed`` varies it), or ``mesh`` with ``file`` relative to the stage folder.
+
+    ``gloss``: strength of its highlights (Blinn and Phong, normalised): light added where the surface mirrors a lens
+    into the camera, relative to a perfect white; ``gloss_exponent``: how small they are.
+    """
+
+    kind: str
+    file: str
+    seed: Annotated[int, Between(0, 2**63 - 1)]
+    gloss: Annotated[float, Between(0.0, 1.0)] = 0.0
+    gloss_exponent: Annotated[float, Between(1.0, 1e4)] = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class MainsTruth:
+    """A relay and whose mains go through it. ``relay``: the board's name in bench/usb.toml; ``feeds``: projectors;
+
+    ``boot_s``: from mains on until they can be spoken to.
+    """
+
+    relay: str
+    channel: Annotated[int, Between(1, 8)]
+    feeds: tuple[str, ...]
+    boot_s: Annotated[float, Between(0.0, 600.0)] = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class BenchTruth:
+    """A whole emulated stage. ``subsamples``: S x S rays a camera pixel; ``time_scale``: emulated / real duration;
+
+    ``latency_s``: from a frame's presentation to its light, real seconds (projectors: one to eight frames, the stage's
+    default is two).
+
+    ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder;
+    ``mains``: which emulated relays feed which projectors, whose mains are on otherwise;
+    ``indirect``: the share of all projected light that object and room throw back evenly on the object.
+    """
+
+    size: str
+    frames: str
+    ambient: Annotated[Three, Between(0.0, 10.0)]
+    latency_s: Annotated[float, Between(0.0, 1.0)]
+    time_scale: Annotated[float, Between(0.0, 1.0)]
+    seed: Annotated[int, Between(0, 2**63 - 1)]
+    subsamples: Annotated[int, Between(1, 8)]
+    object: ObjectTruth
+    camera: CameraTruth
+    projectors: tuple[ProjectorTruth, ...]
+    scenario: str = ""
+    mains: tuple[MainsTruth, ...] = ()
+    indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
+
+
+def write_truth(stage: Path, truth: BenchTruth) -> None:
+    """Write ``bench.toml`` in one step; a reader finds the old or the new file."""
+    stage.mkdir(parents=True, exist_ok=True)
+    temporary = stage / f".{FILE_NAME}.part"
+    temporary.write_text("# The truth of the emulated stage. The controller never reads this file.\n" + dump(truth))
+    temporary.replace(stage / FILE_NAME)
+
+
+def read_truth(stage: Path) -> BenchTruth:
+    """Read ``bench.toml`` of a stage. Raises DeviceError as ``tables.load``, or ``bench-file-missing``."""
+    path = stage / FILE_NAME
+    try:
+        text = read_text(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise DeviceError(
+            "bench-file-missing",
+            what=f"{path} can't be read, so there is no emulated stage here.",
+            remedy="Prepare a stage first: velatura demo --prepare-only --out DIR.",
+        ) from error
+    return load(text, BenchTruth, file=str(path))

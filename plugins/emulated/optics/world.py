@@ -1,0 +1,158 @@
+"""The emulated stage as one world: lamps, outputs, object and camera, so that a shot shows what is really lit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.optics.bumps import FILE as BUMPS
+from plugins.emulated.optics.bumps import bumped, read_bumps
+from plugins.emulated.optics.dng import PictureFacts, dng, with_exif
+from plugins.emulated.optics.objects import StageObject, default_object
+from plugins.emulated.optics.rays import Progress, samples_of
+from plugins.emulated.optics.render import Renderer
+from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM, jpeg, mosaic
+from plugins.emulated.optics.truth import FOLDER, BenchTruth, ObjectTruth
+from plugins.emulated.outputs import VisibleFrames, VisibleFrameSet
+
+MOST_FRAMES_IN_A_SHOT = 6
+
+
+class LightSource(Protocol):
+    """The part of an emulated projector that the world needs."""
+
+    def light_level(self) -> float:
+        """Light now: 0 dark (off, shutter closed, lamp failed) to 1 full."""
+
+
+class World:
+    """Makes the camera's pictures of ``stage``. Use in a ``with`` statement: the outputs are watched inside.
+
+    ``lamps``: one for each projector of ``truth``, in its order. Thread-safe as far as one camera needs.
+    """
+
+    def __init__(
+        self, stage: Path, truth: BenchTruth, lamps: Sequence[LightSource], *, progress: Progress = lambda share: None
+    ) -> None:
+        self._stage, self._set_up, self._truth = stage, truth, truth
+        self._lamps = tuple(lamps)
+        self._samples = samples_of(truth, object_of(stage, truth.object), stage / FOLDER, progress)
+        self._renderer = Renderer(truth, self._samples)
+        self._bumps_seen: tuple[int, int] | None = None
+        self._visible = VisibleFrames(stage / truth.frames, truth.latency_s)
+        self._rng = np.random.default_rng([truth.seed, 2])
+
+    def __enter__(self) -> World:
+        self._visible.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._visible.__exit__(kind, error, trace)
+
+    def warm(self) -> None:
+        """Compile the kernels now, so that the first exposure is not late."""
+        self._renderer.light([self._frame(i, None) for i in range(len(self._lamps))], [1.0] * len(self._lamps))
+
+    def follow_bumps(self) -> int | None:
+        """Look at the bumps of the stage; where they have changed, let them count, and return how many there are.
+
+        Rays are cast again for that; until they are, pictures show the stage as it was.
+        Raises DeviceError as ``read_bumps``; the stage then stays as it is.
+        """
+        path = self._stage / BUMPS
+        try:
+            state = path.stat()
+            seen: tuple[int, int] | None = (state.st_mtime_ns, state.st_size)
+        except OSError:
+            seen = None
+        if seen == self._bumps_seen:
+            return None
+        self._bumps_seen = seen
+        bumps = read_bumps(path, self._set_up)
+        truth = bumped(self._set_up, bumps)
+        samples = self._samples
+        if bumps.bump:
+            samples = samples_of(truth, object_of(self._stage, truth.object), None, lambda share: None)
+        self._truth, self._renderer = truth, Renderer(truth, samples)
+        return len(bumps.bump)
+
+    def expose(self, settings: ShotSettings) -> ShotFiles:
+        """Take one picture: lasts the (scaled) exposure time, and shows what was visible during it."""
+        taken = time.strftime("%Y:%m:%d %H:%M:%S")
+        before = [lamp.light_level() for lamp in self._lamps]
+        start_s = time.monotonic()
+        time.sleep(settings.exposure_s * self._truth.time_scale)
+        end_s = time.monotonic()
+        levels = [0.5 * (first + lamp.light_level()) for first, lamp in zip(before, self._lamps, strict=True)]
+        light = self._mixed(self._visible.during(start_s, end_s), levels)
+        return self._files(light, settings, taken)
+
+    def _mixed(
+        self, visible: list[tuple[float, VisibleFrameSet | None]], levels: Sequence[float]
+    ) -> npt.NDArray[np.float32]:
+        """The time-weighted mean of what was visible; of many frames, the longest-shown few stand for all."""
+        longest = sorted(visible, key=lambda part: part[0], reverse=True)[:MOST_FRAMES_IN_A_SHOT]
+        total = sum(share for share, _ in longest)
+        pictures = [
+            (share / total, self._renderer.light([self._frame(i, shown) for i in range(len(levels))], levels))
+            for share, shown in longest
+        ]
+        if len(pictures) == 1:
+            return pictures[0][1]
+        mixed = np.zeros_like(pictures[0][1])
+        for share, picture in pictures:
+            mixed += np.float32(share) * picture
+        return mixed
+
+    def _frame(self, index: int, shown: VisibleFrameSet | None) -> npt.NDArray[np.uint8]:
+        """What a projector's panel shows: black without a picture, scaled when the picture has another size."""
+        projector = self._truth.projectors[index]
+        width, height = projector.lens.size_px
+        frame = None if shown is None else shown.frames.get(projector.output)
+        if frame is None:
+            return np.zeros((height, width, 3), dtype=np.uint8)
+        if frame.shape != (height, width, 3):
+            return np.asarray(cv2.resize(frame, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+        return frame
+
+    def _files(self, light: npt.NDArray[np.float32], settings: ShotSettings, taken: str) -> ShotFiles:
+        camera = self._truth.camera
+        raw = mosaic(
+            light,
+            camera.sensor,
+            self._rng,
+            exposure_s=settings.exposure_s,
+            iso=settings.iso,
+            aperture_f=settings.aperture_f,
+        )
+        facts = PictureFacts(
+            exposure_s=settings.exposure_s,
+            iso=settings.iso,
+            aperture_f=settings.aperture_f,
+            # Lenses report whole millimetres, so a picture tells the focal length only roughly.
+            focal_length_mm=float(round(camera.lens.focal_px / camera.lens.size_px[0] * SENSOR_WIDTH_MM)),
+            taken=taken,
+            serial_number=camera.serial_number,
+        )
+        levels = {"black_level": camera.sensor.black_level, "white_level": camera.sensor.white_level}
+        return ShotFiles(
+            raw=dng(raw, facts=facts, **levels) if settings.raw else None,
+            jpeg=with_exif(jpeg(raw, camera.sensor), facts) if settings.jpeg else None,
+        )
+
+
+def object_of(stage: Path, kept: ObjectTruth) -> StageObject:
+    """The object of a prepared stage. Raises DeviceError ``object-unreadable``."""
+    if kept.kind == "mesh":
+        return StageObject.read(stage / kept.file)
+    return default_object()

@@ -1,0 +1,1 @@
+"""Emulated projectors with lamps, fans and faults. Entry: `serial`, `pjlink`, `lamp`."""

@@ -1,0 +1,1 @@
+"""An emulated USB bus with HID devices on it. Entry: `bus`, `process`."""

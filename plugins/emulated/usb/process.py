@@ -1,0 +1,241 @@
+"""The emulated USB bus as a process of its own, and the handle that starts and commands it.
+
+The bus must not live in the process that uses it: hidapi waits while it holds Python's interpreter lock. Commands and
+answers are lines of JSON on the child's standard input and output: ``python -m plugins.emulated.usb.process DIR``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, Any, Final, Self
+
+from plugins.emulated.cameras.usb_camera import numbered_camera
+from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, stage_camera
+from plugins.emulated.scenario import parse_scenario
+from plugins.emulated.usb.bus import UsbBus
+from plugins.emulated.usb.device import EmulatedUsbDevice
+from plugins.emulated.usb.key_panel import EmulatedKeyPanel
+from plugins.emulated.usb.light_sensor import EmulatedLightSensor
+from plugins.emulated.usb.relay import EmulatedRelayBoard
+from plugins.emulated.usb.scenario import UsbScenario
+
+KINDS: Final[Mapping[str, Callable[..., EmulatedUsbDevice]]] = {
+    "relay": EmulatedRelayBoard,
+    "light": EmulatedLightSensor,
+    "keys": EmulatedKeyPanel,
+    "camera": numbered_camera,
+    STAGE_CAMERA: stage_camera,
+}
+_PATIENCE_S: Final = 10.0
+
+
+class UsbBusProcess:
+    """Runs a bus in ``folder`` in another process; also a context. Raises RuntimeError where a command fails there."""
+
+    def __init__(self, folder: Path) -> None:
+        self._turn = threading.Lock()
+        hidden = {"LD_PRELOAD", "UMOCKDEV_DIR"}
+        environment = {name: value for name, value in os.environ.items() if name not in hidden}
+        self._process = subprocess.Popen(  # noqa: S603 - this very module
+            [sys.executable, "-m", __name__, os.fspath(folder)],
+            env=environment,
+            cwd=Path(__file__).parents[3],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def add(self, name: str, kind: str, **settings: Any) -> None:
+        """Make a device and plug it in; ``kind``: one of ``KINDS``, or the place of a class, ``module:Class``."""
+        self._ask({"do": "add", "name": name, "kind": kind, "settings": settings})
+
+    def play(self, name: str, scenario: str) -> None:
+        """Play the events of a TOML scenario (see ``plugins.emulated.scenario``) on a device."""
+        self._ask({"do": "play", "name": name, "scenario": scenario})
+
+    def rest(self, name: str) -> None:
+        """End the scenario of a device; what it has done stays done."""
+        self._ask({"do": "rest", "name": name})
+
+    def told(self, name: str) -> list[list[Any]]:
+        """What a scenario has done so far: [seconds, deed] each."""
+        told: list[list[Any]] = self._ask({"do": "told", "name": name})
+        return told
+
+    def plug(self, name: str) -> None:
+        self._ask({"do": "plug", "name": name})
+
+    def unplug(self, name: str) -> None:
+        self._ask({"do": "unplug", "name": name})
+
+    def forget(self, name: str) -> None:
+        """Unplug a device for good."""
+        self._ask({"do": "forget", "name": name})
+
+    def clear(self) -> None:
+        """Unplug every device for good."""
+        self._ask({"do": "clear", "name": ""})
+
+    def set(self, name: str, knob: str, value: Any) -> None:
+        """Turn a knob, e.g. ``faults.silent`` or ``lux``."""
+        self._ask({"do": "set", "name": name, "knob": knob, "value": value})
+
+    def get(self, name: str, knob: str) -> Any:
+        return self._ask({"do": "get", "name": name, "knob": knob})
+
+    def call(self, name: str, method: str, *arguments: Any) -> Any:
+        return self._ask({"do": "call", "name": name, "method": method, "arguments": arguments})
+
+    def bus(self, question: str, name: str) -> Any:
+        """``address_of`` or ``driver_bound``."""
+        return self._ask({"do": "bus", "name": name, "question": question})
+
+    def close(self) -> None:
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        try:
+            self._process.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, command: Mapping[str, Any]) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            with self._turn:
+                self._process.stdin.write(json.dumps(command) + "\n")
+                self._process.stdin.flush()
+                line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        if not line:
+            raise RuntimeError("the process with the emulated USB bus has ended")
+        answer = json.loads(line)
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        return answer["value"]
+
+
+class _Commands:
+    """What the child does with each line."""
+
+    def __init__(self, bus: UsbBus) -> None:
+        self._bus = bus
+        self._devices: dict[str, EmulatedUsbDevice] = {}
+        self._scenarios: dict[str, UsbScenario] = {}
+
+    def close(self) -> None:
+        for scenario in self._scenarios.values():
+            scenario.close()
+
+    def obey(self, command: Mapping[str, Any]) -> Any:
+        name = command["name"]
+        if command["do"] == "clear":
+            self._clear()
+        elif command["do"] == "add":
+            self._devices[name] = _kind(command["kind"])(**command["settings"])
+            self._bus.plug(self._devices[name])
+        else:
+            return self._obey(command, name, self._devices[name])
+        return None
+
+    def _obey(self, command: Mapping[str, Any], name: str, device: EmulatedUsbDevice) -> Any:
+        match command["do"]:
+            case "play":
+                self._play(name, device, command["scenario"])
+            case "rest":
+                self._rest(name)
+            case "told":
+                return self._scenarios[name].told
+            case "plug":
+                self._bus.plug(device)
+            case "unplug":
+                self._bus.unplug(device)
+            case "forget":
+                self._bus.unplug(self._devices.pop(name))
+            case "set":
+                holder, knob = _find(device, command["knob"])
+                setattr(holder, knob, command["value"])
+                device.on_ready()  # what a fault has held back may go on now
+            case "get":
+                holder, knob = _find(device, command["knob"])
+                return getattr(holder, knob)
+            case "call":
+                return getattr(device, command["method"])(*command["arguments"])
+            case "bus":
+                return getattr(self._bus, command["question"])(device)
+            case unknown:
+                raise ValueError(f"no command {unknown}")
+        return None
+
+    def _clear(self) -> None:
+        self.close()
+        self._scenarios.clear()
+        for device in self._devices.values():
+            self._bus.unplug(device)
+        self._devices.clear()
+
+    def _rest(self, name: str) -> None:
+        if name in self._scenarios:
+            self._scenarios.pop(name).close()
+
+    def _play(self, name: str, device: EmulatedUsbDevice, text: str) -> None:
+        self._rest(name)
+        self._scenarios[name] = UsbScenario(
+            parse_scenario(text, file=name),
+            device,
+            name=name,
+            plug=lambda: self._bus.plug(device),
+            unplug=lambda: self._bus.unplug(device),
+        )
+
+
+def _kind(name: str) -> Callable[..., EmulatedUsbDevice]:
+    module, separator, attribute = name.partition(":")
+    if not separator:
+        return KINDS[name]
+    found: Callable[..., EmulatedUsbDevice] = getattr(importlib.import_module(module), attribute)
+    return found
+
+
+def _find(device: EmulatedUsbDevice, dotted: str) -> tuple[Any, str]:
+    """The object that has the last name of ``dotted``, and that name. Raises AttributeError."""
+    *path, last = dotted.split(".")
+    holder: Any = device
+    for part in path:
+        holder = getattr(holder, part)
+    getattr(holder, last)
+    return holder, last
+
+
+def serve(folder: Path, commands: IO[str], answers: IO[str]) -> None:
+    """Serve a bus until ``commands`` ends."""
+    with UsbBus(folder) as bus, contextlib.closing(_Commands(bus)) as table:
+        for line in commands:
+            try:
+                answer = {"value": table.obey(json.loads(line))}
+            except Exception as error:  # noqa: BLE001 - whatever it is, whoever gave the command must hear of it
+                answer = {"error": f"{type(error).__name__}: {error}"}
+            answers.write(json.dumps(answer) + "\n")
+            answers.flush()
+
+
+if __name__ == "__main__":
+    serve(Path(sys.argv[1]), sys.stdin, sys.stdout)

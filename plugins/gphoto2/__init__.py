@@ -1,0 +1,1 @@
+"""Cameras by libgphoto2. Entry: `camera.DRIVER`."""

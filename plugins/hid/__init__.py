@@ -1,0 +1,3 @@
+"""USB HID devices: relays, light sensor, key panel. Entry: `DRIVER` in `relay`, `light_sensor` and
+`stream_deck`.
+"""

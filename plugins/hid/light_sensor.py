@@ -1,0 +1,102 @@
+"""The ColorHug ALS ambient light sensor: darkness is a condition of calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from hal.codecs.hid.light import (
+    PRODUCT,
+    READING_LENGTH,
+    REPORT,
+    SETTINGS_LENGTH,
+    USABLE,
+    VENDOR,
+    LightReading,
+    SensorSettings,
+    parse_reading,
+    parse_settings,
+)
+from hal.deadline import Deadline
+from hal.errors import DeviceBusy, DeviceTimeout
+from hal.registry import Driver, OpenContext, setting
+from hal.values import DeviceIdentity
+from plugins.hid.link import HidKind, HidLink, OpenHid
+
+_KIND: Final = HidKind(name="light sensor", vendor=VENDOR, product=PRODUCT)
+_SETTLE_S: Final = 0.05
+
+
+class ColorHugLightSensor:
+    """``hal.interfaces.LightSensor``. Readings are asked for, never taken from a queue, so none is stale."""
+
+    def __init__(self, *, serial: str = "", backend: str = "hidraw", deadline: Deadline) -> None:
+        self._link = HidLink(_KIND, serial=serial, backend=backend)
+        try:
+            self.illuminance_lux(deadline=deadline)
+        except BaseException:
+            self._link.close()
+            raise
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        def ask(sensor: OpenHid) -> DeviceIdentity:
+            # Asked for its settings so that an answer never comes from a sensor that has left.
+            parse_settings(sensor.handle.get_feature_report(REPORT, SETTINGS_LENGTH))
+            return DeviceIdentity(sensor.found.maker, sensor.found.product, sensor.serial)
+
+        return self._link.call(ask, deadline=deadline)
+
+    def illuminance_lux(self, *, deadline: Deadline) -> float:
+        """See ``hal.interfaces.LightSensor``. Raises DeviceBusy("light-sensor-not-ready") at the deadline."""
+        refused: DeviceBusy | None = None
+        while True:
+            try:
+                reading = self._link.call(_read, deadline=deadline)
+            except DeviceTimeout as error:
+                raise refused or error from None
+            if reading.state in USABLE:
+                return reading.illuminance_lux
+            refused = _not_ready(reading)
+            if deadline.left_s() <= _SETTLE_S:
+                raise refused
+            deadline.sleep(_SETTLE_S)
+
+    def close(self) -> None:
+        self._link.close()
+
+
+def _read(sensor: OpenHid) -> LightReading:
+    wanted = SensorSettings()
+    now = parse_settings(sensor.handle.get_feature_report(REPORT, SETTINGS_LENGTH))
+    if now.power != wanted.power:  # also after it was plugged in again
+        sensor.handle.send_feature_report(wanted.pack())
+    return parse_reading(sensor.handle.get_input_report(REPORT, READING_LENGTH))
+
+
+def _not_ready(reading: LightReading) -> DeviceBusy:
+    return DeviceBusy(
+        "light-sensor-not-ready",
+        what=f"The light sensor has no reading: {reading.state.name.lower().replace('_', ' ')}.",
+        remedy="Wait a few seconds; if it stays so, unplug it and plug it in again.",
+    )
+
+
+def open_light_sensor(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> ColorHugLightSensor:
+    """Open the light sensor of a stage's table."""
+    return ColorHugLightSensor(
+        serial=setting(settings, "serial", str, ""),
+        backend=setting(settings, "backend", str, "hidraw"),
+        deadline=deadline,
+    )
+
+
+DRIVER: Final = Driver(
+    kind="light_sensor",
+    name="colorhug-als",
+    summary="The ColorHug ALS ambient light sensor (273f:1008).",
+    open=open_light_sensor,
+    settings={
+        "serial": "its USB serial number; left out: the only sensor there is",
+        "backend": '"hidraw" (default) or "libusb": which way hidapi goes',
+    },
+)

@@ -1,0 +1,1 @@
+"""Projectors by serial line and PJLink. Entry: `serial.DRIVER`, `pjlink.DRIVER`; profiles by `profile_files`."""

@@ -1,0 +1,280 @@
+"""Projectors on the network that speak PJLink, class 1 or 2."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from hal.codecs.projectors import pjlink
+from hal.codecs.projectors.pjlink import Failure
+from hal.codecs.projectors.profiles import ProjectorProfile
+from hal.deadline import Deadline, turn
+from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
+from hal.links import ByteLink, TcpLink, host_and_port
+from hal.registry import Driver, OpenContext, setting
+from hal.transcript import Transcript
+from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
+from plugins.projectors.pjlink_conversation import PjLinkConversation
+from plugins.projectors.pjlink_habits import Habits
+from plugins.projectors.profile_files import load_profile
+
+
+class PjLinkProjector:
+    """A projector that speaks PJLink. Implements ``hal.interfaces.Projector``.
+
+    Every call has a connection of its own: the projector closes idle ones after 30 s, and what was left unread on an
+    old one can never be taken for a new answer.
+
+    Parameters
+    ----------
+    connect : opens a connection
+    profile : its patience and its lamp; the protocol tells neither
+    name : how the technician knows it, for messages
+    password : at most 32 characters, or None
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[Deadline], ByteLink],
+        profile: ProjectorProfile,
+        *,
+        name: str,
+        password: str | None = None,
+        transcript: Transcript | None = None,
+    ) -> None:
+        self._connect = connect
+        self._timing = profile.timing
+        self._habits = Habits(name, profile.timing)
+        self._lamp = profile.lamp
+        self._name = name
+        self._password = password
+        self._transcript = transcript
+        self._lock = threading.Lock()
+        self._closed = False
+        self._inputs: tuple[str, ...] = ()
+
+    def open(self, deadline: Deadline) -> None:
+        """Reach the projector once, check the password, and learn its inputs."""
+        with self._turn(deadline) as talk:
+            with contextlib.suppress(DeviceBusy):
+                talk.power(deadline)
+            self._inputs = talk.optional("INST", pjlink.parse_inputs, deadline) or ()
+            # Asked once now, so that ``capabilities`` does not promise what it does not tell.
+            talk.optional("LAMP", pjlink.parse_lamps, deadline)
+            talk.optional("ERST", pjlink.parse_errors, deadline)
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        return ProjectorCapabilities(
+            lamp_hours=self._habits.knows("LAMP"),
+            shutter=True,
+            inputs=self._inputs,
+            errors=self._habits.knows("ERST"),
+            lamp_rules=self._lamp,
+            answer_s=3 * self._timing.question_s,
+            switch_s=self._timing.switch_s,
+        )
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        with self._turn(deadline) as talk:
+            maker, model = (talk.text(name, deadline) for name in ("INF1", "INF2"))
+            second = talk.optional("CLSS", pjlink.parse_class, deadline) == 2
+            serial = talk.text("SNUM", deadline, 2) if second else ""
+            firmware = talk.text("SVER", deadline, 2) if second else talk.text("INFO", deadline)
+            return DeviceIdentity(maker or "unknown", model or "PJLink projector", serial, firmware)
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        with self._turn(deadline) as talk:
+            power = talk.power(deadline)
+            trouble = talk.optional("ERST", pjlink.parse_errors, deadline) or ()
+            lamps = talk.optional("LAMP", pjlink.parse_lamps, deadline) or ()
+            failed = any(not word.endswith("-warning") for word in trouble)
+            return ProjectorStatus(
+                Power.FAULT if failed and power is Power.OFF else power,
+                trouble,
+                max((lamp.hours for lamp in lamps), default=None),
+            )
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        with self._turn(deadline) as talk:
+            power = talk.power(deadline)
+            if power is Power.COOLING:
+                raise self._refused("projector-cooling", "is still cooling its lamp, and was not switched on")
+            if power is Power.OFF:
+                self._command(talk, "POWR", "1", "switch on", deadline, lambda: talk.power(deadline) is Power.OFF)
+        if power is Power.OFF:
+            self._confirm((Power.ON, Power.WARMING), "on", deadline)
+
+    def switch_off(self, *, deadline: Deadline) -> None:
+        with self._turn(deadline) as talk:
+            lit = (Power.ON, Power.WARMING)
+            burning = talk.power(deadline) in lit
+            if burning:
+                self._command(talk, "POWR", "0", "switch off", deadline, lambda: talk.power(deadline) in lit)
+        if burning:
+            self._confirm((Power.OFF, Power.COOLING), "off", deadline)
+
+    def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
+        with self._turn(deadline) as talk:
+
+            def is_open() -> bool:
+                told = talk.ask("AVMT", deadline)
+                if isinstance(told, Failure):
+                    raise talk.no_answer()
+                return pjlink.parse_mute(told).video is not closed
+
+            told = self._sent(talk, "AVMT", f"{self._habits.mute}{closed:d}", deadline, is_open)
+            if told in (Failure.PARAMETER, Failure.UNDEFINED):
+                # Some projectors mute picture and sound together or not at all.
+                other = "3" if self._habits.mute == "1" else "1"
+                told = self._sent(talk, "AVMT", f"{other}{closed:d}", deadline, is_open)
+                if isinstance(told, str):
+                    self._habits.mute = other
+            if not self._accepted(told, "move its shutter") and is_open():
+                raise talk.no_answer()
+
+    def troubles(self) -> list[tuple[str, str]]:
+        """As ``hal.interfaces.WatchedProjector.troubles``."""
+        return self._habits.troubles()
+
+    def close(self) -> None:
+        self._closed = True
+        if self._transcript is not None:
+            self._transcript.close()
+
+    def _command(
+        self, talk: PjLinkConversation, name: str, parameter: str, doing: str, deadline: Deadline,
+        unchanged: Callable[[], bool],
+    ) -> bool:  # fmt: skip
+        """Send a command as ``_sent``; False if its answer was lost (it may have worked: look at the state)."""
+        return self._accepted(self._sent(talk, name, parameter, deadline, unchanged), doing)
+
+    def _sent(
+        self, talk: PjLinkConversation, name: str, parameter: str, deadline: Deadline, unchanged: Callable[[], bool]
+    ) -> str | Failure | None:
+        """Send a command, and return its answer; None if that was lost.
+
+        It is sent a second time in one case alone: the connection had been used before, was closed with no answer, and
+        the state is ``unchanged``. Then the projector had closed it after the answer before, and never read this.
+        """
+        try:
+            return talk.tell(name, parameter, deadline)
+        except DeviceTimeout:
+            if deadline.passed:
+                raise
+            return None
+        except DeviceGone:
+            if deadline.passed:
+                raise
+            if not talk.reused:
+                return None
+        with contextlib.suppress(DeviceBusy, DeviceTimeout, DeviceGone, ProtocolError):
+            if unchanged():
+                return talk.tell(name, parameter, deadline)
+        return None
+
+    def _accepted(self, told: str | Failure | None, doing: str) -> bool:
+        if told is Failure.UNAVAILABLE:
+            raise self._refused("projector-not-now", f"will not {doing} in the state it is in")
+        if isinstance(told, Failure):
+            raise self._refused("projector-refused", f"cannot {doing}: it answered {told.value}")
+        if told is not None:
+            pjlink.accepted(told)
+        return told is not None
+
+    def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
+        """Wait until the power state shows what a command should have done, whether or not its answer arrived."""
+        patience = deadline.within(self._timing.confirm_s)
+        while not self._shows(wanted, patience):
+            if patience.passed:
+                raise DeviceTimeout(
+                    f"projector-not-{word}",
+                    what=f"The projector at {self._name} was told to switch {word}, and did not.",
+                    remedy="Look at its lamps and messages; if it shows nothing, switch it by its own button once.",
+                )
+            patience.sleep(self._timing.boot_interval_s)
+
+    def _shows(self, wanted: tuple[Power, ...], deadline: Deadline) -> bool:
+        try:
+            with self._turn(deadline) as talk:
+                return talk.power(deadline) in wanted
+        except (DeviceBusy, DeviceTimeout, DeviceGone):
+            # A projector that starts may answer nothing for a while.
+            if self._closed:
+                raise
+            return False
+
+    def _refused(self, code: str, doing: str) -> DeviceRefused:
+        return DeviceRefused(
+            code,
+            what=f"The projector at {self._name} {doing}.",
+            remedy="Wait until it has cooled and shows standby; if it reports a fault, mend that first.",
+        )
+
+    @contextlib.contextmanager
+    def _turn(self, deadline: Deadline) -> Iterator[PjLinkConversation]:
+        """One caller at a time, none after ``close``; a conversation that ends with it."""
+        talk = PjLinkConversation(self._connect, self._name, self._password, self._timing, self._habits)
+        talk.check(deadline)
+        with turn(self._lock, deadline, partial(talk.check, deadline)), contextlib.closing(talk):
+            if self._closed:
+                raise DeviceGone(
+                    "projector-closed",
+                    what=f"The projector at {self._name} is no longer open.",
+                    remedy="Open the stage again.",
+                )
+            yield talk
+
+
+def _settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[str, int, str | None, ProjectorProfile]:
+    """Host, port, password and profile of a stage.toml table. Raises PluginError and ProtocolError."""
+    host, port = host_and_port(str(setting(settings, "address", str)), pjlink.PORT)
+    password = setting(settings, "password", str)
+    if password is not None and not 0 < len(password) <= pjlink.LONGEST_PASSWORD:
+        raise PluginError(
+            "setting-wrong",
+            what=f"The password has {len(password)} characters; PJLink allows 1 to {pjlink.LONGEST_PASSWORD}.",
+            remedy="Correct password in stage.toml, or leave it out.",
+        )
+    return host, port, password, load_profile(setting(settings, "profile", str, "pjlink"), context.stage)
+
+
+def check_pjlink_projector(settings: Mapping[str, Any], context: OpenContext) -> None:
+    """As ``hal.registry.Driver.check``."""
+    _settings(settings, context)
+
+
+def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PjLinkProjector:
+    """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
+    host, port, password, profile = _settings(settings, context)
+    transcript = None
+    if context.transcripts is not None:
+        context.transcripts.mkdir(parents=True, exist_ok=True)
+        transcript = Transcript(context.transcripts / f"pjlink-{host.replace(':', '_')}-{port}.txt")
+    projector = PjLinkProjector(
+        lambda until: TcpLink(host, port, deadline=until, transcript=transcript),
+        profile,
+        name=str(settings["address"]),
+        password=password,
+        transcript=transcript,
+    )
+    projector.open(deadline)
+    return projector
+
+
+DRIVER = Driver(
+    kind="projector",
+    name="pjlink",
+    summary="Projectors on the network that speak PJLink, class 1 or 2.",
+    open=open_pjlink_projector,
+    settings={
+        "address": 'host:port, or host alone for port 4352, e.g. "192.168.0.20"',
+        "password": "the PJLink password, if the projector has one",
+        "profile": "times of its lamp: pjlink (the default), or a .toml file of the stage",
+    },
+    required=("address",),
+    check=check_pjlink_projector,
+)

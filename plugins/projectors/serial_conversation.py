@@ -1,0 +1,270 @@
+"""Talking with a serial projector: one question at a time, and never an old answer for a new question."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from hal.codecs.projectors.profiles import ProjectorProfile
+from hal.codecs.projectors.serial_protocol import (
+    Answer,
+    Notice,
+    Reply,
+    command_bytes,
+    head_bytes,
+    parse_line,
+    query_bytes,
+    rest_bytes,
+)
+from hal.codecs.projectors.serial_table import Frame, Query, SerialTable
+from hal.deadline import Deadline
+from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout, ProtocolError
+from hal.links import ByteLink
+
+REAPPEAR_S: Final = 4.0
+"""How long a port that was unplugged is waited for: USB adapters need a second or two to come back."""
+COOLS: Final = "projector-cools"
+"""Code of the DeviceBusy that a projector gives because its lamp cools."""
+
+
+class SerialConversation:
+    """Questions and commands over a link that may be unplugged and come back.
+
+    The protocol does not say which question an answer belongs to. So every line that was not asked for is taken off the
+    link before a question, and after a lost answer nothing else is asked until that answer can no longer come.
+
+    ``notice`` is called for every unsolicited line; ``slow`` says whether the projector starts or cools, and must not
+    be asked often.
+    """
+
+    def __init__(
+        self,
+        open_link: Callable[[Deadline], ByteLink],
+        *,
+        name: str,
+        profile: ProjectorProfile,
+        table: SerialTable,
+        address: str,
+        notice: Callable[[Notice], None],
+        slow: Callable[[], bool],
+    ) -> None:
+        self._open_link = open_link
+        self._name = name
+        self._timing = profile.timing
+        self._table = table
+        self._address = address
+        self._notice = notice
+        self._slow = slow
+        self._link: ByteLink | None = None
+        self._closed = False
+        self._sent = b""
+        self._sent_at_s = -1e9
+        self._owed = 0
+        self._owed_until_s = 0.0
+        self._garbage: ProtocolError | None = None
+
+    def open(self, deadline: Deadline) -> None:
+        """Open the link now, so that a wrong port is known at once."""
+        self._link = self._open_link(deadline)
+
+    def close(self) -> None:
+        """Close the link for good. A call in another thread ends with DeviceGone."""
+        self._closed = True
+        self._hang_up()
+
+    def _hang_up(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    def ask(self, question: str, *, deadline: Deadline) -> str:
+        """The value of the answer to a question of the profile; asked once more if the answer is lost.
+
+        Raises
+        ------
+        DeviceTimeout  no answer to either
+        ProtocolError  what came was not an answer
+        DeviceBusy     the projector answered that it won't answer now (code ``COOLS``: because its lamp cools)
+        DeviceGone     the port went away and did not come back
+        """
+        query = self._table.queries[question]
+        self._garbage = None
+        settled = False
+        for attempt in (1, 2):
+            try:
+                if settled:
+                    self._clear(self._connected(deadline))  # half an answer must not grow together with the next
+                else:
+                    self._settle(deadline)
+                    settled = True
+                self._say(query_bytes(self._table, query, self._address), deadline)
+                reply = self._listen(query, deadline.within(self._timing.answer_s))
+            except DeviceGone:
+                self._hang_up()
+                if attempt == 2:
+                    raise
+                continue
+            if isinstance(reply, Answer):
+                return reply.value
+            if reply is not None:
+                raise self._busy(question, cooling=reply is Reply.COOLING)
+            self._check(deadline)
+        raise self._garbage or self.no_answer()
+
+    def command(self, command: str, *, deadline: Deadline) -> Reply | None:
+        """Send a command once; None if no reply came. Never sent again: the caller must look at what it did."""
+        try:
+            self._settle(deadline)
+        except DeviceGone:
+            self._hang_up()
+            self._settle(deadline)
+        try:
+            self._say(command_bytes(self._table, command, self._address), deadline)
+            reply = self._listen(None, deadline.within(self._timing.command_s))
+        except DeviceGone:
+            self._hang_up()
+            return None
+        return reply if isinstance(reply, Reply) else None
+
+    def check_open(self) -> None:
+        """Raise DeviceGone("projector-closed") after ``close``."""
+        if self._closed:
+            raise DeviceGone(
+                "projector-closed",
+                what=f"The projector at {self._name} is no longer open.",
+                remedy="Open the stage again.",
+            )
+
+    def no_answer(self) -> DeviceTimeout:
+        return DeviceTimeout(
+            "projector-no-answer",
+            what=f"The projector at {self._name} did not answer.",
+            remedy="Check its mains power, its serial cable, and the baud rate and profile in stage.toml.",
+        )
+
+    def _settle(self, deadline: Deadline) -> None:
+        """Wait until the projector may be asked again, and take off the link whatever nobody waits for any more."""
+        link = self._connected(deadline)
+        interval_s = self._timing.boot_interval_s if self._slow() else self._timing.interval_s
+        while (wait_s := self._sent_at_s + interval_s - time.monotonic()) > 0:
+            self._check(deadline)
+            deadline.sleep(wait_s)
+        while self._owed and time.monotonic() < self._owed_until_s:
+            self._check(deadline)
+            late = deadline.within(self._owed_until_s - time.monotonic())
+            if (line := self._line(link, late)) is not None and not self._swallow(line):
+                self._owed -= 1
+        self._owed = 0
+        self._clear(link)
+
+    def _clear(self, link: ByteLink) -> None:
+        """Take off the link whatever has arrived; what was told unasked is passed on."""
+        left = link.drain()
+        for line in left.split(self._table.terminator) if self._table.terminator else ():
+            self._swallow(line)
+
+    def _say(self, data: bytes, deadline: Deadline) -> None:
+        link = self._connected(deadline)
+        self._check(deadline)
+        try:
+            link.write(data, deadline=deadline)
+        except DeviceTimeout as error:
+            raise self.no_answer() from error
+        self._sent, self._sent_at_s = data, time.monotonic()
+        self._owed += 1
+        self._owed_until_s = self._sent_at_s + self._timing.late_s
+
+    def _listen(self, query: Query | None, deadline: Deadline) -> Answer | Reply | None:
+        """The reply to what was just said, or None if none came in time; notices are passed on."""
+        link = self._connected(deadline)
+        while (line := self._line(link, deadline)) is not None:
+            try:
+                meaning = parse_line(self._table, line, query, sent=self._sent)
+            except ProtocolError as error:
+                self._garbage = error
+                continue
+            if isinstance(meaning, Notice):
+                self._notice(meaning)
+            elif meaning is Reply.NOTHING or (query is not None and meaning is Reply.ACCEPTED):
+                continue  # some models accept a question before they answer it
+            else:
+                self._owed -= 1
+                return meaning
+        return None
+
+    def _line(self, link: ByteLink, deadline: Deadline) -> bytes | None:
+        """The next line that is not empty, or the next frame; None when the deadline passes."""
+        while True:
+            try:
+                line = (
+                    self._framed(link, self._table.frame, deadline)
+                    if self._table.frame
+                    else self._ended(link, deadline)
+                )
+            except ProtocolError as error:
+                self._garbage = error
+                link.drain()
+                continue
+            except DeviceTimeout:
+                return self._abnormal(link)
+            if line.strip():
+                return line
+
+    def _framed(self, link: ByteLink, frame: Frame, deadline: Deadline) -> bytes:
+        head = link.read_exactly(head_bytes(frame), deadline=deadline)
+        rest = rest_bytes(frame, head, longest=self._table.longest_answer)
+        return head + link.read_exactly(rest, deadline=deadline)
+
+    def _ended(self, link: ByteLink, deadline: Deadline) -> bytes:
+        """A line up to its terminator; one that stands in quotes ends nothing."""
+        quote, longest = self._table.quirks.quote.encode("latin-1"), self._table.longest_answer
+        line = link.read_until(self._table.terminator, limit=longest, deadline=deadline)
+        while quote and line.count(quote) % 2 and len(line) < longest:
+            line += link.read_until(self._table.terminator, limit=longest - len(line), deadline=deadline)
+        return line
+
+    def _abnormal(self, link: ByteLink) -> bytes | None:
+        """What came without its terminator, if it is whole by the rule for abnormal states."""
+        end = self._table.quirks.abnormal_terminator
+        left = link.drain() if end else b""
+        return left if end and left.strip() and left.endswith(end) else None
+
+    def _swallow(self, line: bytes) -> bool:
+        """Pass on a notice; return False for an old answer, True for what an old answer may still follow."""
+        try:
+            meaning = parse_line(self._table, line, sent=self._sent)
+        except ProtocolError:
+            return False
+        if isinstance(meaning, Notice):
+            self._notice(meaning)
+        return meaning not in (Reply.REFUSED, Reply.COOLING)
+
+    def _connected(self, deadline: Deadline) -> ByteLink:
+        """The link; opened again, by the same name, if it was lost."""
+        patience = deadline.within(REAPPEAR_S)
+        link = self._link
+        while link is None:
+            self._check(deadline)
+            self.check_open()
+            try:
+                link = self._link = self._open_link(deadline)
+            except (DeviceGone, DeviceBusy):
+                if patience.passed:
+                    raise
+                patience.sleep(0.1)
+        if self._closed:
+            link.close()  # ``close`` may have looked for it before it was there
+        self.check_open()
+        return link
+
+    def _check(self, deadline: Deadline) -> None:
+        explained = self.no_answer()
+        deadline.check(explained.code, what=explained.what, remedy=explained.remedy)
+
+    def _busy(self, question: str, *, cooling: bool) -> DeviceBusy:
+        return DeviceBusy(
+            COOLS if cooling else "projector-busy",
+            what=f"The projector at {self._name} would not tell its {question.replace('_', ' ')} now.",
+            remedy="Wait until it has finished starting or cooling, and ask again.",
+        )

@@ -1,0 +1,55 @@
+"""What a profile and the settings in stage.toml mean for the serial driver."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hal.codecs.projectors.profiles import ProjectorProfile
+from hal.codecs.projectors.serial_table import SerialTable
+from hal.errors import PluginError
+from hal.registry import OpenContext, setting
+from hal.values import Power
+from plugins.projectors.profile_files import load_profile
+
+
+def serial_table(profile: ProjectorProfile) -> SerialTable:
+    """The serial part of a profile. PluginError("profile-not-serial") if it has none."""
+    if profile.serial is None:
+        raise PluginError(
+            "profile-not-serial",
+            what=f"The profile {profile.name!r} has no serial commands.",
+            remedy='Use another profile, or the driver "pjlink".',
+        )
+    return profile.serial
+
+
+def told_powers(table: SerialTable) -> frozenset[Power]:
+    """The power states that this family names in its answers."""
+    values = table.queries["power"].values if "power" in table.queries else {}
+    return frozenset(Power(word) for word in values.values())
+
+
+def checked_address(table: SerialTable, address: str | None) -> str:
+    """The address to use; it must look like the profile's own, e.g. two digits. PluginError("setting-wrong")."""
+    if address is None:
+        return table.address
+    alike = len(address) == len(table.address) and address.isascii() and address.isalnum()
+    if not alike or (table.address.isdigit() and not address.isdigit()):
+        raise PluginError(
+            "setting-wrong",
+            what=f"The address {address!r} is not like {table.address!r}.",
+            remedy="Set address in stage.toml to the projector's own number, or leave it out.",
+        )
+    return address
+
+
+def read_settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[ProjectorProfile, Path, int, str | None]:
+    """Profile, port, baud rate and address of a stage.toml table. Raises PluginError and ProtocolError."""
+    profile = load_profile(setting(settings, "profile", str), context.stage)
+    table = serial_table(profile)
+    address = setting(settings, "address", str)
+    checked_address(table, address)
+    # Not resolved: the symlink is the stable name, and leads elsewhere after the adapter was unplugged.
+    return profile, context.stage / setting(settings, "port", str), setting(settings, "baud", int, table.baud), address

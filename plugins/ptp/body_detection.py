@@ -1,0 +1,30 @@
+"""Which way of releasing a camera is taken: by the operations that it lists, never by its model's name."""
+
+from __future__ import annotations
+
+from hal.codecs.ptp.datasets import DeviceInfo
+from hal.codecs.ptp.values import Operation
+from hal.deadline import Deadline
+from hal.errors import DeviceRefused
+from plugins.ptp.body import Body, Channel
+from plugins.ptp.canon.body import EosBody
+from plugins.ptp.generic import GenericBody
+
+
+def choose_body(channel: Channel, info: DeviceInfo, *, to_card: bool, keep_on_card: bool, both: bool) -> Body:
+    """The options are those of ``ptp_still.PtpCamera``. Raises DeviceRefused("camera-no-remote-release")."""
+    eos = {Operation.EOS_SET_PROPERTY, Operation.EOS_GET_EVENT} <= info.operations
+    if eos and info.operations & {Operation.EOS_RELEASE, Operation.EOS_RELEASE_ON}:
+        return EosBody(channel, to_card=to_card, keep_on_card=keep_on_card, both=both)
+    if Operation.INITIATE_CAPTURE in info.operations:
+        return GenericBody(channel, info, keep_on_card=keep_on_card)
+    raise DeviceRefused(
+        "camera-no-remote-release",
+        what=f"The {info.model or 'camera'} cannot be released over its cable.",
+        remedy="Set its USB or network mode to PTP or remote control, or use another camera.",
+    )
+
+
+def device_info(channel: Channel, deadline: Deadline) -> DeviceInfo:
+    """What the camera says that it is and can do."""
+    return DeviceInfo.parse(channel.ask(Operation.GET_DEVICE_INFO, doing="say what it is", deadline=deadline).data)

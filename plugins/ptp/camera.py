@@ -1,0 +1,105 @@
+"""The driver ``ptp``: still cameras that speak PTP, over the network or USB, which do what their DeviceInfo lists."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from hal.deadline import Deadline
+from hal.errors import PluginError
+from hal.escapes import toml_value
+from hal.registry import Driver, OpenContext
+from hal.transcript import Transcript
+from plugins.ptp.ip.link import PtpIpLink
+from plugins.ptp.ip.wire import PtpIpAddress
+from plugins.ptp.still import Connect, PtpCamera
+
+
+def _settings(settings: Mapping[str, Any]) -> tuple[str, bool, bool, bool]:
+    """Address, whether pictures go to the card first, whether they stay there, RAW and JPEG. Raises PluginError."""
+    address = str(settings["address"])
+    _way(address, None)
+    to_card = _choice(settings, "target", "computer", "card") == "card"
+    return address, to_card, _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg")
+
+
+def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
+    """As ``hal.registry.Driver.check``."""
+    _settings(settings)
+
+
+def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
+    """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
+    address, to_card, keep_on_card, both = _settings(settings)  # a wrong one leaves no file behind
+    transcript = None
+    if context.transcripts is not None:
+        context.transcripts.mkdir(parents=True, exist_ok=True)
+        name = re.sub(r"[^A-Za-z0-9.-]+", "-", _named(address))
+        transcript = Transcript(context.transcripts / f"{name}.txt", keep=1000)
+    return PtpCamera(
+        _way(address, transcript),
+        serial=str(settings.get("serial", "")),
+        to_card=to_card,
+        keep_on_card=keep_on_card,
+        both=both,
+        transcript=transcript,
+        deadline=deadline,
+    )
+
+
+def _way(address: str, transcript: Transcript | None) -> Connect:
+    """What opens a link to ``address``. Raises PluginError."""
+    if address.startswith("usb:"):
+        # Only here: a stage with its camera on the network needs no libusb.
+        from plugins.ptp.usb.bus import UsbAddress, UsbFinder
+
+        return UsbFinder(UsbAddress.parse(address), transcript=transcript).connect
+    place = PtpIpAddress.parse(address)
+    return lambda until: PtpIpLink.connect(place, transcript=transcript, deadline=until)
+
+
+def _named(address: str) -> str:
+    if address.startswith("usb:"):
+        return address
+    place = PtpIpAddress.parse(address)
+    return f"ptpip-{place.host}-{place.command_port}"
+
+
+def _choice(settings: Mapping[str, Any], key: str, *allowed: str) -> str:
+    value = str(settings.get(key, allowed[0]))
+    if value not in allowed:
+        raise _wrong_setting(key, value, " or ".join(f'"{one}"' for one in allowed))
+    return value
+
+
+def _flag(settings: Mapping[str, Any], key: str) -> bool:
+    value = settings.get(key, False)
+    if not isinstance(value, bool):
+        raise _wrong_setting(key, value, "true or false")
+    return value
+
+
+def _wrong_setting(key: str, value: object, allowed: str) -> PluginError:
+    return PluginError(
+        "camera-setting",
+        what=f"The camera's setting {key} is {toml_value(value)}.",
+        remedy=f"Write {allowed} for {key} in the [camera] table.",
+    )
+
+
+DRIVER: Final = Driver(
+    kind="camera",
+    name="ptp",
+    summary="Still cameras that speak PTP over USB or the network (PTP/IP): standard ones and Canon EOS.",
+    open=open_camera,
+    settings={
+        "address": "usb:SERIAL, usb:VENDOR:PRODUCT, usb:PORT, usb: for any, or ptpip:HOST:COMMANDPORT[:EVENTPORT]",
+        "serial": "serial number that the camera must have; left out: whichever answers",
+        "target": '"computer" (default) or "card": where a Canon EOS puts its pictures first',
+        "raw_and_jpeg": "true to get a JPEG beside each RAW file, where the camera can do that (default false)",
+        "keep_on_card": "true to leave pictures on the card after they were fetched (default false)",
+    },
+    required=("address",),
+    check=check_camera,
+)

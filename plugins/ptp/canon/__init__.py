@@ -1,0 +1,1 @@
+"""What Canon EOS bodies do in their own way. Entry: `body`."""

@@ -1,0 +1,252 @@
+"""Canon EOS bodies, old (910F, such as the EOS 400D) and new (9128/9129): chosen by what the body lists, not by model.
+
+Sequences as libgphoto2 documents them from traces; see ``hal.codecs.ptp.eos`` for the bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Final
+
+from hal.codecs.ptp.eos import Destination, EosProperty, aperture_of, exposure_of, iso_of
+from hal.codecs.ptp.values import Answer, Operation
+from hal.deadline import Deadline
+from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
+from plugins.ptp.body import Channel, nearest, no_such_file, still_waiting
+from plugins.ptp.canon.conversation import EosTalk
+from plugins.ptp.canon.live_view import EosView
+from plugins.ptp.canon.shutter import EosShutter, not_released, released
+from plugins.ptp.files import PendingFile, kind_of
+from plugins.ptp.link import Reply, camera_busy, refused
+from plugins.ptp.shot import Picture, Shot
+
+_BLOCK: Final = 1 << 20
+"""Some bodies stop answering when asked for more at once."""
+_HOST_SPACE: Final = (0x0FFF_FFFF, 0x1000, 1)
+"""What 911A tells the body of this computer's free space, so that it does not refuse to expose."""
+_LONGEST_BULB_S: Final = 900.0
+_FULL: Final = 7
+"""Why a release did nothing: the memory is full."""
+
+
+class EosBody:
+    """See ``plugins.ptp.body.Body``.
+
+    ``to_card``: let pictures go to the card instead of straight to this computer; ``both``: a JPEG beside each RAW
+    """
+
+    def __init__(self, channel: Channel, *, to_card: bool, keep_on_card: bool, both: bool) -> None:
+        self._channel = channel
+        self._talk = EosTalk(channel)
+        self._state = self._talk.state
+        self._shutter = EosShutter(self._talk)
+        self._view = EosView(self._talk)
+        self._to_card = to_card
+        self._keep = keep_on_card
+        self._both = both
+        self._bulb_s: float | None = None
+        self._target_changed = False
+
+    @property
+    def capabilities(self) -> CameraCapabilities:
+        return replace(self._state.capabilities, bulb=self._can_bulb, live_view=self._view.able)
+
+    def prepare(self, *, deadline: Deadline) -> None:
+        for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
+            self._channel.ask(operation, 1, doing="let itself be controlled", deadline=deadline)
+        # Also at the first connection: a program that was killed may have left both as they were.
+        self._shutter.close()
+        self._shutter.let_go()
+        self._talk.drain(deadline)
+        self._view.end(deadline)
+        self._aim_at_target(deadline)
+
+    def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
+        self._talk.drain(deadline)
+        image_format = self._state.pick_format(raw=settings.raw, both=self._both)
+        if image_format is None:
+            raise no_such_file(settings.raw)
+        exposures, isos, apertures = self._state.exposures(), self._state.isos(), self._state.apertures()
+        bulb_s = settings.exposure_s if self._needs_bulb(settings.exposure_s, exposures) else None
+        exposure_s = bulb_s or nearest(exposures, settings.exposure_s, setting="exposure time in seconds")
+        iso = round(nearest(isos, settings.iso, setting="ISO speed")) if isos else settings.iso
+        aperture_f = settings.aperture_f
+        if aperture_f is not None:
+            aperture_f = nearest(apertures, aperture_f, setting="aperture")
+            code = self._talk.set(EosProperty.APERTURE, apertures[aperture_f], deadline)
+            aperture_f = aperture_of(code) or aperture_f
+        self._talk.set(EosProperty.IMAGE_FORMAT, image_format, deadline)
+        code = (self._state.bulb() or 0) if bulb_s is not None else exposures[exposure_s]
+        confirmed_s = exposure_of(self._talk.set(EosProperty.SHUTTER, code, deadline))
+        self._bulb_s = bulb_s
+        if isos:
+            iso = iso_of(self._talk.set(EosProperty.ISO, isos[iso], deadline)) or iso
+        return ExposureSettings(bulb_s or confirmed_s or exposure_s, iso, aperture_f, settings.raw)
+
+    def exposure_s(self, *, deadline: Deadline) -> float:
+        self._talk.drain(deadline)
+        return self._bulb_s or exposure_of(self._state.number(EosProperty.SHUTTER)) or 30.0
+
+    def release(self, shot: Shot, *, deadline: Deadline) -> None:
+        self._view.end(deadline)
+        self._aim_at_target(deadline)
+        self._talk.keep_alive(deadline)
+        give_up = self._channel.patience(deadline)
+        pause_s = 0.01
+        aimed_again = self._to_card
+        while True:
+            # Anew each time: while the body was busy, an earlier picture may have been finished.
+            self._forget_old_pictures(deadline)
+            shot.known = self._channel.handles(deadline)
+            reply = self._shutter.press(shot, bulb=self._bulb_s is not None, deadline=deadline)
+            if released(reply):
+                return
+            shot.not_fired()
+            if _full(reply) and not aimed_again:
+                # Its card is full, but no card was meant: it has changed the target by itself.
+                aimed_again = self._target_changed = True
+                self._aim_at_target(deadline, again=True)
+                continue
+            if reply.ok:
+                raise not_released(reply.parameters[0])
+            if not reply.busy:
+                raise refused(reply, "take a picture")
+            if give_up.passed:
+                raise camera_busy("take a picture")
+            self._talk.drain(deadline)
+            give_up.sleep(pause_s)
+            pause_s = min(0.5, 2 * pause_s)
+
+    def collect(self, shot: Shot, *, deadline: Deadline) -> list[Picture]:
+        """Poll for the records of the new files; look at the list, should a record be lost."""
+        if shot.held:
+            raise shot.missing()
+        timing = self._channel.timing
+        expected = len(self._state.current_format() or (None,))
+        listing_due_s = 0.0 if shot.recovering else 2 * shot.exposure_s + timing.grace_s
+        pause_s = 0.002
+        while True:
+            self._take_in(shot)
+            if len(shot.found) < expected and shot.age_s() >= listing_due_s:
+                before = len(shot.found)
+                self._look_again(shot, deadline)
+                if len(shot.found) > before and not shot.recovering:
+                    self._channel.diary.add("camera-event-lost", "The camera did not tell of a picture that it has.")
+                listing_due_s = shot.age_s() + timing.grace_s
+            if len(shot.found) >= expected or (shot.found and shot.overdue(timing)):
+                self._check_target(shot, deadline)
+                return list(shot.found.values())
+            if shot.overdue(timing):
+                raise shot.missing()
+            still_waiting(deadline)
+            deadline.sleep(pause_s)
+            pause_s = min(0.02, 1.5 * pause_s)
+            self._talk.keep_alive(deadline)
+            self._talk.drain(deadline)
+
+    def download(self, picture: Picture, file: PendingFile, *, deadline: Deadline) -> None:
+        for operation in (Operation.GET_PARTIAL_OBJECT, Operation.EOS_GET_PARTIAL_OBJECT):
+            if self._channel.has(operation):
+                self._channel.download(picture, file, partly=operation, block=_BLOCK, deadline=deadline)
+                return
+        self._channel.download(picture, file, partly=None, block=_BLOCK, deadline=deadline)
+
+    def done(self, picture: Picture, *, deadline: Deadline) -> None:
+        if picture.waiting:
+            self._channel.once(Operation.EOS_TRANSFER_COMPLETE, picture.handle, deadline=deadline)
+        elif not self._keep and self._channel.has(Operation.DELETE_OBJECT):
+            self._channel.once(Operation.DELETE_OBJECT, picture.handle, 0, deadline=deadline)
+
+    def keep_alive(self, *, deadline: Deadline) -> None:
+        self._talk.keep_alive(deadline, at_once=True)
+        self._talk.drain(deadline)
+
+    def status(self, *, deadline: Deadline) -> CameraStatus:
+        self._talk.drain(deadline)
+        changed, self._target_changed = self._target_changed, False
+        warnings = self._state.warnings() + ["target-changed"] * changed
+        battery = self._channel.battery_percent(deadline)
+        return self._channel.status(self._state.battery_percent() if battery is None else battery, warnings, deadline)
+
+    def live_view(self, *, deadline: Deadline) -> bytes:
+        return self._view.frame(deadline)
+
+    def end_live_view(self, *, deadline: Deadline) -> None:
+        self._view.end(deadline)
+
+    def leave(self, *, deadline: Deadline) -> None:
+        self._view.end(deadline)
+        for operation, mode in (
+            (Operation.EOS_SET_REMOTE_MODE, 0),
+            (Operation.EOS_SET_REMOTE_MODE, 1),
+            (Operation.EOS_SET_EVENT_MODE, 0),
+        ):
+            self._channel.once(operation, mode, deadline=deadline)
+
+    @property
+    def _can_bulb(self) -> bool:
+        return self._shutter.bulb and self._state.bulb() is not None
+
+    def _needs_bulb(self, exposure_s: float, exposures: Collection[float]) -> bool:
+        """Whether the wanted time is longer than what the body times by itself, and bulb can do it."""
+        return self._can_bulb and bool(exposures) and 2**0.5 * max(exposures) < exposure_s <= _LONGEST_BULB_S
+
+    def _take_in(self, shot: Shot) -> None:
+        for new in self._state.fresh:
+            if kind_of(new.format, new.filename) is not None and new.handle not in shot.known:
+                shot.found[new.handle] = Picture(new.handle, new.format, new.size, new.filename, new.waiting)
+        self._state.fresh.clear()
+
+    def _check_target(self, shot: Shot, deadline: Deadline) -> None:
+        """A picture on the card, though this computer was named as its target: the body has changed it by itself."""
+        if not self._to_card and not all(picture.waiting for picture in shot.found.values()):
+            self._target_changed = True
+            self._channel.diary.add("camera-target-changed", "The camera stored a picture on its card unasked.")
+            self._aim_at_target(deadline, again=True)
+
+    def _aim_at_target(self, deadline: Deadline, *, again: bool = False) -> None:
+        """Let pictures go to this computer, or to the card; looked at each time, for bodies change it by themselves.
+
+        ``again``: do not believe what the body has said of it.
+        """
+        self._talk.drain(deadline)
+        if not self._state.knows(EosProperty.CAPTURE_DESTINATION):
+            self._to_card = True
+            return
+        cards = [one for one in self._state.allowed(EosProperty.CAPTURE_DESTINATION) if one != Destination.HOST]
+        now = self._state.number(EosProperty.CAPTURE_DESTINATION)
+        wanted: int = Destination.HOST
+        if self._to_card:
+            wanted = now if now != Destination.HOST or not cards else cards[0]
+        self._talk.set(EosProperty.CAPTURE_DESTINATION, wanted, deadline, again=again)
+        if wanted == Destination.HOST and self._channel.has(Operation.EOS_HOST_CAPACITY):
+            self._channel.ask(
+                Operation.EOS_HOST_CAPACITY,
+                *_HOST_SPACE,
+                doing="take note of this computer's space",
+                deadline=deadline,
+            )
+
+    def _forget_old_pictures(self, deadline: Deadline) -> None:
+        """What waits from before this shot belongs to an earlier one, and must not be taken for this one."""
+        self._talk.drain(deadline)
+        for old in self._state.fresh:
+            if old.waiting:
+                self._channel.once(Operation.EOS_TRANSFER_COMPLETE, old.handle, deadline=deadline)
+        self._state.fresh.clear()
+
+    def _look_again(self, shot: Shot, deadline: Deadline) -> None:
+        """A record may have been lost: list the card, or have the body report everything anew."""
+        if not self._to_card:
+            self._channel.ask(Operation.EOS_SET_EVENT_MODE, 1, doing="report everything", deadline=deadline)
+            self._talk.drain(deadline)
+            self._take_in(shot)
+        for handle in sorted(self._channel.handles(deadline) - shot.known - shot.found.keys()):
+            picture = self._channel.picture(handle, deadline)
+            if picture is not None:
+                shot.found[handle] = picture
+
+
+def _full(reply: Reply) -> bool:
+    return reply.code == Answer.STORE_FULL or (reply.ok and reply.parameters[:1] == (_FULL,))

@@ -1,0 +1,1 @@
+"""PTP over TCP (PTP/IP). Entry: `link`."""

@@ -1,0 +1,256 @@
+"""PTP/IP: a camera behind two TCP connections, one for commands and one for events (CIPA DC-005).
+
+One thread at a time may use a link. Everything waits with the caller's deadline and stops when it is cancelled; a
+transaction that was left in the middle breaks the link, because its late answer could be taken for the next one.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+import uuid
+from collections import deque
+from typing import Final, Self
+
+from hal.codecs.ptp import ip as ptp_ip
+from hal.codecs.ptp.values import broken
+from hal.deadline import SLICE_S, Deadline
+from hal.errors import DeviceBusy, DeviceError, DeviceRefused
+from hal.transcript import Transcript
+from plugins.ptp.ip.wire import PtpIpAddress, Wire, readable, still_time
+from plugins.ptp.link import MOST_IN_MEMORY, LinkEvent, Reply, Sink, camera_lost
+
+_BLOCK: Final = 1 << 20
+_MOST_EVENTS: Final = 10_000
+_LONGEST_NOTE: Final = 4096
+_MOST_READS: Final = 16
+
+
+class PtpIpLink:
+    """An open PTP/IP connection; see ``PtpLink``. Made by ``connect``."""
+
+    def __init__(self, command: Wire, transcript: Transcript | None) -> None:
+        self._command = command
+        self._transcript = transcript
+        self._events: Wire | None = None
+        self._event_bytes = bytearray()
+        self._queue: deque[LinkEvent] = deque(maxlen=_MOST_EVENTS)
+        self._transaction = -1
+        self._block = bytearray(_BLOCK)
+        self._broken = False
+        self._ready_for_events = False
+
+    @classmethod
+    def connect(cls, address: PtpIpAddress, *, transcript: Transcript | None = None, deadline: Deadline) -> Self:
+        """Open both connections and introduce this computer; ``transcript`` records all but picture data.
+
+        Raises DeviceGone("camera-off") where nobody listens, DeviceBusy where another computer holds the camera,
+        DeviceRefused where the camera does not know this one, DeviceTimeout.
+        """
+        link = cls(Wire.connect(address.host, address.command_port, deadline=deadline), transcript)
+        try:
+            link._introduce(address, deadline)
+        except BaseException:
+            link.close()
+            raise
+        return link
+
+    @property
+    def broken(self) -> bool:
+        return self._broken
+
+    def transact(
+        self,
+        operation: int,
+        *parameters: int,
+        data: bytes | None = None,
+        sink: Sink | None = None,
+        most: int = MOST_IN_MEMORY,
+        deadline: Deadline,
+    ) -> Reply:
+        still_time(deadline)
+        if self._broken:
+            raise camera_lost("it was closed")
+        self._pump()
+        self._transaction = (self._transaction + 1) % 0xFFFF_FFFF
+        number = self._transaction
+        try:
+            packets = ptp_ip.pack(ptp_ip.Request(1 if data is None else 2, operation, number, parameters))
+            if data is not None:
+                packets += ptp_ip.pack(ptp_ip.StartData(number, len(data)))
+                packets += ptp_ip.pack(ptp_ip.EndData(number, data))
+            self._send(self._command, packets, deadline)
+            return self._answer(number, sink, most, deadline)
+        except BaseException:
+            # The rest of the answer may still come; nobody must take it for the next one.
+            self.close()
+            raise
+
+    def events(self) -> list[LinkEvent]:
+        if not self._broken:
+            self._pump()
+        found = list(self._queue)
+        self._queue.clear()
+        return found
+
+    def wait_event(self, seconds: float, *, deadline: Deadline) -> None:
+        until = deadline.within(seconds)
+        while not self._queue and not until.passed and not self._broken:
+            until.sleep(0)
+            if readable([self._events], min(SLICE_S, until.left_s())):
+                self._pump()
+
+    def close(self) -> None:
+        self._broken = True
+        for wire in (self._command, self._events):
+            if wire is not None:
+                wire.close()
+
+    def _introduce(self, address: PtpIpAddress, deadline: Deadline) -> None:
+        name = socket.gethostname()
+        # The same computer always says the same, so that a camera that pairs asks its owner only once.
+        guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"velatura.{name}").bytes
+        self._send(self._command, ptp_ip.pack(ptp_ip.InitCommandRequest(guid, f"Velatura {name}"[:39])), deadline)
+        accepted = self._packet(self._command, deadline)
+        if not isinstance(accepted, ptp_ip.InitCommandAck):
+            raise _unwelcome(accepted)
+        self._events = Wire.connect(address.host, address.event_port, deadline=deadline)
+        self._send(self._events, ptp_ip.pack(ptp_ip.InitEventRequest(accepted.connection)), deadline)
+        ready = self._packet(self._events, deadline)
+        if not isinstance(ready, ptp_ip.InitEventAck):
+            raise _unwelcome(ready)
+        self._ready_for_events = True
+
+    def _answer(self, number: int, sink: Sink | None, most: int, deadline: Deadline) -> Reply:
+        """Read packets until the response; the data phase, if any, goes to ``sink`` or is kept."""
+        kept = bytearray()
+        take: Sink = kept.extend if sink is None else sink
+        total: int | None = None
+        received = 0
+        while True:
+            still_time(deadline)  # also against a camera that never stops talking
+            length, kind = ptp_ip.parse_header(self._exactly(self._command, ptp_ip.HEADER.size, deadline))
+            if kind in ptp_ip.DATA_TYPES:
+                if length < 4:
+                    raise broken("a piece of data without its request")
+                self._belongs(int.from_bytes(self._exactly(self._command, 4, deadline), "little"), number)
+                received += length - 4
+                if total is None or received > total or received > most:
+                    raise broken(f"{received} bytes of data where {total} were announced and {most} allowed")
+                self._stream(length - 4, take, deadline)
+                continue
+            packet = ptp_ip.parse(kind, self._exactly(self._command, length, deadline))
+            match packet:
+                case ptp_ip.StartData(transaction, announced):
+                    self._belongs(transaction, number)
+                    total = most if announced in ptp_ip.UNKNOWN_TOTAL else announced
+                    if total > most:
+                        raise broken(f"{total} bytes of data where at most {most} were expected")
+                    declared = announced
+                case ptp_ip.Response(code, transaction, parameters):
+                    self._belongs(transaction, number)
+                    if total is not None and declared not in ptp_ip.UNKNOWN_TOTAL and received != total:
+                        raise broken(f"{received} bytes of data where {total} were announced")
+                    return Reply(code, parameters, bytes(kept))
+                case _:
+                    self._aside(packet, self._command, deadline)
+
+    def _belongs(self, transaction: int, number: int) -> None:
+        if transaction != number:
+            raise broken(f"the answer to request {transaction} while request {number} was asked")
+
+    def _stream(self, count: int, take: Sink, deadline: Deadline) -> None:
+        if self._transcript is not None:
+            self._transcript.remark(f"{count} bytes of data")
+        view = memoryview(self._block)
+        while count:
+            piece = view[: min(count, _BLOCK)]
+            still_time(deadline)
+            self._command.fill(piece, deadline, self._wait)
+            take(piece)
+            count -= len(piece)
+
+    def _aside(self, packet: ptp_ip.Packet, wire: Wire, deadline: Deadline) -> None:
+        """Packets that may come at any time, on either connection."""
+        match packet:
+            case ptp_ip.Event(code, _, parameters):
+                self._queue.append(LinkEvent(code, parameters))
+            case ptp_ip.Ping():
+                self._send(wire, ptp_ip.pack(ptp_ip.Pong()), deadline)
+            case ptp_ip.Pong():
+                pass
+            case ptp_ip.Cancel():
+                raise camera_lost("the camera cancelled the transfer")
+            case _:
+                raise broken(f"a packet of type {packet.TYPE} at the wrong moment")
+
+    def _pump(self) -> None:
+        """Take in whatever lies on the event connection, without waiting."""
+        if self._events is None:
+            return
+        try:
+            for _ in range(_MOST_READS):
+                self._event_bytes += self._events.available()
+                if len(self._event_bytes) < ptp_ip.HEADER.size:
+                    break
+                self._parse_events(self._events, Deadline(time.monotonic() + 1.0))
+        except DeviceError:
+            self.close()
+            raise
+
+    def _parse_events(self, events: Wire, deadline: Deadline) -> None:
+        pending = self._event_bytes
+        while len(pending) >= ptp_ip.HEADER.size:
+            length, kind = ptp_ip.parse_header(pending[: ptp_ip.HEADER.size])
+            end = ptp_ip.HEADER.size + length
+            if kind in ptp_ip.DATA_TYPES:
+                raise broken("picture data on the event connection")
+            if len(pending) < end:
+                return
+            self._note(pending[:end])
+            packet = ptp_ip.parse(kind, bytes(pending[ptp_ip.HEADER.size : end]))
+            del pending[:end]
+            self._aside(packet, events, deadline)
+
+    def _packet(self, wire: Wire, deadline: Deadline) -> ptp_ip.Packet:
+        length, kind = ptp_ip.parse_header(self._exactly(wire, ptp_ip.HEADER.size, deadline))
+        if kind in ptp_ip.DATA_TYPES:
+            raise broken("picture data before the session was open")
+        return ptp_ip.parse(kind, self._exactly(wire, length, deadline))
+
+    def _exactly(self, wire: Wire, count: int, deadline: Deadline) -> bytearray:
+        data = bytearray(count)
+        wire.fill(memoryview(data), deadline, self._wait)
+        self._note(data)
+        return data
+
+    def _wait(self, deadline: Deadline) -> None:
+        """Wait for bytes; meanwhile answer pings, because a camera that exposes for a minute may ask."""
+        still_time(deadline)
+        if readable([self._command, self._events], min(SLICE_S, deadline.left_s())) and self._ready_for_events:
+            self._pump()
+
+    def _send(self, wire: Wire, data: bytes, deadline: Deadline) -> None:
+        if self._transcript is not None:
+            self._transcript.sent(data[:_LONGEST_NOTE])
+        wire.send(data, deadline)
+
+    def _note(self, data: bytes | bytearray) -> None:
+        if self._transcript is not None:
+            self._transcript.received(bytes(data[:_LONGEST_NOTE]))
+
+
+def _unwelcome(packet: ptp_ip.Packet) -> DeviceError:
+    if not isinstance(packet, ptp_ip.InitFail):
+        return broken(f"a packet of type {packet.TYPE} instead of a welcome")
+    if packet.reason == 2:
+        return DeviceBusy(
+            "camera-in-use",
+            what="The camera is connected to another computer.",
+            remedy="End the other connection, or switch the camera off and on, then try again.",
+        )
+    return DeviceRefused(
+        "camera-refused-pairing",
+        what="The camera does not accept this computer.",
+        remedy="Pair it in the camera's network menu (the name begins with Velatura), then try again.",
+    )

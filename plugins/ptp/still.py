@@ -1,0 +1,309 @@
+"""A still camera that speaks PTP over whatever link: what it is told survives its leaving and coming back."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Final, TypeVar
+
+from hal.codecs.ptp.datasets import DeviceInfo
+from hal.codecs.ptp.values import Answer, Operation
+from hal.deadline import Deadline, in_seconds, turn
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
+from hal.transcript import Transcript
+from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
+from plugins.ptp.body import Body, Channel
+from plugins.ptp.body_detection import choose_body, device_info
+from plugins.ptp.files import PendingFile, commit_all, kind_of
+from plugins.ptp.link import Diary, PtpLink, refused
+from plugins.ptp.shot import Picture, Shot, Timing
+
+Connect = Callable[[Deadline], PtpLink]
+Result = TypeVar("Result")
+
+_SESSION: Final = 1
+_ATTEMPTS: Final = 4
+_CLOSE_S: Final = 0.7
+_ALIVE_S: Final = 1.0
+
+
+class PtpCamera:
+    """A camera over any PTP link (``hal.interfaces.Camera``).
+
+    ``connect`` opens a new link whenever one is needed: a lost connection is opened again, the settings are restored,
+    and a picture in progress is looked for on the camera instead of being taken again. One caller at a time; the others
+    wait. While nobody calls, a thread of its own keeps the camera awake.
+
+    Parameters
+    ----------
+    serial : the camera must say this serial number; "" takes the first that answers and stays with it
+    to_card : let a Canon EOS store on its card instead of sending straight to this computer
+    keep_on_card : leave pictures on the card after they are safe here
+    both : a JPEG comes with each RAW file, where the camera can do that
+    transcript : closed with the camera; what passes over a link is recorded by whoever opens it
+    """
+
+    def __init__(
+        self,
+        connect: Connect,
+        *,
+        serial: str = "",
+        to_card: bool = False,
+        keep_on_card: bool = False,
+        both: bool = False,
+        timing: Timing | None = None,
+        transcript: Transcript | None = None,
+        deadline: Deadline,
+    ) -> None:
+        self._connect = connect
+        self._transcript = transcript
+        self._serial = serial
+        self._to_card = to_card
+        self._keep = keep_on_card
+        self._both = both
+        self._timing = timing or Timing()
+        self._channel: Channel | None = None
+        self._body: Body | None = None
+        self._settings: ExposureSettings | None = None
+        self._closed = False
+        self._exposing_until_s = 0.0
+        self._diary = Diary(transcript)
+        self._lock = threading.RLock()
+        self._leaving = threading.Event()
+        self._capabilities = self._reopen(deadline).capabilities
+        threading.Thread(target=self._stay_awake, name="ptp-keep-alive", daemon=True).start()
+
+    @property
+    def capabilities(self) -> CameraCapabilities:
+        return self._capabilities
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        def ask(body: Body) -> DeviceInfo:
+            assert self._channel is not None
+            return device_info(self._channel, deadline)
+
+        info = self._with_body(ask, deadline)
+        return DeviceIdentity(info.manufacturer, info.model, info.serial, info.version)
+
+    def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
+        confirmed = self._with_body(lambda body: body.configure(settings, deadline=deadline), deadline)
+        self._settings = confirmed
+        return confirmed
+
+    def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
+        """See ``hal.interfaces.Camera.capture``.
+
+        A connection that is lost in the middle is opened again. Where the button may have been pressed, the picture
+        is then looked for on the camera; it is never taken again. Raises DeviceGone("camera-shot-lost") where the
+        camera has none.
+        """
+        with self._turn(deadline):
+            shot = Shot(self._with_body(lambda body: self._exposure_s(body, deadline), deadline))
+            try:
+                return self._capture(shot, destination, deadline)
+            except BaseException:
+                if shot.fired:
+                    self._exposing_until_s = shot.fired_at_s + shot.exposure_s
+                    if self._channel is not None:
+                        self._channel.exposing_until_s = self._exposing_until_s
+                raise
+
+    def status(self, *, deadline: Deadline) -> CameraStatus:
+        """See ``hal.interfaces.WatchedCamera``."""
+        return self._with_body(lambda body: body.status(deadline=deadline), deadline)
+
+    def troubles(self) -> list[tuple[str, str]]:
+        """See ``hal.interfaces.WatchedCamera``."""
+        return self._diary.take()
+
+    def live_view(self, *, deadline: Deadline) -> bytes:
+        """See ``hal.interfaces.LiveViewCamera``."""
+        return self._with_body(lambda body: body.live_view(deadline=deadline), deadline)
+
+    def end_live_view(self, *, deadline: Deadline) -> None:
+        """See ``hal.interfaces.LiveViewCamera``."""
+        self._with_body(lambda body: body.end_live_view(deadline=deadline), deadline)
+
+    def close(self) -> None:
+        self._closed = True
+        self._leaving.set()
+        # A call that another thread has left hanging must not keep this one from ending.
+        mine = self._lock.acquire(timeout=_CLOSE_S)
+        try:
+            self._close(farewell=mine)
+        finally:
+            if mine:
+                self._lock.release()
+
+    def _close(self, *, farewell: bool) -> None:
+        """``farewell``: nobody else is on the link, whose answer could be taken for ours and ours for his."""
+        deadline = in_seconds(_CLOSE_S)
+        body, channel, self._body, self._channel = self._body, self._channel, None, None
+        if channel is not None:
+            with contextlib.suppress(DeviceError):
+                if farewell and body is not None and not channel.link.broken:
+                    body.leave(deadline=deadline)
+                    channel.once(Operation.CLOSE_SESSION, deadline=deadline)
+            channel.link.close()
+        if self._transcript is not None:
+            self._transcript.close()
+
+    def _capture(self, shot: Shot, destination: Path, deadline: Deadline) -> list[CapturedFile]:
+        self._check_time_for(shot, deadline)
+        attempt = 0
+        while True:
+            attempt += 1
+            body = self._ready(deadline, self._timing.reconnect_s if shot.fired else self._timing.come_back_s)
+            try:
+                if shot.fired:
+                    shot.resume()
+                else:
+                    body.release(shot, deadline=deadline)
+                pictures = body.collect(shot, deadline=deadline)
+                return self._fetch(body, pictures, destination, deadline)
+            except (DeviceGone, DeviceTimeout, ProtocolError) as error:
+                # Only a broken link is worth another attempt; a camera that answers has said its last word.
+                if attempt == _ATTEMPTS or deadline.passed or not self._link_broken():
+                    raise
+                self._diary.add(error.code, error.what)
+
+    def _with_body(self, work: Callable[[Body], Result], deadline: Deadline) -> Result:
+        """Do ``work``; if that breaks the connection, once more on a new one. Only for what may be done twice."""
+        with self._turn(deadline):
+            body = self._ready(deadline, self._timing.come_back_s)
+            try:
+                return work(body)
+            except (DeviceGone, DeviceTimeout, ProtocolError) as error:
+                if deadline.passed or not self._link_broken():
+                    raise
+                self._diary.add(error.code, error.what)
+            return work(self._ready(deadline, self._timing.come_back_s))
+
+    @contextlib.contextmanager
+    def _turn(self, deadline: Deadline) -> Iterator[None]:
+        """One caller at a time; another's exposure may take longer than this one has."""
+        with turn(self._lock, deadline, partial(_still_time, deadline)):
+            yield
+
+    def _stay_awake(self) -> None:
+        """A camera that nobody talks to switches itself off."""
+        while not self._leaving.wait(self._timing.idle_s):
+            if not self._lock.acquire(blocking=False):
+                continue  # somebody talks to it
+            try:
+                if self._body is not None and not self._link_broken():
+                    self._body.keep_alive(deadline=in_seconds(_ALIVE_S))
+            except DeviceError as error:
+                self._diary.add(error.code, error.what)
+            finally:
+                self._lock.release()
+
+    def _exposure_s(self, body: Body, deadline: Deadline) -> float:
+        return self._settings.exposure_s if self._settings is not None else body.exposure_s(deadline=deadline)
+
+    def _check_time_for(self, shot: Shot, deadline: Deadline) -> None:
+        if deadline.left_s() <= shot.exposure_s:
+            raise DeviceTimeout(
+                "camera-deadline-too-short",
+                what=f"An exposure of {shot.exposure_s:g} s does not fit in the {deadline.left_s():.1f} s left for it.",
+                remedy="Give the picture more than twice its exposure; nothing was exposed.",
+            )
+
+    def _fetch(self, body: Body, pictures: list[Picture], destination: Path, deadline: Deadline) -> list[CapturedFile]:
+        """Download all files of one picture, name them together, and only then let the camera forget them."""
+        with ExitStack() as temporary:
+            pending: list[PendingFile] = []
+            for picture in pictures:
+                kind = kind_of(picture.format, picture.filename)
+                if kind is None:
+                    continue
+                path = destination.parent / f"{destination.name}{kind[1]}"
+                file = temporary.enter_context(PendingFile(path, kind[0]))
+                body.download(picture, file, deadline=deadline)
+                pending.append(file)
+            captured = commit_all(pending)
+        # The files are safe: whatever goes wrong now must not make the caller take this picture again.
+        with contextlib.suppress(DeviceError):
+            for picture in pictures:
+                body.done(picture, deadline=in_seconds(max(1.0, min(5.0, deadline.left_s()))))
+        return captured
+
+    def _ready(self, deadline: Deadline, patience_s: float) -> Body:
+        """The body on a working connection; a broken one is opened again within ``patience_s``."""
+        _still_time(deadline)
+        self._check_open()
+        if self._body is not None and not self._link_broken():
+            return self._body
+        give_up = deadline.within(patience_s)
+        pause_s = 0.05
+        gone: DeviceGone | None = None
+        while True:
+            self._check_open()
+            try:
+                return self._reopen(deadline)
+            except (DeviceGone, DeviceBusy, DeviceTimeout, ProtocolError) as error:
+                # A camera that restarts refuses connections at first, or still holds the lost one.
+                gone = error if isinstance(error, DeviceGone) else gone
+                if give_up.passed:
+                    raise gone or error from None
+                give_up.sleep(pause_s)
+                pause_s = min(1.0, 2 * pause_s)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise DeviceGone(
+                "camera-closed", what="The camera's connection was closed.", remedy="Open the camera again."
+            )
+
+    def _link_broken(self) -> bool:
+        return self._channel is None or self._channel.link.broken
+
+    def _reopen(self, deadline: Deadline) -> Body:
+        if self._channel is not None:
+            self._channel.link.close()
+        link = self._connect(deadline)
+        try:
+            self._channel = Channel(link, self._timing, self._diary, operations=frozenset({Operation.GET_DEVICE_INFO}))
+            reply = self._channel.once(Operation.OPEN_SESSION, _SESSION, deadline=deadline)
+            if not reply.ok and reply.code != Answer.SESSION_ALREADY_OPEN:
+                raise refused(reply, "open a session")
+            info = device_info(self._channel, deadline)
+            self._check_serial(info)
+            self._channel = Channel(
+                link, self._timing, self._diary, operations=info.operations, properties=info.properties
+            )
+            self._channel.exposing_until_s = self._exposing_until_s
+            body = choose_body(self._channel, info, to_card=self._to_card, keep_on_card=self._keep, both=self._both)
+            body.prepare(deadline=deadline)
+            if self._settings is not None:
+                body.configure(self._settings, deadline=deadline)
+            # ``close`` does not wait for ever for whoever is here: nobody else would let go of what it did not find.
+            self._check_open()
+        except BaseException:
+            link.close()
+            raise
+        self._body = body
+        self._capabilities = body.capabilities
+        return body
+
+    def _check_serial(self, info: DeviceInfo) -> None:
+        """Calibration belongs to one camera: another one at the same address must not go unnoticed."""
+        if self._serial and info.serial != self._serial:
+            raise DeviceRefused(
+                "camera-other",
+                what=f"The camera that answers is number {info.serial or '(none)'}, not {self._serial}.",
+                remedy="Connect the right camera, or change serial in stage.toml and recalibrate.",
+            )
+        self._serial = self._serial or info.serial
+
+
+def _still_time(deadline: Deadline) -> None:
+    deadline.check(
+        "camera-no-answer",
+        what="There was no time left to ask the camera.",
+        remedy="Give it more time, then try again.",
+    )

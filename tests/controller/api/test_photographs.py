@@ -1,0 +1,170 @@
+"""Photographs and folders of captures, as the API reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from controller import api
+from tests.controller.calibrate.simulator import Scene, photographed, positions
+from tests.controller.capture.test_raw import RGGB, mosaic_of, write_dng
+
+SCENE = Scene((132, 100), (64, 48), 1.9, 3.0, seed=3)
+EXPOSURE_S = 0.5
+
+
+def write_captures(folder: Path) -> None:
+    """The simulator's photographs as 16-bit TIFF files, named as a camera would, with their description."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = [f"projector_px = [{SCENE.projector_px[0]}, {SCENE.projector_px[1]}]", f"exposure_s = {EXPOSURE_S}"]
+    lines.append("[pictures]")
+    for number, (name, image) in enumerate(photographed(SCENE).items()):
+        file = f"IMG_{number:04}.tiff"
+        assert cv2.imwrite(str(folder / file), np.rint(65534 * np.clip(image, 0, 1)).astype(np.uint16)[..., ::-1])
+        lines.append(f'{name} = "{file}"')
+    (folder / "captures.toml").write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("captures")
+    write_captures(made)
+    return made
+
+
+def test_a_raw_file_is_linear_light_with_the_saturated_pixels_unknown(tmp_path: Path) -> None:
+    scene = np.full((32, 48, 3), (0.2, 0.4, 0.3))
+    scene[:8] = 1.2
+    write_dng(tmp_path / "shot.dng", mosaic_of(scene, RGGB))
+    found = api.develop(tmp_path / "shot.dng")
+    np.testing.assert_allclose(found.image[12:], scene[12:].astype(np.float32), atol=5e-4)
+    assert np.isnan(found.image[:6]).all()
+    assert found.saturated[:6].all()
+    assert found.noise is None
+    assert found.bayer is not None
+    np.testing.assert_array_equal(found.bayer, RGGB)
+    measured = api.CameraProfile(noise=api.CameraNoise(1e-4, 2e-4))
+    assert api.develop(tmp_path / "shot.dng", camera=measured).noise == api.CameraNoise(1e-4, 2e-4)
+
+
+@pytest.mark.parametrize(("name", "dtype", "full"), [("a.png", np.uint8, 255), ("a.tif", np.uint16, 65535)])
+def test_plain_pictures_are_taken_as_linear_light(tmp_path: Path, name: str, dtype: type, full: int) -> None:
+    values: npt.NDArray[Any] = np.random.default_rng(1).integers(0, full, (5, 6, 3)).astype(dtype)
+    values[2, 3, 1] = full
+    assert cv2.imwrite(str(tmp_path / name), values[..., ::-1])
+    found = api.develop(tmp_path / name)
+    assert found.saturated.sum() == 1
+    assert np.isnan(found.image[2, 3]).all()
+    known = ~found.saturated
+    np.testing.assert_allclose(found.image[known], values[known] / full, rtol=1e-6)
+
+
+def test_what_was_exported_as_exr_is_read_back_exactly(tmp_path: Path) -> None:
+    image = np.random.default_rng(2).random((7, 9, 3), np.float32) * 20
+    np.testing.assert_array_equal(api.develop(api.export(tmp_path / "a.exr", image)).image, image)
+
+
+@pytest.mark.parametrize("name", ["gone.dng", "gone.png", "gone.jpg"])
+def test_a_file_that_is_not_there_is_named(tmp_path: Path, name: str) -> None:
+    with pytest.raises(api.VelaturaError, match=name) as error:
+        api.develop(tmp_path / name, camera=api.CameraProfile(response=np.tile(np.linspace(0, 1, 256), (3, 1))))
+    assert error.value.code == "photograph-unreadable"
+
+
+def test_brackets_of_any_number_type_give_the_radiance() -> None:
+    radiance = np.random.default_rng(3).uniform(0.1, 3, (6, 7, 3))
+    exposures_s = [0.1, 0.5, 2.0]
+    images = [np.where(radiance * one < 1, radiance * one, np.nan) for one in exposures_s]
+    merged = api.merge_brackets(images, exposures_s)
+    np.testing.assert_allclose(merged.radiance, radiance, rtol=1e-5)
+    assert np.all(merged.sigma > 0)
+
+
+def test_a_folder_is_decoded_to_the_positions_that_the_scene_has(folder: Path) -> None:
+    captures = api.read_captures(folder)
+    assert captures.projector_px == SCENE.projector_px
+    np.testing.assert_allclose(
+        captures.pictures["white"][20, 30], photographed(SCENE)["white"][20, 30] / EXPOSURE_S, atol=1e-4
+    )
+    found = api.decode(captures)
+    assert found.valid.mean() > 0.5
+    error = (found.projector_px - positions(SCENE))[found.valid]
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    fitted = api.fit_metapixels(captures, found).metapixels
+    off = (fitted.centre_px - SCENE.true_centres())[fitted.valid]
+    assert np.sqrt(np.mean(off**2)) < 0.1
+    measured = api.measure_response(captures)
+    np.testing.assert_allclose(measured.mixing, SCENE.mixing, atol=0.02)
+
+
+def test_a_calibration_predicts_a_photograph_that_it_was_not_made_of(folder: Path) -> None:
+    captures = api.read_captures(folder)
+    calibration = api.calibrate({"left": captures})
+    assert [part.name for part in calibration.projectors] == ["left"]
+    transport = api.build_transport(calibration)
+    response = calibration.projectors[0].radiometry.response
+    shown = api.draw_patterns(SCENE.projector_px, response=response)["random-0"]
+    light = np.stack([response[c][shown[..., c]] for c in range(3)], axis=-1).astype(np.float32)
+    seen = captures.pictures["random-0"] - captures.pictures["black"]
+    difference = (transport.forward([light]) - seen)[transport.object_mask]
+    assert np.sqrt(np.mean(difference**2) / np.mean(seen[transport.object_mask] ** 2)) < 0.05
+
+
+def test_files_named_after_their_patterns_need_only_the_projectors_size(tmp_path: Path) -> None:
+    api.export(tmp_path / "black.exr", np.zeros((4, 5, 3), np.float32))
+    api.export(tmp_path / "gray-x-0.exr", np.full((4, 5, 3), 0.5, np.float32))
+    api.export(tmp_path / "notes.exr", np.ones((4, 5, 3), np.float32))
+    found = api.read_captures(tmp_path, projector_px=(64, 48), exposure_s=0.25)
+    assert set(found.pictures) == {"black", "gray-x-0"}
+    np.testing.assert_array_equal(found.pictures["gray-x-0"], np.full((4, 5, 3), 2, np.float32))
+
+
+def test_several_exposures_of_a_pattern_are_merged(tmp_path: Path) -> None:
+    api.export(tmp_path / "short.png", np.full((4, 5, 3), 51, np.uint8))
+    api.export(tmp_path / "long.png", np.full((4, 5, 3), 255, np.uint8))
+    pictures = {"white": [("short.png", 0.1), ("long.png", 1.0)]}
+    found = api.read_captures(tmp_path, projector_px=(64, 48), pictures=pictures)
+    np.testing.assert_allclose(found.pictures["white"], 2.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "projector_px = [64]",
+        "projector_px = [64, 48]",
+        "projector_px = [64, 48]\nexposure_s = 0",
+        "projector_px = [64, 48]\nexposure = 1",
+        "projector_px = [64, 48",
+        "projector_px = [64, 48]\npictures = 3",
+        "projector_px = [64, 48]\n[pictures]\nblack = 3",
+        "projector_px = [64, 48]\n[pictures]\nblack = []",
+        'projector_px = [64, 48]\n[pictures]\nblack = [{file = "a.png", exposure_s = -1}]',
+    ],
+)
+def test_a_wrong_description_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "captures.toml").write_text(text)
+    with pytest.raises(api.VelaturaError) as error:
+        api.read_captures(tmp_path)
+    assert error.value.code == "captures-description-wrong"
+
+
+def test_a_file_that_the_description_names_and_the_folder_lacks_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "captures.toml").write_text('projector_px = [64, 48]\n[pictures]\nblack = "gone.png"')
+    with pytest.raises(api.VelaturaError, match=r"gone\.png") as error:
+        api.read_captures(tmp_path)
+    assert error.value.code == "capture-file-missing"
+
+
+def test_no_captures_and_a_dark_projector_are_refused() -> None:
+    with pytest.raises(api.VelaturaError, match="no captures"):
+        api.calibrate({})
+    dark = {name: np.zeros_like(image) for name, image in photographed(SCENE).items()}
+    with pytest.raises(api.VelaturaError) as error:
+        api.calibrate({"left": api.CaptureSet(dark, SCENE.projector_px)})
+    assert error.value.code == "projector-dark"

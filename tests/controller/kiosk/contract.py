@@ -1,0 +1,242 @@
+"""What every kiosk answers and refuses, operation by operation: for the real one, and for the double of the panel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import pytest
+from PIL import Image
+
+from controller.core.errors import VelaturaError
+from controller.kiosk.interface import (
+    Aiming,
+    Appearance,
+    Comparison,
+    EventRow,
+    Finding,
+    FoundDevice,
+    Job,
+    Kiosk,
+    KioskState,
+    LampDay,
+    Results,
+    Schedule,
+    TriedDevice,
+)
+from controller.kiosk.operations.dispatch import AT_SOCKET, local_values
+from tests.controller.kiosk import vase
+
+PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"
+"""Every kiosk of these tests plays PLAYING, has OTHER installed as well, and the finished calibration RUN."""
+TEXT = f"{vase.TEXT}\n[bundle]\nallow_unsigned = true\n"
+NEEDS_A_CALIBRATION = {"feasibility"}
+"""What no stage of these tests can do: tests/end_to_end/test_targets.py asks it of a calibrated one."""
+
+
+class Stage(Protocol):
+    """A kiosk with the knobs of a test."""
+
+    kiosk: Kiosk
+    folder: Path
+
+    def settle(self) -> None:
+        """Let what was asked for show in the kiosk's state."""
+
+
+Check = Callable[[Any, Stage], object]
+
+
+@dataclass(frozen=True)
+class Case:
+    """``sent`` to the operation; ``code`` of the refusal, or empty, and then ``holds`` must be true of the answer.
+
+    ``first``: operations that are asked before, with what they are sent
+    """
+
+    op: str
+    sent: dict[str, Any] = field(default_factory=dict)
+    code: str = ""
+    holds: Check = lambda answer, stage: answer is None
+    first: tuple[tuple[str, dict[str, Any]], ...] = ()
+
+    def __str__(self) -> str:
+        return "-".join([self.op, *(str(value)[:20] for value in self.sent.values()), self.code or "ok"])
+
+
+def every(kind: type, *, least: int = 0) -> Check:
+    return lambda answer, stage: len(answer) >= least and all(type(one) is kind for one in answer)
+
+
+def a_file(answer: Any, stage: Stage) -> bool:
+    return isinstance(answer, Path) and answer.is_file()
+
+
+def perhaps_a_file(answer: Any, stage: Stage) -> bool:
+    return answer is None or a_file(answer, stage)
+
+
+def a_job(answer: Any, stage: Stage) -> bool:
+    return isinstance(answer, Job) and answer.number > 0 and not answer.ended and bool(answer.name)
+
+
+def names_of(rows: Sequence[Appearance]) -> list[str]:
+    return [row.name for row in rows]
+
+
+def hours(**changes: Any) -> dict[str, Any]:
+    row = {"day": "mon", "opens": "10:00", "closes": "18:00", "appearance": OTHER}
+    return {"time_zone": "Europe/Vienna", "drift_check": "03:00", "rows": [row | changes]}
+
+
+FULL = ("recalibrate", {"kind": "full"})
+"""Work that is not done yet when the next question comes."""
+TOML = TEXT.replace("iso = 100", "iso = 200")
+
+CASES: tuple[Case, ...] = (
+    Case("state", holds=lambda state, _: type(state) is KioskState and state.playing == PLAYING),
+    Case("events", holds=lambda rows, _: every(EventRow, least=1)(rows, _) and ascending(rows)),
+    Case("events", {"after": 10**9}, holds=lambda rows, _: list(rows) == []),
+    Case("events", {"level": "error"}, holds=lambda rows, _: all(row.level == "error" for row in rows)),
+    Case("start"),
+    Case("stop"),
+    Case("play", {"name": OTHER}),
+    Case("play", {"name": "no such"}, "appearance-unknown"),
+    Case("identify", {"on": True}, holds=lambda _, stage: shows_names(stage)),
+    Case("camera", holds=lambda jpeg, _: jpeg is None or jpeg.startswith(b"\xff\xd8")),
+    Case("lamp-history", holds=every(LampDay)),
+    Case("recalibrate", {"kind": "full"}, holds=a_job),
+    Case("recalibrate", {"kind": "quick"}, holds=a_job),
+    Case("recalibrate", {"kind": "full", "projector": "left"}, holds=a_job),
+    Case("recalibrate", {"kind": "full", "projector": "camera"}, "projector-unknown"),
+    Case("recalibrate", {"kind": "quick"}, "busy", first=(FULL,)),
+    Case("cancel", {}, "nothing-to-cancel"),
+    Case("cancel", first=(FULL,)),
+    Case("job", {"number": 10**9}, "job-given-up"),
+    Case("compute", {"name": "wood", "target": "target.png"}, holds=a_job),
+    Case("compute", {"name": OTHER, "target": "target.png"}, holds=a_job),
+    Case("compute", {"name": "wood", "target": "target.png", "fit": "crop"}, holds=a_job),
+    Case("compute", {"name": "wood", "target": "target.png", "fit": "stretch"}, "field-wrong"),
+    Case("compute", {"name": "wood", "target": "BACKUP"}, "target-unreadable"),
+    Case("compute", {"name": "two words", "target": "target.png"}, "field-wrong"),
+    Case("compute", {"name": "wood", "target": "target.png"}, "busy", first=(FULL,)),
+    Case("compare", holds=a_job),
+    Case("compare", {"name": OTHER}, holds=a_job),
+    Case("compare", {"name": "no such"}, "appearance-unknown"),
+    Case("compare", {}, "busy", first=(FULL,)),
+    Case("test-shots", holds=a_job),
+    Case("test-shots", {}, "busy", first=(FULL,)),
+    Case("appearances", holds=lambda rows, _: every(Appearance)(rows, _) and names_of(rows)[:2] == [PLAYING, OTHER]
+         and [row.playing for row in rows][:2] == [True, False]),
+    Case("preview", {"name": PLAYING}, holds=perhaps_a_file),
+    Case("preview", {"name": "no such"}),
+    Case("remove-appearance", {"name": OTHER}),
+    Case("remove-appearance", {"name": PLAYING}, "appearance-in-use"),
+    Case("remove-appearance", {"name": OTHER}, "appearance-in-use", first=(("set-schedule", hours()),)),
+    Case("remove-appearance", {"name": "no such"}, "appearance-unknown"),
+    Case("remove-appearance", {"name": OTHER}, "busy", first=(FULL,)),
+    Case("comparisons", holds=every(Comparison)),
+    Case("comparison-picture", {"name": "no such", "picture": "error"}),
+    Case("runs", holds=lambda runs, _: RUN in runs),
+    Case("results", {"run": RUN}, holds=lambda found, _: type(found) is Results and found.run == RUN),
+    Case("results", {"run": "20200101-100000-calibrate"}, "run-unknown"),
+    Case("run-picture", {"run": RUN, "picture": "error"}, holds=perhaps_a_file),
+    Case("run-picture", {"run": "nothing", "picture": "error"}, "run-unknown"),
+    Case("report", {"run": "nothing"}, "run-unknown"),
+    Case("aiming", holds=lambda found, _: type(found) is Aiming),
+    Case("aiming-picture", holds=perhaps_a_file),
+    Case("schedule", holds=lambda found, _: type(found) is Schedule),
+    Case("seen", {"number": 10**9}, holds=lambda _, stage: stage.kiosk.snapshot().failures == ()),
+    Case("set-schedule", hours(), holds=lambda _, stage: stage.kiosk.schedule().rows[0].appearance == OTHER),
+    Case("set-schedule", hours(appearance="no such"), "schedule-wrong"),
+    Case("set-schedule", hours(day="2026-02-31"), "schedule-wrong"),
+    Case("set-schedule", hours(closes=""), "schedule-wrong"),
+    Case("set-schedule", hours() | {"time_zone": "Europe/Atlantis"}, "schedule-zone"),
+    Case("settings", holds=lambda text, _: text.strip() == TEXT.strip()),
+    Case("check-settings", {"text": TOML}, holds=lambda _, stage: stage.kiosk.settings().strip() == TEXT.strip()),
+    Case("check-settings", {"text": "[stage"}, "stage-syntax"),
+    Case("check-settings", {"text": TEXT.replace("iso = 100", 'iso = "high"')}, "stage-key-type"),
+    Case("check-settings", {"text": '[stage]\nname = "alone"\n'}, "stage-key-missing"),
+    Case("save-settings", {"text": TOML}, holds=lambda _, stage: stage.kiosk.settings() == TOML),
+    Case("save-settings", {"text": "[stage"}, "stage-syntax"),
+    Case("save-settings", {"text": TOML}, "busy", first=(FULL,)),
+    Case("doctor", holds=every(Finding)),
+    Case("backup", holds=a_file),
+    Case("restore", {"backup": "BACKUP"}, holds=lambda _, stage: stage.kiosk.settings().strip() == TEXT.strip(),
+         first=(("save-settings", {"text": TOML}),)),
+    Case("restore", {"backup": "target.png"}, "not-a-backup"),
+    Case("restore", {"backup": "BACKUP"}, "busy", first=(FULL,)),
+    Case("diagnostics", holds=a_file),
+    Case("find-devices", holds=every(FoundDevice)),
+    Case("try-device", {"key": "nothing"}, holds=lambda tried, _: type(tried) is TriedDevice and not tried.works),
+)  # fmt: skip
+
+
+def ascending(rows: Sequence[EventRow]) -> bool:
+    numbers = [row.number for row in rows]
+    return numbers == sorted(set(numbers))
+
+
+def shows_names(stage: Stage) -> bool:
+    """At once: whoever asked looks at the next page."""
+    return stage.kiosk.snapshot().identifying
+
+
+def ask(stage: Stage, op: str, sent: dict[str, Any]) -> Any:
+    operation = next(one for one in AT_SOCKET if one.name == op)
+    return operation.of(stage.kiosk, local_values(operation, sent))
+
+
+class Contract:
+    """For a class with a fixture ``stage``, whose kiosk works on ``stage.folder`` or keeps its files there."""
+
+    @pytest.mark.parametrize("case", CASES, ids=str)
+    def test_it_answers_and_refuses_like_every_kiosk(self, stage: Stage, case: Case) -> None:
+        target = stage.folder / "target.png"
+        Image.new("RGB", (60, 40), (200, 90, 30)).save(target)
+        # Before anything runs: the double and the real one need their own kind of file.
+        paths = {"target.png": str(target), "BACKUP": str(stage.kiosk.backup())}
+        sent = {name: paths.get(value, value) if isinstance(value, str) else value for name, value in case.sent.items()}
+        for op, before in case.first:
+            ask(stage, op, before)
+        if case.code:
+            with pytest.raises(VelaturaError) as caught:
+                ask(stage, case.op, sent)
+            assert (caught.value.code, bool(caught.value.remedy)) == (case.code, True)
+        else:
+            assert case.holds(ask(stage, case.op, sent), stage)
+
+    def test_a_job_that_was_begun_is_known_or_waits(self, stage: Stage) -> None:
+        job = ask(stage, *FULL)
+        known = ask(stage, "job", {"number": job.number})
+        assert known is None or (known.number, known.ended) == (job.number, False)
+        stage.kiosk.cancel()
+
+    def test_a_subscriber_hears_of_a_change_until_it_leaves(self, stage: Stage) -> None:
+        heard: list[int] = []
+        leave = stage.kiosk.subscribe(lambda: heard.append(1))
+        assert shows_names_after(stage)
+        assert heard
+        leave()
+        count = len(heard)
+        stage.kiosk.identify(False)
+        stage.settle()
+        assert len(heard) == count
+
+    def test_the_state_says_nothing_that_is_no_number(self, stage: Stage) -> None:
+        state = stage.kiosk.snapshot()
+        assert math.isfinite(state.since_unix_s)
+        assert all(math.isfinite(lamp.hours) for lamp in state.lamps)
+
+
+def shows_names_after(stage: Stage) -> bool:
+    stage.kiosk.identify(True)
+    return shows_names(stage)
+
+
+def test_every_operation_of_a_kiosk_is_in_the_contract() -> None:
+    declared = {one.name for one in AT_SOCKET if one.holder == "kiosk"}
+    assert {case.op for case in CASES} == declared - NEEDS_A_CALIBRATION

@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from controller.kiosk.decide.clock import Clockwork, beginning, synchronised
+from controller.kiosk.store.event_log import Decision, EventLog
+
+MAY = 1_778_000_000.0
+HOUR_S = 3600.0
+DAY_S = 86_400.0
+
+
+@dataclass
+class Clocks:
+    """A wall clock that anybody sets, and one that only goes on."""
+
+    folder: Path
+    wall_s: float = MAY
+    passed_s: float = 0.0
+    synchronised: bool = False
+    log: EventLog = field(init=False)
+    clockwork: Clockwork = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.boot()
+
+    def boot(self) -> None:
+        self.log = EventLog(self.folder / "events.sqlite", wall=lambda: self.wall_s, durable=False)
+        self.clockwork = Clockwork(self.log, lambda: self.wall_s, lambda: self.passed_s, lambda: self.synchronised)
+
+    def reboot(self, *, without_s: float = 0.0) -> None:
+        self.log.close()
+        self.wall_s, self.passed_s = self.wall_s + without_s, 0.0
+        self.boot()
+
+    def wait(self, seconds: float) -> float | None:
+        self.wall_s, self.passed_s = self.wall_s + seconds, self.passed_s + seconds
+        return self.clockwork.now()
+
+    def told(self, code: str) -> list[str]:
+        return [row.text for row in self.log.after(0) if row.code == code]
+
+
+@pytest.fixture
+def clocks(tmp_path: Path) -> Iterator[Clocks]:
+    made = Clocks(tmp_path)
+    yield made
+    made.log.close()
+
+
+def test_time_goes_on_as_the_clock_does_and_nothing_is_told(clocks: Clocks) -> None:
+    assert [clocks.wait(0.25) for _ in range(3)] == [MAY + 0.25, MAY + 0.5, MAY + 0.75]
+    assert clocks.log.after(0) == []
+
+
+def test_a_clock_that_is_disciplined_by_seconds_is_not_told(clocks: Clocks) -> None:
+    clocks.wait(1.0)
+    for _ in range(20):
+        clocks.wall_s += 10.0
+        clocks.wait(0.25)
+    assert clocks.told("clock-set") == []
+
+
+@pytest.mark.parametrize(
+    ("by_s", "said"), [(5400.0, "ahead by 90 min"), (-5400.0, "back by 90 min"), (-3 * DAY_S, "3 days")]
+)
+def test_a_clock_that_somebody_sets_is_told_once(clocks: Clocks, by_s: float, said: str) -> None:
+    clocks.wait(60.0)
+    clocks.wall_s += by_s
+    clocks.wait(0.25)
+    clocks.wait(0.25)
+    (told,) = clocks.told("clock-set")
+    assert said in told
+    assert ("stands still" in told) is (by_s == -5400.0)
+
+
+def test_set_back_a_little_time_stands_still_until_the_clock_has_caught_up(clocks: Clocks) -> None:
+    before = clocks.wait(60.0)
+    clocks.wall_s -= HOUR_S
+    assert clocks.wait(10.0) == before
+    assert clocks.wait(HOUR_S) == MAY + 70.0
+
+
+def test_set_back_by_days_it_is_doubted_unless_it_is_synchronised(clocks: Clocks) -> None:
+    clocks.wait(60.0)
+    clocks.wall_s -= 2 * DAY_S
+    assert clocks.wait(1.0) is None
+    assert len(clocks.told("clock-unknown")) == 1
+    clocks.synchronised = True
+    assert clocks.wait(1.0) == MAY + 62.0 - 2 * DAY_S
+    assert len(clocks.told("clock-known")) == 1
+
+
+def test_a_leap_far_ahead_is_remembered_only_after_it_has_lasted(clocks: Clocks) -> None:
+    clocks.wait(60.0)
+    clocks.wall_s += 30 * DAY_S
+    clocks.wait(1.0)
+    clocks.wall_s -= 30 * DAY_S
+    assert clocks.wait(1.0) == MAY + 62.0, "a glitch leaves no trace"
+    clocks.wall_s += 30 * DAY_S
+    clocks.wait(1.0)
+    clocks.wait(HOUR_S)
+    clocks.reboot()
+    clocks.wall_s -= 30 * DAY_S
+    assert clocks.wait(1.0) is None, "what stayed is believed over a boot"
+
+
+def test_what_was_believed_outlives_a_boot_into_a_clock_without_battery(clocks: Clocks) -> None:
+    clocks.wait(120.0)
+    clocks.reboot()
+    clocks.wall_s = 0.0
+    assert clocks.wait(1.0) is None
+
+
+def test_the_stages_first_time_is_kept(clocks: Clocks) -> None:
+    assert clocks.clockwork.since_s == float("inf")
+    clocks.wait(1.0)
+    assert clocks.clockwork.since_s == MAY + 1.0
+    clocks.wait(DAY_S)
+    clocks.reboot()
+    assert clocks.clockwork.since_s == MAY + 1.0
+
+
+def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
+    assert clocks.log.tell(beginning(clocks.log)).level == "info"
+    clocks.wait(600.0)
+    clocks.reboot(without_s=5 * HOUR_S)
+    cut = clocks.log.tell(beginning(clocks.log))
+    assert cut.level == "warning"
+    assert "cut off, after 2026-05-05 17:03 UTC" in cut.text
+    clocks.log.tell(Decision("service-ended", "The kiosk ends."))
+    clocks.reboot(without_s=5 * HOUR_S)
+    assert clocks.log.tell(beginning(clocks.log)).text == "The kiosk begins."
+
+
+def test_asking_the_kernel_gives_an_answer() -> None:
+    with contextlib.suppress(OSError):
+        assert synchronised() in (True, False)

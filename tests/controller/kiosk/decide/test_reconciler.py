@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from controller.core.errors import WorkError
+from controller.kiosk.decide.interfaces import BLACK, Request, Showing
+from controller.run.state_machine import State
+from hal.values import Power, ProjectorStatus
+from tests.controller.kiosk.model import BUNDLE, NAMES, Kiosk
+
+
+@pytest.fixture
+def kiosk(tmp_path: Path) -> Kiosk:
+    return Kiosk(tmp_path)
+
+
+def test_boots_from_nothing_to_playing(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    assert kiosk.lit == list(NAMES)
+    assert kiosk.player.view.shown == Showing(BUNDLE, "shine")
+    assert not kiosk.sins
+
+
+def test_pictures_are_on_the_outputs_before_any_lamp_has_answered(kiosk: Kiosk) -> None:
+    kiosk.conductor.step()
+    kiosk.conductor.step()
+    assert kiosk.player.view.shown == Showing(BUNDLE, "shine")
+
+
+def test_without_a_bundle_the_lamps_stay_off_and_the_log_says_why(kiosk: Kiosk) -> None:
+    kiosk.stock.installed = None
+    kiosk.run(30)
+    assert kiosk.state is State.OFF
+    assert not kiosk.lit
+    assert kiosk.codes.count("nothing-installed") == 1
+
+
+def test_stops_on_request_and_cools_and_starts_again_only_when_asked(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.conductor.shut()
+    kiosk.run_until(State.OFF)
+    kiosk.run(60)
+    assert kiosk.state is State.OFF
+    assert kiosk.player.view.shown == BLACK
+    kiosk.conductor.open()
+    kiosk.run_until(State.PLAYING)
+    assert not kiosk.sins
+
+
+def test_a_request_survives_a_restart_of_the_service(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.conductor.choose("marble")
+    kiosk.conductor.shut()
+    kiosk.run_until(State.OFF)
+    kiosk.log.close()
+    kiosk.boot()
+    kiosk.run(60)
+    assert kiosk.state is State.OFF
+    kiosk.conductor.open()
+    kiosk.run_until(State.PLAYING)
+    assert kiosk.player.view.shown == Showing(BUNDLE, "marble")
+
+
+def test_a_dead_lamp_degrades_and_the_others_take_over_with_their_own_frames(kiosk: Kiosk) -> None:
+    beside = Path("bundles-without/left.vel")
+    kiosk.run_until(State.PLAYING)
+    kiosk.lamps["left"].burst()
+    kiosk.run_until(State.DEGRADED)
+    assert "left" in kiosk.conductor.machine.reason
+    kiosk.run(15)
+    assert [kind for _, kind, _ in kiosk.works.done] == ["takeover"]
+    kiosk.stock.beside[frozenset({"left"})] = beside
+    kiosk.run(2)
+    assert kiosk.player.view.shown == Showing(beside, "shine")
+    kiosk.lamps["left"].dud = False
+    kiosk.run_until(State.PLAYING)
+    assert kiosk.player.view.shown == Showing(BUNDLE, "shine")
+    assert not kiosk.sins
+
+
+def test_a_lamp_that_never_lights_is_struck_three_times_and_left_alone_until_somebody_opens_again(kiosk: Kiosk) -> None:
+    kiosk.lamps["left"].dud = True
+    kiosk.run_until(State.DEGRADED, within_s=300)
+    kiosk.run(1000)
+    assert kiosk.lamps["left"].strikes == 3
+    assert "lamp-given-up" in kiosk.codes
+    assert not kiosk.sins
+
+
+def test_a_silent_cable_degrades_but_takes_no_picture_away(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.lamps["left"].trouble = "silent"
+    kiosk.gone.add("left")
+    kiosk.run_until(State.DEGRADED)
+    assert kiosk.player.view.shown == Showing(BUNDLE, "shine")
+    kiosk.gone.clear()
+    kiosk.lamps["left"].trouble = ""
+    kiosk.run_until(State.PLAYING)
+    assert not kiosk.sins
+
+
+def test_when_every_lamp_fails_it_is_a_fault_with_reason_and_it_comes_back_when_mended(kiosk: Kiosk) -> None:
+    for lamp in kiosk.lamps.values():
+        lamp.reports = ProjectorStatus(Power.FAULT, ("lamp-failed",))
+    kiosk.run_until(State.FAULT)
+    assert "lamp-failed" in kiosk.conductor.machine.reason
+    for lamp in kiosk.lamps.values():
+        lamp.reports = None
+    kiosk.run_until(State.PLAYING, within_s=1200)
+
+
+def test_a_lamp_that_can_not_be_switched_off_is_a_fault(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.lamps["right"].trouble = "refuse"
+    kiosk.conductor.shut()
+    kiosk.run_until(State.FAULT)
+    assert "right" in kiosk.conductor.machine.reason
+    assert kiosk.lit == ["right"]
+    kiosk.lamps["right"].trouble = ""
+    kiosk.run_until(State.OFF)
+
+
+def test_without_a_camera_playback_goes_on_and_recalibration_says_why_it_cannot(kiosk: Kiosk) -> None:
+    kiosk.works.camera = False
+    kiosk.run_until(State.PLAYING)
+    with pytest.raises(WorkError, match="no camera"):
+        kiosk.conductor.ask(Request("quick", light=True))
+    kiosk.run(5)
+    assert kiosk.state is State.PLAYING
+
+
+def test_recalibrates_on_request_and_plays_again(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.conductor.ask(Request("quick", light=True))
+    with pytest.raises(WorkError, match="Other work"):
+        kiosk.conductor.ask(Request("quick", light=True))
+    kiosk.run_until(State.CALIBRATING)
+    assert kiosk.player.want is None
+    kiosk.run_until(State.PLAYING)
+    assert [how for *_, how in kiosk.works.done] == ["done"]
+
+
+def test_work_is_cancelled_and_playing_goes_on(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.conductor.ask(Request("quick", light=True))
+    kiosk.run_until(State.CALIBRATING)
+    kiosk.conductor.cancel()
+    kiosk.run_until(State.PLAYING, within_s=5)
+    with pytest.raises(WorkError, match="No work"):
+        kiosk.conductor.cancel()
+
+
+def test_a_camera_that_dies_in_a_calibration_ends_the_work_and_not_the_playing(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.conductor.ask(Request("quick", light=True))
+    kiosk.run_until(State.CALIBRATING)
+    kiosk.works.camera = False
+    kiosk.run_until(State.PLAYING, within_s=5)
+
+
+def test_a_hung_player_degrades_and_recovers(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.player.hung_at_s = kiosk.world.time_s
+    kiosk.run_until(State.DEGRADED, within_s=3)
+    kiosk.run_until(State.PLAYING, within_s=10)
+
+
+def test_lamps_that_burn_when_the_service_begins_are_not_struck_again(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.log.close()
+    kiosk.boot()
+    assert kiosk.run_until(State.PLAYING) < 5
+    assert [lamp.strikes for lamp in kiosk.lamps.values()] == [1, 1, 1]
+
+
+def test_a_full_ledger_strikes_nothing_and_says_so(kiosk: Kiosk) -> None:
+    kiosk.shelf.full = True
+    kiosk.run_until(State.FAULT)
+    assert not kiosk.lit
+    kiosk.shelf.full = False
+    kiosk.run_until(State.PLAYING, within_s=1200)

@@ -1,0 +1,395 @@
+"""Work in a thread of its own: whatever comes of it is told, kept for whoever follows it, and ends nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.cli import serve_command as program
+from controller.core.errors import VelaturaError, WorkError
+from controller.core.storage import runtime_folder, write_atomically
+from controller.kiosk.api import kiosk as kiosk_module
+from controller.kiosk.api.control import NAME, ControlServer
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.decide.interfaces import Finished, Request
+from controller.kiosk.interface import Job, Schedule
+from controller.kiosk.jobs.follow_job import ask_and_follow
+from controller.kiosk.jobs.job_runner import JobReporter, Kind, ThreadWorks, run_name
+from controller.kiosk.operations.dispatch import socket_table
+from controller.kiosk.service import Service
+from controller.kiosk.store import archive
+from controller.kiosk.store.accounts import Accounts, Role
+from controller.kiosk.store.event_log import Decision, EventLog
+from controller.run.progress import Level, Phase, Progress, Silent
+from controller.stage.check import check_stage
+from hal.deadline import Cancelled
+from hal.errors import DeviceGone
+from tests.controller.kiosk.vase import graded_run, vase
+
+
+def well(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+    return Finished(request, Decision("done", "It is done."))
+
+
+def raising(error: BaseException) -> Kind:
+    def do(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        raise error
+
+    return Kind(do)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[EventLog]:
+    found = EventLog(tmp_path / "events.sqlite", durable=False)
+    yield found
+    found.close()
+
+
+class Ended(threading.Event):
+    """Set by the works' last change of a job."""
+
+    works: ThreadWorks
+
+    def changed(self) -> None:
+        if self.works.job is not None and self.works.job.ended:
+            self.set()
+
+
+def worked(log: EventLog, kind: Kind, number: int = 0) -> tuple[ThreadWorks, Finished]:
+    ended = Ended()
+    works = ended.works = ThreadWorks({"work": kind}, log, ended.changed, number=number)
+    works.begin(Request("work"))
+    assert ended.wait(20)
+    works.close(20)
+    finished = works.finished()
+    assert finished is not None
+    return works, finished
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "level"),
+    [
+        (Cancelled(), Cancelled().code, "info"),
+        (WorkError("no-space", what="Full.", remedy="Free some."), "no-space", "error"),
+        (DeviceGone("camera-gone", what="Gone.", remedy="Plug it in."), "camera-gone", "error"),
+        (KeyError("nobody thought of this"), "crash", "error"),
+        (MemoryError(), "crash", "error"),
+        (SystemExit(3), "crash", "error"),
+    ],
+)
+def test_whatever_ends_the_work_is_its_outcome(log: EventLog, error: BaseException, code: str, level: str) -> None:
+    works, finished = worked(log, raising(error))
+    assert finished.failed
+    assert (finished.outcome.code, finished.outcome.level) == (code, level)
+    assert works.running is None
+    assert works.job is not None
+    assert (works.job.ended, works.job.failed, works.job.outcome) == (True, True, finished.outcome.text)
+
+
+@pytest.mark.parametrize("how", [lambda works: works.cancel(), lambda works: works.close(20)], ids=["cancel", "close"])
+def test_work_is_asked_to_end(log: EventLog, how: Callable[[ThreadWorks], None]) -> None:
+    def waits(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+        if not cancel.wait(20):
+            raise AssertionError("nobody asked")
+        raise Cancelled
+
+    ended = Ended()
+    works = ended.works = ThreadWorks({"work": Kind(waits)}, log, ended.changed)
+    works.begin(Request("work"))
+    assert works.running == Request("work")
+    how(works)
+    assert ended.wait(20)
+    finished = works.finished()
+    assert finished is not None
+    assert finished.outcome.code == Cancelled().code
+    works.close(20)
+
+
+def test_it_is_finished_once_and_can_be_asked_for_by_its_number(log: EventLog) -> None:
+    works, finished = worked(log, Kind(well), number=41)
+    assert works.finished() is None
+    assert not finished.failed
+    assert works.number == 42
+    job = works.known(42)
+    assert job is not None
+    assert (job.ended, job.outcome) == (True, "It is done.")
+    assert works.known(41) is None
+    assert works.known(43) is None
+
+
+def test_work_for_which_the_system_has_no_thread_has_failed(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    works = ThreadWorks({"work": Kind(well)}, log)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", start)
+        works.begin(Request("work"))
+    finished = works.finished()
+    assert finished is not None
+    assert (finished.failed, finished.outcome.code) == (True, "crash")
+    assert works.running is None
+    works.close(20)
+
+
+def test_only_the_last_jobs_are_remembered(log: EventLog) -> None:
+    ended = Ended()
+    works = ended.works = ThreadWorks({"work": Kind(well)}, log, ended.changed)
+    for _ in range(20):
+        ended.clear()
+        works.begin(Request("work"))
+        assert ended.wait(20)
+        works.close(20)
+        works.finished()
+    assert [number for number in range(25) if works.known(number) is not None] == list(range(5, 21))
+
+
+def test_the_steps_of_a_job_are_those_up_to_the_present_one(log: EventLog) -> None:
+    changes: list[int] = []
+    reporter = JobReporter(Job(1, "work"), log, lambda: changes.append(1))
+
+    def at(index: int, count: int, phase: Phase, share: float) -> list[tuple[str, float]]:
+        reporter.progress(Progress(f"step {index}", index, count, phase, 0.5, share, 1.0, 2.0))
+        return [(step.title, step.done) for step in reporter.job.steps]
+
+    assert at(0, 3, Phase.RUNNING, 0.25) == [("step 0", 0.25)]
+    assert at(0, 3, Phase.DONE, 0.25) == [("step 0", 1.0)]
+    assert at(1, 3, Phase.RUNNING, 0.5) == [("step 0", 1.0), ("step 1", 0.5)]
+    # Resumed, or another runner: as many steps as that one has.
+    assert at(1, 2, Phase.RUNNING, 0.75) == [("", 0.0), ("step 1", 0.75)]
+    reporter.say("Look at this.", Level.WARNING)
+    assert (reporter.job.count, reporter.job.left_s, len(changes)) == (2, 2.0, 5)
+    assert [(row.level, row.text) for row in log.after(0)] == [("warning", "Look at this.")]
+
+
+def test_the_name_of_a_run_is_that_of_its_folder() -> None:
+    assert run_name({"run": "/somewhere/runs/20260101-100000-calibrate"}) == "20260101-100000-calibrate"
+    assert run_name({}) == ""
+
+
+PNG = b"\x89PNG, as far as anybody looks"
+
+
+@pytest.fixture
+def kiosk(tmp_path: Path) -> Iterator[StageKiosk]:
+    """A calibrated stage whose service has done seven jobs before it began anew; it is moved by hand."""
+    stage = vase(tmp_path)
+    graded_run(stage, "20260101-100000-calibrate", {"left": 0.01})
+    (stage / "target.png").write_bytes(PNG)
+    log = EventLog(stage / EventLog.FILE, durable=False)
+    log.keep("job", "7")
+    found = StageKiosk(stage)
+    found.attach(Service(check_stage(stage), log))
+    yield found
+    found.service.works.close(20)
+    log.close()
+
+
+def asked(kiosk: StageKiosk) -> Job:
+    return kiosk.compute("wood", kiosk.stage / "target.png")
+
+
+def test_jobs_are_numbered_on_over_restarts_of_the_service(kiosk: StageKiosk) -> None:
+    job = asked(kiosk)
+    assert job.number == 8
+    assert kiosk.job(8) is None, "it waits"
+    kiosk.service.conductor.step()
+    kiosk.service.works.close(20)
+    ended = kiosk.job(8)
+    assert ended is not None
+    assert (ended.number, ended.ended, ended.failed) == (8, True, True)
+
+
+def test_work_that_is_given_up_before_it_begins_is_told_to_whoever_follows_it(kiosk: StageKiosk) -> None:
+    number = asked(kiosk).number
+    kiosk.cancel()
+    with pytest.raises(WorkError) as caught:
+        kiosk.job(number)
+    assert caught.value.code == "job-given-up"
+    assert "work-cancelled" in [row.code for row in kiosk.events()]
+
+
+def followed(kiosk: StageKiosk, cancel: threading.Event | None = None, **instead: Any) -> Mapping[str, Any]:
+    served = socket_table(kiosk.holders()) | instead
+    with ControlServer(runtime_folder(kiosk.stage.resolve()) / NAME, served):
+        arguments = {"name": "wood", "target": str(kiosk.stage / "target.png")}
+        return ask_and_follow(stage=kiosk.stage, op="compute", arguments=arguments, reporter=Silent(),
+                              cancel=cancel or threading.Event(), every_s=0.01)  # fmt: skip
+
+
+def test_who_stops_following_a_job_that_ends_at_that_moment_has_stopped(kiosk: StageKiosk) -> None:
+    cancel = threading.Event()
+
+    def job(number: int) -> Job:
+        kiosk.cancel()
+        cancel.set()
+        return Job(number, "New appearance")
+
+    with pytest.raises(Cancelled):
+        followed(kiosk, cancel, job=job)
+    assert not kiosk.service.conductor.working
+
+
+def test_who_stops_following_cancels_the_job(kiosk: StageKiosk) -> None:
+    cancel = threading.Event()
+    cancel.set()
+    with pytest.raises(Cancelled):
+        followed(kiosk, cancel)
+    assert not kiosk.service.conductor.working
+
+
+def test_who_follows_work_that_never_begins_does_not_wait_for_ever(kiosk: StageKiosk) -> None:
+    def compute(name: str, target: str) -> Job:
+        job = asked(kiosk)
+        kiosk.stop()
+        return job
+
+    with pytest.raises(VelaturaError) as caught:
+        followed(kiosk, compute=compute)
+    assert caught.value.code == "job-given-up"
+
+
+def test_who_follows_hears_of_his_own_job_though_another_one_has_begun_since(kiosk: StageKiosk) -> None:
+    def compute(name: str, target: str) -> Job:
+        first = asked(kiosk)
+        kiosk.service.conductor.step()
+        kiosk.service.works.close(20)
+        kiosk.service.conductor.step()
+        asked(kiosk)
+        kiosk.service.conductor.step()
+        return first
+
+    with pytest.raises(WorkError) as caught:
+        followed(kiosk, compute=compute)
+    assert caught.value.code == "job-failed"
+    assert caught.value.what.startswith("New appearance wood: ")
+
+
+class ToldMeanwhile(EventLog):
+    """Another thread tells something as soon as somebody has looked at its number."""
+
+    meanwhile: Callable[[], object] | None = None
+
+    @property
+    def number(self) -> int:
+        found, meanwhile = super().number, self.meanwhile
+        self.meanwhile = None
+        if meanwhile is not None:
+            meanwhile()
+        return found
+
+
+def test_an_event_that_is_told_while_the_panel_is_brought_up_to_date_reaches_it(tmp_path: Path) -> None:
+    stage, heard = vase(tmp_path), list[int]()
+    log = ToldMeanwhile(stage / EventLog.FILE, durable=False)
+    found = StageKiosk(stage)
+    found.attach(service := Service(check_stage(stage), log))
+    for _ in range(2):
+        service.changed()
+    found.subscribe(lambda: heard.append(found.events()[-1].number))
+    log.meanwhile = lambda: log.tell(Decision("lamp-went-off", "The lamp went off."))
+    for _ in range(2):
+        service.changed()
+    assert heard[-1:] == [log.number]
+    log.close()
+
+
+def elsewhere(do: Callable[[], object]) -> str:
+    """The code with which another technician is refused; empty where they are not."""
+    with ThreadPoolExecutor(1) as other:
+        error = other.submit(do).exception(20)
+    return error.code if isinstance(error, VelaturaError) else ""
+
+
+def test_of_two_technicians_with_a_new_appearance_at_once_one_is_refused_and_changes_nothing(
+    kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused: list[str] = []
+
+    def other() -> Job:
+        return kiosk.compute("stone", kiosk.stage / "target.png")
+
+    def write(path: Path, data: bytes) -> None:
+        if not refused:
+            refused.append("asked")
+            refused.append(elsewhere(other))
+        write_atomically(path, data)
+
+    monkeypatch.setattr(kiosk_module, "write_atomically", write)
+    assert asked(kiosk).name == "New appearance"
+    assert refused == ["asked", "busy"]
+    assert '"wood"' in kiosk.settings()
+    assert '"stone"' not in kiosk.settings()
+
+
+def test_no_work_begins_while_a_backup_takes_the_place_of_what_it_reads(
+    kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused: list[str] = []
+
+    def restore(stage: Path, backup: Path) -> None:
+        refused.append(elsewhere(lambda: kiosk.service.ask(Request("publish"))))
+        kiosk.service.conductor.step()
+
+    monkeypatch.setattr(archive, "restore", restore)
+    kiosk.restore(kiosk.stage / "backup.tar.gz")
+    assert refused == ["busy"]
+    assert kiosk.service.works.job is None
+    assert asked(kiosk).name == "New appearance", "and then it may"
+
+
+def test_who_follows_work_that_was_given_up_is_not_told_of_the_next_ones_outcome(kiosk: StageKiosk) -> None:
+    given_up = asked(kiosk)
+    kiosk.cancel()
+    following = asked(kiosk)
+    assert following.number != given_up.number
+    assert kiosk.job(following.number) is None, "it waits"
+    with pytest.raises(WorkError) as caught:
+        kiosk.job(given_up.number)
+    assert caught.value.code == "job-given-up"
+
+
+def test_hours_that_are_sent_while_the_service_is_made_anew_are_refused_and_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kiosk, cancel, refused = StageKiosk(vase(tmp_path)), threading.Event(), list[str]()
+
+    @contextlib.contextmanager
+    def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool) -> Iterator[Service]:
+        log = EventLog(stage / EventLog.FILE, durable=False)
+        service = Service(check_stage(stage), log)  # it has read the hours
+        if refused:
+            cancel.set()
+        refused.append(elsewhere(lambda: kiosk.set_schedule(Schedule("UTC"))))
+        kiosk.reload.set()  # somebody has saved settings
+        yield service
+        service.changed()
+        log.close()
+
+    monkeypatch.setattr(program, "serving", serving)
+    monkeypatch.setattr(program, "StageKiosk", lambda stage: kiosk)
+    program.serve(stage=tmp_path, panel=None, leave_lit=False, setup=False, reporter=Silent(), cancel=cancel)
+    assert refused == ["not-set-up", "begins-anew"]
+    assert not (tmp_path / "schedule.toml").exists()
+
+
+def test_of_two_at_the_socket_of_a_kiosk_without_panel_neither_loses_an_account(
+    kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (kiosk.stage / "kiosk/panel/accounts.json").unlink()
+    asked_for, add, other = socket_table(kiosk.holders()), Accounts.add, ["otto"]
+
+    def slowly(accounts: Accounts, name: str, role: Role, password: str) -> None:
+        if other:
+            asked_for["add-account"](other.pop(), "viewer", "a good long one")
+        add(accounts, name, role, password)
+
+    monkeypatch.setattr(Accounts, "add", slowly)
+    asked_for["add-account"]("vera", "viewer", "a good long one")
+    assert [one["name"] for one in asked_for["accounts"]()] == ["otto", "vera"]

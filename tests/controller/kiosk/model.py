@@ -1,0 +1,229 @@
+"""A kiosk of models in virtual time: lamps that remember every sin, a player, work, and clocks that anybody may set."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from controller.kiosk.decide.clock import Clockwork, beginning
+from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing
+from controller.kiosk.decide.reconciler import Conductor, Limits
+from controller.kiosk.interface import Schedule
+from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.rig.lamp_guard import LampGuard
+from controller.run.state_machine import State
+from hal.deadline import Deadline
+from hal.errors import DeviceGone
+from hal.values import Power, ProjectorStatus
+from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World
+
+NAMES = ("left", "right", "above")
+STEP_S = 1.0
+BUNDLE = Path("bundles/one.vel")
+LIMITS = Limits(power_up_s=120.0, cool_down_s=60.0)
+
+
+class FragileLamp(Lamp):
+    """Knobs beyond the session's model: ``dud`` takes strikes and stays dark; ``slow_s`` before each answer."""
+
+    dud = False
+    slow_s = 0.0
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        self.world.time_s += self.slow_s
+        return super().status(deadline=deadline)
+
+    def strike(self, *, sin: bool) -> None:
+        before = self.strikes
+        super().strike(sin=sin)
+        if self.dud and self.strikes > before:
+            self.lit_at_s, self.off_at_s = None, self.world.time_s
+
+    def burst(self) -> None:
+        self.dud = True
+        self.go_dark()
+
+
+@dataclass
+class ModelPlayer:
+    """Shows what it is told at once, unless it is hung or has trouble; a hung one comes back after 5 s."""
+
+    world: World
+    want: Showing | None = BLACK
+    hung_at_s: float | None = None
+    broken: bool = False
+    shown: Showing | None = None
+
+    @property
+    def view(self) -> PlayerView:
+        if self.hung_at_s is not None and self.world.time_s - self.hung_at_s > 5.0:
+            self.hung_at_s = None
+        if self.broken or self.hung_at_s is not None:
+            return PlayerView(None, Decision("player-hung", "The player did not answer.", "It is started again."))
+        if self.want is not None:
+            self.shown = self.want
+        return PlayerView(self.shown)
+
+
+@dataclass
+class ModelWorks:
+    """Work that takes virtual time. ``camera`` away: photographs are refused, and fail under way."""
+
+    world: World
+    seconds: dict[str, float] = field(default_factory=lambda: {"drift": 20.0, "quick": 60.0})
+    camera: bool = True
+    drifted: bool = False
+    done: list[tuple[float, str, str]] = field(default_factory=list)
+    _request: Request | None = None
+    _ends_s: float = 0.0
+    cancelled: bool = False
+
+    def refusal(self, request: Request) -> Decision | None:
+        if request.light and not self.camera:
+            return Decision("camera-missing", "There is no camera.", "Plug it in.", "error")
+        return None
+
+    def begin(self, request: Request) -> None:
+        self._request, self.cancelled = request, False
+        self._ends_s = self.world.time_s + self.seconds.get(request.kind, 10.0)
+
+    @property
+    def running(self) -> Request | None:
+        return self._request
+
+    def finished(self) -> Finished | None:
+        request = self._request
+        if request is None:
+            return None
+        fails = request.light and not self.camera
+        if self.world.time_s < self._ends_s and not (fails or self.cancelled):
+            return None
+        self._request = None
+        how = "failed" if fails else "cancelled" if self.cancelled else "done"
+        self.done.append((self.world.time_s, request.kind, how))
+        if how != "done":
+            told = Decision(f"work-{how}", f"It was {how}.", "Try again.", "error")
+            return Finished(request, told, failed=True)
+        then: tuple[Request, ...] = ()
+        if request.kind == "drift" and self.drifted:
+            self.drifted = False
+            then = (Request("quick", light=True, key=request.key),)
+        return Finished(request, Decision("work-done", "Done."), then=then)
+
+    def cancel(self) -> None:
+        self.cancelled = True
+
+
+@dataclass
+class ModelStock:
+    installed: Path | None = BUNDLE
+    beside: dict[frozenset[str], Path] = field(default_factory=dict)
+
+    def bundle(self) -> Path | None:
+        return self.installed
+
+    def names(self) -> Sequence[str]:
+        return ("shine", "marble")
+
+    def without(self, missing: Collection[str], appearance: str) -> Path | None:
+        return self.beside.get(frozenset(missing))
+
+
+@dataclass
+class Kiosk:
+    """Everything, on a clock of its own. ``wall_offset_s``: what the wall clock is off from ``world.time_s``."""
+
+    folder: Path
+    schedule: Schedule = field(default_factory=lambda: Schedule("UTC"))
+    world: World = field(default_factory=World)
+    wall_offset_s: float = 1_780_000_000.0
+    without_time: bool = False
+
+    def __post_init__(self) -> None:
+        self.lamps = {name: FragileLamp(self.world) for name in NAMES}
+        self.shelf = Shelf()
+        self.gone: set[str] = set()
+        self.stock = ModelStock()
+        self.works = ModelWorks(self.world)
+        self.player = ModelPlayer(self.world)
+        self.boot()
+
+    def boot(self) -> None:
+        """The service begins, after whatever ended it; lamps, ledger and disk are as they were."""
+        self.log = EventLog(self.folder / "events.sqlite", wall=self.wall, durable=False)
+        self.log.tell(beginning(self.log))
+        self.works = ModelWorks(self.world, camera=self.works.camera, done=self.works.done, drifted=self.works.drifted)
+        self.player = ModelPlayer(self.world)
+        self.keepers = [self._keeper(name) for name in NAMES]
+        self.conductor = Conductor(
+            self.keepers, self.player, self.works, self.stock, self.log,
+            schedule=lambda: self.schedule,
+            clock=Clockwork(self.log, self.wall, self.world.now_s, lambda: False),
+            monotonic=self.world.now_s,
+            without_time=self.without_time,
+            limits=LIMITS,
+        )  # fmt: skip
+
+    def wall(self) -> float:
+        return self.world.time_s + self.wall_offset_s
+
+    def _keeper(self, name: str) -> ProjectorKeeper:
+        def open_guard(deadline: Deadline) -> LampGuard:
+            if name in self.gone:
+                raise DeviceGone("port-gone", what=f"The cable of {name} is away.", remedy="Plug it in.")
+            return LampGuard(name, self.lamps[name], self.shelf, clock=self.world)
+
+        return ProjectorKeeper(name, open_guard, self.log.tell, clock=self.world)
+
+    def power_cut(self, seconds: float) -> None:
+        """Everything goes dark for so long."""
+        self.log.close()
+        for lamp in self.lamps.values():
+            lamp.go_dark()
+        self.world.time_s += seconds
+        self.world.reboot()
+        self.boot()
+
+    def step(self, seconds: float = STEP_S) -> None:
+        for keeper in self.keepers:
+            keeper.step()
+        self.conductor.step()
+        self.world.time_s += seconds
+
+    def run(self, seconds: float, step_s: float = STEP_S) -> None:
+        ends_s = self.world.time_s + seconds
+        while self.world.time_s < ends_s:
+            self.step(step_s)
+
+    def run_until(self, *states: State, within_s: float = 400.0) -> float:
+        """Seconds until one of these states; an assertion error if none comes in time."""
+        began_s = self.world.time_s
+        while self.state not in states:
+            assert self.world.time_s - began_s < within_s, f"{self.state} {self.conductor.machine.reason}\n{self.told}"
+            self.step()
+        return self.world.time_s - began_s
+
+    @property
+    def state(self) -> State:
+        return self.conductor.machine.state
+
+    @property
+    def told(self) -> list[str]:
+        return [f"{row.code}: {row.text}" for row in self.log.after(0)[-25:]]
+
+    @property
+    def codes(self) -> list[str]:
+        return [row.code for row in self.log.after(0)]
+
+    @property
+    def lit(self) -> list[str]:
+        return [name for name, lamp in self.lamps.items() if lamp.lit_at_s is not None]
+
+    @property
+    def sins(self) -> list[str]:
+        return [sin for lamp in self.lamps.values() for sin in lamp.sins]
+
+
+__all__ = ["BUNDLE", "NAMES", "RULES", "FragileLamp", "Kiosk", "ModelPlayer", "ModelWorks", "Power"]

@@ -1,0 +1,105 @@
+"""What the stock finds in bundles: pictures for the panel, and frames for a stage that lost a projector."""
+
+from __future__ import annotations
+
+import os
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from controller.bundle.export import png
+from controller.bundle.install import install
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import Trust
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.core.errors import WorkError
+from controller.core.storage import write_atomically
+from controller.kiosk.store import bundle_store as stock_module
+from controller.kiosk.store.bundle_store import PREVIEWS, BundleStock, slots_without
+from tests.controller.artefacts.names import projectors as stages
+
+UNSIGNED = Trust((), allow_unsigned=True)
+
+
+def installed(stage: Path, revision: int, names: tuple[str, ...], slots: Path | None = None) -> bytes:
+    """A bundle in which all but the last appearance have a picture; that picture."""
+    picture = png(np.full((4, 6, 3), 10 * revision, np.uint8))
+    frames = {"P1": np.zeros((8, 8, 3), np.uint8)}
+    made = [NewAppearance(name, frames, thumbnail=None if name == names[-1] else picture) for name in names]
+    write_bundle(
+        stage / "made.vel", stage="demo", calibration="one", created_unix_s=1, outputs=[("P1", 8, 8)],
+        appearances=made, key=None, revision=revision,
+    )  # fmt: skip
+    install(stage / "made.vel", slots or stage / "bundles", trusted=(), allow_unsigned=True)
+    return picture
+
+
+def test_each_appearance_has_the_picture_of_its_own_bundle_or_none(tmp_path: Path) -> None:
+    stock = BundleStock(tmp_path, UNSIGNED)
+    assert stock.previews() == {}
+    first = installed(tmp_path, 1, ("marble", "a name with spaces", "bare"))
+    found = stock.previews()
+    assert sorted(found) == ["a name with spaces", "marble"]
+    assert {file.read_bytes() for file in found.values()} == {first}
+    second = installed(tmp_path, 2, ("marble", "bare"))
+    assert {name: file.read_bytes() for name, file in stock.previews().items()} == {"marble": second}
+    assert len(list((tmp_path / PREVIEWS).iterdir())) == 1, "those of the bundle before are gone"
+
+
+def test_a_disk_that_takes_nothing_costs_the_pictures_alone(tmp_path: Path) -> None:
+    installed(tmp_path, 1, ("marble", "bare"))
+    (tmp_path / "kiosk").write_text("a file where a folder should be")
+    assert BundleStock(tmp_path, UNSIGNED).previews() == {}
+
+
+def test_frames_without_a_projector_serve_what_they_hold(tmp_path: Path) -> None:
+    installed(tmp_path, 1, ("marble", "bare"))
+    stock = BundleStock(tmp_path, UNSIGNED)
+    assert stock.without({"left"}, "marble") is None
+    installed(tmp_path, 1, ("marble",), slots_without(tmp_path, {"left"}))
+    assert stock.without({"left"}, "marble") is not None
+    assert stock.without({"left"}, "bare") is None
+
+
+def test_pictures_that_the_disk_did_not_take_are_made_when_there_is_space_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, 1, ("marble", "wood", "bare"))
+    failures = [WorkError("no-space", what="The disk is full.", remedy="Free some.")]
+
+    def write(path: Path, data: bytes) -> None:
+        if path.name == "1.png" and failures:
+            raise failures.pop()
+        write_atomically(path, data)
+
+    monkeypatch.setattr(stock_module, "write_atomically", write)
+    stock = BundleStock(tmp_path, UNSIGNED)
+    stock.previews()
+    assert not failures
+    assert sorted(stock.previews()) == ["marble", "wood"]
+
+
+def test_what_is_read_while_others_are_forgotten_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(tmp_path, 1, ("marble", "bare"))
+    stock, close = BundleStock(tmp_path, UNSIGNED), Bundle.close
+
+    def closing(bundle: Bundle) -> None:
+        close(bundle)
+        for number in range(66):  # another thread, months later: one after the other of these is installed
+            stock.index(tmp_path / f"{number}.vel")
+
+    monkeypatch.setattr(Bundle, "close", closing)
+    assert list(stock.names()) == ["marble", "bare"]
+
+
+@given(stages)
+def test_every_set_of_lost_projectors_has_a_folder_of_its_own_inside_the_stage(names: list[str]) -> None:
+    sets = [some for count in range(1, len(names) + 1) for some in combinations(names, count)]
+    folders = {slots_without(Path("stage"), some) for some in sets}
+    assert len(folders) == len(sets)
+    for folder in folders:
+        assert Path(os.path.normpath(folder)).parent == Path("stage") / "bundles-without"
+        assert len(folder.name.encode()) <= 255

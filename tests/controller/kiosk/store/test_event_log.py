@@ -1,0 +1,79 @@
+"""The kiosk's memory on a disk that takes nothing when the kiosk begins, and in a file that is damaged."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.kiosk.store.event_log import MOST_FAILURES, Decision, EventLog
+
+
+def test_what_failed_is_kept_until_it_was_seen_over_starts_and_nonsense(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for number in range(MOST_FAILURES + 2):
+        log.tell_failure(Decision(f"failed-{number}", "It failed.", "Look.", "error"))
+    assert len(log.failures) == MOST_FAILURES
+    log.close()
+    again = EventLog(path, durable=False)
+    assert [row.code for row in again.failures][0::19] == ["failed-2", "failed-21"]
+    again.seen(again.failures[-2].number)
+    assert [row.code for row in again.failures] == ["failed-21"]
+    again.keep("failures", "[{}]")
+    again.close()
+    assert EventLog(path, durable=False).failures == ()
+
+
+def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_when_there_is_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, connect = tmp_path / EventLog.FILE, sqlite3.connect
+    log = EventLog(path, durable=False)
+    log.tell(Decision("first", "One."))
+    log.keep("chosen", "glass")
+    log.close()
+
+    def full(database: Any, **options: Any) -> sqlite3.Connection:
+        if database == path:
+            error = sqlite3.OperationalError("disk I/O error")
+            error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE  # what SQLite says on a file system without space
+            raise error
+        found: sqlite3.Connection = connect(database, **options)
+        return found
+
+    monkeypatch.setattr(sqlite3, "connect", full)
+    log = EventLog(path, durable=False)
+    log.tell(Decision("second", "Two."))
+    log.mark_done("drift-check 2026-01-01", "drift-none")
+    assert log.problem == "disk I/O error"
+    assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
+    monkeypatch.setattr(sqlite3, "connect", connect)
+    log.mark_done("drift-check 2026-01-02", "drift-none")
+    assert log.problem is None
+    log.close()
+    log = EventLog(path, durable=False)
+    assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
+    assert log.done() == {"drift-check 2026-01-01", "drift-check 2026-01-02"}
+    log.close()
+    assert not list(path.parent.glob("*.damaged-*"))
+
+
+@pytest.mark.parametrize("length", [50, 5000])
+def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length: int) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for _ in range(100):
+        log.tell(Decision("before", "One. " * 50))
+    log.close()
+    path.write_bytes(path.read_bytes()[:length])
+    log = EventLog(path, durable=False)
+    log.tell(Decision("after", "Two."))
+    assert log.problem is None
+    log.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)] == ["after"]
+    log.close()
+    assert len(list(path.parent.glob("*.damaged-*"))) == 1

@@ -1,0 +1,75 @@
+"""A picture of any size becomes one of the camera's view."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from controller.core.errors import UsageError
+from controller.kiosk.store.targets import fitted
+from controller.kiosk.values import Fit
+
+VIEW = (60, 40)
+
+
+def png_of(width: int, height: int) -> bytes:
+    """Its left half red, its right half green."""
+    picture = np.zeros((height, width, 3), np.uint8)
+    picture[:, : width // 2, 2] = 255
+    picture[:, width // 2 :, 1] = 255
+    return cv2.imencode(".png", picture)[1].tobytes()
+
+
+def seen(png: bytes) -> np.ndarray:
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    return np.asarray(picture)
+
+
+def test_a_picture_of_the_right_size_stays_as_it_is() -> None:
+    png = png_of(*VIEW)
+    assert fitted(png, VIEW) == png
+
+
+@pytest.mark.parametrize(
+    ("how", "size", "said"),
+    [
+        ("fit", (120, 40), (60, 20)), ("fit", (30, 40), (30, 40)), ("fit", (6, 4), (60, 40)),
+        ("fill", (120, 40), (60, 40)), ("fill", (30, 40), (60, 40)), ("fill", (6, 4), (60, 40)),
+        ("crop", (120, 40), (60, 40)), ("crop", (30, 20), (30, 20)), ("crop", (6, 400), (6, 40)),
+        ("fit", (4000, 1), (60, 1)), ("fill", (1, 1), (60, 40)),
+    ],
+)  # fmt: skip
+def test_where_the_target_says_something_is_as_was_chosen(
+    how: Fit, size: tuple[int, int], said: tuple[int, int]
+) -> None:
+    found = seen(fitted(png_of(*size), VIEW, how))
+    assert found.shape == (VIEW[1], VIEW[0], 4)
+    rows, columns = np.nonzero(found[..., 3] > 127)
+    assert (int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1) == said
+    assert abs(int(columns.min()) - (VIEW[0] - said[0]) // 2) <= 1
+    assert abs(int(rows.min()) - (VIEW[1] - said[1]) // 2) <= 1
+
+
+def test_the_middle_stays_in_the_middle_and_nothing_is_stretched() -> None:
+    for how in ("fit", "fill", "crop"):
+        found = seen(fitted(png_of(240, 80), VIEW, how))
+        row = found[20]
+        red, green = row[: 30 - 1], row[30 + 1 :]
+        assert (red[red[:, 3] > 200][:, 2] > 200).all()
+        assert (green[green[:, 3] > 200][:, 1] > 200).all()
+
+
+def test_grey_and_deep_pictures_keep_their_values() -> None:
+    deep = cv2.imencode(".png", np.full((10, 10), 40_000, np.uint16))[1].tobytes()
+    found = seen(fitted(deep, VIEW, "crop"))
+    assert found.dtype == np.uint16
+    assert found[20, 30].tolist() == [40_000, 40_000, 40_000, 65_535]
+
+
+@pytest.mark.parametrize("data", [b"", b"Dear reader,", b"\x89PNG\r\n\x1a\n"])
+def test_what_is_no_picture_is_refused(data: bytes) -> None:
+    with pytest.raises(UsageError) as caught:
+        fitted(data, VIEW)
+    assert caught.value.code == "target-unreadable"

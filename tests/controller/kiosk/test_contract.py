@@ -1,0 +1,97 @@
+"""The real kiosk and the panel's double keep the same contract."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.bundle.export import png
+from controller.bundle.install import current, install
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.doctor.values import Examination
+from controller.kiosk.api import finding
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
+from controller.kiosk.jobs.job_runner import JobReporter, Kind
+from controller.kiosk.service import Service
+from controller.kiosk.store.event_log import Decision, EventLog
+from controller.stage.check import check_stage
+from tests.controller.kiosk import contract
+from tests.controller.kiosk.contract import OTHER, PLAYING, RUN, Contract
+from tests.controller.kiosk.vase import graded_run, vase
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+
+test_every_operation_of_a_kiosk_is_in_the_contract = contract.test_every_operation_of_a_kiosk_is_in_the_contract
+
+
+@dataclass
+class Real:
+    """A kiosk over its service, whose devices nobody opens and whose work waits: no thread moves it."""
+
+    kiosk: StageKiosk
+    folder: Path
+
+    def settle(self) -> None:
+        self.kiosk.service.changed()
+
+
+@dataclass
+class Double:
+    kiosk: MemoryKiosk
+    folder: Path
+
+    def settle(self) -> None:
+        """It shows everything at once."""
+
+
+def install_two(stage: Path) -> None:
+    frames = {"P1": np.zeros((1050, 1400, 3), np.uint8)}
+    preview = png(np.full((4, 6, 3), 90, np.uint8))
+    made = [NewAppearance(PLAYING, frames, thumbnail=preview), NewAppearance(OTHER, frames)]
+    write_bundle(
+        stage / "made.vel", stage="The vase", calibration=RUN, created_unix_s=1_767_600_000,
+        outputs=[("P1", 1400, 1050)], appearances=made, key=None,
+    )  # fmt: skip
+    install(stage / "made.vel", stage / "bundles", trusted=(), allow_unsigned=True)
+
+
+def endless(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
+    cancel.wait(60)
+    return Finished(request, Decision("cancelled", "It was cancelled."), failed=True)
+
+
+class TestStageKiosk(Contract):
+    @pytest.fixture
+    def stage(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Real]:
+        monkeypatch.setattr(finding, "examine", lambda **_: Examination((), (), (), ()))
+        stage = vase(tmp_path / "stage")
+        (stage / "stage.toml").write_text(contract.TEXT)
+        graded_run(stage, RUN, {"left": 0.01})
+        (stage / "runs" / RUN / "geometry.json").write_text('{"camera": {"size_px": [240, 160]}}')
+        install_two(stage)
+        log = EventLog(stage / EventLog.FILE, durable=False)
+        log.tell(Decision("first", "It begins."))
+        service = Service(check_stage(stage), log)
+        # Work that only devices can do waits for its end instead; whether it may begin is the kiosk's own to say.
+        works = vars(service.works)
+        works["_kinds"] = {name: Kind(endless) for name in works["_kinds"]}
+        vars(service.player)["_view"] = PlayerView(Showing(current(stage / "bundles"), PLAYING))
+        kiosk = StageKiosk(stage)
+        kiosk.attach(service)
+        service.changed()
+        yield Real(kiosk, stage)
+        service.works.close(20)
+        log.close()
+
+
+class TestMemoryKiosk(Contract):
+    @pytest.fixture
+    def stage(self, tmp_path: Path) -> Iterator[Double]:
+        kiosk = MemoryKiosk(tmp_path / "pictures", step_s=0.5, names=(PLAYING, OTHER), run=RUN, toml=contract.TEXT)
+        yield Double(kiosk, tmp_path)
+        kiosk.close()

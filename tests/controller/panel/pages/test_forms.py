@@ -1,0 +1,107 @@
+"""The forms of the pages over a served panel: what they change, and what they must not lose."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from controller.kiosk.interface import Schedule, ScheduleRow
+from tests.controller.panel.served import Served, csrf
+
+KEPT = Schedule("Europe/Vienna", (ScheduleRow("mon", "10:00", "18:00", "marble"),), "03:00")
+FORM: dict[str, Any] = {
+    "time_zone": "Europe/Vienna", "drift_check": "04:00", "day": ["tue", "", "2026-12-24"],
+    "opens": ["10:00", "", ""], "closes": ["18:00", "", ""], "appearance": ["warm wood", "", ""],
+}  # fmt: skip
+
+
+def sent(client: httpx.Client, form: dict[str, Any], **files: Any) -> str:
+    """Send the schedule; what the page then says."""
+    token = csrf(client.get("/schedule").text)
+    answer = client.post("/do/set-schedule", data=form | {"csrf": token}, **files)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/schedule")
+    return client.get("/schedule").text
+
+
+def test_rows_stay_together_and_empty_ones_are_left_out(fresh: Served) -> None:
+    with fresh.entered("otto") as client:
+        sent(client, FORM | {"day": [" tue ", "", "2026-12-24"]})
+    rows = (ScheduleRow("tue", "10:00", "18:00", "warm wood"), ScheduleRow("2026-12-24", "", "", ""))
+    assert fresh.kiosk.schedule() == Schedule("Europe/Vienna", rows, "04:00")
+
+
+WRONG: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"appearance": []}, "did not arrive whole"),
+    ({"opens": ["10:00", ""]}, "did not arrive whole"),
+    ({"day": ["tue"]}, "did not arrive whole"),
+    ({"day": [], "opens": ["10:00"]}, "did not arrive whole"),
+    ({"day": ["someday", "", ""]}, "day"),
+    ({"opens": ["25:00", "", ""]}, "opens"),
+    ({"drift_check": "3:00"}, "drift_check"),
+    ({"time_zone": ""}, "time_zone"),
+    ({"appearance": ["<script>", "", ""]}, "appearance"),
+    ({"day": ["mon"] * 401, "opens": [""] * 401, "closes": [""] * 401, "appearance": [""] * 401}, "rows"),
+)
+
+
+def test_hours_that_are_wrong_or_did_not_arrive_whole_change_nothing(fresh: Served) -> None:
+    with fresh.entered("otto") as client:
+        for change, word in WRONG:
+            page = sent(client, FORM | change)
+            (note,) = re.findall(r'class="note[^>]*>(.*?)</', page, re.DOTALL)
+            assert word in note
+            assert fresh.kiosk.schedule() == KEPT
+
+
+def test_a_file_that_nobody_asked_for_is_removed_and_leaves_the_form_as_it_is(fresh: Served) -> None:
+    incoming: Path = fresh.app.state.panel.options.folder / "incoming"
+    with fresh.entered("otto") as client:
+        sent(client, FORM, files={"day": ("evil.toml", b"mon", "text/plain")})
+    assert len(fresh.kiosk.schedule().rows) == 2
+    assert list(incoming.iterdir()) == []
+
+
+def test_a_disk_that_takes_no_upload_is_told_in_words(fresh: Served) -> None:
+    incoming: Path = fresh.app.state.panel.options.folder / "incoming"
+    incoming.write_bytes(b"no folder")
+    with fresh.entered("otto") as client:
+        form = {"csrf": csrf(client.get("/appearances/new").text)}
+        answer = client.post("/do/upload-target", data=form, files={"file": ("a.png", b"x")})
+        assert answer.status_code == 507
+        assert "Free some space" in answer.text
+        assert "set-schedule" in sent(client, FORM), "the panel goes on"
+    assert len(fresh.kiosk.schedule().rows) == 2
+
+
+def test_a_form_that_is_none_is_refused_and_ends_no_session(fresh: Served) -> None:
+    with fresh.entered("otto") as client:
+        token = csrf(client.get("/schedule").text)
+        plain = {"content-type": "text/plain"}
+        assert client.post("/do/set-schedule", content=b"csrf=" + token.encode(), headers=plain).status_code == 403
+        many = {"csrf": token} | {f"x{number}": "" for number in range(2500)}
+        assert client.post("/do/set-schedule", data=many).status_code == 400
+        assert client.post("/do/set-schedule", files={"csrf": ("csrf", token.encode())}).status_code == 403
+        assert client.get("/schedule").status_code == 200
+    assert fresh.kiosk.schedule() == KEPT
+
+
+def test_a_form_that_failed_leads_to_no_address_of_its_senders(fresh: Served) -> None:
+    with fresh.entered("otto") as client:
+        form = {"csrf": csrf(client.get("/appearances/new").text), "name": "wood"}
+        for target in ("../../login", "//elsewhere.example", "\u00e9\u00e9", "abc?x=1", "a/../b", ""):
+            answer = client.post("/do/compute", data=form | {"target": target})
+            assert (answer.status_code, answer.headers["location"]) == (303, "/")
+        answer = client.post("/do/compute", data=form | {"target": "ab" * 12})
+        assert answer.headers["location"] == "/appearances/new/" + "ab" * 12
+
+
+def test_settings_that_are_wrong_come_back_as_they_were_typed(fresh: Served) -> None:
+    with fresh.entered("tina") as client:
+        form = {"csrf": csrf(client.get("/settings").text), "text": "[stage\r\nname = <b>", "other": "field"}
+        answer = client.post("/do/save-settings", data=form)
+        assert answer.status_code == 422
+        assert "[stage\r\nname = &lt;b&gt;" in answer.text.replace("\n", "\r\n").replace("\r\r", "\r")
+        assert "<b>" not in answer.text.partition("<textarea")[2].partition("</textarea")[0]

@@ -1,0 +1,208 @@
+"""Real windows on an X server with three outputs: found by name or serial number, refused, gone, back, and plain.
+
+Needs Xorg with the dummy driver and xrandr (.ci/system-packages); a machine without them fails here.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.core.errors import WorkError
+from controller.play.control.launch import PlayerProcess
+from tests.controller.play.display.xorg import CONNECTORS, HEIGHT, WIDTH, Outputs, edid, running_server
+from tests.controller.play.wire import Frames, Pictures, Wire, noise
+
+Start = Callable[..., PlayerProcess]
+NAMES = ("P1", "P2", "Prój3")
+SIZES = [(name, WIDTH, HEIGHT) for name in NAMES]
+WHERE = dict(zip(NAMES, CONNECTORS, strict=True))
+APPEARANCES = 4
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outputs]:
+    with running_server(tmp_path_factory.mktemp("xorg")) as outputs:
+        yield outputs
+
+
+@pytest.fixture
+def outputs(server: Outputs) -> Outputs:
+    server.reset()
+    return server
+
+
+@pytest.fixture
+def play(start: Start, tmp_path: Path) -> Callable[..., PlayerProcess]:
+    """Start a player with windows and a bundle of noise in the appearances "0" to "3"."""
+    path = tmp_path / "windows.vel"
+    made = [NewAppearance(str(seed), noise(SIZES, seed)) for seed in range(APPEARANCES)]
+    write_bundle(path, stage="s", calibration="c", created_unix_s=0, outputs=SIZES, appearances=made)
+
+    def started(**changes: Any) -> PlayerProcess:
+        settings = {"outputs": SIZES, "frames": None, "where": WHERE, "bundle": path, "allow_unsigned": True, **changes}
+        return start(**settings)
+
+    return started
+
+
+def shown(outputs: Outputs, lefts: tuple[int, ...] = (0, WIDTH, 2 * WIDTH)) -> Pictures:
+    return {name: outputs.picture(left) for name, left in zip(NAMES, lefts, strict=True)}
+
+
+def same(found: Pictures, expected: Pictures) -> bool:
+    return all(np.array_equal(found[name], expected[name]) for name in NAMES)
+
+
+def comes_true(condition: Callable[[], object]) -> bool:
+    ends = time.monotonic() + 60
+    while not (true := condition()) and time.monotonic() < ends:
+        time.sleep(0.02)
+    return bool(true)
+
+
+def test_each_output_shows_its_own_picture_byte_for_byte(outputs: Outputs, play: Start) -> None:
+    outputs.set_edid("DUMMY2", edid("SN-0815 b", 77))
+    with Wire(play(where={"P1": "DUMMY1", "P2": "SN-0815 b", "Prój3": "DUMMY0"}).socket) as wire:
+        lefts = (WIDTH, 2 * WIDTH, 0)
+        inbox = Frames(Path(wire.ask("hello")["inbox"]))
+        for seed in range(APPEARANCES):
+            assert wire.ask("play", appearance=str(seed))["ok"]
+            assert same(shown(outputs, lefts), noise(SIZES, seed))
+            assert wire.ask("show", sequence=inbox.write(noise(SIZES, 50 + seed)))["ok"]
+            assert same(shown(outputs, lefts), noise(SIZES, 50 + seed))
+        assert wire.ask("identify")["ok"]
+        pictures = list(shown(outputs, lefts).values())
+        assert all(picture[0].all() and picture[:, -1].all() for picture in pictures)
+        assert not np.array_equal(pictures[0], pictures[1])
+        assert wire.ask("stop")["ok"]
+        assert not any(picture.any() for picture in shown(outputs, lefts).values())
+
+
+@pytest.mark.parametrize("serial", ["77", "OTM-77"])
+def test_the_serial_number_may_be_given_as_the_projector_says_it(outputs: Outputs, play: Start, serial: str) -> None:
+    outputs.set_edid("DUMMY1", edid("x", 77))
+    with Wire(play(where={**WHERE, "P2": serial}).socket) as wire:
+        assert wire.ask("play", appearance="1")["ok"]
+    assert same(shown(outputs), noise(SIZES, 1))
+
+
+def refusal(play: Start, **changes: Any) -> str:
+    with pytest.raises(WorkError) as caught:
+        play(**changes)
+    return caught.value.what
+
+
+def test_what_can_not_be_right_is_refused_with_its_reason(outputs: Outputs, play: Start) -> None:
+    assert "no output DP-9; it has DUMMY0, DUMMY1, DUMMY2" in refusal(play, where={**WHERE, "P2": "DP-9"})
+    outputs.place("DUMMY1", WIDTH, "other")
+    told = refusal(play)
+    assert "P2 is 120x100" in told
+    assert "160x120" in told
+    outputs.place("DUMMY1", WIDTH, "quick")
+    assert "P1 runs at 60.150 Hz and P2 at 120.301 Hz" in refusal(play)
+    for connector in ("DUMMY0", "DUMMY1"):
+        outputs.set_edid(connector, edid("twin"))
+    assert "DUMMY0 and DUMMY1 have the same serial number twin" in refusal(play, where={**WHERE, "P2": "twin"})
+
+
+def test_an_output_that_goes_is_named_and_shows_the_picture_when_it_is_back(outputs: Outputs, play: Start) -> None:
+    with Wire(play().socket) as wire:
+        wire.ask("play", appearance="2")
+        outputs.xrandr("--output", "DUMMY1", "--off")
+        assert comes_true(lambda: wire.ask("status")["missing_outputs"] == ["P2"])
+        assert wire.ask("play", appearance="3")["ok"]
+        expected = noise(SIZES, 3)
+        assert np.array_equal(outputs.picture(0), expected["P1"])
+        assert np.array_equal(outputs.picture(2 * WIDTH), expected["Prój3"])
+        outputs.place("DUMMY1", WIDTH, "other")
+        time.sleep(0.3)
+        assert wire.ask("status")["missing_outputs"] == ["P2"], "another size is not what was calibrated"
+        outputs.place("DUMMY1", WIDTH)
+        assert comes_true(lambda: same(shown(outputs), expected))
+        assert wire.ask("status")["missing_outputs"] == []
+
+
+def test_outputs_that_are_moved_keep_their_pictures(outputs: Outputs, play: Start) -> None:
+    with Wire(play().socket) as wire:
+        wire.ask("play", appearance="1")
+        outputs.xrandr("--output", "DUMMY0", "--pos", f"{WIDTH}x0", "--output", "DUMMY1", "--pos", "0x0")
+        assert comes_true(lambda: same(shown(outputs, (WIDTH, 0, 2 * WIDTH)), noise(SIZES, 1)))
+
+
+def gammas() -> list[str]:
+    ramps = subprocess.run(["xrandr", "--verbose"], check=True, capture_output=True, text=True).stdout
+    return [line.split()[-1] for line in ramps.splitlines() if "Gamma:" in line][:3]
+
+
+def test_an_output_that_is_back_with_a_gamma_ramp_loses_it(outputs: Outputs, play: Start) -> None:
+    player = play()
+    with Wire(player.socket) as wire:
+        wire.ask("play", appearance="2")
+        # Stopped meanwhile, so that it finds the output as its driver left it, however quick it is.
+        os.kill(player.pid, signal.SIGSTOP)
+        outputs.xrandr("--output", "DUMMY1", "--off")
+        outputs.place("DUMMY1", WIDTH)
+        outputs.xrandr("--output", "DUMMY1", "--gamma", "2:1:1")
+        assert gammas() != ["1.0:1.0:1.0"] * 3
+        os.kill(player.pid, signal.SIGCONT)
+        assert comes_true(lambda: gammas() == ["1.0:1.0:1.0"] * 3)
+        assert comes_true(lambda: same(shown(outputs), noise(SIZES, 2)))
+        assert wire.ask("status")["missing_outputs"] == []
+
+
+def test_a_gamma_ramp_is_taken_away_and_nothing_blanks(outputs: Outputs, play: Start) -> None:
+    outputs.xrandr("--output", "DUMMY1", "--gamma", "2:1:1")
+    play()
+    assert gammas() == ["1.0:1.0:1.0"] * 3
+    asked = subprocess.run(["xset", "q"], check=True, capture_output=True, text=True).stdout
+    assert "timeout:  0 " in asked
+
+
+def test_a_fade_goes_through_mixtures_of_light_and_ends_exactly(outputs: Outputs, play: Start) -> None:
+    before, after = (noise(SIZES, seed)["P2"].astype(float) ** 2 for seed in (0, 1))
+
+    def share(picture: npt.NDArray[np.uint8]) -> float:
+        """How much of the second is in it, if it is a mixture."""
+        best = float(
+            np.vdot(picture.astype(float) ** 2 - before, after - before) / np.vdot(after - before, after - before)
+        )
+        mixed = np.sqrt(np.clip((1 - best) * before + best * after, 0, None))
+        assert np.abs(picture - mixed).max() < 1.2, "not a mixture"
+        return best
+
+    with Wire(play().socket) as wire:
+        wire.ask("play", appearance="0")
+        wire.send(b'{"id": 1, "op": "play", "appearance": "1", "fade_s": 0.8}\n')
+        shares: list[float] = []
+        while not shares or shares[-1] < 1:
+            shares.append(share(outputs.picture(WIDTH)))
+        assert wire.receive()["ok"]
+    assert shares == sorted(shares)
+    assert sum(0 < value < 1 for value in shares) > 3
+    assert same(shown(outputs), noise(SIZES, 1))
+
+
+def test_no_screen_mixes_two_appearances(outputs: Outputs, play: Start) -> None:
+    expected = [np.hstack(list(noise(SIZES, seed).values())) for seed in range(APPEARANCES)]
+    seen: set[int] = set()
+    with Wire(play().socket) as wire:
+        wire.ask("sequence", items=[[str(seed), 1 / 60] for seed in range(APPEARANCES)])
+        read, ends = 0, time.monotonic() + 60
+        while (read < 100 or len(seen) < APPEARANCES) and time.monotonic() < ends:
+            read += 1
+            now = outputs.picture(0, 3 * WIDTH)
+            matches = [seed for seed in range(APPEARANCES) if np.array_equal(now, expected[seed])]
+            assert len(matches) == 1
+            seen |= set(matches)
+    assert len(seen) == APPEARANCES

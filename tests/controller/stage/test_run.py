@@ -1,0 +1,349 @@
+"""The composition root with drivers of models: what is opened when, and how everything is left."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.core.errors import UsageError, WorkError
+from controller.core.storage import exclusive
+from controller.rig.rig import Rig
+from controller.run.journal import Journal
+from controller.run.progress import Level, Progress
+from controller.run.runner import Context, Step
+from controller.run.state_machine import Event
+from controller.run.step_id import StepId
+from controller.stage.check import check_stage
+from controller.stage.run import LOCK, unfinished_run
+from controller.stage.session import OwnSession
+from hal.deadline import Cancelled, Deadline
+from hal.errors import DeviceError, DeviceGone, DriverFault, PluginError
+from hal.registry import Driver, Drivers, OpenContext
+from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
+from tests.controller.rig.rig_model import ModelCamera, ModelDisplay
+
+STAGE = """\
+[stage]
+name = "models"
+[[projectors]]
+name = "left"
+output = "P1"
+driver = "model"
+port = "A"
+[[projectors]]
+name = "right"
+output = "P2"
+driver = "model"
+port = "B"
+[camera]
+driver = "model"
+iso = 100
+focal_length_px = 500
+[display]
+driver = "model"
+[safety]
+power_down_s = 0.3
+"""
+
+
+class QuickLamp:
+    """Lit and dark at once; ``stuck``: it can be lit and never goes out; ``unclosable``: closing it fails."""
+
+    def __init__(self, *, stuck: bool = False, unclosable: bool = False) -> None:
+        self.lit, self.stuck, self.open, self.unclosable = False, stuck, True, unclosable
+        self.odd: Exception | None = None
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        return ProjectorCapabilities(False, False, (), False, LampRules(0.0, 0.0, 0.0, 0.0))
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        return DeviceIdentity("Model", "Lamp")
+
+    def close(self) -> None:
+        if self.unclosable:
+            raise OSError(5, "Input/output error")
+        self.open = False
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        if self.odd is not None:
+            raise self.odd
+        return ProjectorStatus(Power.ON if self.lit else Power.OFF)
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        self.lit = True
+
+    def switch_off(self, *, deadline: Deadline) -> None:
+        if self.stuck:
+            raise DeviceGone("port-lost", what="The port went away.", remedy="Plug it in.")
+        self.lit = False
+
+    def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
+        """It has none."""
+
+
+class OddLamp(QuickLamp):
+    """Its driver has something to tell."""
+
+    untold: tuple[str, ...] = ()
+
+    def troubles(self) -> list[tuple[str, str]]:
+        told, self.untold = self.untold, ()
+        return [("projector-answer-odd", text) for text in told]
+
+
+class Told:
+    """A reporter that remembers what was said, until its terminal is ``closed``."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[Level, str]] = []
+        self.closed = False
+
+    def progress(self, now: Progress) -> None:
+        """Not of interest here."""
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        if self.closed:
+            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+        self.said.append((level, text))
+
+
+class Models:
+    """A stage folder, its drivers, and the devices that they opened."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.lamps: dict[str, QuickLamp] = {}
+        self.stuck: set[str] = set()
+        self.unclosable: set[str] = set()
+        self.odd_in = ""
+        self.camera_error: Exception | None = None
+        self.told = Told()
+        self.cancel = threading.Event()
+        (folder / "stage.toml").write_text(STAGE)
+        settings = {"port": "the port"}
+        self.drivers = Drivers(
+            (
+                Driver("projector", "model", "A lamp.", self._lamp, settings, ("port",)),
+                Driver("camera", "model", "A camera.", self._camera),
+                Driver("display", "model", "A display.", lambda *_: ModelDisplay()),
+            )
+        )
+
+    def _lamp(self, settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> QuickLamp:
+        if settings["port"] == "nowhere":
+            raise PluginError("setting-wrong", what="The setting 'port' is 'nowhere'.", remedy="Correct it.")
+        port = settings["port"]
+        lamp = OddLamp(stuck=port in self.stuck, unclosable=port in self.unclosable)
+        lamp.untold = (self.odd_in,) if self.odd_in and port == "A" else ()
+        self.lamps[port] = lamp
+        return lamp
+
+    def _camera(self, settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> ModelCamera:
+        if self.camera_error is not None:
+            raise self.camera_error
+        return ModelCamera()
+
+    def run(self, work: Callable[[Context], Sequence[Path]] = lambda context: (), name: str = "trial") -> Path:
+        def steps(rig: Rig, run: Path) -> Sequence[Step]:
+            assert run.parent == self.folder / "runs"
+            return [Step(StepId("work"), work)]
+
+        checked = check_stage(self.folder, drivers=self.drivers)
+        return OwnSession(checked.stage.folder).run(checked, steps, name=name, reporter=self.told, cancel=self.cancel)
+
+    def states(self) -> list[str]:
+        (run,) = (self.folder / "runs").iterdir()
+        with Journal(run) as journal:
+            return [event.text.split(" (")[0] for event in journal.events() if event.code == "state"]
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> Models:
+    return Models(tmp_path)
+
+
+def test_lamps_are_lit_while_the_work_goes_on_and_off_afterwards(models: Models) -> None:
+    seen: list[bool] = []
+
+    def work(context: Context) -> Sequence[Path]:
+        seen.extend(lamp.lit for lamp in models.lamps.values())
+        return ()
+
+    run = models.run(work)
+    assert seen == [True, True]
+    assert [(lamp.lit, lamp.open) for lamp in models.lamps.values()] == [(False, False)] * 2
+    assert models.states() == [
+        "off -> powering", "powering -> warming", "warming -> ready", "ready -> cooling", "cooling -> off",
+    ]  # fmt: skip
+    with Journal(run) as journal:
+        assert journal.outcomes() == [("trial", "done")]
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError(), Cancelled(), WorkError("bad", what="Bad.", remedy="Mend.")])
+def test_whatever_the_work_raises_the_lamps_go_off_and_the_error_comes_through(
+    models: Models, error: BaseException
+) -> None:
+    def work(context: Context) -> Sequence[Path]:
+        raise error
+
+    with pytest.raises(type(error)) as raised:
+        models.run(work)
+    assert raised.value is error
+    assert not any(lamp.lit for lamp in models.lamps.values())
+    assert models.states()[-1] == "cooling -> off"
+
+
+def test_what_a_projector_is_odd_in_is_told_once_and_stops_nothing(models: Models) -> None:
+    models.odd_in = "The lamp hours of projector left stay unknown."
+    run = models.run()
+    assert [text for level, text in models.told.said if level is Level.WARNING] == [models.odd_in]
+    with Journal(run) as journal:
+        assert [event.text for event in journal.events() if event.code == "projector-answer-odd"] == [models.odd_in]
+
+
+def test_a_lamp_that_stays_lit_is_a_failure_though_the_work_is_done(models: Models) -> None:
+    models.stuck = {"A"}
+    with pytest.raises(DeviceError) as failed:
+        models.run()
+    assert failed.value.code == "lamp-still-lit"
+    assert "left" in failed.value.what
+    assert "right" not in failed.value.what
+    assert not models.lamps["B"].lit
+    assert any(level is Level.ERROR and "left could not" in text for level, text in models.told.said)
+    assert models.states()[-1] == "ready -> cooling"
+
+
+def test_a_lamp_that_stays_lit_does_not_hide_why_the_work_failed(models: Models) -> None:
+    models.stuck = {"A"}
+
+    def work(context: Context) -> Sequence[Path]:
+        raise WorkError("bad", what="Bad.", remedy="Mend.")
+
+    with pytest.raises(WorkError) as failed:
+        models.run(work)
+    assert failed.value.code == "bad"
+    assert any("left could not" in text for _, text in models.told.said)
+
+
+def test_a_driver_that_fails_to_close_is_told_and_keeps_nothing_else_open(models: Models) -> None:
+    models.unclosable = {"B"}
+    with pytest.raises(DriverFault, match="'model' of projector right raised OSError"):
+        models.run()
+    assert [lamp.open for lamp in models.lamps.values()] == [False, True]
+    assert models.states()[-1] == "cooling -> off"
+
+
+def test_a_driver_that_fails_to_close_does_not_hide_why_the_work_failed(models: Models) -> None:
+    models.unclosable = {"B"}
+
+    def work(context: Context) -> Sequence[Path]:
+        raise WorkError("bad", what="Bad.", remedy="Mend.")
+
+    with pytest.raises(WorkError) as failed:
+        models.run(work)
+    assert "projector right" in failed.value.__notes__[0]
+    assert not models.lamps["A"].open
+
+
+def test_a_terminal_that_went_away_keeps_no_lamp_lit(models: Models) -> None:
+    models.stuck = {"A"}
+
+    def work(context: Context) -> Sequence[Path]:
+        models.told.closed = True
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    with pytest.raises(BrokenPipeError):
+        models.run(work)
+    assert not models.lamps["B"].lit
+    assert models.states()[-1] == "ready -> cooling"
+
+
+def test_a_stage_at_work_is_refused_before_any_device_is_opened(models: Models) -> None:
+    with exclusive(models.folder / LOCK, what_is_running="Another"), pytest.raises(UsageError) as refused:
+        models.run()
+    assert refused.value.code == "already-running"
+    assert models.lamps == {}
+    assert not (models.folder / "runs").exists()
+
+
+def test_a_device_that_can_not_be_opened_begins_no_run_and_leaves_the_others_closed(models: Models) -> None:
+    models.camera_error = DeviceGone("camera-off", what="Off.", remedy="Switch it on.")
+    with pytest.raises(DeviceGone):
+        models.run()
+    assert [lamp.open for lamp in models.lamps.values()] == [False, False]
+    assert not any(lamp.lit for lamp in models.lamps.values())
+    assert not (models.folder / "runs").exists()
+
+
+def test_what_a_driver_finds_wrong_in_its_settings_is_told_with_the_line(models: Models) -> None:
+    (models.folder / "stage.toml").write_text(STAGE.replace('port = "B"', 'port = "nowhere"'))
+    with pytest.raises(UsageError) as wrong:
+        models.run()
+    assert wrong.value.code == "setting-wrong"
+    assert wrong.value.what == "stage.toml, line 12: The setting 'port' is 'nowhere'."
+
+
+def test_an_output_that_the_display_does_not_have_is_told_with_those_it_has(models: Models) -> None:
+    (models.folder / "stage.toml").write_text(STAGE.replace('"P2"', '"P3"'))
+    with pytest.raises(UsageError, match="one of P1, P2") as wrong:
+        models.run()
+    assert wrong.value.code == "stage-key-value"
+
+
+def test_an_unknown_driver_is_told_with_those_there_are(models: Models) -> None:
+    (models.folder / "stage.toml").write_text(
+        STAGE.replace('[camera]\ndriver = "model"', '[camera]\ndriver = "modell"')
+    )
+    with pytest.raises(UsageError) as wrong:
+        check_stage(models.folder, drivers=models.drivers)
+    assert wrong.value.what == "stage.toml, line 14: in [camera] 'driver' = 'modell' is not a camera driver."
+    assert wrong.value.remedy == "'driver' is one of model."
+
+
+def test_a_run_that_failed_goes_on_in_its_folder_and_one_that_is_done_does_not(models: Models) -> None:
+    def fails(context: Context) -> Sequence[Path]:
+        (context.folder / ".half.npz.x1.part").write_bytes(b"half")
+        raise WorkError("bad", what="Bad.", remedy="Mend.")
+
+    with pytest.raises(WorkError):
+        models.run(fails)
+    (failed,) = (models.folder / "runs").iterdir()
+    assert unfinished_run(models.folder, "trial") == failed
+    assert models.run() == failed
+    assert not list(failed.glob(".*.part"))  # as a killed process leaves them
+    following = unfinished_run(models.folder, "trial")
+    assert following.name.endswith("-trial")
+    assert not following.exists() or following == failed  # the same second names the same folder
+    assert unfinished_run(models.folder, "other").name.endswith("-other")
+
+
+def test_the_same_step_is_not_done_twice_when_a_run_goes_on(models: Models) -> None:
+    done: list[str] = []
+
+    def steps(rig: Rig, run: Path) -> Sequence[Step]:
+        def first(context: Context) -> Sequence[Path]:
+            done.append("first")
+            return ()
+
+        def second(context: Context) -> Sequence[Path]:
+            done.append("second")
+            if done.count("second") == 1:
+                raise Cancelled
+            return ()
+
+        return [
+            Step(StepId("first"), first, enter=Event.RECALIBRATE, leave=Event.CALIBRATED),
+            Step(StepId("second"), second),
+        ]
+
+    checked = check_stage(models.folder, drivers=models.drivers)
+    with pytest.raises(Cancelled):
+        OwnSession(checked.stage.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
+    OwnSession(checked.stage.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
+    assert done == ["first", "second", "second"]

@@ -1,0 +1,107 @@
+"""Uploads of every size on a real, calibrated kiosk; and appearances that can't be made, which stop no other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import pytest
+
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.interface import Job
+from controller.kiosk.service import Service
+from controller.kiosk.store.event_log import EventLog
+from controller.panel.uploads import Targets, UploadLimits
+from controller.stage.check import check_stage
+from tests.end_to_end.conftest import FinishedDemo
+from tests.end_to_end.kiosk import copied, wait_for
+from tests.end_to_end.test_targets import CAMERA_PX, grey_png
+
+pytestmark = pytest.mark.timeout(1500)
+HEAD = "\n[[appearances]]"
+
+
+@pytest.fixture
+def kiosk(finished_demo: FinishedDemo, tmp_path: Path) -> Iterator[StageKiosk]:
+    """Over its service on the demo's calibration; a test moves it by hand, and no device is opened."""
+    stage = copied(finished_demo.stage, tmp_path / "stage")
+    toml = stage / "stage.toml"
+    # What the demo solved stays in every bundle; solving that again would test nothing here.
+    toml.write_text(toml.read_text().partition(HEAD)[0] + f'{HEAD}\nname = "checkerboard"\nkind = "checkerboard"\n')
+    log = EventLog(stage / EventLog.FILE, durable=False)
+    kiosk = StageKiosk(stage)
+    kiosk.attach(Service(check_stage(stage), log))
+    yield kiosk
+    kiosk.service.works.close(60)
+    log.close()
+
+
+def ended(kiosk: StageKiosk, job: Job) -> Job:
+    """After its end was taken note of."""
+    service, done = kiosk.service, threading.Event()
+
+    def look() -> bool:
+        service.conductor.step()
+        service.changed()
+        known = kiosk.job(job.number)
+        if known is not None and known.ended:
+            # What follows from it is another test's.
+            with_more = service.conductor.working
+            if with_more:
+                kiosk.cancel()
+            else:
+                done.set()
+        return done.is_set()
+
+    wait_for(look)
+    found = kiosk.job(job.number)
+    assert found is not None
+    return found
+
+
+def test_an_upload_of_another_size_becomes_a_target_and_an_appearance(kiosk: StageKiosk, tmp_path: Path) -> None:
+    (tmp_path / "phone.png").write_bytes(grey_png(77, 52))
+    targets = Targets(tmp_path / "targets", UploadLimits(), fitted=kiosk.fitted)
+    target = targets.path(targets.add(tmp_path / "phone.png", "fill"))
+    picture = cv2.imread(str(target), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    assert picture.shape == (CAMERA_PX[1], CAMERA_PX[0], 4)
+    assert kiosk.feasibility(target).read_bytes().startswith(b"\x89PNG")
+    assert kiosk.feasibility(tmp_path / "phone.png").read_bytes().startswith(b"\x89PNG")
+    job = ended(kiosk, kiosk.compute("phone", tmp_path / "phone.png"))
+    assert not job.failed, job.outcome
+    assert "phone" in [one.name for one in kiosk.appearances()]
+    assert kiosk.snapshot().failures == ()
+
+
+def test_a_bad_appearance_stops_no_other_and_stays_in_sight_until_it_was_seen(
+    kiosk: StageKiosk, tmp_path: Path
+) -> None:
+    (tmp_path / "good.png").write_bytes(grey_png(*CAMERA_PX))
+    (kiosk.stage / "small.png").write_bytes(grey_png(77, 52))
+    with (kiosk.stage / "stage.toml").open("a") as toml:
+        toml.write(f'{HEAD}\nname = "small"\nkind = "picture"\nfile = "small.png"\n')
+    job = ended(kiosk, kiosk.compute("good", tmp_path / "good.png"))
+    assert not job.failed, job.outcome
+    assert "good" in [one.name for one in kiosk.appearances()]
+    assert "small was not solved: small.png is 77 x 52 pixels" in job.outcome
+    (failure,) = kiosk.snapshot().failures
+    assert (failure.code, failure.level) == ("appearance-failed", "error")
+    again = EventLog(kiosk.stage / EventLog.FILE, durable=False)
+    assert again.failures == (failure,), "a new start shows it, too"
+    again.close()
+    kiosk.seen(failure.number)
+    assert kiosk.snapshot().failures == ()
+
+
+def test_a_new_appearance_that_can_not_be_solved_is_taken_out_of_stage_toml(kiosk: StageKiosk, tmp_path: Path) -> None:
+    (tmp_path / "cut.png").write_bytes(grey_png(*CAMERA_PX))
+    job = kiosk.compute("cut", tmp_path / "cut.png")
+    (kiosk.stage / "appearances" / "cut.png").write_bytes(b"the disk lost it")
+    found = ended(kiosk, job)
+    assert found.failed
+    assert "cut was not solved" in found.outcome
+    assert "cut" not in kiosk.settings()
+    assert "checkerboard" in [one.name for one in kiosk.appearances()]

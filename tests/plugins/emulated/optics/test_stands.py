@@ -1,0 +1,76 @@
+"""Stages whose projectors stand where they are told to, or are more or fewer than three."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.deadline import in_seconds
+from hal.errors import DeviceError, PluginError
+from hal.registry import OpenContext
+from plugins.emulated.bench import DRIVER
+from plugins.emulated.optics.truth import BenchTruth, read_truth
+
+TABLE = """\
+[[stands]]
+name = "{name}"
+position_m = [0.3, -0.4, -1.2]
+rotation_vector = [0.1, -0.2, 0.0]
+throw_ratio = 2.0
+centre_share = [0.5, 1.05]
+focus_m = 1.25
+lumens = {lumens}
+pupil_m = 0.03
+"""
+
+
+def prepared(tmp_path: Path, stage_name: str = "stage", **settings: Any) -> BenchTruth:
+    stage = tmp_path / stage_name
+    stage.mkdir()
+    bench = DRIVER.open(settings, OpenContext(stage=stage), in_seconds(5))
+    bench.prepare(stage, size="small", object_file=None, seed=3)
+    return read_truth(stage)
+
+
+def test_six_projectors_stand_in_six_places_and_the_first_three_are_those_of_three(tmp_path: Path) -> None:
+    three, six = prepared(tmp_path, "three"), prepared(tmp_path, "six", projectors=6)
+    assert six.projectors[:3] == three.projectors
+    assert len({projector.pose.position_m for projector in six.projectors}) == 6
+    assert [projector.output for projector in six.projectors] == ["P1", "P2", "P3", "P4", "P5", "P6"]
+    assert len({projector.port for projector in six.projectors}) == 6
+
+
+def test_a_projector_stands_and_shines_as_it_is_told(tmp_path: Path) -> None:
+    file = tmp_path / "stands.toml"
+    file.write_text(TABLE.format(name="one", lumens=2000.0) + TABLE.format(name="two", lumens=4000.0))
+    one, two = prepared(tmp_path, stands=str(file)).projectors
+    assert (one.name, one.pose.position_m, one.pose.rotation_vector) == ("one", (0.3, -0.4, -1.2), (0.1, -0.2, 0.0))
+    assert (one.lens.focal_px, one.lens.centre_px) == (560.0, (139.5, 220.0))
+    assert one.focus.distance_m == 1.25
+    assert two.light.brightness == pytest.approx(2 * one.light.brightness)
+    # 2000 lumens on a picture 0.625 m wide and three quarters as high
+    assert one.light.brightness == pytest.approx(2000 / (0.625 * 0.46875) / 9000)
+
+
+@pytest.mark.parametrize("settings", [{"projectors": 0}, {"projectors": 7}, {"projectors": True}, {"stands": "none"}])
+def test_wrong_settings_are_refused_before_anything_is_written(tmp_path: Path, settings: dict[str, Any]) -> None:
+    with pytest.raises(PluginError) as refused:
+        prepared(tmp_path, **settings)
+    assert refused.value.code == "setting-wrong"
+    assert list((tmp_path / "stage").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (TABLE.format(name="one", lumens=-1.0), "lumens"),
+        (TABLE.format(name="one", lumens=1000.0).replace("pupil_m", "pupil"), "pupil"),
+        (TABLE.format(name="one", lumens=1000.0) * 2, "one"),
+    ],
+)
+def test_a_wrong_stand_is_named(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "stands.toml").write_text(text)
+    with pytest.raises(DeviceError, match=told):
+        prepared(tmp_path, stands=str(tmp_path / "stands.toml"))

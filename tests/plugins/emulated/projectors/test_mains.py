@@ -1,0 +1,43 @@
+"""What [[mains]] of bench.toml may say; what relays then do is shown in on_usb_bus/test_mains.py."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from hal.errors import DeviceError
+from plugins.emulated.optics.truth import BenchTruth, MainsTruth, read_truth, write_truth
+from plugins.emulated.projectors.mains import boot_times, check_mains
+from plugins.emulated.usb.bench import UsbDeviceTruth
+
+BOARD = UsbDeviceTruth("cupboard", "relay", channels=2)
+LIGHT = UsbDeviceTruth("dark", "light")
+LEFT = MainsTruth("cupboard", 1, ("left", "right"), 12.0)
+
+
+def test_it_is_kept_in_bench_toml(tiny_truth: BenchTruth, tmp_path: Path) -> None:
+    for mains in ((), (LEFT, MainsTruth("cupboard", 2, ("above",)))):
+        truth = dataclasses.replace(tiny_truth, mains=mains)
+        write_truth(tmp_path, truth)
+        assert read_truth(tmp_path) == truth
+    check_mains(mains, tiny_truth.projectors, (BOARD, LIGHT))
+    assert boot_times(mains) == {"left": 12.0, "right": 12.0, "above": 0.0}
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        MainsTruth("cupboard", 3, ("above",)),
+        MainsTruth("elsewhere", 1, ("above",)),
+        MainsTruth("dark", 1, ("above",)),
+        MainsTruth("cupboard", 1, ("above",)),
+        MainsTruth("cupboard", 2, ("left",)),
+        MainsTruth("cupboard", 2, ("nobody",)),
+    ],
+)
+def test_a_wrong_wiring_is_named_by_its_table(tiny_truth: BenchTruth, second: MainsTruth) -> None:
+    with pytest.raises(DeviceError, match=r"\[\[mains\]\] table 2") as caught:
+        check_mains((LEFT, second), tiny_truth.projectors, (BOARD, LIGHT))
+    assert caught.value.code == "mains-wrong"

@@ -1,0 +1,96 @@
+"""The tree that docs/architecture.md shows is the tree that exists, and keeps its rules."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+TOPS = ("controller", "hal", "plugins", "firmware_configs")
+MOST_MODULES = 15
+
+
+def folders() -> list[Path]:
+    """Every folder of the product that holds a file, relative to the root."""
+    found = {file.parent for top in TOPS for file in (ROOT / top).rglob("*") if file.is_file()}
+    return sorted(folder.relative_to(ROOT) for folder in found if "__pycache__" not in folder.parts)
+
+
+def packages() -> list[Path]:
+    return [folder for folder in folders() if any((ROOT / folder).glob("*.py"))]
+
+
+def named() -> list[str]:
+    tree = PAGE.partition("## The tree")[2].split("```")[1]
+    return [line.split()[0].rstrip("/") for line in tree.splitlines() if line.strip()]
+
+
+def test_the_page_names_every_folder_once_and_no_other() -> None:
+    assert Counter(named()) == Counter(folder.as_posix() for folder in folders())
+
+
+def test_each_named_folder_is_explained() -> None:
+    tree = PAGE.partition("## The tree")[2].split("```")[1]
+    assert [line for line in tree.splitlines() if len(line.split()) == 1] == []
+
+
+@pytest.mark.parametrize("folder", packages(), ids=str)
+def test_each_package_says_what_lives_there(folder: Path) -> None:
+    text = (ROOT / folder / "__init__.py").read_text("utf-8")
+    assert len(ast.get_docstring(ast.parse(text)) or "") > 20
+
+
+@pytest.mark.parametrize("folder", packages(), ids=str)
+def test_what_a_package_names_exists(folder: Path) -> None:
+    text = ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text("utf-8"))) or ""
+    for first, symbol in re.findall(r"(?<!`)`(\w+)(?:\.(\w+))?`(?!`)", text):
+        if first.islower():
+            module = ROOT / folder / first
+            place = module / "__init__.py" if module.is_dir() else module.with_suffix(".py")
+            if first in TOPS:
+                assert any((ROOT / first / symbol).parent.glob(f"{symbol}*")), symbol
+            else:
+                assert re.search(
+                    rf"^(def|class) {symbol}\b|^{symbol}\b" if symbol else "", place.read_text("utf-8"), re.MULTILINE
+                )
+
+
+def test_no_folder_has_too_many_modules_but_those_that_the_page_excuses() -> None:
+    excused = PAGE.partition("A folder has at most 15 modules.")[2].partition("\n## ")[0]
+    names = re.findall(r"^- `([\w/]+)`: \S", excused, re.MULTILINE)
+    count = Counter(
+        module.parent.relative_to(ROOT).as_posix()
+        for top in (*TOPS, "tests", "benchmarks")
+        for module in (ROOT / top).rglob("*.py")
+        if module.name != "__init__.py"
+    )
+    assert sorted(folder for folder, modules in count.items() if modules > MOST_MODULES) == sorted(names)
+
+
+def imports() -> dict[str, set[str]]:
+    """Modules by what they import anywhere in their file, also inside functions and for types alone."""
+    files = {}
+    for top in TOPS:
+        for path in (ROOT / top).rglob("*.py"):
+            files[".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")] = path
+    graph: dict[str, set[str]] = {}
+    for module, path in files.items():
+        graph[module] = set()
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                targets = {f"{node.module}.{alias.name}" for alias in node.names}
+                graph[module] |= {target if target in files else node.module for target in targets}
+            elif isinstance(node, ast.Import):
+                graph[module] |= {alias.name for alias in node.names}
+        graph[module] &= files.keys() - {module}
+    return graph
+
+
+def test_no_file_imports_itself_by_way_of_others() -> None:
+    TopologicalSorter(imports()).prepare()  # raises CycleError, which names the files
