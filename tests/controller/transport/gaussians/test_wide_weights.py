@@ -77,7 +77,7 @@ def check_against_matrices(transport: LightTransport, truth: list[sp.csr_matrix]
     wanted: Float64 = np.sum([T @ p.reshape(-1) for T, p in zip(truth, frames, strict=True)], axis=0)
     light = transport.forward(frames)
     np.testing.assert_allclose(light.reshape(-1), wanted, rtol=1e-4, atol=1e-5)
-    r = np.random.default_rng(seed).standard_normal((*transport.shape, 3)).astype(np.float32)
+    r = np.random.default_rng(seed).standard_normal((*transport.camera_shape, 3)).astype(np.float32)
     for T, back in zip(truth, transport.adjoint(r), strict=True):
         np.testing.assert_allclose(back.reshape(-1), T.T @ r.reshape(-1).astype(np.float64), rtol=1e-3, atol=1e-3)
 
