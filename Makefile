@@ -17,7 +17,8 @@ OBJECT ?=
 NAME ?=
 COUNT ?=
 CORES := $(shell nproc 2>/dev/null || echo 2)
-# Many tests wait for devices and programs, so there are more workers than cores.
+# Many tests wait for devices and programs, so there are more workers than cores. A worker that crashed is not started
+# again: pytest-xdist would run its file again and again, without an end.
 WORKERS ?= $(shell expr $(CORES) + 1)
 # Folders of tests that need no other program. `slow` marks those that take seconds.
 FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture config core kiosk/decide plan report solve transport) \
@@ -34,7 +35,7 @@ blender:
 	@.ci/setup-blender
 
 test: test-setup
-	.venv/bin/python -m pytest --durations=10 -n $(WORKERS) --dist loadfile $(TESTS)
+	.venv/bin/python -m pytest --durations=10 -n $(WORKERS) --dist loadfile --max-worker-restart=0 $(TESTS)
 
 test-setup:
 	@.ci/setup test
