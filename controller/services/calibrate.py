@@ -16,6 +16,7 @@ from controller.bundle.signing import Trust, load_signing_key
 from controller.core.errors import UsageError
 from controller.rig.ambient_light import dark_after
 from controller.rig.rig import Rig
+from controller.run.compiling import kernels_compiled
 from controller.run.journal import Journal
 from controller.run.progress import Level, Reporter
 from controller.run.runner import Runner, Step
@@ -141,8 +142,13 @@ def make_appearances(
             options = replace(options, mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
         outputs = output_sizes(checked)
         scale = costs.scale(size for _, size in outputs.values())
-        with answering_on(scheduler, calibrated, wishes) as answering, Journal(run) as journal:
+        with (
+            kernels_compiled(reporter) as compiled,
+            answering_on(scheduler, calibrated, wishes) as answering,
+            Journal(run) as journal,
+        ):
             steps = [
+                *compiled,
                 *([] if is_graded(run) else [verify_step(calibrated, (), scale)]),
                 gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
                 *solve_steps(calibrated, wishes, options, (), scale, answering=answering),

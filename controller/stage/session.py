@@ -13,6 +13,7 @@ from controller.core.storage import clear_unfinished_writes
 from controller.rig.ambient_light import dark_before
 from controller.rig.lamp_session import lit, power_steps
 from controller.rig.rig import Rig
+from controller.run.compiling import kernels_compiled
 from controller.run.journal import Journal
 from controller.run.progress import Reporter
 from controller.run.runner import Runner, Step
@@ -94,6 +95,7 @@ class OwnSession(StageSession):
         safety = stage.tables.safety
         with (
             stage_lock(stage.folder),
+            kernels_compiled(reporter) as compiled,
             self.around or contextlib.nullcontext(),
             opened(checked, deadline=deadline, plays=plays) as rig,
             Journal(unfinished_run(stage.folder, name, finished=self.again)) as journal,
@@ -102,7 +104,7 @@ class OwnSession(StageSession):
             machine = Machine(journal.record_change)
             first = dark_before(rig.darkness) if dark else []
             power = power_steps(rig, power_up_s=safety.power_up_s)
-            steps = [*first, *before(rig), *power, *make_steps(rig, journal.folder)]
+            steps = [*first, *before(rig), *power, *compiled, *make_steps(rig, journal.folder)]
             with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
                 Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
             return journal.folder
@@ -137,9 +139,9 @@ class BorrowedSession(StageSession):
         """See ``StageSession``. Raises ValueError without a rig."""
         if self.rig is None:
             raise ValueError("this session was given no devices to work with")
-        with Journal(unfinished_run(self.rig.stage, name)) as journal:
+        with kernels_compiled(reporter) as compiled, Journal(unfinished_run(self.rig.stage, name)) as journal:
             clear_unfinished_writes(journal.folder)
             first = dark_before(self.rig.darkness) if dark else []
-            steps = [*first, *make_steps(self.rig, journal.folder)]
+            steps = [*first, *compiled, *make_steps(self.rig, journal.folder)]
             Runner(steps, journal, reporter=reporter).run(name, deadline=in_seconds(LONGEST_RUN_S, cancel))
             return journal.folder

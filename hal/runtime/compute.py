@@ -60,6 +60,22 @@ def kernel_folder() -> Path:
     return cache_folder() / "kernels"
 
 
+def can_keep_kernels() -> bool:
+    """Whether compiled kernels can be kept for other programs: ``kernel_folder`` can be made and written to."""
+    try:
+        _make_private(kernel_folder())
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
+        return False
+    return True
+
+
+def _make_private(folder: Path) -> None:
+    """Make a folder for this user alone, because what lies in it is executed. Raises ``OSError``."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if folder.stat().st_uid != os.geteuid() or not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} belongs to another user or cannot be written")
+
+
 class KernelFolder:
     """Tells numba where a kernel's machine code is kept: a folder named after the contents of its sources.
 
@@ -93,10 +109,8 @@ class KernelFolder:
         return None
 
     def ensure_cache_path(self) -> None:
-        """Make the folder, for this user alone: what lies in it is executed. Raises ``OSError``."""
-        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if self._folder.stat().st_uid != os.geteuid() or not os.access(self._folder, os.W_OK):
-            raise PermissionError(f"{self._folder} belongs to another user or cannot be written")
+        """Make the folder. Raises ``OSError``."""
+        _make_private(self._folder)
 
     def get_cache_path(self) -> str:
         """The folder."""

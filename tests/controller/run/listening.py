@@ -1,13 +1,17 @@
-"""A reporter that keeps the progress it is told."""
+"""A reporter that keeps the progress and the sentences that it is given."""
 
 from __future__ import annotations
 
-from controller.run.progress import Progress, Silent
+from controller.run.progress import Level, Progress, Silent
 
 
 class Listening(Silent):
     def __init__(self) -> None:
         self.told: list[Progress] = []
+        self.said: list[str] = []
 
     def progress(self, now: Progress) -> None:
         self.told.append(now)
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self.said.append(text)
