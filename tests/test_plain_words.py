@@ -16,8 +16,8 @@ import pytest
 ROOT: Final = Path(__file__).parents[1]
 FOLDERS: Final = (
     "controller/blender", "controller/bundle", "controller/calibrate", "controller/capture", "controller/config",
-    "controller/live", "controller/plan", "controller/play", "controller/report", "controller/study",
-    "plugins/emulated",
+    "controller/kiosk", "controller/live", "controller/panel", "controller/plan", "controller/play",
+    "controller/report", "controller/study", "plugins/emulated",
 )  # fmt: skip
 """Folders whose messages, help and templates are in plain words."""
 PAGES: Final = ("docs/study",)

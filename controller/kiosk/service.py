@@ -1,4 +1,4 @@
-"""The kiosk's service: makes the conductor and every keeper from a stage, and runs each in a thread of its own."""
+"""The kiosk's service: makes the reconciler and all supervisors of a stage, and runs each in its own thread."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from controller.kiosk.jobs.job_runner import ThreadWorks
 from controller.kiosk.store import archive
 from controller.kiosk.store.bundle_store import BundleStock
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.photo_retention import TIDY_S, forget_old_photographs
+from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.keys_supervisor import KeysKeeper
@@ -45,7 +45,7 @@ AFTER_CRASH_S: Final = 5.0
 
 
 class Service:
-    """One stage that runs by itself. ``changed`` is called after every step that may have changed something."""
+    """One stage that runs by itself. ``changed`` is called after every step."""
 
     def __init__(self, checked: Checked, log: EventLog) -> None:
         stage = checked.stage
@@ -78,7 +78,7 @@ class Service:
         self._known_runs: tuple[float, bool] = (0.0, False)
 
     def start(self) -> None:
-        """Begin: the player first, so that there are pictures before any device has answered."""
+        """Start; the player first, so that it shows pictures before any device has answered."""
         self.log.tell(beginning(self.log))
         if self.schedule.problem is not None:
             problem = self.schedule.problem
@@ -91,19 +91,19 @@ class Service:
             self._thread(keeper.name, keeper.step, STEP_S)
         if self.keys is not None:
             self._thread("keys", self.keys.step, 2.0)
-        forget_old = partial(forget_old_photographs, self.stage, self.log, time.time)
-        self._thread("old photographs", forget_old, TIDY_S, first_s=TIDY_S)
+        purge_old = partial(purge_old_photographs, self.stage, self.log, time.time)
+        self._thread("old photographs", purge_old, TIDY_S, first_s=TIDY_S)
 
     def run(self, cancel: threading.Event) -> None:
-        """Decide, over and over, until ``cancel``. Feeds systemd's watchdog."""
+        """Call the reconciler until ``cancel``, and feed systemd's watchdog."""
         notifier = Notifier()
         ready = False
         while not cancel.is_set():
             try:
                 self._decide()
-            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
-                # systemd's watchdog is not fed: what lasts is mended by a new start.
-                what = f"The conductor met an error that Velatura does not know ({type(error).__name__}: {error})."
+            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
+                # The watchdog is not fed, so systemd restarts the service if the error persists.
+                what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
                 self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
                 cancel.wait(AFTER_CRASH_S)
                 continue
@@ -124,7 +124,7 @@ class Service:
         self.changed()
 
     def end(self, *, leave_lit: bool) -> None:
-        """Stop the work, cool the lamps (unless they are to stay lit for the next start), and let go of everything."""
+        """Cancel the job, cool the lamps (unless ``leave_lit``, for the next start), and close everything."""
         self.works.close(END_WORK_S)
         if not leave_lit:
             self.player.want = BLACK
@@ -139,7 +139,7 @@ class Service:
         self.lamp_history.note(self.lamps, date.today(), now=True)
         self.player.close()
         self.devices.close()
-        self.log.tell(Decision("service-ended", "The kiosk ends."))
+        self.log.tell(Decision("service-ended", "The kiosk has stopped."))
 
     def rows(self) -> tuple[DeviceRow, ...]:
         """Every device as the panel shows it."""
@@ -156,10 +156,10 @@ class Service:
     @property
     def lamps(self) -> tuple[Lamp, ...]:
         views = [keeper.view for keeper in self.devices.projectors]
-        return tuple(Lamp(one.name, one.hours, one.strikes, one.condition is Condition.LIT) for one in views)
+        return tuple(Lamp(view.name, view.hours, view.strikes, view.condition is Condition.LIT) for view in views)
 
     def _scene(self) -> str | None:
-        """What has lit the object since a while, for the light sensor."""
+        """What has lit the object long enough for the light sensor, or None."""
         shown = self.player.view.shown
         if self.conductor.machine.state not in (State.PLAYING, State.DEGRADED) or shown is None or not shown.appearance:
             return None
@@ -170,25 +170,27 @@ class Service:
         return f"{shown.bundle} {shown.appearance} {lit}"
 
     def _calibrated(self) -> bool:
-        # Asked four times a second while a task is due; opening every journal each time would be a waste.
-        at_s, found = self._known_runs
+        # Called four times a second while a task is due, so the journals are not opened each time.
+        at_s, calibrated = self._known_runs
         if time.monotonic() - at_s > 5.0 or not at_s:
-            found = bool(finished_calibrations(self.stage))
-            self._known_runs = time.monotonic(), found
-        return found
+            calibrated = bool(finished_calibrations(self.stage))
+            self._known_runs = time.monotonic(), calibrated
+        return calibrated
 
     def _light_wanted(self) -> bool:
         machine = self.conductor.machine.state
-        return machine not in (State.OFF, State.COOLING) or any(one.want_lit for one in self.devices.projectors)
+        return machine not in (State.OFF, State.COOLING) or any(
+            projector.want_lit for projector in self.devices.projectors
+        )
 
     def _wait_until_dark(self) -> None:
         until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
-        while any(one.may_light for one in self.devices.projectors) and time.monotonic() < until_s:
+        while any(projector.may_light for projector in self.devices.projectors) and time.monotonic() < until_s:
             time.sleep(0.1)
-        names = [one.name for one in self.devices.projectors if one.view.maybe_lit]
+        names = [projector.name for projector in self.devices.projectors if projector.view.maybe_lit]
         if names:
             self.log.tell(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
-                                   "Switch it off by its remote control.", "error"))  # fmt: skip
+                                   "Switch it off with its remote control.", "error"))  # fmt: skip
 
     def _thread(self, name: str, step: Callable[[], None], every_s: float, *, first_s: float = 0.0) -> None:
         def loop() -> None:
@@ -196,8 +198,8 @@ class Service:
             while not self._stop.is_set():
                 try:
                     step()
-                except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
-                    what = f"{name} met an error that Velatura does not know ({type(error).__name__}: {error})."
+                except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
+                    what = f"{name} met an unexpected error ({type(error).__name__}: {error})."
                     self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
                     self._stop.wait(AFTER_CRASH_S)
                 self._stop.wait(every_s)
@@ -221,14 +223,14 @@ class Service:
         return KeysKeeper(table.driver, opened, presses, lambda: self.conductor.machine.state, self.log.tell)
 
     def _recalibrate(self) -> None:
-        # A refusal is in the log; the key has nothing to show it on.
+        # The log has the refusal; a key can't show it.
         with contextlib.suppress(WorkError):
             self.conductor.ask(Request("quick", light=True))
 
 
 @contextlib.contextmanager
 def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) -> Iterator[Service]:
-    """A started service, its loop in a thread; ended, with the lamps cooled, on leaving.
+    """A started service with its loop in a thread; stopped, with the lamps cooled, at the end.
 
     Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
     """

@@ -1,4 +1,4 @@
-"""What can be done on a stage's folder, with or without a running kiosk."""
+"""The operations that need only the stage's folder, and no running kiosk."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from controller.stage.check import check_stage
 
 
 class FolderKiosk:
-    """The methods of the operations that are declared ``offline``, for a caller that holds the stage's lock where they
-    change something. See ``controller.kiosk.interface.Kiosk`` for what each does.
+    """The methods of the ``offline`` operations; those that change something need the stage's lock.
+
+    See ``controller.kiosk.interface.Kiosk`` for what each does.
     """
 
     def __init__(self, stage: Path) -> None:
@@ -81,13 +82,13 @@ class FolderKiosk:
 
 
 def appearances_of(stock: BundleStock, compared: Sequence[Comparison], *, playing: str) -> tuple[Appearance, ...]:
-    """Those of the installed bundle, in its order; ``playing``: the name of the one on the projectors, or empty."""
+    """The appearances of the installed bundle, in its order. ``playing``: the name of the one that plays, or empty."""
     index = stock.index(stock.bundle())
     if index is None:
         return ()
     made, previews = float(index.created_unix_s), stock.previews()
-    errors = {one.name: one.history[0].delta_e for one in compared}
+    errors = {comparison.name: comparison.history[0].delta_e for comparison in compared}
     return tuple(
-        Appearance(one.name, made, errors.get(one.name), one.name == playing, previews.get(one.name))
-        for one in index.appearances
+        Appearance(entry.name, made, errors.get(entry.name), entry.name == playing, previews.get(entry.name))
+        for entry in index.appearances
     )

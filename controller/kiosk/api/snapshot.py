@@ -1,4 +1,4 @@
-"""Everything that the panel's first page shows, taken from a running service."""
+"""The state that the panel's first page shows, read from a running service."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GRADES_EVERY_S: Final = 10.0
 
 
 class Snapshots:
-    """For one thread: that of the conductor."""
+    """Use it only in the reconciler's thread."""
 
     def __init__(self, stage: Path) -> None:
         self._stage = stage
@@ -22,7 +22,7 @@ class Snapshots:
         self._since = ("", 0.0)
 
     def of(self, service: Service, revision: int) -> KioskState:
-        """The state as of now; the grades, which are read from the disk, as of some seconds ago."""
+        """The state now; the grades come from the disk and may be some seconds old."""
         machine, shown = service.conductor.machine, service.player.view.shown
         state = machine.state.value
         if self._since[0] != state:
@@ -65,5 +65,5 @@ class Snapshots:
     def _disk_row(self, service: Service) -> tuple[DeviceRow, ...]:
         if service.log.problem is None:
             return ()
-        remedy = "Free some space on the disk; playback goes on meanwhile."
+        remedy = "Free some space on the disk. Playback continues."
         return (DeviceRow("disk", "disk", "", (), f"The event log can't be written: {service.log.problem}.", remedy),)

@@ -1,7 +1,7 @@
-"""Decides what the stage does: schedule, technician, lamps, player and work come together here, and nowhere else.
+"""Decides what the stage does, from the schedule, operators, lamps, player and jobs.
 
-``step`` looks at all of them, moves the state machine, and says what is wanted of each. It waits for nothing, so a
-device that hangs holds up only its own keeper.
+``step`` reads all of them, moves the state machine, and sets the wanted state of each. It waits for nothing, so a
+device that hangs delays only its own supervisor.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from controller.kiosk.store.event_log import Decision, EventLog
 from controller.run.state_machine import Event, Machine, State
 
 RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
-"""Between attempts to come out of FAULT."""
+"""Between attempts to leave FAULT."""
 _ON: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED)
 
 
@@ -47,13 +47,13 @@ class Limits:
 
 
 class Conductor:
-    """The kiosk's decisions. ``step`` is called about four times a second by one thread; commands come from any.
+    """The kiosk's decisions. One thread calls ``step`` about four times a second; commands may come from any thread.
 
     Parameters
     ----------
-    schedule : asked at every step
+    schedule : read at every step
     clock : the time to plan with; ``monotonic``: seconds that only go up, for deadlines
-    without_time : whether the stage is open while nobody knows the time
+    without_time : whether the stage is open while the time is unknown
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Conductor:
         self._attempts, self._missing = 0, frozenset[str]()
         self._lit_until_s, self._lit_closed = float("-inf"), False
 
-    # -- asked from outside
+    # -- commands and questions
 
     @property
     def plan(self) -> Plan:
@@ -91,23 +91,23 @@ class Conductor:
 
     @property
     def working(self) -> bool:
-        """Whether work runs or waits."""
+        """Whether a job runs or waits."""
         with self._lock:
             return self._agenda.head is not None
 
     def waits(self, number: int) -> bool:
-        """Whether the job of this number has not begun yet, and will."""
+        """Whether the job of this number waits to start."""
         with self._lock:
             return self._agenda.waits(number)
 
     def open(self) -> None:
-        """Play until the schedule says otherwise the next time."""
+        """Play until the next scheduled change."""
         with self._lock:
             self.wishes.override(True, self._plan)
             self._since_s = min(self._since_s, self._monotonic() - RETRY_S[-1])
 
     def shut(self) -> None:
-        """Stop, and cool the lamps, until the schedule says otherwise the next time."""
+        """Stop, and cool the lamps, until the next scheduled change."""
         with self._lock:
             self._agenda.cancel()
             self._lit_until_s = float("-inf")
@@ -119,20 +119,20 @@ class Conductor:
             self.wishes.choose(appearance, self._plan)
 
     def light_for(self, seconds: float, *, closed_too: bool = False) -> None:
-        """Light, also with nothing to play, while open or ``closed_too``; 0 ends it, and so does ``shut``."""
+        """Keep the lamps lit, even with nothing to play, while open or ``closed_too``. 0 or ``shut`` ends it."""
         with self._lock:
             self._lit_until_s, self._lit_closed = self._monotonic() + seconds, closed_too
 
     def ask(self, *requests: Request) -> None:
-        """Queue work. Raises WorkError("busy") while other work runs or waits, and with the reason it can't be done."""
+        """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         with self._lock:
             self._agenda.ask(*requests)
 
     @contextlib.contextmanager
     def idle(self) -> Iterator[None]:
-        """What work reads may be changed: none begins meanwhile, and only who is here may ask for some.
+        """No job starts inside this context, so files that jobs read may be changed. Only its thread may queue jobs.
 
-        Raises WorkError("busy") while work runs or waits, and while somebody else is here.
+        Raises WorkError("busy") while a job runs or waits, and while another thread is inside.
         """
         with self._lock:
             self._agenda.hold()
@@ -140,22 +140,22 @@ class Conductor:
             yield
         finally:
             with self._lock:
-                self._agenda.let_go()
+                self._agenda.release()
 
     def cancel(self) -> None:
         """Raises WorkError("nothing-to-cancel")."""
         with self._lock:
             if self._agenda.head is None:
-                raise WorkError("nothing-to-cancel", what="No work is going on.", remedy="There is nothing to do.")
+                raise WorkError("nothing-to-cancel", what="No job is running.", remedy="There is nothing to cancel.")
             self._agenda.cancel()
 
     # -- one step
 
     def step(self) -> None:
         with self._lock:
-            # First: what is done now must not be due in the plan.
+            # First: a task that has just ended must not be due in the plan.
             self._take_finished()
-            self._look_at_the_clock()
+            self._update_plan()
             wanted_open = self.wishes.open(self._plan)
             self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
             views = [keeper.view for keeper in self._keepers]
@@ -170,12 +170,12 @@ class Conductor:
             self._begin_work(views)
             self._show(views, open_now)
 
-    def _look_at_the_clock(self) -> None:
+    def _update_plan(self) -> None:
         now_s = self._clock.now()
         self._plan = plan(now_s, self._schedule(), self._log.done(), since_s=self._clock.since_s)
         self.wishes.follow(self._plan)
 
-    # -- work
+    # -- jobs
 
     def _take_finished(self) -> None:
         finished = self._agenda.take_finished()
@@ -193,7 +193,7 @@ class Conductor:
         if (request := self._agenda.ready(views)) is None:
             return
         if request.light:
-            self._go(Event.RECALIBRATE, f"{request.kind} begins")
+            self._go(Event.RECALIBRATE, f"{request.kind} starts")
             self._player.want = None
         self._agenda.begin()
 
@@ -203,11 +203,11 @@ class Conductor:
         state = self.machine.state
         if state is State.OFF:
             if light:
-                self._go(Event.START, "the lamps are wanted")
+                self._go(Event.START, "light is needed")
         elif state is State.COOLING:
             self._cool(views)
         elif state is State.FAULT:
-            self._mend(views, light)
+            self._recover(views, light)
         elif state is State.CALIBRATING:
             return
         elif not light:
@@ -254,9 +254,9 @@ class Conductor:
             self._go(Event.COOLED, "every lamp is off or cooling by itself")
         elif self._monotonic() - self._since_s > self._limits.cool_down_s:
             names = ", ".join(view.name for view in lit)
-            self._go(Event.FAIL, f"The lamp of {names} could not be switched off. Switch it off by its remote control.")
+            self._go(Event.FAIL, f"The lamp of {names} could not be switched off. Use its remote control.")
 
-    def _mend(self, views: Sequence[ProjectorView], light: bool) -> None:
+    def _recover(self, views: Sequence[ProjectorView], light: bool) -> None:
         if not light:
             if not any(view.condition is Condition.LIT or view.maybe_lit for view in views) or self._waited(60.0):
                 self._go(Event.STOP, "closed")
@@ -264,7 +264,7 @@ class Conductor:
             RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
         ):
             self._attempts += 1
-            self._go(Event.START, "another attempt")
+            self._go(Event.START, "trying again")
 
     def _waited(self, seconds: float) -> bool:
         return self._monotonic() - self._since_s >= seconds
@@ -283,13 +283,13 @@ class Conductor:
         level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
         self._log.tell(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
 
-    # -- the picture
+    # -- the player
 
     def _show(self, views: Sequence[ProjectorView], open_now: bool) -> None:
         state = self.machine.state
         if state is State.CALIBRATING:
             return
-        # Where every lamp is dark, nobody takes over.
+        # If every lamp is dark, no projector can replace another.
         missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
         self._player.want = self._pictures.of(self._plan, missing) if open_now and state in _ON else BLACK
 
@@ -303,6 +303,6 @@ def _reasons(views: Sequence[ProjectorView]) -> str:
 
 
 _FAULTY: Final = Decision(
-    "work-impossible", "The work was given up: the stage is in a fault.",
-    "See what the fault is, mend that, and ask again.", "error",
+    "work-impossible", "The job was cancelled because the stage has a fault.",
+    "Correct the fault, then start the job again.", "error",
 )  # fmt: skip

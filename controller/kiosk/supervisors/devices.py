@@ -1,4 +1,4 @@
-"""The keepers of every device of a stage, and the rig that they lend to work."""
+"""The supervisors of all devices of a stage, and the rig that they lend to jobs."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Tell = Callable[[Decision], object]
 
 
 class Devices:
-    """Made from a checked stage; opens nothing by itself. ``step`` functions are in ``steps``, one a thread.
+    """All device supervisors of a stage; the devices are opened by their ``step``.
 
-    ``scene`` names what lights the object for longer than a moment, for the light sensor; None: nothing that lasts.
+    ``scene`` names the steady picture on the object, for the light sensor; None while nothing is steady.
     """
 
     def __init__(self, checked: Checked, runtime: Path, tell: Tell) -> None:
@@ -54,16 +54,16 @@ class Devices:
 
     @property
     def others(self) -> tuple[DeviceKeeper, ...]:
-        """Every keeper of a device that is no projector."""
+        """The supervisors of all devices that are not projectors."""
         return tuple(keeper for keeper in (self.camera, self.sensor, self.mains) if keeper is not None)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with no device, and yet worth a look."""
+        """Problems that belong to no device."""
         return () if self._room is None else (f"{self._room} {_DARKEN}",)
 
     def rows(self) -> tuple[DeviceRow, ...]:
-        """As the panel shows them."""
+        """The rows that the panel shows."""
         drivers = [table.driver for table in self._checked.stage.tables.projectors]
         projectors = [
             projector_row(keeper.view, driver) for keeper, driver in zip(self.projectors, drivers, strict=True)
@@ -71,31 +71,33 @@ class Devices:
         return (*projectors, *(keeper.row for keeper in self.others))
 
     def missing_for_work(self) -> Decision | None:
-        """The device that photographs need and that is away, or None."""
+        """The missing device that photographs need, or None."""
         if self.camera.device is None or self.camera.problem is not None:
-            problem = self.camera.problem or Decision("camera-missing", "The camera was not found yet.", "Wait for it.")
-            reason = f"There can be no photographs without the camera. {problem.reason}"
+            problem = self.camera.problem or Decision(
+                "camera-missing", "The camera is not connected yet.", "Wait for it."
+            )
+            reason = f"No photographs are possible without the camera. {problem.reason}"
             return replace(problem, reason=reason, level="error")
-        away = [
+        missing = [
             keeper.name for keeper in self.projectors if keeper.view.condition in (Condition.LOST, Condition.BROKEN)
         ]
-        if away:
-            return Decision("projector-missing", f"There can be no photographs without projector {', '.join(away)}.",
-                            "Mend it first; playback goes on without it.", "error")  # fmt: skip
+        if missing:
+            return Decision("projector-missing", f"No photographs are possible without projector {', '.join(missing)}.",
+                            "Repair it first. Playback continues without it.", "error")  # fmt: skip
         return None
 
     @contextlib.contextmanager
     def lent(self) -> Iterator[Rig]:
-        """The opened devices for one piece of work. Raises DeviceGone("device-missing") and what opening raises."""
+        """The opened devices for one job. Raises DeviceGone("device-missing") and what opening raises."""
         with contextlib.ExitStack() as stack:
             for keeper in (self.camera, *([] if self.sensor is None else [self.sensor])):
-                # The keeper looks at it from a thread of its own, and must not meanwhile.
+                # The supervisor's thread must not use the device during the job.
                 stack.enter_context(keeper.lent)
-            # Not before it is ours: its keeper may let go of it while it is waited for.
+            # Only with the lock: before that, its supervisor may close it.
             camera, guards = self.camera.device, [keeper.guard for keeper in self.projectors]
             if camera is None or any(guard is None for guard in guards):
-                raise DeviceGone("device-missing", what="A device that the work needs is away.",
-                                 remedy="See the devices.")  # fmt: skip
+                raise DeviceGone("device-missing", what="A device that the job needs is missing.",
+                                 remedy="See the list of devices.")  # fmt: skip
             driver, settings = self._checked.display
             table = self._checked.stage.tables.display
             display = cast("Display", open_device(table, driver, settings, self._context, in_seconds(20)))
@@ -105,7 +107,7 @@ class Devices:
             try:
                 yield replace(rig, darkness=self._darkness())
             except DeviceGone as error:
-                # Its keeper lost it and let go of it, which is all that the work has noticed.
+                # The job sees only a closed device; its supervisor knows the reason.
                 lost = any(keeper.guard is not guard for keeper, guard in zip(self.projectors, guards, strict=True))
                 if lost and (missing := self.missing_for_work()) is not None:
                     raise DeviceGone("device-missing", what=missing.reason, remedy=missing.remedy) from error
@@ -146,26 +148,26 @@ class Devices:
             return None
 
         def open_sensor(deadline: Deadline) -> Device:
-            found = light_sensor(self._checked, self._context, contextlib.ExitStack(), deadline)
-            assert found is not None
-            return found.sensor
+            opened = light_sensor(self._checked, self._context, contextlib.ExitStack(), deadline)
+            assert opened is not None
+            return opened.sensor
 
         watch = LightWatch(table.most_lux)
 
         def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
             lux = cast("LightSensor", device).illuminance_lux(deadline=deadline)
-            self._tell_of_light(watch.saw(lux, self.scene()))
+            self._report_light(watch.saw(lux, self.scene()))
             dark = "dark enough to calibrate" if lux <= table.most_lux else "too bright to calibrate"
             return (LiveValue("Light", f"{lux:.2f} lux ({dark})"),)
 
         return DeviceKeeper("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0)
 
-    def _tell_of_light(self, room: str | None) -> None:
+    def _report_light(self, room: str | None) -> None:
         before, self._room = self._room, room
         if room is not None and before is None:
             self._tell(Decision("room-bright", room, _DARKEN, "warning"))
         elif room is None and before is not None:
-            self._tell(Decision("room-dark", "Nothing but the projectors lights the object any more."))
+            self._tell(Decision("room-dark", "The room is dark again."))
 
     def _darkness(self) -> Darkness | None:
         table = self._checked.stage.tables.light_sensor
@@ -186,11 +188,11 @@ class Devices:
         return MainsKeeper(drivers, open_circuits, self._tell)
 
 
-_DARKEN: Final = "Switch the lights off and close the blinds: the appearance is pale in other light."
+_DARKEN: Final = "Switch the lights off and close the blinds. Other light makes the appearance pale."
 
 
 def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
-    """A projector as the panel shows it."""
+    """The row of a projector on the panel."""
     hours = f"{view.hours:,.0f} h under Velatura, {view.strikes} strikes"
     values = [LiveValue("Lamp", view.condition.value), LiveValue("Hours", hours)]
     if view.counter_hours is not None:
@@ -202,8 +204,8 @@ def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
 
 
 def _look_at_camera(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
-    found = device.identity(deadline=deadline)
-    values = [LiveValue("Model", printable(f"{found.maker} {found.model}"))]
+    identity = device.identity(deadline=deadline)
+    values = [LiveValue("Model", printable(f"{identity.maker} {identity.model}"))]
     if isinstance(device, WatchedCamera):
         status = device.status(deadline=deadline)
         if status.battery_percent is not None:

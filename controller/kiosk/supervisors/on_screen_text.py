@@ -1,4 +1,4 @@
-"""A few lines of text on a projector, by the player's inbox (docs/reference/player-protocol.md, "Frame file")."""
+"""Shows lines of text on a projector through the player's inbox (docs/reference/player-protocol.md, "Frame file")."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from controller.play.display.identification import write_text
 from controller.play.frames import SEQUENCE_AT, FrameSet, OutputSize, layout_bytes
 
 _TALL: Final = 14
-"""The picture's height over that of a line; a line that is too long is written smaller."""
+"""Picture height divided by line height; a line that is too long is drawn smaller."""
 
 
 def outputs_of(hello: Mapping[str, Any]) -> tuple[OutputSize, ...]:
-    """The outputs that a player tells in its answer to hello."""
+    """The outputs in a player's answer to hello."""
     return tuple(OutputSize(row["name"], row["width_px"], row["height_px"]) for row in hello["outputs"])
 
 
 def notice(outputs: Sequence[OutputSize], lines: Sequence[str], turn: int) -> FrameSet:
-    """The lines on output number ``turn``, in capitals, white on black, in the middle of the picture."""
+    """The lines on output number ``turn``, in upper case, white on black, in the middle of the picture."""
     frames = FrameSet.black(outputs)
     image = frames.pixels[turn]
     height = image.shape[0]
@@ -33,7 +33,7 @@ def notice(outputs: Sequence[OutputSize], lines: Sequence[str], turn: int) -> Fr
 
 
 def put(inbox: Path, outputs: Sequence[OutputSize], frames: FrameSet) -> int:
-    """Write a set into the inbox; the sequence number that ``show`` has to be sent with. Raises OSError."""
+    """Write a set into the inbox; returns the sequence number for ``show``. Raises OSError."""
     _, offsets = layout_bytes(outputs)
     with inbox.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapped:
         sequence = np.frombuffer(mapped, "<u8", 1, SEQUENCE_AT)

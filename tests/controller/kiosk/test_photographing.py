@@ -22,7 +22,7 @@ from controller.services import recalibrate as drift_services
 from tests.controller.kiosk.vase import graded_run, vase
 
 ROWS = [{"name": "marble", "delta_e00_median": 1.5}, {"name": "glass", "delta_e00_median": 2.25}]
-CAMERA = Decision("camera-gone", "There can be no photographs without the camera. It is gone.", "Plug it in.", "error")
+CAMERA = Decision("camera-gone", "No photographs are possible without the camera. It is gone.", "Plug it in.", "error")
 
 
 class Stage:

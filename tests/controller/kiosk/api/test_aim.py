@@ -52,7 +52,7 @@ def test_the_hints_say_what_to_turn_and_no_more(tmp_path: Path) -> None:
     assert (found.source, found.overlap, found.exposure) == ("test shots", 0.5, 0.7)
     assert [hint.partition(":")[0] for hint in found.hints] == [
         "left lights 42% of the object", "left is out of focus.", "20% of the object is too dark",
-        "Light grazes, or is soft, on 11% of the object",
+        "Light is grazing or soft on 11% of the object",
     ]  # fmt: skip
     well = aimed(stage, projectors=SHOTS["projectors"][1:], too_dark=0.1, too_soft=0.1)
     assert well.hints == ()

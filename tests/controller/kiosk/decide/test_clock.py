@@ -67,7 +67,7 @@ def test_a_clock_that_is_disciplined_by_seconds_is_not_told(clocks: Clocks) -> N
 
 
 @pytest.mark.parametrize(
-    ("by_s", "said"), [(5400.0, "ahead by 90 min"), (-5400.0, "back by 90 min"), (-3 * DAY_S, "3 days")]
+    ("by_s", "said"), [(5400.0, "forward by 90 min"), (-5400.0, "back by 90 min"), (-3 * DAY_S, "3 days")]
 )
 def test_a_clock_that_somebody_sets_is_told_once(clocks: Clocks, by_s: float, said: str) -> None:
     clocks.wait(60.0)
@@ -76,7 +76,7 @@ def test_a_clock_that_somebody_sets_is_told_once(clocks: Clocks, by_s: float, sa
     clocks.wait(0.25)
     (told,) = clocks.told("clock-set")
     assert said in told
-    assert ("stands still" in told) is (by_s == -5400.0)
+    assert ("The schedule waits" in told) is (by_s == -5400.0)
 
 
 def test_set_back_a_little_time_stands_still_until_the_clock_has_caught_up(clocks: Clocks) -> None:
@@ -132,10 +132,10 @@ def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
     clocks.reboot(without_s=5 * HOUR_S)
     cut = clocks.log.tell(beginning(clocks.log))
     assert cut.level == "warning"
-    assert "cut off, after 2026-05-05 17:03 UTC" in cut.text
-    clocks.log.tell(Decision("service-ended", "The kiosk ends."))
+    assert "ended unexpectedly after 2026-05-05 17:03 UTC" in cut.text
+    clocks.log.tell(Decision("service-ended", "The kiosk has stopped."))
     clocks.reboot(without_s=5 * HOUR_S)
-    assert clocks.log.tell(beginning(clocks.log)).text == "The kiosk begins."
+    assert clocks.log.tell(beginning(clocks.log)).text == "The kiosk is starting."
 
 
 def test_asking_the_kernel_gives_an_answer() -> None:

@@ -134,7 +134,7 @@ def test_without_a_camera_playback_goes_on_and_recalibration_says_why_it_cannot(
 def test_recalibrates_on_request_and_plays_again(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
     kiosk.conductor.ask(Request("quick", light=True))
-    with pytest.raises(WorkError, match="Other work"):
+    with pytest.raises(WorkError, match="Another job"):
         kiosk.conductor.ask(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
     assert kiosk.player.want is None
@@ -148,7 +148,7 @@ def test_work_is_cancelled_and_playing_goes_on(kiosk: Kiosk) -> None:
     kiosk.run_until(State.CALIBRATING)
     kiosk.conductor.cancel()
     kiosk.run_until(State.PLAYING, within_s=5)
-    with pytest.raises(WorkError, match="No work"):
+    with pytest.raises(WorkError, match="No job is running"):
         kiosk.conductor.cancel()
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from controller.kiosk.decide.interfaces import Condition
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.projector_supervisor import ASK_ANEW_S, MOST_STRIKES, ProjectorKeeper
+from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES, REOPEN_AFTER_FAULT_S, ProjectorKeeper
 from controller.rig.lamp_guard import LampGuard
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
@@ -104,7 +104,7 @@ def test_a_fault_that_was_told_once_is_asked_about_anew_and_the_mended_lamp_ligh
     kept.lamp.burst()
     assert kept.run(10) is Condition.BROKEN
     kept.lamp.dud = False
-    assert kept.run(ASK_ANEW_S - 15) is Condition.BROKEN
+    assert kept.run(REOPEN_AFTER_FAULT_S - 15) is Condition.BROKEN
     assert kept.run(30) is Condition.LIT
     assert kept.codes[-1] == "projector-back"
 
