@@ -61,7 +61,7 @@ def test_work_whose_projector_is_lost_meanwhile_says_which_and_not_that_somebody
         raise closed()
     assert caught.value.code == "device-missing"
     assert "without projector left" in caught.value.what
-    assert "Mend it" in caught.value.remedy
+    assert "Repair it first." in caught.value.remedy
 
 
 class LosesItMeanwhile:
