@@ -45,7 +45,7 @@ AFTER_CRASH_S: Final = 5.0
 
 
 class Service:
-    """One stage that runs by itself. ``changed`` is called after every step."""
+    """One stage that runs by itself. ``changed`` is called after every step that may have changed something."""
 
     def __init__(self, checked: Checked, log: EventLog) -> None:
         stage = checked.stage
@@ -95,7 +95,7 @@ class Service:
         self._thread("old photographs", purge_old, TIDY_S, first_s=TIDY_S)
 
     def run(self, cancel: threading.Event) -> None:
-        """Call the reconciler until ``cancel``, and feed systemd's watchdog."""
+        """Decide, over and over, until ``cancel``. Feeds systemd's watchdog."""
         notifier = Notifier()
         ready = False
         while not cancel.is_set():
@@ -185,7 +185,7 @@ class Service:
 
     def _wait_until_dark(self) -> None:
         until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
-        while any(projector.may_light for projector in self.devices.projectors) and time.monotonic() < until_s:
+        while any(one.may_light for one in self.devices.projectors) and time.monotonic() < until_s:
             time.sleep(0.1)
         names = [projector.name for projector in self.devices.projectors if projector.view.maybe_lit]
         if names:
@@ -230,7 +230,7 @@ class Service:
 
 @contextlib.contextmanager
 def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) -> Iterator[Service]:
-    """A started service with its loop in a thread; stopped, with the lamps cooled, at the end.
+    """A started service, its loop in a thread; ended, with the lamps cooled, on leaving.
 
     Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
     """

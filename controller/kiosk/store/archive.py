@@ -187,15 +187,15 @@ def _unpack(file: Path, folder: Path) -> None:
             members = []
             for count, member in enumerate(archive):
                 if count >= MOST_FILES or _harmless(member) is None:
-                    raise _not_a_backup()
+                    raise _not_ours()
                 members.append(member)
             if not members or members[0].name != MARK:
-                raise _not_a_backup()
+                raise _not_ours()
             _require_room(folder, sum(member.size for member in members))
             # The data filter refuses absolute paths, "..", devices and links that lead out.
             archive.extractall(folder, members, filter="data")
     except (tarfile.TarError, OSError, EOFError, ValueError) as error:
-        raise _not_a_backup() from error
+        raise _not_ours() from error
 
 
 def _require_room(folder: Path, size: int) -> None:
@@ -209,7 +209,7 @@ def _require_room(folder: Path, size: int) -> None:
         )
 
 
-def _not_a_backup() -> UsageError:
+def _not_ours() -> UsageError:
     return UsageError(
         "not-a-backup",
         what="This file is not a backup of a Velatura stage, or it is damaged.",

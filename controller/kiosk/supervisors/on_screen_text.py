@@ -13,7 +13,7 @@ from controller.play.display.identification import write_text
 from controller.play.frames import SEQUENCE_AT, FrameSet, OutputSize, layout_bytes
 
 _TALL: Final = 14
-"""Picture height divided by line height; a line that is too long is drawn smaller."""
+"""The picture's height over that of a line; a line that is too long is written smaller."""
 
 
 def outputs_of(hello: Mapping[str, Any]) -> tuple[OutputSize, ...]:
@@ -22,7 +22,7 @@ def outputs_of(hello: Mapping[str, Any]) -> tuple[OutputSize, ...]:
 
 
 def notice(outputs: Sequence[OutputSize], lines: Sequence[str], turn: int) -> FrameSet:
-    """The lines on output number ``turn``, in upper case, white on black, in the middle of the picture."""
+    """The lines on output number ``turn``, in capitals, white on black, in the middle of the picture."""
     frames = FrameSet.black(outputs)
     image = frames.pixels[turn]
     height = image.shape[0]

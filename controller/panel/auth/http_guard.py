@@ -32,7 +32,7 @@ class BodyTooLarge(Exception):
 
 
 class Guard:
-    """Wraps the panel. ``hosts`` without port; ``body_limits``: bytes by path, for the upload paths."""
+    """Wraps the panel. ``hosts`` without port; ``body_limits`` bytes by path, for the paths that take uploads."""
 
     def __init__(self, app: ASGIApp, *, hosts: tuple[str, ...], body_limits: dict[str, int], tls: bool) -> None:
         self._app, self._hosts, self._limits = app, frozenset(host.lower() for host in hosts), body_limits
@@ -65,7 +65,7 @@ class Guard:
         host = headers.get("host", "").lower()
         name = host if host.endswith("]") else host.rpartition(":")[0] or host
         if name not in self._hosts:
-            # Prevents DNS rebinding: a page of another host name that resolves to this machine.
+            # A page of another name that resolves to this machine must not reach it (DNS rebinding).
             return PlainTextResponse("This host name is not allowed. Start the kiosk with --name to allow it.", 421)
         length = headers.get("content-length", "0")
         if not length.isascii() or not length.isdigit() or int(length[:18]) > self._limit(scope):
