@@ -13,19 +13,19 @@ from typing import Final
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
-from controller.kiosk.decide.clock import Clockwork, beginning
+from controller.kiosk.decide.clock import TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, Condition, Request
-from controller.kiosk.decide.reconciler import Conductor, Limits
+from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import DeviceRow, Lamp
-from controller.kiosk.jobs.job_handlers import Kinds
-from controller.kiosk.jobs.job_runner import ThreadWorks
+from controller.kiosk.jobs.job_handlers import JobHandlers
+from controller.kiosk.jobs.job_runner import JobRunner
 from controller.kiosk.store import archive
-from controller.kiosk.store.bundle_store import BundleStock
+from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.devices import Devices
-from controller.kiosk.supervisors.keys_supervisor import KeysKeeper
+from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.kiosk.supervisors.lamp_history import LampHistory
 from controller.kiosk.supervisors.player_supervisor import PlayerKeeper
 from controller.play.control.launch import PlayerSettings
@@ -51,22 +51,22 @@ class Service:
         stage = checked.stage
         self.checked, self.log, self.stage = checked, log, stage.folder
         self.runtime = runtime_folder(stage.folder)
-        self.stock = BundleStock(stage.folder, stage_trust(stage))
+        self.bundles = BundleStore(stage.folder, stage_trust(stage))
         self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
         self.player = PlayerKeeper(self.runtime, self._settings, log.tell)
         self.devices = Devices(checked, self.runtime, log.tell)
         self.devices.scene = self._scene
         self.lamp_history = LampHistory(stage.folder)
-        kinds = Kinds(
+        handlers = JobHandlers(
             stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated,
-            open_now=lambda: bool(self.schedule.now.rows) and self.conductor.plan.open is True,
+            open_now=lambda: bool(self.schedule.now.rows) and self.reconciler.plan.open is True,
         )  # fmt: skip
-        self.works = ThreadWorks(kinds.table(), log, number=int(log.value("job") or 0))
+        self.jobs = JobRunner(handlers.table(), log, number=int(log.value("job") or 0))
         safety = stage.tables.safety
-        self.conductor = Conductor(
-            self.devices.projectors, self.player, self.works, self.stock, log,
+        self.reconciler = Reconciler(
+            self.devices.projectors, self.player, self.jobs, self.bundles, log,
             schedule=lambda: self.schedule.now,
-            clock=Clockwork(log, time.time, time.monotonic),
+            clock=TrustedClock(log, time.time, time.monotonic),
             monotonic=time.monotonic,
             without_time=self.schedule.open_without_time,
             limits=Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
@@ -74,7 +74,7 @@ class Service:
         self.changed: Callable[[], None] = lambda: None
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self.keys = self._keys_keeper()
+        self.keys = self._keys_supervisor()
         self._known_runs: tuple[float, bool] = (0.0, False)
 
     def start(self) -> None:
@@ -83,12 +83,12 @@ class Service:
         if self.schedule.problem is not None:
             problem = self.schedule.problem
             self.log.tell(Decision(problem.code, problem.what, problem.remedy, "error"))
-        self.conductor.step()
+        self.reconciler.step()
         self._thread("player", self.player.step, STEP_S)
         for projector in self.devices.projectors:
             self._thread(f"projector {projector.name}", projector.step, LOOK_S)
-        for keeper in self.devices.others:
-            self._thread(keeper.name, keeper.step, STEP_S)
+        for supervisor in self.devices.others:
+            self._thread(supervisor.name, supervisor.step, STEP_S)
         if self.keys is not None:
             self._thread("keys", self.keys.step, 2.0)
         purge_old = partial(purge_old_photographs, self.stage, self.log, time.time)
@@ -115,17 +115,17 @@ class Service:
         notifier.stopping()
 
     def _decide(self) -> None:
-        self.conductor.step()
+        self.reconciler.step()
         if self.devices.mains is not None:
             self.devices.mains.want_on = self._light_wanted()
-        if self.works.number:
-            self.log.keep("job", str(self.works.number))
+        if self.jobs.number:
+            self.log.keep("job", str(self.jobs.number))
         self.lamp_history.note(self.lamps, date.today())
         self.changed()
 
     def end(self, *, leave_lit: bool) -> None:
         """Cancel the job, cool the lamps (unless ``leave_lit``, for the next start), and close everything."""
-        self.works.close(END_WORK_S)
+        self.jobs.close(END_WORK_S)
         if not leave_lit:
             self.player.want = BLACK
             for projector in self.devices.projectors:
@@ -146,7 +146,7 @@ class Service:
         return (*self.devices.rows(), *(() if self.keys is None else (self.keys.row,)))
 
     def ask(self, *requests: Request) -> None:
-        self.conductor.ask(*requests)
+        self.reconciler.ask(*requests)
 
     # -- inside
 
@@ -155,15 +155,16 @@ class Service:
 
     @property
     def lamps(self) -> tuple[Lamp, ...]:
-        views = [keeper.view for keeper in self.devices.projectors]
+        views = [supervisor.view for supervisor in self.devices.projectors]
         return tuple(Lamp(view.name, view.hours, view.strikes, view.condition is Condition.LIT) for view in views)
 
     def _scene(self) -> str | None:
         """What has lit the object long enough for the light sensor, or None."""
         shown = self.player.view.shown
-        if self.conductor.machine.state not in (State.PLAYING, State.DEGRADED) or shown is None or not shown.appearance:
+        state = self.reconciler.machine.state
+        if state not in (State.PLAYING, State.DEGRADED) or shown is None or not shown.appearance:
             return None
-        views = [keeper.view for keeper in self.devices.projectors]
+        views = [supervisor.view for supervisor in self.devices.projectors]
         if any(view.coming or (view.shines and view.stable_left_s > 0) for view in views):
             return None
         lit = " ".join(view.name for view in views if view.shines)
@@ -178,7 +179,7 @@ class Service:
         return calibrated
 
     def _light_wanted(self) -> bool:
-        machine = self.conductor.machine.state
+        machine = self.reconciler.machine.state
         return machine not in (State.OFF, State.COOLING) or any(
             projector.want_lit for projector in self.devices.projectors
         )
@@ -208,7 +209,7 @@ class Service:
         self._threads.append(thread)
         thread.start()
 
-    def _keys_keeper(self) -> KeysKeeper | None:
+    def _keys_supervisor(self) -> KeysSupervisor | None:
         table = self.checked.stage.tables.key_panel
         if table is None:
             return None
@@ -219,13 +220,13 @@ class Service:
                 assert panel is not None
                 yield panel
 
-        presses = (self.conductor.open, self.conductor.shut, self._recalibrate)
-        return KeysKeeper(table.driver, opened, presses, lambda: self.conductor.machine.state, self.log.tell)
+        presses = (self.reconciler.open, self.reconciler.shut, self._recalibrate)
+        return KeysSupervisor(table.driver, opened, presses, lambda: self.reconciler.machine.state, self.log.tell)
 
     def _recalibrate(self) -> None:
         # The log has the refusal; a key can't show it.
         with contextlib.suppress(WorkError):
-            self.conductor.ask(Request("quick", light=True))
+            self.reconciler.ask(Request("quick", light=True))
 
 
 @contextlib.contextmanager
@@ -250,7 +251,7 @@ def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) ->
         with contextlib.closing(log):
             service = Service(checked, log)
             ended = threading.Event()
-            loop = threading.Thread(target=service.run, args=(ended,), name="conductor", daemon=True)
+            loop = threading.Thread(target=service.run, args=(ended,), name="reconciler", daemon=True)
             try:
                 service.start()
                 loop.start()

@@ -124,16 +124,16 @@ class StageKiosk(FolderKiosk):
 
     def _show_notice(self) -> None:
         service = self._service
-        if service is not None and self._notice is not None and service.stock.bundle() is None:
+        if service is not None and self._notice is not None and service.bundles.bundle() is None:
             service.player.notice = self._notice[0]
-            service.conductor.light_for(NOTICE_S)
+            service.reconciler.light_for(NOTICE_S)
             self._notice_ends_s = time.monotonic() + NOTICE_S
 
     def _end_notice(self, service: Service) -> None:
         if self._notice is not None and (self._notice[1]() or time.monotonic() > self._notice_ends_s):
             self._notice = None
             service.player.notice = ()
-            service.conductor.light_for(0.0)
+            service.reconciler.light_for(0.0)
 
     # -- frequent questions
 
@@ -181,7 +181,7 @@ class StageKiosk(FolderKiosk):
 
     def _begun(self, service: Service, asked: Request, name: str) -> Job:
         # Before it is queued, because it may start at once.
-        number = service.works.reserve()
+        number = service.jobs.reserve()
         service.ask(replace(asked, number=number))
         return Job(number, name)
 
@@ -189,28 +189,28 @@ class StageKiosk(FolderKiosk):
         """A requested job; None while it waits. Raises WorkError("job-given-up") if it will never start."""
         service = self.service
         # In this order, so that a job that starts between the two calls is not taken for a lost one.
-        waits = service.conductor.waits(number)
-        if (job := service.works.known(number)) is None and not waits:
+        waits = service.reconciler.waits(number)
+        if (job := service.jobs.known(number)) is None and not waits:
             raise WorkError("job-given-up", what="The job will not start: the kiosk cancelled it or restarted.",
                             remedy="See `velatura events` for the reason, then start it again.")  # fmt: skip
         return job
 
     def cancel(self) -> None:
-        self.service.conductor.cancel()
+        self.service.reconciler.cancel()
 
     def play(self, name: str) -> None:
         service = self.service
-        service.stock.check_name(name)
-        service.conductor.choose(name)
-        service.conductor.open()
+        service.bundles.check_name(name)
+        service.reconciler.choose(name)
+        service.reconciler.open()
 
     def stop(self) -> None:
-        self.service.conductor.shut()
+        self.service.reconciler.shut()
 
     def start(self) -> None:
-        for keeper in self.service.devices.projectors:
-            keeper.forgive()
-        self.service.conductor.open()
+        for supervisor in self.service.devices.projectors:
+            supervisor.forgive()
+        self.service.reconciler.open()
 
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         picture, size_px = target.read_bytes(), targets.camera_view_px(self.stage)
@@ -221,29 +221,29 @@ class StageKiosk(FolderKiosk):
         settings.check_name(name)
         picture = self.fitted(target, fit)
         kept = self.stage / "appearances" / f"{name}.png"
-        with service.conductor.idle():
+        with service.reconciler.idle():
             write_atomically(kept, picture)
             settings.add_picture(self.stage, name, kept)
             return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def appearances(self) -> Sequence[Appearance]:
-        return appearances_of(self.service.stock, self.comparisons(), playing=self._last.playing)
+        return appearances_of(self.service.bundles, self.comparisons(), playing=self._last.playing)
 
     def compare(self, name: str | None = None) -> Job:
         service = self.service
-        service.stock.check_name(name)
+        service.bundles.check_name(name)
         asked = Request("compare", light=True, arguments=() if name is None else (name,))
         return self._begun(service, asked, title_of(asked))
 
     def comparisons(self) -> Sequence[Comparison]:
-        return runs.comparisons(self.stage, self.service.stock.names())
+        return runs.comparisons(self.stage, self.service.bundles.names())
 
     def remove_appearance(self, name: str) -> None:
         service = self.service
         if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
             raise UsageError("appearance-in-use", what=f"{name} is playing, or the schedule names it.",
                              remedy="Play another one, and remove it from the schedule.")  # fmt: skip
-        with service.conductor.idle():
+        with service.reconciler.idle():
             settings.remove_picture(self.stage, name)
             settings.forget_solved(self.stage, name)
             service.ask(Request("publish"))
@@ -255,7 +255,7 @@ class StageKiosk(FolderKiosk):
         return Schedule("UTC") if self._service is None else self._service.schedule.now
 
     def set_schedule(self, schedule: Schedule) -> None:
-        self.service.schedule.replace(schedule, self.service.stock.names())
+        self.service.schedule.replace(schedule, self.service.bundles.names())
 
     def identify(self, on: bool) -> None:
         self.service.player.identifying = on
@@ -288,7 +288,7 @@ class StageKiosk(FolderKiosk):
             self.reload.set()
 
     def _idle(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext() if self._service is None else self._service.conductor.idle()
+        return contextlib.nullcontext() if self._service is None else self._service.reconciler.idle()
 
     def camera_picture(self) -> bytes | None:
         return None if self._service is None else aim.camera_picture(self._service.devices)
@@ -306,7 +306,7 @@ class StageKiosk(FolderKiosk):
         service, asked = self.service, Request("aim", light=True)
         job = self._begun(service, asked, title_of(asked))
         # Test shots are repeated while aiming; the lamps stay lit between them.
-        service.conductor.light_for(AIMING_S, closed_too=True)
+        service.reconciler.light_for(AIMING_S, closed_too=True)
         return job
 
     def find_devices(self) -> Sequence[FoundDevice]:

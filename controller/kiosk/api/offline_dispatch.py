@@ -17,7 +17,7 @@ from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.accounts import AccountActions
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
-from controller.kiosk.store.bundle_store import BundleStock
+from controller.kiosk.store.bundle_store import BundleStore
 from controller.stage.calibrations import stage_trust
 from controller.stage.run import stage_lock
 
@@ -53,10 +53,10 @@ def status_of(stage: Path) -> dict[str, Any]:
     if is_running(stage):
         return dict(ask(stage, "status"))
     loaded = load_stage(stage)
-    stock = BundleStock(loaded.folder, stage_trust(loaded))
+    bundles = BundleStore(loaded.folder, stage_trust(loaded))
     reason = "No kiosk runs on this stage."
     return {"stage": loaded.tables.stage.name, "state": "off", "reason": reason, "devices": [], "playing": "",
-            "appearances": list(stock.names()), "serving": False}  # fmt: skip
+            "appearances": list(bundles.names()), "serving": False}  # fmt: skip
 
 
 def status_text(state: Mapping[str, Any]) -> str:

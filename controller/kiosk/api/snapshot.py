@@ -23,7 +23,7 @@ class Snapshots:
 
     def of(self, service: Service, revision: int) -> KioskState:
         """The state now; the grades come from the disk and may be some seconds old."""
-        machine, shown = service.conductor.machine, service.player.view.shown
+        machine, shown = service.reconciler.machine, service.player.view.shown
         state = machine.state.value
         if self._since[0] != state:
             self._since = (state, time.time())
@@ -31,7 +31,7 @@ class Snapshots:
         if time.monotonic() - at_s > GRADES_EVERY_S or not at_s:
             grades = runs.grades(self._stage, service.checked.stage.tables.calibration.worst_grade)
             self._grades = time.monotonic(), grades
-        index = service.stock.index(bundle := service.stock.bundle())
+        index = service.bundles.index(bundle := service.bundles.bundle())
         identity = None
         if index is not None and bundle is not None:
             identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
@@ -42,9 +42,9 @@ class Snapshots:
             reason=machine.reason,
             since_unix_s=self._since[1],
             devices=(*service.rows(), self._player_row(service), *self._disk_row(service)),
-            job=service.works.job,
+            job=service.jobs.job,
             playing=shown.appearance if shown is not None else "",
-            next_event=service.conductor.plan.next,
+            next_event=service.reconciler.plan.next,
             bundle=identity,
             lamps=service.lamps,
             grades=grades,

@@ -31,7 +31,7 @@ def synchronised() -> bool:
     return bool(state >= 0 and not status & _UNSYNCHRONISED) and os.name == "posix"
 
 
-class Clockwork:
+class TrustedClock:
     """The time to plan with; remembers the latest one over restarts."""
 
     def __init__(

@@ -49,8 +49,8 @@ class ProjectorView:
         return not self.looked or self.condition in (Condition.DARK, Condition.COOLING, Condition.LIGHTING)
 
 
-class Keeper(Protocol):
-    """Brings one projector into the wanted state; see ``ProjectorKeeper``."""
+class ProjectorPort(Protocol):
+    """Brings one projector into the wanted state; see ``ProjectorSupervisor``."""
 
     name: str
     want_lit: bool | None
@@ -92,7 +92,7 @@ class PlayerPort(Protocol):
     def view(self) -> PlayerView: ...
 
 
-class Stock(Protocol):
+class Bundles(Protocol):
     """The bundles of the stage."""
 
     def bundle(self) -> Path | None:
@@ -134,7 +134,7 @@ class Finished:
     then: tuple[Request, ...] = ()
 
 
-class Works(Protocol):
+class Jobs(Protocol):
     """Runs one request at a time."""
 
     def refusal(self, request: Request) -> Decision | None:

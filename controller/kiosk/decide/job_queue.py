@@ -9,16 +9,16 @@ from dataclasses import replace
 from typing import Final
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide.interfaces import Condition, Finished, ProjectorView, Request, Works
+from controller.kiosk.decide.interfaces import Condition, Finished, Jobs, ProjectorView, Request
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import Decision, EventLog
 
 
-class Agenda:
+class JobQueue:
     """One job runs, the others wait. Call it only with the reconciler's lock held."""
 
-    def __init__(self, works: Works, log: EventLog, *, monotonic: Callable[[], float], patience_s: float) -> None:
-        self._works, self._log = works, log
+    def __init__(self, jobs: Jobs, log: EventLog, *, monotonic: Callable[[], float], patience_s: float) -> None:
+        self._jobs, self._log = jobs, log
         self._monotonic, self._patience_s = monotonic, patience_s
         self._waiting: tuple[Request | None, float] = (None, 0.0)
         self._queue: deque[Request] = deque()
@@ -28,7 +28,7 @@ class Agenda:
     @property
     def head(self) -> Request | None:
         """The job that runs, or is next."""
-        return self._works.running or (self._queue[0] if self._queue else None)
+        return self._jobs.running or (self._queue[0] if self._queue else None)
 
     @property
     def needs_light(self) -> bool:
@@ -42,7 +42,7 @@ class Agenda:
     def ask(self, *requests: Request) -> None:
         """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         self.check_idle()
-        if (why := self._works.refusal(requests[0])) is not None:
+        if (why := self._jobs.refusal(requests[0])) is not None:
             self._log.tell(why)
             raise WorkError(why.code, what=why.reason, remedy=why.remedy)
         self._queue.extend(requests)
@@ -64,7 +64,7 @@ class Agenda:
 
     def offer(self, request: Request) -> bool:
         """Queue a background job if there is no other; returns whether it was queued."""
-        if self.head is not None or self._holder is not None or self._works.refusal(request) is not None:
+        if self.head is not None or self._holder is not None or self._jobs.refusal(request) is not None:
             return False
         self._queue.append(request)
         return True
@@ -74,13 +74,13 @@ class Agenda:
         if self._queue:
             self._settle("cancelled")
             self._log.tell(_CANCELLED)
-        if self._works.running is not None:
+        if self._jobs.running is not None:
             self._cancelled = True
-            self._works.cancel()
+            self._jobs.cancel()
 
     def take_finished(self) -> Finished | None:
         """The job that ended since the last call; its follow-up jobs are now first in the queue."""
-        finished = self._works.finished()
+        finished = self._jobs.finished()
         if finished is None:
             return None
         self._tell(finished.outcome)
@@ -103,7 +103,7 @@ class Agenda:
             request = Request("drift", light=True, key=task.key)
             if playing or self.head is not None or self._holder is not None:
                 continue
-            if (why := self._works.refusal(request)) is not None:
+            if (why := self._jobs.refusal(request)) is not None:
                 self._log.mark_done(task.key, why.code)
                 reason = f"The {task.what} ({task.key}) is skipped. {why.reason}"
                 self._log.tell(replace(why, reason=reason, level="warning"))
@@ -113,7 +113,7 @@ class Agenda:
 
     def ready(self, views: Sequence[ProjectorView]) -> Request | None:
         """The job that can start with these lamps; one whose lamps do not light in time is dropped with the reason."""
-        if not self._queue or self._works.running is not None or self._holder is not None:
+        if not self._queue or self._jobs.running is not None or self._holder is not None:
             return None
         request = self._queue[0]
         if not request.light:
@@ -137,7 +137,7 @@ class Agenda:
         return None
 
     def begin(self) -> None:
-        self._works.begin(self._queue.popleft())
+        self._jobs.begin(self._queue.popleft())
 
     def drop(self, why: Decision) -> None:
         """Drop all waiting jobs."""

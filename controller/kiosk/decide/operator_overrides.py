@@ -23,7 +23,7 @@ class Override:
     until_s: float | None = None
 
 
-class Wishes:
+class OperatorOverrides:
     """Stored in the event log's file, to survive a restart. ``without_time``: open while the time is unknown."""
 
     def __init__(self, log: EventLog, *, without_time: bool) -> None:

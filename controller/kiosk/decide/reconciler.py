@@ -13,21 +13,21 @@ from dataclasses import dataclass
 from typing import Final
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide.clock import Clockwork
-from controller.kiosk.decide.content_selector import Pictures
+from controller.kiosk.decide.clock import TrustedClock
+from controller.kiosk.decide.content_selector import ContentSelector
 from controller.kiosk.decide.interfaces import (
     BLACK,
+    Bundles,
     Condition,
-    Keeper,
+    Jobs,
     PlayerPort,
     PlayerView,
+    ProjectorPort,
     ProjectorView,
     Request,
-    Stock,
-    Works,
 )
-from controller.kiosk.decide.job_queue import Agenda
-from controller.kiosk.decide.operator_overrides import Wishes
+from controller.kiosk.decide.job_queue import JobQueue
+from controller.kiosk.decide.operator_overrides import OperatorOverrides
 from controller.kiosk.decide.planner import Plan, plan
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -46,7 +46,7 @@ class Limits:
     cool_down_s: float = 900.0
 
 
-class Conductor:
+class Reconciler:
     """The kiosk's decisions. One thread calls ``step`` about four times a second; commands may come from any thread.
 
     Parameters
@@ -58,25 +58,25 @@ class Conductor:
 
     def __init__(
         self,
-        keepers: Sequence[Keeper],
+        supervisors: Sequence[ProjectorPort],
         player: PlayerPort,
-        works: Works,
-        stock: Stock,
+        jobs: Jobs,
+        bundles: Bundles,
         log: EventLog,
         *,
         schedule: Callable[[], Schedule],
-        clock: Clockwork,
+        clock: TrustedClock,
         monotonic: Callable[[], float],
         without_time: bool = False,
         limits: Limits | None = None,
     ) -> None:
-        self._keepers, self._player, self._log = keepers, player, log
+        self._supervisors, self._player, self._log = supervisors, player, log
         self._schedule, self._clock, self._monotonic = schedule, clock, monotonic
         self._limits = limits or Limits()
-        self._agenda = Agenda(works, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
+        self._queue = JobQueue(jobs, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
         self.machine = Machine(self._changed)
-        self.wishes = Wishes(log, without_time=without_time)
-        self._pictures = Pictures(stock, self.wishes, self._agenda, log)
+        self.overrides = OperatorOverrides(log, without_time=without_time)
+        self._content = ContentSelector(bundles, self.overrides, self._queue, log)
         self._lock = threading.RLock()
         self._plan = Plan(None)
         self._since_s = monotonic()
@@ -93,30 +93,30 @@ class Conductor:
     def working(self) -> bool:
         """Whether a job runs or waits."""
         with self._lock:
-            return self._agenda.head is not None
+            return self._queue.head is not None
 
     def waits(self, number: int) -> bool:
         """Whether the job of this number waits to start."""
         with self._lock:
-            return self._agenda.waits(number)
+            return self._queue.waits(number)
 
     def open(self) -> None:
         """Play until the next scheduled change."""
         with self._lock:
-            self.wishes.override(True, self._plan)
+            self.overrides.override(True, self._plan)
             self._since_s = min(self._since_s, self._monotonic() - RETRY_S[-1])
 
     def shut(self) -> None:
         """Stop, and cool the lamps, until the next scheduled change."""
         with self._lock:
-            self._agenda.cancel()
+            self._queue.cancel()
             self._lit_until_s = float("-inf")
-            self.wishes.override(False, self._plan)
+            self.overrides.override(False, self._plan)
 
     def choose(self, appearance: str) -> None:
         """Play this appearance of the bundle from now on."""
         with self._lock:
-            self.wishes.choose(appearance, self._plan)
+            self.overrides.choose(appearance, self._plan)
 
     def light_for(self, seconds: float, *, closed_too: bool = False) -> None:
         """Keep the lamps lit, even with nothing to play, while open or ``closed_too``. 0 or ``shut`` ends it."""
@@ -126,7 +126,7 @@ class Conductor:
     def ask(self, *requests: Request) -> None:
         """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         with self._lock:
-            self._agenda.ask(*requests)
+            self._queue.ask(*requests)
 
     @contextlib.contextmanager
     def idle(self) -> Iterator[None]:
@@ -135,19 +135,19 @@ class Conductor:
         Raises WorkError("busy") while a job runs or waits, and while another thread is inside.
         """
         with self._lock:
-            self._agenda.hold()
+            self._queue.hold()
         try:
             yield
         finally:
             with self._lock:
-                self._agenda.release()
+                self._queue.release()
 
     def cancel(self) -> None:
         """Raises WorkError("nothing-to-cancel")."""
         with self._lock:
-            if self._agenda.head is None:
+            if self._queue.head is None:
                 raise WorkError("nothing-to-cancel", what="No job is running.", remedy="There is nothing to cancel.")
-            self._agenda.cancel()
+            self._queue.cancel()
 
     # -- one step
 
@@ -156,46 +156,46 @@ class Conductor:
             # First: a task that has just ended must not be due in the plan.
             self._take_finished()
             self._update_plan()
-            wanted_open = self.wishes.open(self._plan)
-            self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
-            views = [keeper.view for keeper in self._keepers]
-            open_now = self._pictures.something(wanted_open)
+            wanted_open = self.overrides.open(self._plan)
+            self._queue.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
+            views = [supervisor.view for supervisor in self._supervisors]
+            open_now = self._content.something(wanted_open)
             lit_anyway = (wanted_open or self._lit_closed) and self._monotonic() < self._lit_until_s
-            light = open_now or lit_anyway or self._agenda.needs_light
+            light = open_now or lit_anyway or self._queue.needs_light
             self._move(views, light, open_now)
             cooling = self.machine.state in (State.COOLING, State.OFF)
-            for keeper in self._keepers:
-                if keeper.want_lit is not (wanted := light and not cooling):
-                    keeper.want_lit = wanted
+            for supervisor in self._supervisors:
+                if supervisor.want_lit is not (wanted := light and not cooling):
+                    supervisor.want_lit = wanted
             self._begin_work(views)
             self._show(views, open_now)
 
     def _update_plan(self) -> None:
         now_s = self._clock.now()
         self._plan = plan(now_s, self._schedule(), self._log.done(), since_s=self._clock.since_s)
-        self.wishes.follow(self._plan)
+        self.overrides.follow(self._plan)
 
     # -- jobs
 
     def _take_finished(self) -> None:
-        finished = self._agenda.take_finished()
+        finished = self._queue.take_finished()
         if finished is not None and self.machine.state is State.CALIBRATING:
             event = Event.CANCEL if finished.failed else Event.CALIBRATED
             self._go(event, finished.outcome.reason)
 
     def _begin_work(self, views: Sequence[ProjectorView]) -> None:
-        head = self._agenda.head
+        head = self._queue.head
         state = self.machine.state
         if state is State.FAULT and head is not None and head.light:
-            self._agenda.drop(_FAULTY)
+            self._queue.drop(_FAULTY)
         if head is not None and head.light and state not in (State.READY, State.PLAYING, State.DEGRADED):
             return
-        if (request := self._agenda.ready(views)) is None:
+        if (request := self._queue.ready(views)) is None:
             return
         if request.light:
             self._go(Event.RECALIBRATE, f"{request.kind} starts")
             self._player.want = None
-        self._agenda.begin()
+        self._queue.begin()
 
     # -- states
 
@@ -243,7 +243,7 @@ class Conductor:
                 self._go(Event.RECOVERED, "every projector gives light again")
         elif reasons or self._missing:
             self._go(Event.DEGRADE, reasons or f"{', '.join(sorted(self._missing))} gives no light.")
-        elif state is State.READY and open_now and not self._agenda.needs_light:
+        elif state is State.READY and open_now and not self._queue.needs_light:
             self._go(Event.PLAY, "open")
         elif state is State.PLAYING and not open_now:
             self._go(Event.PAUSE, "closed")
@@ -291,7 +291,7 @@ class Conductor:
             return
         # If every lamp is dark, no projector can replace another.
         missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
-        self._player.want = self._pictures.of(self._plan, missing) if open_now and state in _ON else BLACK
+        self._player.want = self._content.of(self._plan, missing) if open_now and state in _ON else BLACK
 
     @property
     def player(self) -> PlayerView:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from controller.kiosk.decide.interfaces import Finished, Request
-from controller.kiosk.jobs.job_runner import JobReporter, Kind, run_name
+from controller.kiosk.jobs.job_runner import JobHandler, JobReporter, run_name
 from controller.kiosk.store import settings
-from controller.kiosk.store.bundle_store import BundleStock
+from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision
 from controller.rig.rig import Rig
 from controller.run.progress import Phase, Progress
@@ -34,7 +34,7 @@ LendRig = Callable[[], AbstractContextManager[Rig]]
 """Lends the opened devices to a job; raises DeviceError if one is missing."""
 
 
-class Kinds:
+class JobHandlers:
     """``missing_device``: the device that photographs need and that is missing; ``calibrated``: whether the stage has a
     calibration; ``open_now``: whether it is open by its schedule. All answer from memory.
     """
@@ -51,21 +51,21 @@ class Kinds:
         self._stage, self._lend = stage, lend
         self._missing_device, self._calibrated, self._open_now = missing_device, calibrated, open_now
 
-    def table(self) -> dict[str, Kind]:
+    def table(self) -> dict[str, JobHandler]:
         """Every kind by its name."""
         lit, known = self._needs_camera, self._needs_calibration
         return {
-            "aim": Kind(self._aim, lambda request: self._missing_device()),
-            "drift": Kind(self._drift, lit),
-            "quick": Kind(self._quick, lit),
-            "projector": Kind(self._projector, lit),
-            "full": Kind(self._full, lambda request: self._missing_device()),
-            "compare": Kind(self._compare, lit),
-            "publish": Kind(self._publish, known),
-            "compute": Kind(self._publish, known),
-            "report": Kind(self._report),
-            "takeover": Kind(self._takeover, known),
-            "variants": Kind(self._variants, known),
+            "aim": JobHandler(self._aim, lambda request: self._missing_device()),
+            "drift": JobHandler(self._drift, lit),
+            "quick": JobHandler(self._quick, lit),
+            "projector": JobHandler(self._projector, lit),
+            "full": JobHandler(self._full, lambda request: self._missing_device()),
+            "compare": JobHandler(self._compare, lit),
+            "publish": JobHandler(self._publish, known),
+            "compute": JobHandler(self._publish, known),
+            "report": JobHandler(self._report),
+            "takeover": JobHandler(self._takeover, known),
+            "variants": JobHandler(self._variants, known),
         }
 
     def _needs_calibration(self, request: Request) -> Decision | None:
@@ -197,7 +197,7 @@ class Kinds:
         return f"Removed from stage.toml again: {', '.join(removed)}. " if removed else ""
 
     def _installed(self) -> Sequence[str]:
-        return BundleStock(self._stage, stage_trust(check_stage(self._stage).stage)).names()
+        return BundleStore(self._stage, stage_trust(check_stage(self._stage).stage)).names()
 
     def _report(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         from controller.services.report import calibration_report

@@ -66,20 +66,25 @@ Do = Callable[[Request, JobReporter, threading.Event], Finished]
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class JobHandler:
     """``refusal`` says from memory why the job can't run now, or None."""
 
     do: Do
     refusal: Callable[[Request], Decision | None] = lambda request: None
 
 
-class ThreadWorks:
-    """See ``interfaces.Works``. ``number``: that of the last job of the previous service."""
+class JobRunner:
+    """See ``interfaces.Jobs``. ``number``: that of the last job of the previous service."""
 
     def __init__(
-        self, kinds: Mapping[str, Kind], log: EventLog, changed: Callable[[], None] = lambda: None, *, number: int = 0
+        self,
+        handlers: Mapping[str, JobHandler],
+        log: EventLog,
+        changed: Callable[[], None] = lambda: None,
+        *,
+        number: int = 0,
     ) -> None:
-        self._kinds, self._log, self._changed = kinds, log, changed
+        self._handlers, self._log, self._changed = handlers, log, changed
         self._number = number
         self._lock = threading.Lock()
         self._request: Request | None = None
@@ -115,7 +120,7 @@ class ThreadWorks:
         return self._request
 
     def refusal(self, request: Request) -> Decision | None:
-        return self._kinds[request.kind].refusal(request)
+        return self._handlers[request.kind].refusal(request)
 
     def begin(self, request: Request) -> None:
         self._request, self._cancel = request, threading.Event()
@@ -150,7 +155,7 @@ class ThreadWorks:
 
     def _run(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> None:
         try:
-            finished = self._kinds[request.kind].do(request, reporter, cancel)
+            finished = self._handlers[request.kind].do(request, reporter, cancel)
         except Cancelled as error:
             finished = Finished(request, Decision(error.code, error.what, error.remedy), failed=True)
         except (VelaturaError, DeviceError) as error:

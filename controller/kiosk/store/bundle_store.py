@@ -28,8 +28,8 @@ def slots_without(stage: Path, missing: Collection[str]) -> Path:
     return stage / WITHOUT / safe_name(" + ".join(name.replace("+", "++") for name in sorted(missing)))
 
 
-class BundleStock:
-    """Reads the installed bundles, again only when their links change. See ``interfaces.Stock``."""
+class BundleStore:
+    """Reads the installed bundles, again only when their links change. See ``interfaces.Bundles``."""
 
     def __init__(self, stage: Path, trust: Trust) -> None:
         self._stage, self._trust = stage, trust

@@ -22,7 +22,7 @@ _REOPEN_S: Final = (2.0, 5.0, 15.0)
 Look = Callable[[Device, Deadline], tuple[LiveValue, ...]]
 
 
-class DeviceKeeper:
+class DeviceSupervisor:
     """One device. One thread calls ``step`` repeatedly.
 
     ``look`` polls the device and returns the values to show; ``every_s``: seconds between two polls.

@@ -13,9 +13,9 @@ from controller.core.text import printable
 from controller.kiosk.decide.interfaces import Condition, ProjectorView
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.device_supervisor import DeviceKeeper
-from controller.kiosk.supervisors.mains_supervisor import Boards, MainsKeeper
-from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
+from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
+from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.rig.ambient_light import Darkness, LightWatch
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile
@@ -40,22 +40,22 @@ class Devices:
         self._checked, self._tell = checked, tell
         self._context = OpenContext(stage=checked.stage.folder, runtime=runtime)
         self._ledger = LampFile(checked.stage.folder / LampFile.NAME)
-        self.mains = self._mains_keeper()
+        self.mains = self._mains_supervisor()
         self.projectors = tuple(self._projector(number) for number in range(len(checked.projectors)))
         if self.mains is not None:
-            self.mains.keepers = self.projectors
+            self.mains.supervisors = self.projectors
         tables = checked.stage.tables
         self.scene: Callable[[], str | None] = lambda: None
         self._room: str | None = None
-        self.camera = DeviceKeeper(
+        self.camera = DeviceSupervisor(
             "camera", "camera", tables.camera.driver, self._open_camera, _look_at_camera, tell, every_s=60.0
         )
         self.sensor = self._sensor()
 
     @property
-    def others(self) -> tuple[DeviceKeeper, ...]:
+    def others(self) -> tuple[DeviceSupervisor, ...]:
         """The supervisors of all devices that are not projectors."""
-        return tuple(keeper for keeper in (self.camera, self.sensor, self.mains) if keeper is not None)
+        return tuple(supervisor for supervisor in (self.camera, self.sensor, self.mains) if supervisor is not None)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -66,9 +66,9 @@ class Devices:
         """The rows that the panel shows."""
         drivers = [table.driver for table in self._checked.stage.tables.projectors]
         projectors = [
-            projector_row(keeper.view, driver) for keeper, driver in zip(self.projectors, drivers, strict=True)
+            projector_row(supervisor.view, driver) for supervisor, driver in zip(self.projectors, drivers, strict=True)
         ]
-        return (*projectors, *(keeper.row for keeper in self.others))
+        return (*projectors, *(supervisor.row for supervisor in self.others))
 
     def missing_for_work(self) -> Decision | None:
         """The missing device that photographs need, or None."""
@@ -79,7 +79,9 @@ class Devices:
             reason = f"No photographs are possible without the camera. {problem.reason}"
             return replace(problem, reason=reason, level="error")
         missing = [
-            keeper.name for keeper in self.projectors if keeper.view.condition in (Condition.LOST, Condition.BROKEN)
+            supervisor.name
+            for supervisor in self.projectors
+            if supervisor.view.condition in (Condition.LOST, Condition.BROKEN)
         ]
         if missing:
             return Decision("projector-missing", f"No photographs are possible without projector {', '.join(missing)}.",
@@ -90,11 +92,11 @@ class Devices:
     def lent(self) -> Iterator[Rig]:
         """The opened devices for one job. Raises DeviceGone("device-missing") and what opening raises."""
         with contextlib.ExitStack() as stack:
-            for keeper in (self.camera, *([] if self.sensor is None else [self.sensor])):
+            for supervisor in (self.camera, *([] if self.sensor is None else [self.sensor])):
                 # The supervisor's thread must not use the device during the job.
-                stack.enter_context(keeper.lent)
+                stack.enter_context(supervisor.lent)
             # Only with the lock: before that, its supervisor may close it.
-            camera, guards = self.camera.device, [keeper.guard for keeper in self.projectors]
+            camera, guards = self.camera.device, [supervisor.guard for supervisor in self.projectors]
             if camera is None or any(guard is None for guard in guards):
                 raise DeviceGone("device-missing", what="A device that the job needs is missing.",
                                  remedy="See the list of devices.")  # fmt: skip
@@ -108,7 +110,9 @@ class Devices:
                 yield replace(rig, darkness=self._darkness())
             except DeviceGone as error:
                 # The job sees only a closed device; its supervisor knows the reason.
-                lost = any(keeper.guard is not guard for keeper, guard in zip(self.projectors, guards, strict=True))
+                lost = any(
+                    supervisor.guard is not guard for supervisor, guard in zip(self.projectors, guards, strict=True)
+                )
                 if lost and (missing := self.missing_for_work()) is not None:
                     raise DeviceGone("device-missing", what=missing.reason, remedy=missing.remedy) from error
                 raise
@@ -116,12 +120,12 @@ class Devices:
     def close(self) -> None:
         for projector in self.projectors:
             projector.close()
-        for keeper in self.others:
-            keeper.close()
+        for supervisor in self.others:
+            supervisor.close()
 
     # -- opening
 
-    def _projector(self, number: int) -> ProjectorKeeper:
+    def _projector(self, number: int) -> ProjectorSupervisor:
         tables = self._checked.stage.tables
         table, (driver, settings) = tables.projectors[number], self._checked.projectors[number]
         at_least = tables.safety.at_least()
@@ -132,7 +136,7 @@ class Devices:
 
         silenced = None if self.mains is None else partial(self.mains.silences, table.name)
         unfed = partial(self._unfed, table.name)
-        return ProjectorKeeper(table.name, open_guard, self._tell, asleep=silenced, unfed=unfed)
+        return ProjectorSupervisor(table.name, open_guard, self._tell, asleep=silenced, unfed=unfed)
 
     def _unfed(self, projector: str) -> Decision | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]
@@ -142,7 +146,7 @@ class Devices:
         table, (driver, settings) = self._checked.stage.tables.camera, self._checked.camera
         return cast("Device", open_device(table, driver, settings, self._context, deadline))
 
-    def _sensor(self) -> DeviceKeeper | None:
+    def _sensor(self) -> DeviceSupervisor | None:
         table = self._checked.stage.tables.light_sensor
         if table is None:
             return None
@@ -160,7 +164,7 @@ class Devices:
             dark = "dark enough to calibrate" if lux <= table.most_lux else "too bright to calibrate"
             return (LiveValue("Light", f"{lux:.2f} lux ({dark})"),)
 
-        return DeviceKeeper("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0)
+        return DeviceSupervisor("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0)
 
     def _report_light(self, room: str | None) -> None:
         before, self._room = self._room, room
@@ -175,7 +179,7 @@ class Devices:
             return None
         return Darkness(cast("LightSensor", self.sensor.device), table.most_lux)
 
-    def _mains_keeper(self) -> MainsKeeper | None:
+    def _mains_supervisor(self) -> MainsSupervisor | None:
         if not self._checked.relays:
             return None
         drivers = ", ".join(table.driver for table in self._checked.stage.tables.relays)
@@ -185,7 +189,7 @@ class Devices:
             circuits = mains_circuits(self._checked, self._context, stack, deadline)
             return Boards(circuits, stack)
 
-        return MainsKeeper(drivers, open_circuits, self._tell)
+        return MainsSupervisor(drivers, open_circuits, self._tell)
 
 
 _DARKEN: Final = "Switch the lights off and close the blinds. Other light makes the appearance pale."

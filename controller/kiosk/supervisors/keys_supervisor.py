@@ -14,7 +14,7 @@ from hal.errors import DeviceError
 from hal.interfaces import ButtonPanel
 
 
-class KeysKeeper:
+class KeysSupervisor:
     """One key panel. One thread calls ``step`` repeatedly until it is open; then ``KeyService`` takes over.
 
     ``open_panel`` opens the panel, and closes it at the end; ``presses``: the actions of play, stop and recalibrate.

@@ -10,8 +10,8 @@ from typing import cast
 
 from controller.kiosk.interface import LiveValue
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceKeeper
-from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceSupervisor
+from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.mains_relays import Circuit
 from hal.deadline import Deadline, in_seconds
@@ -35,7 +35,7 @@ class Boards:
         self._stack.close()
 
 
-class MainsKeeper(DeviceKeeper):
+class MainsSupervisor(DeviceSupervisor):
     """Closes the relays while light is wanted, and opens each when the lamps behind it have cooled.
 
     A relay that fails, or a projector that is silent, does not delay the others.
@@ -47,7 +47,7 @@ class MainsKeeper(DeviceKeeper):
     ) -> None:  # fmt: skip
         super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0, monotonic=monotonic)
         self.want_on = True
-        self.keepers: tuple[ProjectorKeeper, ...] = ()
+        self.supervisors: tuple[ProjectorSupervisor, ...] = ()
         self._off: frozenset[str] = frozenset()
         self._booted_at_s: dict[str, float] = {}
 
@@ -63,7 +63,7 @@ class MainsKeeper(DeviceKeeper):
             self._off = frozenset()
             act = self._switch_on
         else:
-            guards = {keeper.name: keeper.guard for keeper in self.keepers}
+            guards = {supervisor.name: supervisor.guard for supervisor in self.supervisors}
             act = partial(self._switch_off, guards=guards)
         values, failed = [], list[DeviceError]()
         for circuit in boards.circuits:

@@ -33,7 +33,7 @@ _REOPEN_S: Final = (2.0, 5.0, 15.0)
 """Not longer, because a person who plugs a cable in again waits for the result."""
 
 
-class ProjectorKeeper:
+class ProjectorSupervisor:
     """One projector. One thread calls ``step`` repeatedly; any thread may use the rest.
 
     Parameters

@@ -19,7 +19,7 @@ from controller.calibrate.values import Geometry, Pinhole
 from controller.core.errors import UsageError
 from controller.kiosk.api.aim import FIGURES, FOLDER, MAPS, aiming, camera_picture, feasibility_map, grazing_share
 from controller.kiosk.interface import Aiming, LiveValue
-from controller.kiosk.supervisors.device_supervisor import DeviceKeeper
+from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
 from controller.stage.check import check_stage
 from hal.deadline import Deadline
@@ -152,7 +152,7 @@ def devices_with(folder: Path, camera: Camera) -> Devices:
         device.identity(deadline=deadline)
         return ()
 
-    found.camera = DeviceKeeper("camera", "camera", "model", lambda _: camera, look, lambda _: None, every_s=0.0)
+    found.camera = DeviceSupervisor("camera", "camera", "model", lambda _: camera, look, lambda _: None, every_s=0.0)
     return found
 
 

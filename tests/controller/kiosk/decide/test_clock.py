@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.decide.clock import Clockwork, beginning, synchronised
+from controller.kiosk.decide.clock import TrustedClock, beginning, synchronised
 from controller.kiosk.store.event_log import Decision, EventLog
 
 MAY = 1_778_000_000.0
@@ -24,14 +24,14 @@ class Clocks:
     passed_s: float = 0.0
     synchronised: bool = False
     log: EventLog = field(init=False)
-    clockwork: Clockwork = field(init=False)
+    trusted: TrustedClock = field(init=False)
 
     def __post_init__(self) -> None:
         self.boot()
 
     def boot(self) -> None:
         self.log = EventLog(self.folder / "events.sqlite", wall=lambda: self.wall_s, durable=False)
-        self.clockwork = Clockwork(self.log, lambda: self.wall_s, lambda: self.passed_s, lambda: self.synchronised)
+        self.trusted = TrustedClock(self.log, lambda: self.wall_s, lambda: self.passed_s, lambda: self.synchronised)
 
     def reboot(self, *, without_s: float = 0.0) -> None:
         self.log.close()
@@ -40,7 +40,7 @@ class Clocks:
 
     def wait(self, seconds: float) -> float | None:
         self.wall_s, self.passed_s = self.wall_s + seconds, self.passed_s + seconds
-        return self.clockwork.now()
+        return self.trusted.now()
 
     def told(self, code: str) -> list[str]:
         return [row.text for row in self.log.after(0) if row.code == code]
@@ -118,12 +118,12 @@ def test_what_was_believed_outlives_a_boot_into_a_clock_without_battery(clocks: 
 
 
 def test_the_stages_first_time_is_kept(clocks: Clocks) -> None:
-    assert clocks.clockwork.since_s == float("inf")
+    assert clocks.trusted.since_s == float("inf")
     clocks.wait(1.0)
-    assert clocks.clockwork.since_s == MAY + 1.0
+    assert clocks.trusted.since_s == MAY + 1.0
     clocks.wait(DAY_S)
     clocks.reboot()
-    assert clocks.clockwork.since_s == MAY + 1.0
+    assert clocks.trusted.since_s == MAY + 1.0
 
 
 def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
