@@ -103,7 +103,7 @@ class Kiosk(Protocol):
         """What the photographed installed appearances achieved, in the bundle's order."""
 
     def remove_appearance(self, name: str) -> None:
-        """Raises UsageError for the one that is playing, or that the schedule names."""
+        """Raises UsageError if it is playing, or in the schedule."""
 
     def lamp_history(self) -> Sequence[LampDay]:
         """Each lamp's last days, at most 400, oldest first; days without light are omitted."""
@@ -132,7 +132,7 @@ class Kiosk(Protocol):
         """A new file for remote support: events, journals, states; without secrets and pictures. Seconds."""
 
     def settings(self) -> str:
-        """The text of stage.toml, empty when there is none."""
+        """The text of stage.toml, empty if there is none."""
 
     def validate_settings(self, text: str) -> None:
         """Raises UsageError naming line, key and what is allowed."""
@@ -141,7 +141,7 @@ class Kiosk(Protocol):
         """Validate, keep the old text in a copy, write, and apply it (devices are reopened). Raises as above."""
 
     def camera_picture(self) -> bytes | None:
-        """The camera's last live picture as JPEG, made by the kiosk itself; None when there is none."""
+        """The camera's last live picture as JPEG, made by the kiosk itself; None if there is none."""
 
     def runs(self) -> Sequence[str]:
         """Names of the runs that have results, newest first."""

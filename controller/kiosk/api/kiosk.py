@@ -241,7 +241,7 @@ class StageKiosk(FolderKiosk):
     def remove_appearance(self, name: str) -> None:
         service = self.service
         if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
-            raise UsageError("appearance-in-use", what=f"{name} is playing, or the schedule names it.",
+            raise UsageError("appearance-in-use", what=f"{name} is playing, or it is in the schedule.",
                              remedy="Play another one, and remove it from the schedule.")  # fmt: skip
         with service.reconciler.idle():
             settings.remove_picture(self.stage, name)

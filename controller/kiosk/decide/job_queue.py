@@ -158,7 +158,7 @@ class JobQueue:
 
 _CANCELLED: Final = Decision("work-cancelled", "The waiting jobs were cancelled.")
 _TOO_LATE: Final = Decision(
-    "lamps-not-steady", "The job was cancelled because the lamps were not lit and steady in time.",
+    "lamps-not-steady", "The job was cancelled because the lamps were not lit and stable in time.",
     "See the problems of the projectors, or increase power_up_s under [safety].", "error",
 )  # fmt: skip
 

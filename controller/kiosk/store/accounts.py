@@ -53,7 +53,7 @@ class Token:
 
 
 class Accounts:
-    """The accounts of a kiosk, in ``file`` (JSON, mode 0600). Safe to use from several threads.
+    """The accounts of a kiosk, in ``file`` (JSON, mode 0600). Thread-safe.
 
     ``hasher`` argon2id; the default is RFC 9106's low-memory choice, about 50 ms.
     """

@@ -197,12 +197,12 @@ _DARKEN: Final = "Switch the lights off and close the blinds. Other light makes 
 
 def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
     """The row of a projector on the panel."""
-    hours = f"{view.hours:,.0f} h under Velatura, {view.strikes} strikes"
+    hours = f"{view.hours:,.0f} h with Velatura, {view.strikes} strikes"
     values = [LiveValue("Lamp", view.condition.value), LiveValue("Hours", hours)]
     if view.counter_hours is not None:
-        values.append(LiveValue("Its own counter", f"{view.counter_hours:,} h"))
+        values.append(LiveValue("Projector's counter", f"{view.counter_hours:,} h"))
     if view.condition is Condition.LIT and view.stable_left_s > 0:
-        values.append(LiveValue("Steady in", f"{view.stable_left_s:.0f} s"))
+        values.append(LiveValue("Stable in", f"{view.stable_left_s:.0f} s"))
     what, remedy = (None, "") if view.problem is None else (view.problem.reason, view.problem.remedy)
     return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy)
 
@@ -215,7 +215,7 @@ def _look_at_camera(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]
         if status.battery_percent is not None:
             values.append(LiveValue("Battery", f"{status.battery_percent} %"))
         if status.free_pictures is not None:
-            values.append(LiveValue("Room for", f"{status.free_pictures} pictures"))
+            values.append(LiveValue("Space for", f"{status.free_pictures} pictures"))
         if status.warnings:
             values.append(LiveValue("Warnings", ", ".join(status.warnings)))
     return tuple(values)

@@ -267,10 +267,10 @@ class ProjectorSupervisor:
     def _strike_failed(self) -> None:
         self._struck_at_s = None
         self._failed_strikes += 1
+        retried = self._failed_strikes < MOST_STRIKES
         self._tell(Decision(
             "lamp-not-lit", f"The lamp of projector {self.name} was switched on, but gave no light.",
-            "It is tried again when it has rested." if self._failed_strikes < MOST_STRIKES else "It stays off now.",
-            "warning",
+            "It is tried again after its minimum off time." if retried else "It stays off now.", "warning",
         ))  # fmt: skip
 
     def _light_limit_s(self, guard: LampGuard) -> float:
