@@ -115,8 +115,7 @@ def test_messages_and_help_are_plain(folder: str) -> None:
 
 @pytest.mark.parametrize("folder", [*FOLDERS, *PAGES])
 def test_templates_and_pages_are_plain(folder: str) -> None:
-    place = ROOT / folder
-    pages = [path for path in (place, *place.rglob("*")) if path.suffix in (".html", ".md")]
+    pages = [path for path in (ROOT / folder, *(ROOT / folder).rglob("*")) if path.suffix in (".html", ".md")]
     wrong = [
         f"{path.relative_to(ROOT)}:{number}: {fault}"
         for path in sorted(pages)
