@@ -16,12 +16,15 @@ import pytest
 ROOT: Final = Path(__file__).parents[1]
 FOLDERS: Final = (
     "controller/blender", "controller/bundle", "controller/calibrate", "controller/capture", "controller/config",
-    "controller/live", "controller/plan", "controller/play", "controller/report", "controller/study",
-    "plugins/emulated",
+    "controller/kiosk", "controller/live", "controller/panel", "controller/plan", "controller/play",
+    "controller/report", "controller/study", "plugins/emulated",
 )  # fmt: skip
 """Folders whose messages, help and templates are in plain words."""
-PAGES: Final = ("docs/study",)
-"""Folders of docs whose pages are in plain words; docs/decisions keep their wording."""
+PAGES: Final = (
+    "docs/explanation/kiosk.md", "docs/how-to/panel.md", "docs/reference/http-api.md", "docs/study",
+    "docs/tutorials/first-kiosk.md",
+)  # fmt: skip
+"""Pages of docs, and folders of pages, in plain words; docs/decisions keep their wording."""
 LONGEST: Final = 25
 """Words in a sentence of ``what`` and ``remedy``."""
 
@@ -112,7 +115,7 @@ def test_messages_and_help_are_plain(folder: str) -> None:
 
 @pytest.mark.parametrize("folder", [*FOLDERS, *PAGES])
 def test_templates_and_pages_are_plain(folder: str) -> None:
-    pages = [path for path in (ROOT / folder).rglob("*") if path.suffix in (".html", ".md")]
+    pages = [path for path in (ROOT / folder, *(ROOT / folder).rglob("*")) if path.suffix in (".html", ".md")]
     wrong = [
         f"{path.relative_to(ROOT)}:{number}: {fault}"
         for path in sorted(pages)
@@ -122,8 +125,9 @@ def test_templates_and_pages_are_plain(folder: str) -> None:
     assert wrong == []
 
 
-def test_every_folder_exists() -> None:
-    assert [folder for folder in (*FOLDERS, *PAGES) if not (ROOT / folder).is_dir()] == []
+def test_every_folder_and_page_exists() -> None:
+    assert [folder for folder in FOLDERS if not (ROOT / folder).is_dir()] == []
+    assert [page for page in PAGES if not (ROOT / page).exists()] == []
 
 
 def test_faults_are_found() -> None:

@@ -1,1 +1,1 @@
-"""A stage that runs by itself: `interface.Kiosk` is what may be asked of it, `service` is what runs."""
+"""A stage that runs by itself: `interface.Kiosk` is its interface, `service` runs it."""

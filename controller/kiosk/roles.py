@@ -1,4 +1,4 @@
-"""Who may do what: the three roles, and what names and passwords of accounts look like."""
+"""The three roles, and the rules for names and passwords of accounts."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from controller.core.errors import UsageError
 
 ACCOUNT_NAME: Final = r"^[a-z][a-z0-9._-]{0,31}$"
 LONGEST_PASSWORD: Final = 200
-"""Longer ones only cost time to hash."""
+"""Longer passwords only take longer to hash."""
 
 
 class Role(enum.IntEnum):
-    """What an account may do; each role may do all that the ones before it may."""
+    """What an account may do; each role includes the lower ones."""
 
     VIEWER = 1
     OPERATOR = 2

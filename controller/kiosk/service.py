@@ -1,4 +1,4 @@
-"""The kiosk's service: makes the conductor and every keeper from a stage, and runs each in a thread of its own."""
+"""The kiosk's service: makes the reconciler and all supervisors of a stage, and runs each in its own thread."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Final
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
-from controller.kiosk.decide.clock import Clockwork, beginning
+from controller.kiosk.decide.clock import TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, Condition, Request
-from controller.kiosk.decide.reconciler import Conductor, Limits
+from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import DeviceRow, Lamp
-from controller.kiosk.jobs.job_handlers import Kinds
-from controller.kiosk.jobs.job_runner import ThreadWorks
+from controller.kiosk.jobs.job_handlers import JobHandlers
+from controller.kiosk.jobs.job_runner import JobRunner
 from controller.kiosk.store import archive
-from controller.kiosk.store.bundle_store import BundleStock
+from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.photo_retention import TIDY_S, forget_old_photographs
+from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.devices import Devices
-from controller.kiosk.supervisors.keys_supervisor import KeysKeeper
+from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.kiosk.supervisors.lamp_history import LampHistory
 from controller.kiosk.supervisors.player_supervisor import PlayerKeeper
 from controller.play.control.launch import PlayerSettings
@@ -51,22 +51,22 @@ class Service:
         stage = checked.stage
         self.checked, self.log, self.stage = checked, log, stage.folder
         self.runtime = runtime_folder(stage.folder)
-        self.stock = BundleStock(stage.folder, stage_trust(stage))
+        self.bundles = BundleStore(stage.folder, stage_trust(stage))
         self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
         self.player = PlayerKeeper(self.runtime, self._settings, log.tell)
         self.devices = Devices(checked, self.runtime, log.tell)
         self.devices.scene = self._scene
         self.lamp_history = LampHistory(stage.folder)
-        kinds = Kinds(
+        handlers = JobHandlers(
             stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated,
-            open_now=lambda: bool(self.schedule.now.rows) and self.conductor.plan.open is True,
+            open_now=lambda: bool(self.schedule.now.rows) and self.reconciler.plan.open is True,
         )  # fmt: skip
-        self.works = ThreadWorks(kinds.table(), log, number=int(log.value("job") or 0))
+        self.jobs = JobRunner(handlers.table(), log, number=int(log.value("job") or 0))
         safety = stage.tables.safety
-        self.conductor = Conductor(
-            self.devices.projectors, self.player, self.works, self.stock, log,
+        self.reconciler = Reconciler(
+            self.devices.projectors, self.player, self.jobs, self.bundles, log,
             schedule=lambda: self.schedule.now,
-            clock=Clockwork(log, time.time, time.monotonic),
+            clock=TrustedClock(log, time.time, time.monotonic),
             monotonic=time.monotonic,
             without_time=self.schedule.open_without_time,
             limits=Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
@@ -74,25 +74,25 @@ class Service:
         self.changed: Callable[[], None] = lambda: None
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self.keys = self._keys_keeper()
+        self.keys = self._keys_supervisor()
         self._known_runs: tuple[float, bool] = (0.0, False)
 
     def start(self) -> None:
-        """Begin: the player first, so that there are pictures before any device has answered."""
+        """Start; the player first, so that it shows pictures before any device has answered."""
         self.log.tell(beginning(self.log))
         if self.schedule.problem is not None:
             problem = self.schedule.problem
             self.log.tell(Decision(problem.code, problem.what, problem.remedy, "error"))
-        self.conductor.step()
+        self.reconciler.step()
         self._thread("player", self.player.step, STEP_S)
         for projector in self.devices.projectors:
             self._thread(f"projector {projector.name}", projector.step, LOOK_S)
-        for keeper in self.devices.others:
-            self._thread(keeper.name, keeper.step, STEP_S)
+        for supervisor in self.devices.others:
+            self._thread(supervisor.name, supervisor.step, STEP_S)
         if self.keys is not None:
             self._thread("keys", self.keys.step, 2.0)
-        forget_old = partial(forget_old_photographs, self.stage, self.log, time.time)
-        self._thread("old photographs", forget_old, TIDY_S, first_s=TIDY_S)
+        purge_old = partial(purge_old_photographs, self.stage, self.log, time.time)
+        self._thread("old photographs", purge_old, TIDY_S, first_s=TIDY_S)
 
     def run(self, cancel: threading.Event) -> None:
         """Decide, over and over, until ``cancel``. Feeds systemd's watchdog."""
@@ -101,9 +101,9 @@ class Service:
         while not cancel.is_set():
             try:
                 self._decide()
-            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
-                # systemd's watchdog is not fed: what lasts is mended by a new start.
-                what = f"The conductor met an error that Velatura does not know ({type(error).__name__}: {error})."
+            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
+                # The watchdog is not fed, so systemd restarts the service if the error persists.
+                what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
                 self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
                 cancel.wait(AFTER_CRASH_S)
                 continue
@@ -115,17 +115,17 @@ class Service:
         notifier.stopping()
 
     def _decide(self) -> None:
-        self.conductor.step()
+        self.reconciler.step()
         if self.devices.mains is not None:
             self.devices.mains.want_on = self._light_wanted()
-        if self.works.number:
-            self.log.keep("job", str(self.works.number))
+        if self.jobs.number:
+            self.log.keep("job", str(self.jobs.number))
         self.lamp_history.note(self.lamps, date.today())
         self.changed()
 
     def end(self, *, leave_lit: bool) -> None:
-        """Stop the work, cool the lamps (unless they are to stay lit for the next start), and let go of everything."""
-        self.works.close(END_WORK_S)
+        """Cancel the job, cool the lamps (unless ``leave_lit``, for the next start), and close everything."""
+        self.jobs.close(END_WORK_S)
         if not leave_lit:
             self.player.want = BLACK
             for projector in self.devices.projectors:
@@ -139,14 +139,14 @@ class Service:
         self.lamp_history.note(self.lamps, date.today(), now=True)
         self.player.close()
         self.devices.close()
-        self.log.tell(Decision("service-ended", "The kiosk ends."))
+        self.log.tell(Decision("service-ended", "The kiosk has stopped."))
 
     def rows(self) -> tuple[DeviceRow, ...]:
         """Every device as the panel shows it."""
         return (*self.devices.rows(), *(() if self.keys is None else (self.keys.row,)))
 
     def ask(self, *requests: Request) -> None:
-        self.conductor.ask(*requests)
+        self.reconciler.ask(*requests)
 
     # -- inside
 
@@ -155,40 +155,43 @@ class Service:
 
     @property
     def lamps(self) -> tuple[Lamp, ...]:
-        views = [keeper.view for keeper in self.devices.projectors]
-        return tuple(Lamp(one.name, one.hours, one.strikes, one.condition is Condition.LIT) for one in views)
+        views = [supervisor.view for supervisor in self.devices.projectors]
+        return tuple(Lamp(view.name, view.hours, view.strikes, view.condition is Condition.LIT) for view in views)
 
     def _scene(self) -> str | None:
-        """What has lit the object since a while, for the light sensor."""
+        """What has lit the object long enough for the light sensor, or None."""
         shown = self.player.view.shown
-        if self.conductor.machine.state not in (State.PLAYING, State.DEGRADED) or shown is None or not shown.appearance:
+        state = self.reconciler.machine.state
+        if state not in (State.PLAYING, State.DEGRADED) or shown is None or not shown.appearance:
             return None
-        views = [keeper.view for keeper in self.devices.projectors]
+        views = [supervisor.view for supervisor in self.devices.projectors]
         if any(view.coming or (view.shines and view.stable_left_s > 0) for view in views):
             return None
         lit = " ".join(view.name for view in views if view.shines)
         return f"{shown.bundle} {shown.appearance} {lit}"
 
     def _calibrated(self) -> bool:
-        # Asked four times a second while a task is due; opening every journal each time would be a waste.
-        at_s, found = self._known_runs
+        # Called four times a second while a task is due, so the journals are not opened each time.
+        at_s, calibrated = self._known_runs
         if time.monotonic() - at_s > 5.0 or not at_s:
-            found = bool(finished_calibrations(self.stage))
-            self._known_runs = time.monotonic(), found
-        return found
+            calibrated = bool(finished_calibrations(self.stage))
+            self._known_runs = time.monotonic(), calibrated
+        return calibrated
 
     def _light_wanted(self) -> bool:
-        machine = self.conductor.machine.state
-        return machine not in (State.OFF, State.COOLING) or any(one.want_lit for one in self.devices.projectors)
+        machine = self.reconciler.machine.state
+        return machine not in (State.OFF, State.COOLING) or any(
+            projector.want_lit for projector in self.devices.projectors
+        )
 
     def _wait_until_dark(self) -> None:
         until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
         while any(one.may_light for one in self.devices.projectors) and time.monotonic() < until_s:
             time.sleep(0.1)
-        names = [one.name for one in self.devices.projectors if one.view.maybe_lit]
+        names = [projector.name for projector in self.devices.projectors if projector.view.maybe_lit]
         if names:
             self.log.tell(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
-                                   "Switch it off by its remote control.", "error"))  # fmt: skip
+                                   "Switch it off with its remote control.", "error"))  # fmt: skip
 
     def _thread(self, name: str, step: Callable[[], None], every_s: float, *, first_s: float = 0.0) -> None:
         def loop() -> None:
@@ -196,8 +199,8 @@ class Service:
             while not self._stop.is_set():
                 try:
                     step()
-                except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
-                    what = f"{name} met an error that Velatura does not know ({type(error).__name__}: {error})."
+                except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
+                    what = f"{name} met an unexpected error ({type(error).__name__}: {error})."
                     self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
                     self._stop.wait(AFTER_CRASH_S)
                 self._stop.wait(every_s)
@@ -206,7 +209,7 @@ class Service:
         self._threads.append(thread)
         thread.start()
 
-    def _keys_keeper(self) -> KeysKeeper | None:
+    def _keys_supervisor(self) -> KeysSupervisor | None:
         table = self.checked.stage.tables.key_panel
         if table is None:
             return None
@@ -217,13 +220,13 @@ class Service:
                 assert panel is not None
                 yield panel
 
-        presses = (self.conductor.open, self.conductor.shut, self._recalibrate)
-        return KeysKeeper(table.driver, opened, presses, lambda: self.conductor.machine.state, self.log.tell)
+        presses = (self.reconciler.open, self.reconciler.shut, self._recalibrate)
+        return KeysSupervisor(table.driver, opened, presses, lambda: self.reconciler.machine.state, self.log.tell)
 
     def _recalibrate(self) -> None:
-        # A refusal is in the log; the key has nothing to show it on.
+        # The log has the refusal; a key can't show it.
         with contextlib.suppress(WorkError):
-            self.conductor.ask(Request("quick", light=True))
+            self.reconciler.ask(Request("quick", light=True))
 
 
 @contextlib.contextmanager
@@ -248,7 +251,7 @@ def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) ->
         with contextlib.closing(log):
             service = Service(checked, log)
             ended = threading.Event()
-            loop = threading.Thread(target=service.run, args=(ended,), name="conductor", daemon=True)
+            loop = threading.Thread(target=service.run, args=(ended,), name="reconciler", daemon=True)
             try:
                 service.start()
                 loop.start()

@@ -1,4 +1,4 @@
-"""``velatura init``: from the devices that are plugged in to a first stage.toml."""
+"""``velatura init``: writes a first stage.toml for the devices that are plugged in."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from controller.run.progress import Silent
 from controller.services.bundle import make_key
 
 Ask = Callable[[str, str], str]
-"""A question and what is suggested -> the answer."""
+"""Question and suggested answer -> answer."""
 USUAL_FOCAL_LENGTH_PX: Final = 5000.0
 
 
 def set_up(
     folder: Path, *, name: str | None, focal_length_px: float | None, ask: Ask, tools: Tools | None = None
 ) -> dict[str, Any]:
-    """Search, ask for names, make the signing key, and write stage.toml; what was written, in words.
+    """Search devices, ask for names, make the signing key, and write stage.toml; returns what was written.
 
-    Raises UsageError("stage-exists"), ("doctor-not-enough") when too little is plugged in, and as ``load_stage`` for
-    answers that make no stage (nothing is left behind then).
+    Raises UsageError("stage-exists"), ("doctor-not-enough") if devices are missing, and as ``load_stage`` for
+    answers that are not a valid stage (then no file remains).
     """
     file = folder / FILE
     if file.exists():
-        raise UsageError("stage-exists", what=f"{file} is there already.",
-                         remedy="Edit it, or let `velatura doctor --write` add what is new.")  # fmt: skip
-    seen = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event(), tools=tools)
-    content, words = new_stage(folder, seen)
-    content["stage"]["name"] = name or ask("What is the object called?", folder.resolve().name)
+        raise UsageError("stage-exists", what=f"{file} exists already.",
+                         remedy="Edit it, or run `velatura doctor --write` to add new devices.")  # fmt: skip
+    examination = examine(stage=None, write_it=False, reporter=Silent(), cancel=threading.Event(), tools=tools)
+    content, words = new_stage(folder, examination)
+    content["stage"]["name"] = name or ask("Name of the object?", folder.resolve().name)
     for number, projector in enumerate(content["projectors"], 1):
-        asked = f"What is projector {number} ({projector['driver']}, output {projector['output']}) called?"
-        projector["name"] = ask(asked, projector["name"])
+        question = f"Name of projector {number} ({projector['driver']}, output {projector['output']})?"
+        projector["name"] = ask(question, projector["name"])
     camera = content["camera"]
     if focal_length_px is None and "focal_length_px" not in camera:
-        focal_length_px = _number(ask("The lens's focal length in pixels?", f"{USUAL_FOCAL_LENGTH_PX:g}"))
+        focal_length_px = _number(ask("Focal length of the camera lens in pixels?", f"{USUAL_FOCAL_LENGTH_PX:g}"))
     if focal_length_px is not None:
         camera["focal_length_px"] = focal_length_px
     folder.mkdir(parents=True, exist_ok=True)
@@ -59,4 +59,6 @@ def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError as error:
-        raise UsageError("not-a-number", what=f"{text[:40]!r} is not a number.", remedy="Write one.") from error
+        raise UsageError(
+            "not-a-number", what=f"{text[:40]!r} is not a number.", remedy="Enter a number, for example 5000."
+        ) from error

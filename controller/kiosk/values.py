@@ -1,6 +1,6 @@
-"""The values that a kiosk gives and takes: what the panel shows, the API answers, and the command line prints.
+"""The values of a kiosk's interface: shown by the panel, returned by the API, printed by the command line.
 
-Every text may hold what a device or a file said: it is hostile, and whoever shows it escapes it.
+Any text may come from a device or a file, so it is untrusted: escape it where it is shown.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Unsubscribe = Callable[[], None]
 
 @dataclass(frozen=True, slots=True)
 class LiveValue:
-    """One value of a device in words: label "Lamp", text "1,204 h"."""
+    """One value of a device as text: label "Lamp", text "1,204 h"."""
 
     label: str
     text: str
@@ -50,11 +50,11 @@ class JobStep:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Work that is going on, or that ended last (``ended`` True).
+    """The job that is running, or the last one that ended (``ended`` True).
 
-    ``number`` grows with every job; ``left_s`` None until it can be told; ``run`` the run's folder name where the job
-    makes one; ``outcome`` a sentence when it ended, with ``failed`` when it did not do what was asked; ``count`` how
-    many steps it will have, 0 until that is known, and ``steps`` those up to the present one
+    ``number`` grows with every job; ``left_s`` None until it is known; ``run`` the run's folder name if the job
+    makes one; ``outcome`` a sentence when it ended, with ``failed`` if it failed; ``count`` the number of steps it will
+    have, 0 until that is known; ``steps`` those up to the current one
     """
 
     number: int
@@ -71,7 +71,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class NextEvent:
-    """The next thing that the schedule does: ``what`` "opens", "closes", "drift check", ...; ``at_unix_s`` seconds."""
+    """The next scheduled event: ``what`` "opens", "closes", "drift check", ...; ``at_unix_s`` seconds."""
 
     what: str
     at_unix_s: float
@@ -88,7 +88,7 @@ class BundleIdentity:
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """``hours`` lit and ``strikes`` as counted; ``life_hours`` what the maker promises, or None."""
+    """``hours`` lit and ``strikes`` as counted; ``life_hours``: the maker's rated life, or None."""
 
     projector: str
     hours: float
@@ -99,7 +99,7 @@ class Lamp:
 
 @dataclass(frozen=True, slots=True)
 class LampDay:
-    """A lamp at the end of one day (local date, "2026-12-24"): ``hours`` lit and ``strikes`` as counted by then."""
+    """A lamp at the end of one day (local date, "2026-12-24"): ``hours`` lit and ``strikes`` as counted then."""
 
     projector: str
     day: str
@@ -109,10 +109,10 @@ class LampDay:
 
 @dataclass(frozen=True, slots=True)
 class Grade:
-    """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False where the older one stayed.
+    """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False if the older one stays in use.
 
     ``delta_e`` is the largest of the newest median colour differences (CIEDE2000) of the appearances that were solved
-    on this calibration, None where none was photographed.
+    on this calibration, None if none was photographed.
     """
 
     run: str
@@ -129,9 +129,9 @@ class KioskState:
     """Everything that the panel's first page shows, as of one moment.
 
     ``state`` is a value of ``controller.run.state_machine.State``; ``reason`` one sentence; ``since_unix_s`` when it
-    began. ``warnings``: sentences on what is wrong with no device (light in the room); ``failures``: work that failed,
-    as the event log has it, until somebody has seen it. ``revision`` grows with every change, also over restarts of the
-    service. ``needs_setup`` is True while the stage has no valid stage.toml.
+    began. ``warnings``: sentences on problems that belong to no device (light in the room); ``failures``: failed jobs,
+    as in the event log, until an operator confirms them. ``revision`` grows with every change, also over restarts of
+    the service. ``needs_setup`` is True while the stage has no valid stage.toml.
     """
 
     revision: int
@@ -154,7 +154,7 @@ class KioskState:
 
 @dataclass(frozen=True, slots=True)
 class EventRow:
-    """One line of the event log; numbers grow by one and never begin anew."""
+    """One line of the event log; numbers grow by one and never start again."""
 
     number: int
     unix_s: float
@@ -166,7 +166,7 @@ class EventRow:
 @dataclass(frozen=True, slots=True)
 class Appearance:
     """A solved appearance; ``preview`` is a PNG of how the object will look, or None. ``delta_e``: the newest of its
-    ``Comparison``, None where it was never photographed.
+    ``Comparison``, None if it was never photographed.
     """
 
     name: str
@@ -178,7 +178,7 @@ class Appearance:
 
 @dataclass(frozen=True, slots=True)
 class Achieved:
-    """How near a photograph of one appearance came to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
+    """How close the photograph of an appearance is to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
     percentile of the colour difference (CIEDE2000), ``rmse`` of the target's white, ``sharpness`` 0..1.
     """
 
@@ -194,7 +194,7 @@ class Achieved:
 class Comparison:
     """What one installed appearance achieves: ``history`` newest first, at least one, and the newest one's pictures.
 
-    Names in use: "before", "target", "achieved", "error", "resolution"; files that the kiosk made itself (JPEG).
+    Keys: "before", "target", "achieved", "error", "resolution"; files that the kiosk made itself (JPEG).
     """
 
     name: str
@@ -207,7 +207,7 @@ class ScheduleRow:
     """Opening hours of one weekday ("mon".."sun") or of one date ("2026-12-24", which takes precedence over weekdays).
 
     ``opens`` and ``closes`` are local times "HH:MM"; both empty means closed. ``closes`` at or before ``opens`` is on
-    the next day. ``appearance`` empty: what was played last.
+    the next day. ``appearance`` empty: the last one.
     """
 
     day: str
@@ -248,11 +248,10 @@ class ProjectorAim:
 class Aiming:
     """What the aiming page shows. Shares are of the object's area in the camera's picture, 0..1.
 
-    ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing`` where nothing can be done;
-    ``camera_focus`` 0..1, and ``exposure`` the brightest hundredth's level, 0..1 of full scale: measured by test shots
-    alone, None without; ``hints`` sentences on
-    what to turn which way; ``source`` "test shots", "calibration", or empty where nothing was measured yet (there are
-    no projectors then); ``picture`` an overview that the kiosk drew (PNG), or None
+    ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing``: shares that can't be used;
+    ``camera_focus`` 0..1, and ``exposure`` the level of the brightest 1 %, 0..1 of full scale: None without test shots;
+    ``hints`` sentences on what to change; ``source`` "test shots", "calibration", or empty if nothing was measured yet
+    (``projectors`` is empty then); ``picture`` an overview that the kiosk drew (PNG), or None
     """
 
     projectors: tuple[ProjectorAim, ...] = ()
@@ -269,7 +268,7 @@ class Aiming:
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A device that a search found: ``key`` names it to ``try_device``; ``table`` is its text for stage.toml."""
+    """A device that a search found: ``key`` identifies it for ``try_device``; ``table`` is its text for stage.toml."""
 
     key: str
     kind: str
@@ -280,7 +279,7 @@ class FoundDevice:
 
 @dataclass(frozen=True, slots=True)
 class TriedDevice:
-    """What came of trying a device: ``works``, and a sentence in either case (the remedy in it)."""
+    """The result of trying a device: ``works``, and a sentence in both cases (with the remedy)."""
 
     works: bool
     what: str
@@ -290,7 +289,7 @@ class TriedDevice:
 class Results:
     """Pictures of one run, as files the kiosk made itself (PNG or JPEG), by name.
 
-    Names in use: "before", "target", "achieved", "error", "resolution". ``figures`` are (label, value text).
+    Keys: "before", "target", "achieved", "error", "resolution". ``figures`` are (label, value text).
     """
 
     run: str

@@ -1,3 +1,3 @@
-"""The technician's web panel and the HTTP API; web only, everything else is asked of `controller.kiosk`. Entry:
-`app`, `server`.
+"""The technician's web panel and the HTTP API. It contains only web code and uses `controller.kiosk` for the rest.
+Entry points: `app`, `server`.
 """

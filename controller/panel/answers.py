@@ -1,4 +1,4 @@
-"""From a request to checked values, and from an operation's answer to a response: shared by forms, pictures and API."""
+"""Converts requests to checked values, and results of operations to responses; shared by forms, pictures and API."""
 
 from __future__ import annotations
 
@@ -21,19 +21,18 @@ from controller.panel.context import Panel
 from hal.errors import DeviceError
 
 FAILURES: Final = (VelaturaError, DeviceError)
-"""What a kiosk's refusal may be: both trees say what happened and what to do."""
+"""The errors of a kiosk; both have code, what and remedy."""
 
 Failure = VelaturaError | DeviceError
 
 NOT_KEPT: Final = "upload-not-kept"
 INCOMING: Final = "incoming"
-"""Folder of the panel: uploads, while they come and until they are taken."""
+"""The panel's folder for uploads until they are used."""
 
 
 def status_of(error: Failure) -> int:
-    """404 for what is not there, 422 for what is wrong, 409 for what can't be now, 502 for a device that failed.
-
-    507 for an upload that the disk did not take.
+    """404: does not exist; 422: wrong request; 409: not possible now; 502: a device failed; 507: an upload could not be
+    saved.
     """
     if error.code == NOT_KEPT:
         return 507
@@ -49,7 +48,7 @@ def failure(error: Failure) -> Response:
 
 
 async def run(panel: Panel, operation: Operation, values: Values) -> Any:
-    """Do an operation in a thread, with the files of uploaded targets for their keys. Raises what it raises."""
+    """Run an operation in a thread; keys of uploaded targets become their files. Raises what it raises."""
     targets = [field.name for field in operation.fields if field.kind == "target"]
 
     def do() -> Any:
@@ -60,7 +59,7 @@ async def run(panel: Panel, operation: Operation, values: Values) -> Any:
 
 
 def response(operation: Operation, answer: Any, values: Values) -> Response:
-    """Raises UsageError("picture-unknown") where there is no picture."""
+    """Raises UsageError("picture-unknown") if there is no picture."""
     kind = operation.answer
     if kind is Answer.NOTHING:
         return JSONResponse({"done": True})
@@ -73,7 +72,7 @@ def response(operation: Operation, answer: Any, values: Values) -> Response:
             raise UsageError(
                 "picture-unknown",
                 what="The camera shows no picture now.",
-                remedy="Look at the camera's line on the first page.",
+                remedy="See the camera in the list of devices on the first page.",
             )
         return Response(answer, media_type=kind.media)
     if kind is Answer.PICTURE:
@@ -86,12 +85,12 @@ def response(operation: Operation, answer: Any, values: Values) -> Response:
 def _picture(path: Path | None) -> Response:
     types = {".png": "image/png", ".jpg": "image/jpeg"}
     if path is None or path.suffix not in types or not path.is_file():
-        raise UsageError("picture-unknown", what="There is no such picture.", remedy="Load the page again.")
+        raise UsageError("picture-unknown", what="This picture does not exist.", remedy="Load the page again.")
     return FileResponse(path, media_type=types[path.suffix])
 
 
 def plain(value: Any) -> Any:
-    """Values as JSON has them; paths are left out: they mean nothing outside this machine."""
+    """Values as JSON, without paths, which mean nothing outside this machine."""
     if is_dataclass(value) and not isinstance(value, type):
         return {key: plain(inner) for key, inner in asdict(value).items() if not isinstance(inner, Path)}
     if isinstance(value, dict):
@@ -102,12 +101,12 @@ def plain(value: Any) -> Any:
 
 
 def scalar_values(operation: Operation, request: Request) -> Values:
-    """The values in the path and after the question mark. Raises UsageError."""
+    """The values in the path and the query. Raises UsageError."""
     path = [field for field in operation.fields if operation.where(field) == "path"]
     query = [field for field in operation.fields if operation.where(field) == "query"]
     sent = request.query_params
     if len(sent.multi_items()) != len(sent):
-        raise UsageError("field-wrong", what="A field was sent twice.", remedy="Send each field once.")
+        raise UsageError("field-wrong", what="A field was sent more than once.", remedy="Send each field once.")
     return parse(path, request.path_params, strings=True) | parse(query, sent, strings=True)
 
 
@@ -130,7 +129,7 @@ async def json_values(operation: Operation, request: Request) -> Values:
 
 
 async def body_file(request: Request, folder: Path) -> Path:
-    """The request's whole body as a private temporary file, which the caller removes. Raises as ``not_kept`` says."""
+    """The request's body as a private temporary file, which the caller deletes. Raises the error of ``not_saved``."""
     path = None
     try:
         path = temporary(folder)
@@ -141,14 +140,14 @@ async def body_file(request: Request, folder: Path) -> Path:
         if path is not None:
             path.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise not_kept(error) from error
+            raise not_saved(error) from error
         raise
     return path
 
 
-def not_kept(error: OSError) -> WorkError:
-    """What the disk did not take of an upload."""
-    return WorkError(NOT_KEPT, what=f"The file could not be kept: {error.strerror}.",
+def not_saved(error: OSError) -> WorkError:
+    """The error for an upload that could not be saved."""
+    return WorkError(NOT_KEPT, what=f"The file could not be saved: {error.strerror}.",
                      remedy="Free some space on the disk, and send it again.")  # fmt: skip
 
 
@@ -161,5 +160,5 @@ def temporary(folder: Path) -> Path:
 
 
 def fields_from_path(operation: Operation) -> tuple[Field, ...]:
-    """All but an upload, as fields of a form: a form sends names of the path in its body."""
+    """All fields except an upload; a form sends the fields of the path in its body."""
     return tuple(field for field in operation.fields if field.kind != "file")

@@ -1,4 +1,4 @@
-"""The API: the table of operations as JSON with tokens, its OpenAPI document, and the figures for Prometheus."""
+"""The HTTP API: the table of operations as JSON with tokens, its OpenAPI document, and Prometheus metrics."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ERROR: Final = {"$ref": "#/components/responses/Error"}
 
 
 def entries(panel: Panel) -> list[Entry]:
-    """All routes for machines."""
+    """The routes of the API."""
     table = [Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op)) for op in panel.operations]
     table.append(Entry("GET", PREFIX + "/openapi.json", "token", Role.VIEWER, _document(panel.operations)))
     table.append(Entry("GET", "/metrics", "token", Role.VIEWER, _metrics(panel)))
@@ -34,7 +34,7 @@ def entries(panel: Panel) -> list[Entry]:
 
 
 def body_limits(panel: Panel) -> dict[str, int]:
-    """Bytes that the uploads take."""
+    """The largest uploads in bytes, by path."""
     images, restore = panel.options.uploads.most_bytes, panel.options.most_restore_bytes
     return {
         PREFIX + "/targets": images,
@@ -85,7 +85,7 @@ def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
         "info": {
             "title": "Velatura",
             "version": "1",
-            "description": "All that the panel shows and does. Tokens are made on its page of accounts.",
+            "description": "All operations of the panel. Make tokens on its page Accounts.",
         },
         "servers": [{"url": PREFIX}],
         "security": [{"token": []}],
@@ -97,7 +97,7 @@ def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
                     "description": "What happened, and what to do",
                     "content": {"application/json": {"schema": error}},
                 },
-                "Plain": {"description": "Refused before it was read", "content": {"text/plain": {}}},
+                "Plain": {"description": "Refused before the body was read", "content": {"text/plain": {}}},
             },
         },
     }
@@ -133,18 +133,18 @@ def _described(operation: Operation) -> dict[str, Any]:
 
 
 class KioskFigures(Collector):
-    """The kiosk's state as Prometheus has it, read when it is asked for."""
+    """The kiosk's state as Prometheus metrics, read at each request."""
 
     def __init__(self, panel: Panel) -> None:
         self._panel = panel
 
     def collect(self) -> Iterator[Metric]:
         now = self._panel.kiosk.snapshot()
-        state = GaugeMetricFamily("velatura_state", "1 for the present state", labels=["state"])
+        state = GaugeMetricFamily("velatura_state", "1 for the current state", labels=["state"])
         for possible in State:
             state.add_metric([possible.value], float(now.state == possible.value))
         yield state
-        playing = InfoMetricFamily("velatura_playing", "What is on the projectors")
+        playing = InfoMetricFamily("velatura_playing", "The appearance that is playing")
         playing.add_metric([], {"appearance": now.playing})
         yield playing
         problems = GaugeMetricFamily(
@@ -154,7 +154,7 @@ class KioskFigures(Collector):
             problems.add_metric([device.name, device.kind], float(device.problem is not None))
         yield problems
         hours = GaugeMetricFamily("velatura_lamp_hours", "Hours that a lamp was lit", labels=["projector"])
-        strikes = GaugeMetricFamily("velatura_lamp_strikes", "How often a lamp was struck", labels=["projector"])
+        strikes = GaugeMetricFamily("velatura_lamp_strikes", "How often a lamp was switched on", labels=["projector"])
         for lamp in now.lamps:
             hours.add_metric([lamp.projector], lamp.hours)
             strikes.add_metric([lamp.projector], float(lamp.strikes))
@@ -164,8 +164,10 @@ class KioskFigures(Collector):
         yield GaugeMetricFamily(
             "velatura_job_running", "1 while a job runs", float(now.job is not None and not now.job.ended)
         )
-        yield GaugeMetricFamily("velatura_job_done_ratio", "Mean share done of the job's steps", done)
-        yield GaugeMetricFamily("velatura_open_panels", "Panels that follow live", float(self._panel.hub.listening))
+        yield GaugeMetricFamily("velatura_job_done_ratio", "Progress of the job, the mean of its steps", done)
+        yield GaugeMetricFamily(
+            "velatura_open_panels", "Open panels with live updates", float(self._panel.hub.listening)
+        )
 
 
 def _metrics(panel: Panel) -> Endpoint:

@@ -1,4 +1,4 @@
-"""The panel as one Starlette application: a table of routes, and nothing outside it."""
+"""The panel as a Starlette application with one table of routes."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ def make_panel(
 ) -> Starlette:
     """The panel of ``kiosk``, ready to be served.
 
-    ``accounts.first_start()`` belongs to the caller, who shows the one-time password where technicians look. The
-    table of routes is at ``.state.entries``, the panel's parts at ``.state.panel``.
+    The caller calls ``accounts.first_start()`` and shows the one-time password. The table of routes is at
+    ``.state.entries``, the panel's parts at ``.state.panel``.
     """
     options.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    # Of those who were uploading when the service was killed; a backup may have gigabytes.
+    # Remains of uploads when the service was killed; a backup may have gigabytes.
     shutil.rmtree(options.folder / answers.INCOMING, ignore_errors=True)
     drawing = Drawing()
 
     def draw() -> dict[str, str]:
-        # A stage that is not set up yet may have no schedule.
+        # A stage that is not set up may have no schedule.
         with contextlib.suppress(*FAILURES):
             drawing.use_zone(kiosk.schedule().time_zone)
         return drawing.parts(kiosk.snapshot(), list(kiosk.events()))
@@ -90,13 +90,11 @@ def make_panel(
 
 
 def _routes(panel: Panel, table: list[Entry]) -> list[Route]:
-    """One route a path, so that a wrong method is answered with those that there are. Longer paths do not hide behind
-    names.
-    """
+    """One route per path, so that a wrong method is answered with the allowed ones."""
     by_path: dict[str, dict[str, Entry]] = {}
     for entry in table:
         if by_path.setdefault(entry.path, {}).setdefault(entry.method, entry) is not entry:
-            raise ValueError(f"{entry.method} {entry.path} stands twice in the table of routes")
+            raise ValueError(f"{entry.method} {entry.path} is twice in the table of routes")
     return [_route(panel, path, entries) for path, entries in by_path.items()]
 
 
@@ -142,7 +140,7 @@ async def _too_large(_: Request, __: Exception) -> Response:
 
 
 async def _http_problem(request: Request, error: Exception) -> Response:
-    """An address that is not in the table: back to the front for people, a plain refusal for machines."""
+    """An unknown path: redirect browsers to the first page, and answer other clients with the error."""
     assert isinstance(error, HTTPException)
     if error.status_code == 404 and request.method == "GET" and "text/html" in request.headers.get("accept", ""):
         return RedirectResponse("/", 303)

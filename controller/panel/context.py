@@ -1,4 +1,4 @@
-"""What every part of the panel works with: the kiosk, who may log in, what was uploaded, how it is set up."""
+"""What the parts of the panel share: kiosk, accounts, uploads and options."""
 
 from __future__ import annotations
 
@@ -26,11 +26,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class PanelOptions:
-    """How the panel is set up.
+    """The settings of the panel.
 
-    ``folder`` private files of the panel (accounts, sessions, uploads). ``hosts`` the names under which browsers may
-    reach it, without port: a page of another name that resolves to us is refused. Loopback by default; with
-    ``tls_certificate`` and ``tls_key`` (PEM files) it speaks TLS only, and cookies never leave it.
+    ``folder``: private files of the panel (accounts, sessions, uploads). ``hosts``: the allowed host names, without
+    port. Loopback by default; with ``tls_certificate`` and ``tls_key`` (PEM files) it uses only TLS, also for cookies.
     """
 
     folder: Path
@@ -52,7 +51,7 @@ class PanelOptions:
 
 @dataclass(slots=True)
 class Panel:
-    """One panel with everything it holds."""
+    """The parts of one panel."""
 
     kiosk: Kiosk
     accounts: Accounts
@@ -62,10 +61,10 @@ class Panel:
     hub: Hub
     operations: Sequence[Operation] = OPERATIONS
     by_address: LoginLimit = field(default_factory=LoginLimit)
-    # Wide, so that nobody can lock a technician out by typing wrong passwords elsewhere.
+    # High, so that wrong passwords from elsewhere can't lock a technician out.
     by_account: LoginLimit = field(default_factory=lambda: LoginLimit(burst=50))
     by_token: LoginLimit = field(default_factory=lambda: LoginLimit(burst=20, refill_s=5.0))
-    # Argon2 takes 64 MiB each: two at a time are enough for people.
+    # Each Argon2 hash needs 64 MiB, so only two run at a time.
     hashing: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(2))
     costly: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
     working: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(16))
@@ -73,10 +72,10 @@ class Panel:
 
     @property
     def holders(self) -> dict[str, Any]:
-        """Who does the operations."""
+        """The holders of the operations."""
         accounts = AccountActions(lambda: self.accounts, self.sessions.end_all, self.costly)
         return {"kiosk": self.kiosk, "accounts": accounts, "targets": self.targets}
 
     async def ask(self, question: Callable[[], T]) -> T:
-        """The kiosk's answer, got in a thread: it is not asynchronous."""
+        """Call ``question`` in a thread, because the kiosk is not asynchronous."""
         return await anyio.to_thread.run_sync(question, limiter=self.working)

@@ -1,8 +1,7 @@
-"""The process that decodes one uploaded picture and ends: bytes on its input, our own PNG on its output.
+"""A process that decodes one uploaded picture: bytes on standard input, a new PNG on standard output.
 
-Runs as a file of its own with ``python -I``: it imports nothing of the controller, so there is nothing in its memory
-to steal. Exit codes: 0 done; 3 not a picture that we take; 4 too many pixels. A crash, or a limit of the system, is
-any other.
+Runs with ``python -I`` and imports nothing of the controller, so that its memory contains no secrets. Exit codes:
+0 done; 3 not an accepted picture; 4 too many pixels; any other: a crash or a limit of the system.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ NOT_A_PICTURE, TOO_MANY_PIXELS = 3, 4
 
 
 def limit(memory_bytes: int, seconds: int) -> None:
-    """From now on this process has so much memory and processor time, and can write no file and start no process."""
+    """Limit memory and processor time of this process; it then can't write files or start processes."""
     resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
@@ -30,10 +29,10 @@ def limit(memory_bytes: int, seconds: int) -> None:
 
 
 def decode(data: bytes, most_pixels: int) -> bytes:
-    """``data`` as PNG: RGB, 8 bit, turned as its EXIF says, without any metadata. Raises ValueError, OSError,
+    """``data`` as PNG: RGB, 8 bit, rotated by its EXIF data, without metadata. Raises ValueError, OSError,
     SyntaxError.
 
-    Of 16 bits the higher ones are kept. A picture of floats, or of 32 bits, says nowhere what is white: ValueError.
+    Of 16 bits the upper 8 are kept. Floats and 32 bits have no defined white: ValueError.
     """
     from PIL import Image, ImageOps
 
@@ -42,7 +41,7 @@ def decode(data: bytes, most_pixels: int) -> bytes:
         if picture.width * picture.height > most_pixels:
             raise SystemExit(TOO_MANY_PIXELS)
         plain = _eight_bits(ImageOps.exif_transpose(picture)).convert("RGB")
-    # A fresh picture of the bare pixels: nothing else of the file can come along.
+    # A new picture made only from the pixels, so that nothing else of the file is copied.
     clean = Image.frombytes("RGB", plain.size, plain.tobytes())
     out = io.BytesIO()
     clean.save(out, "PNG", compress_level=1)
@@ -50,7 +49,7 @@ def decode(data: bytes, most_pixels: int) -> bytes:
 
 
 def _eight_bits(picture: Image.Image) -> Image.Image:
-    """Pillow itself would take every 16-bit grey above 255 for white."""
+    """Pillow would clip 16-bit grey at 255."""
     from PIL import Image
 
     if picture.mode in ("I", "F"):

@@ -1,4 +1,4 @@
-"""Server-sent events: every change is drawn once, whoever many panels are open."""
+"""Server-sent events: each change is rendered once, however many panels are open."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import anyio
 KEEP_ALIVE_S: Final = 15.0
 QUEUED: Final = 8
 AGAIN_S: Final = 1.0
-"""After a drawing that failed."""
+"""Pause after a failed rendering."""
 _LOG: Final = logging.getLogger("velatura.panel")
 
 Draw = Callable[[], dict[str, str]]
 
 
 class Hub:
-    """Draws the live parts after a change, at most ``frames_per_s`` times a second, and hands them to all open panels.
+    """Renders the live parts after a change, at most ``frames_per_s`` times a second, for all open panels.
 
-    ``draw`` returns the HTML of each part by name; it runs in a thread. Lives on one event loop, from ``run`` on;
-    ``changed`` may be called from any thread.
+    ``draw`` returns the HTML of each part by name; it runs in a thread. Use it on the event loop of ``run``; only
+    ``changed`` and ``end`` may be called from any thread.
     """
 
     def __init__(self, draw: Draw, *, frames_per_s: float, most: int) -> None:
@@ -41,13 +41,13 @@ class Hub:
         return len(self._listeners)
 
     def changed(self) -> None:
-        """Something changed; returns at once."""
+        """Report a change; returns at once."""
         loop = self._loop
         if loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(self._dirty.set)
 
     def end(self) -> None:
-        """End the streams of all open panels; from any thread. Their pages ask again, of the next start."""
+        """End the streams of all open panels. Their pages reconnect after the next start."""
         loop = self._loop
         if loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(self._end)
@@ -58,7 +58,7 @@ class Hub:
             _put(queue, ": the service ends\n\n")
 
     async def run(self) -> None:
-        """Draw after every change, until cancelled. Costs nothing while nobody looks."""
+        """Render after every change, until cancelled; does nothing while no panel is open."""
         self._loop = asyncio.get_running_loop()
         self._dirty.set()
         while True:
@@ -67,18 +67,18 @@ class Hub:
             if self._listeners:
                 try:
                     await self._redraw()
-                except Exception:  # noqa: BLE001 - one bad drawing must not end the live parts for good
-                    _LOG.exception("The live parts could not be drawn.")
-                    # What has changed is not drawn yet, and nobody says so again.
+                except Exception:  # noqa: BLE001 - one failure must not end the live updates
+                    _LOG.exception("The live parts could not be rendered.")
+                    # The change is not shown yet, and will not be reported again.
                     self._dirty.set()
                     await asyncio.sleep(AGAIN_S)
             await asyncio.sleep(self._pause_s)
 
     async def _redraw(self) -> None:
         async with self._drawing:
-            await self._draw_and_tell()
+            await self._draw_and_send()
 
-    async def _draw_and_tell(self) -> None:
+    async def _draw_and_send(self) -> None:
         parts = await anyio.to_thread.run_sync(self._draw)
         changed = {name: html for name, html in parts.items() if self._parts.get(name) != html}
         self._parts = parts
@@ -92,15 +92,15 @@ class Hub:
         return f"id: {self._number}\nevent: parts\ndata: {json.dumps(parts)}\n\n"
 
     async def stream(self, alive: Callable[[], bool]) -> AsyncIterator[str]:
-        """The events of one open panel: all at first, then what changes, until ``alive`` says no (logged out)."""
+        """The events of one panel: first all parts, then the changed ones, until ``alive`` is false (logged out)."""
         if len(self._listeners) >= self._most:
             yield "retry: 10000\nevent: full\ndata: {}\n\n"
             return
         queue: asyncio.Queue[str] = asyncio.Queue(QUEUED)
-        # Before the drawing, or nobody would look when something changes meanwhile, and it would stay unseen.
+        # Before rendering, so that a change in the meantime is sent, too.
         self._listeners.add(queue)
         try:
-            # Those who look already are told too: what is sent later is compared with what was drawn last.
+            # All open panels get it, because later changes are computed against the last rendering.
             await self._redraw()
             _empty(queue)
             yield "retry: 1000\n" + self._message(self._parts)
@@ -114,7 +114,7 @@ class Hub:
 
 
 def _put(queue: asyncio.Queue[str], message: str) -> None:
-    """A panel that does not read is dropped back to the newest: it will ask again when it wakes up."""
+    """A panel that does not read its events is asked to reload."""
     if queue.full():
         _empty(queue)
         message = "event: reload\ndata: {}\n\n"

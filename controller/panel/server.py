@@ -1,4 +1,4 @@
-"""Serving the panel: loopback and plain by default, TLS by configuration."""
+"""Serves the panel: plain HTTP on loopback by default, TLS if configured."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ START_S = 10.0
 
 
 class PanelServer:
-    """The panel in a thread of its own, beside the supervisor. ``start`` and ``stop`` once each."""
+    """Serves the panel in its own thread. Call ``start`` and ``stop`` once each."""
 
     def __init__(self, app: Starlette, options: PanelOptions) -> None:
         """Raises UsageError("panel-open-without-tls") for an address beyond this machine without TLS."""
@@ -36,7 +36,7 @@ class PanelServer:
             access_log=False,
             ws="none",
             server_header=False,
-            # A header of a stranger must not decide whom the limits count.
+            # A client's header must not decide which address the login limits count.
             proxy_headers=False,
             timeout_keep_alive=20,
             timeout_graceful_shutdown=1,
@@ -47,14 +47,14 @@ class PanelServer:
         self._thread = threading.Thread(target=self._run, name="panel", daemon=True)
 
     def _run(self) -> None:
-        # How uvicorn says that it could not listen; ``start`` says it to people.
+        # Uvicorn's signal that it could not listen; ``start`` reports it.
         with contextlib.suppress(SystemExit):
             self._server.run()
 
     def start(self) -> str:
-        """Begin to serve; return the address.
+        """Start serving; returns the address.
 
-        Raises WorkError("panel-port-taken") when another program listens there, and ("panel-not-started").
+        Raises WorkError("panel-port-taken") if another program listens there, and ("panel-not-started").
         """
         check_port(self._options.host, self._options.port)
         self._thread.start()
@@ -67,14 +67,14 @@ class PanelServer:
         return f"{'https' if self._options.tls else 'http'}://{self._options.host}:{port}/"
 
     def stop(self) -> None:
-        """End, also for panels that are open: their pages find the next start by themselves."""
+        """Stop, and disconnect open panels; their pages reconnect after the next start."""
         self._app.state.panel.hub.end()
         self._server.should_exit = True
         self._thread.join(START_S)
 
 
 def check_exposure(options: PanelOptions) -> None:
-    """Raises UsageError("panel-open-without-tls"): passwords must not cross a network in the clear."""
+    """Raises UsageError("panel-open-without-tls"): passwords must not cross a network unencrypted."""
     try:
         loopback = ipaddress.ip_address(options.host).is_loopback
     except ValueError:
@@ -83,12 +83,12 @@ def check_exposure(options: PanelOptions) -> None:
         raise UsageError(
             "panel-open-without-tls",
             what=f"The panel would be reachable at {options.host} without TLS.",
-            remedy="Give it a certificate and a key, or let it listen on 127.0.0.1 and use a tunnel.",
+            remedy="Set --certificate and --key, or use the address 127.0.0.1 and a tunnel.",
         )
 
 
 def check_port(host: str, port: int) -> None:
-    """Raises WorkError("panel-port-taken" or "panel-not-started") where nothing can listen; uvicorn only logs why."""
+    """Raises WorkError("panel-port-taken" or "panel-not-started"); uvicorn only logs why."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(family) as trial:
@@ -98,8 +98,8 @@ def check_port(host: str, port: int) -> None:
         if error.errno == errno.EADDRINUSE:
             raise WorkError(
                 "panel-port-taken",
-                what=f"Another program listens on port {port} of {host}, so the panel can't.",
-                remedy=f"End it, or give another port: --panel {host}:{port % 65535 + 1}.",
+                what=f"Port {port} of {host} is used by another program.",
+                remedy=f"Stop that program, or choose another port: --panel {host}:{port % 65535 + 1}.",
             ) from error
         raise _not_started(host, port, error.strerror) from error
 
@@ -109,5 +109,5 @@ def _not_started(host: str, port: int, why: str | None = None) -> WorkError:
     return WorkError(
         "panel-not-started",
         what=f"The panel could not listen on {host}, port {port}{detail}.",
-        remedy="Give an address of this machine and a port from 1024: --panel HOST:PORT.",
+        remedy="Use an address of this machine and a port of 1024 or higher: --panel HOST:PORT.",
     )

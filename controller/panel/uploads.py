@@ -1,4 +1,4 @@
-"""Uploaded pictures: decoded in a process of their own, kept and served only as we encoded them again."""
+"""Uploaded pictures: decoded in a separate process; only the new encoding is stored and served."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from controller.kiosk.values import Fit
 from controller.panel import decoder
 
 Fitted = Callable[[Path, Fit], bytes]
-"""The PNG of a file as one of the camera's view."""
+"""Fits a PNG file to the camera's view."""
 
 
 @dataclass(frozen=True, slots=True)
 class UploadLimits:
-    """``most_bytes`` of the file as it comes; pixels, memory and time of its decoding."""
+    """``most_bytes`` of the uploaded file; pixels, memory and time for decoding it."""
 
     most_bytes: int = 64 << 20
     most_pixels: int = 40_000_000
@@ -32,9 +32,9 @@ class UploadLimits:
 
 
 def decode_picture(file: Path, limits: UploadLimits) -> bytes:
-    """The picture in ``file`` as a PNG that we made (RGB, 8 bit, no metadata).
+    """The picture in ``file``, encoded again as PNG (RGB, 8 bit, no metadata).
 
-    Raises UsageError("picture-refused") for anything but a PNG, JPEG, TIFF or WebP that decodes within ``limits``, and
+    Raises UsageError("picture-refused") unless it is a PNG, JPEG, TIFF or WebP that decodes within ``limits``, and
     UsageError("picture-too-large") for one with too many pixels.
     """
     command = [sys.executable, "-I", str(Path(decoder.__file__))]
@@ -57,7 +57,7 @@ def decode_picture(file: Path, limits: UploadLimits) -> bytes:
         raise UsageError(
             "picture-too-large",
             what=f"The picture has more than {limits.most_pixels / 1e6:.0f} million pixels.",
-            remedy="Make it smaller; more than the camera's own resolution is of no use.",
+            remedy="Scale it down. The resolution of the camera is enough.",
         )
     if done.returncode != 0 or not done.stdout.startswith(b"\x89PNG"):
         raise _refused()
@@ -68,12 +68,12 @@ def _refused() -> UsageError:
     return UsageError(
         "picture-refused",
         what="The file could not be read as a picture.",
-        remedy="Save it as PNG or JPEG and upload it again.",
+        remedy="Save it as PNG or JPEG, and upload it again.",
     )
 
 
 class Targets:
-    """Uploaded targets, as our own PNG files in ``folder``; the newest ``most`` are kept."""
+    """Uploaded targets as PNG files in ``folder``; the newest ``most`` are kept."""
 
     def __init__(
         self,
@@ -84,8 +84,8 @@ class Targets:
         fitted: Fitted = lambda file, fit: file.read_bytes(),
     ) -> None:
         self._folder, self._limits, self._most, self._fitted = folder, limits, most, fitted
-        # One at a time: the limits hold for all uploads together.
-        self._one = threading.Lock()
+        # One upload at a time, so that the limits hold for all together.
+        self._decoding = threading.Lock()
 
     @property
     def limits(self) -> UploadLimits:
@@ -96,7 +96,7 @@ class Targets:
 
         Raises as ``decode_picture``.
         """
-        with self._one:
+        with self._decoding:
             png = decode_picture(uploaded, self._limits)
             key = secrets.token_hex(12)
             file = self._folder / f"{key}.png"
@@ -111,5 +111,5 @@ class Targets:
         """Raises UsageError("target-unknown")."""
         file = self._folder / f"{key}.png"
         if not re.fullmatch(TARGET_KEY, key) or not file.is_file():
-            raise UsageError("target-unknown", what="This target is not there any more.", remedy="Upload it again.")
+            raise UsageError("target-unknown", what="This target no longer exists.", remedy="Upload it again.")
         return file

@@ -163,16 +163,16 @@ class NinetyDays:
             # After a clock was ahead, the kiosk's time stands still until the truth has caught up.
             self._excuse(lasts_s + max(0.0, wrong_s) + REPAIR_S, kind)
         elif kind == "drift":
-            self.kiosk.works.drifted = True
+            self.kiosk.jobs.drifted = True
         elif kind == "player":
             self.kiosk.player.hung_at_s = self.now_s
         else:
-            self.kiosk.works.camera = False
-            self.mends.append((self.now_s + hours * 3600, lambda: setattr(self.kiosk.works, "camera", True)))
+            self.kiosk.jobs.camera = False
+            self.mends.append((self.now_s + hours * 3600, lambda: setattr(self.kiosk.jobs, "camera", True)))
 
     def _new_lamp(self, lamp: object) -> None:
         setattr(lamp, "dud", False)  # noqa: B010 - the knob of a model
-        for keeper in self.kiosk.keepers:
+        for keeper in self.kiosk.supervisors:
             keeper.forgive()
 
     def _right_clock(self) -> None:
@@ -214,7 +214,7 @@ class NinetyDays:
             self.account.minutes["open" if truly else "closed"] += 1
         elif at_s - self.changed_s <= SETTLING_S:
             self.account.minutes["opening or closing"] += 1
-        elif not truly and self.kiosk.conductor.plan.open is False and self._checking():
+        elif not truly and self.kiosk.reconciler.plan.open is False and self._checking():
             self.account.minutes["nightly check"] += 1
         elif at_s <= self.excused_until_s:
             self.account.minutes[f"excused: {self.why}"] += 1
@@ -224,13 +224,13 @@ class NinetyDays:
             self.account.minutes["every lamp dead"] += 1
         else:
             self.account.unaccounted.append(
-                f"{local:%Y-%m-%d %H:%M} {state.value} {self.kiosk.conductor.machine.reason}"
+                f"{local:%Y-%m-%d %H:%M} {state.value} {self.kiosk.reconciler.machine.reason}"
             )
 
     def _checking(self) -> bool:
         """A check that finds a lamp dark is given up, and the lamps are cooled."""
         begun_s = self.heard.get("task-due", -1e9)
-        return self.kiosk.conductor.working or self.kiosk.state is State.COOLING or self.now_s - begun_s < SETTLING_S
+        return self.kiosk.reconciler.working or self.kiosk.state is State.COOLING or self.now_s - begun_s < SETTLING_S
 
 
 def live(folder: Path, *, days: float, start: datetime, seed: int) -> Account:

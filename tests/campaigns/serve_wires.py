@@ -73,14 +73,14 @@ def reach(kiosk: WiredKiosk, step: str) -> None:
     def state(*wanted: State) -> None:
         assert kiosk.until(lambda: kiosk.state in wanted, REACH_S), f"{step} was not reached: {kiosk.state.value}"
 
-    conductor = kiosk.service.conductor
+    reconciler = kiosk.service.reconciler
     if step in ("off", "powering", "warming", "cooling"):
-        conductor.shut()
+        reconciler.shut()
         state(State.COOLING, State.OFF)
     if step in ("off", "powering", "warming"):
         state(State.OFF)
     if step in ("powering", "warming"):
-        conductor.open()
+        reconciler.open()
         state(State.POWERING, State.WARMING)
     if step == "warming":
         state(State.WARMING, State.READY, State.PLAYING)
@@ -89,7 +89,7 @@ def reach(kiosk: WiredKiosk, step: str) -> None:
         state(State.DEGRADED)
     if step == "calibrating":
         assert kiosk.until(lambda: kiosk.service.devices.missing_for_work() is None, REACH_S), "nothing to work with"
-        conductor.ask(Request("full", light=True))
+        reconciler.ask(Request("full", light=True))
         state(State.CALIBRATING)
 
 
@@ -122,17 +122,17 @@ def mend(kiosk: WiredKiosk, fault: Fault) -> None:
     fault.mend(kiosk)
     mend_usb(kiosk)
     mend_projectors(kiosk)
-    kiosk.service.conductor.open()
+    kiosk.service.reconciler.open()
 
 
 def _end_the_work(kiosk: WiredKiosk) -> None:
-    if kiosk.until(lambda: not kiosk.service.conductor.working, WORK_S):
+    if kiosk.until(lambda: not kiosk.service.reconciler.working, WORK_S):
         return
     try:
-        kiosk.service.conductor.cancel()
+        kiosk.service.reconciler.cancel()
     except WorkError:
         return  # it ended by itself meanwhile
-    assert kiosk.until(lambda: not kiosk.service.conductor.working, SETTLE_S), "the work can't be cancelled"
+    assert kiosk.until(lambda: not kiosk.service.reconciler.working, SETTLE_S), "the work can't be cancelled"
 
 
 def _explained(kiosk: WiredKiosk, before: int) -> None:

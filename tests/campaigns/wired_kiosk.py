@@ -197,16 +197,16 @@ class WiredKiosk:
 
     @property
     def silent_s(self) -> float:
-        """Since the conductor's last step."""
+        """Since the reconciler's last step."""
         return time.monotonic() - self._beaten_s
 
     @property
     def state(self) -> State:
-        return self.service.conductor.machine.state
+        return self.service.reconciler.machine.state
 
     @property
     def reason(self) -> str:
-        return self.service.conductor.machine.reason
+        return self.service.reconciler.machine.reason
 
     def signal_player(self, number: signal.Signals) -> None:
         for pid in children(os.getpid()):

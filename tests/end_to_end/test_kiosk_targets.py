@@ -34,7 +34,7 @@ def kiosk(finished_demo: FinishedDemo, tmp_path: Path) -> Iterator[StageKiosk]:
     kiosk = StageKiosk(stage)
     kiosk.attach(Service(check_stage(stage), log))
     yield kiosk
-    kiosk.service.works.close(60)
+    kiosk.service.jobs.close(60)
     log.close()
 
 
@@ -43,12 +43,12 @@ def ended(kiosk: StageKiosk, job: Job) -> Job:
     service, done = kiosk.service, threading.Event()
 
     def look() -> bool:
-        service.conductor.step()
+        service.reconciler.step()
         service.changed()
         known = kiosk.job(job.number)
         if known is not None and known.ended:
             # What follows from it is another test's.
-            with_more = service.conductor.working
+            with_more = service.reconciler.working
             if with_more:
                 kiosk.cancel()
             else:

@@ -1,3 +1,3 @@
-"""The kiosk as its callers see it: over the running service (`kiosk`), by its socket (`control`), or with no
-service running (`offline_dispatch`).
+"""How callers use a kiosk: the running service (`kiosk`), its socket (`control`), or the folder without a
+service (`offline_dispatch`).
 """

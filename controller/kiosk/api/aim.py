@@ -1,4 +1,4 @@
-"""What the camera sees, how well the projectors cover the object, and what a target asks too much of."""
+"""What the camera sees, how well the projectors cover the object, and where a target can't be reached."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from controller.calibrate.values import Geometry
 
 GRAZING: Final = 0.25
-"""Cosine of the angle to the normal, below which light grazes."""
+"""Below this cosine of the angle to the surface normal, light is grazing."""
 LEAST_COVERAGE, SOFT_FOCUS, MUCH = 0.5, 0.4, 0.1
 DIM, BURNT = 0.25, 0.98
 DARK = 0.1
-"""Below this share of the median light of the object, a place is too dark to work with."""
+"""Below this share of the object's median light, a place is too dark."""
 FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
-"""As ``controller.steps.capture.aiming`` writes them, which is not loaded before there is something to photograph."""
+"""Names as in ``controller.steps.capture.aiming``, which is loaded only to photograph."""
 MAPS, MAPS_KEPT = "kiosk/feasibility", 20
 _ANSWER_S = 5.0
 _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
@@ -46,13 +46,13 @@ _lock = threading.Lock()
 
 
 def camera_picture(devices: Devices) -> bytes | None:
-    """The camera's live picture, decoded and encoded anew, as JPEG; None without live view, or while it works."""
+    """The camera's live picture, decoded and encoded again, as JPEG; None without live view, or while a job uses it."""
     import cv2
 
     if not devices.camera.lent.acquire(timeout=0.5):
         return None
     try:
-        # Not before it is ours: its keeper may let go of it and open it anew meanwhile.
+        # Only with the lock: before that, its supervisor may close and reopen it.
         camera = devices.camera.device
         if not isinstance(camera, LiveViewCamera) or not camera.capabilities.live_view:
             return None
@@ -69,9 +69,9 @@ def camera_picture(devices: Devices) -> bytes | None:
 
 
 def aiming(checked: Checked) -> Aiming:
-    """Coverage, overlap and focus by the newest test shots, or by the calibration where that is newer or alone.
+    """Coverage, overlap and focus from the test shots or the calibration, whichever is newer.
 
-    Where that one can't be read, by the test shots that there are; without any, the hint says what is wrong.
+    If the calibration can't be read, from the test shots; without any, the hint says what is wrong.
     """
     folder = checked.stage.folder
     shots = _of_shots(folder / FOLDER)
@@ -79,14 +79,14 @@ def aiming(checked: Checked) -> Aiming:
         run = next(iter(finished_calibrations(folder)), None)
         if run is None or (shots is not None and shots.measured_unix_s > began_s(run.name)):
             return shots or Aiming()
-        return _remembered(run, checked.names)
+        return _cached(run, checked.names)
     except VelaturaError as error:
         return shots or Aiming(hints=(f"{error.what} {error.remedy}",))
     except _UNREADABLE as error:
-        return shots or Aiming(hints=(f"The calibration can't be read ({type(error).__name__}). Calibrate anew.",))
+        return shots or Aiming(hints=(f"The calibration can't be read ({type(error).__name__}). Calibrate again.",))
 
 
-def _remembered(run: Path, names: Sequence[str]) -> Aiming:
+def _cached(run: Path, names: Sequence[str]) -> Aiming:
     from controller.artefacts.calibrated import Calibrated
 
     with _lock:
@@ -100,25 +100,25 @@ def _of_shots(folder: Path) -> Aiming | None:
     try:
         return _judged(folder, json.loads((folder / FIGURES).read_text()))
     except _UNREADABLE:
-        # New ones are taken in seconds; damaged ones must not keep anybody from the page where that is asked for.
+        # Damaged shots must not block the page on which new ones are taken in seconds.
         return None
 
 
-def _judged(folder: Path, found: dict[str, Any]) -> Aiming:
-    aims = tuple(ProjectorAim(**row) for row in found["projectors"])
-    exposure, camera = found["exposure"], found["camera_focus"]
-    hints = [*_hints(aims), *_shared_hints(found["too_dark"], found["too_soft"])]
+def _judged(folder: Path, figures: dict[str, Any]) -> Aiming:
+    aims = tuple(ProjectorAim(**row) for row in figures["projectors"])
+    exposure, camera = figures["exposure"], figures["camera_focus"]
+    hints = [*_hints(aims), *_shared_hints(figures["too_dark"], figures["too_soft"])]
     if exposure < DIM or exposure > BURNT:
         word = "dark" if exposure < DIM else "bright"
-        hints.append(f"The camera's picture is too {word}: change its aperture, or the ISO in stage.toml.")
+        hints.append(f"The camera's picture is too {word}: change the aperture, or the ISO in stage.toml.")
     if camera < SOFT_FOCUS:
         hints.append("No pattern is sharp anywhere: focus the camera first.")
-    return Aiming(aims, found["overlap"], found["too_dark"], found["too_soft"], camera, exposure, tuple(hints),
-                  "test shots", found["measured_unix_s"], folder / PICTURE)  # fmt: skip
+    return Aiming(aims, figures["overlap"], figures["too_dark"], figures["too_soft"], camera, exposure, tuple(hints),
+                  "test shots", figures["measured_unix_s"], folder / PICTURE)  # fmt: skip
 
 
 def _hints(aims: Sequence[ProjectorAim]) -> list[str]:
-    hints = [f"{aim.projector} lights {aim.coverage:.0%} of the object: turn it, or move it further away."
+    hints = [f"{aim.projector} lights {aim.coverage:.0%} of the object: turn it, or move it farther away."
              for aim in aims if aim.coverage < LEAST_COVERAGE]  # fmt: skip
     return hints + [f"{aim.projector} is out of focus." for aim in aims if aim.focus < SOFT_FOCUS]
 
@@ -126,18 +126,16 @@ def _hints(aims: Sequence[ProjectorAim]) -> list[str]:
 def _shared_hints(dark: float, grazing: float) -> list[str]:
     hints = []
     if dark > MUCH:
-        hints.append(f"{dark:.0%} of the object is too dark: turn a projector towards it, or clear what shades it.")
+        hints.append(f"{dark:.0%} of the object is too dark: turn a projector towards it, or remove obstacles.")
     if grazing > MUCH:
-        hints.append(
-            f"Light grazes, or is soft, on {grazing:.0%} of the object: move a projector more to the front of it."
-        )
+        hints.append(f"Light is grazing or soft on {grazing:.0%} of the object: move a projector further to the front.")
     return hints
 
 
 def _of_calibration(calibrated: Calibrated) -> Aiming:
     transport, calibration = calibrated.transport, calibrated.calibration
     mask = calibration.object_mask
-    lit = np.stack([np.asarray(one, bool) & mask for one in transport.lit])
+    lit = np.stack([np.asarray(part, bool) & mask for part in transport.lit])
     white = sum(np.asarray(part.white, np.float32).mean(axis=2) for part in calibration.projectors)
     on_object = np.asarray(white)[mask]
     usual = float(np.median(on_object)) if on_object.size else 1.0
@@ -147,7 +145,7 @@ def _of_calibration(calibrated: Calibrated) -> Aiming:
         covariance = part.metapixels.covariance_px2[part.metapixels.valid]
         size_px = float(np.sqrt(np.median(covariance[:, 0] + covariance[:, 2]) / 2)) if len(covariance) else np.inf
         pitch_px = float(np.sqrt(max(1, int(lit[number].sum())) / max(1, len(covariance))))
-        # A sharp pixel's light has a standard deviation of about a third of the distance to the next.
+        # The light of a sharp pixel has a standard deviation of about a third of the pixel pitch.
         focus = float(np.clip(pitch_px / max(3 * size_px, 1e-6), 0, 1))
         aims.append(ProjectorAim(part.name, float(lit[number].sum() / area), focus))
     dark = float((on_object < DARK * usual).mean()) if on_object.size else 0.0
@@ -159,7 +157,7 @@ def _of_calibration(calibrated: Calibrated) -> Aiming:
 
 
 def grazing_share(geometry: Geometry, lit: npt.NDArray[np.bool_], mask: Mask) -> float:
-    """The share of the object that is lit, and by no projector steeper than ``GRAZING`` (a cosine)."""
+    """The share of the object that is lit only at cosines below ``GRAZING``."""
     steepest = np.zeros(mask.shape)
     for part, pinhole in zip(lit, geometry.projectors, strict=True):
         centre_m = -pinhole.rotation.T @ pinhole.translation_m
@@ -178,7 +176,7 @@ def read_geometry_of(calibrated: Calibrated) -> Geometry:
 
 
 def feasibility_map(stage: Path, target: Path) -> Path:
-    """A PNG of how far the target is out of reach; the newest ``MAPS_KEPT`` stay on the disk.
+    """A PNG that shows how far the target is out of reach; the newest ``MAPS_KEPT`` are kept.
 
     Raises UsageError("not-calibrated", "target-unreadable"), WorkError("no-space").
     """
@@ -195,23 +193,23 @@ def feasibility_map(stage: Path, target: Path) -> Path:
     transport, black = calibrated.transport, calibrated.calibration.black
     size_px = (black.shape[1], black.shape[0])
     with tempfile.TemporaryDirectory() as folder:
-        # EXR is made for this view by whoever renders it.
+        # An EXR is rendered for this view already.
         whole = target if target.suffix.lower() == ".exr" else Path(folder) / "target.png"
         if whole != target:
             whole.write_bytes(fitted(target.read_bytes(), size_px))
-        asked = load_target(whole, size_px)
-    exposure = choose_exposure(transport, asked.image, black, share=checked.stage.tables.solve.exposure_share)
-    found = feasibility(transport, np.float32(exposure) * asked.image, black)
-    worst = np.maximum(found.too_bright, found.too_dark).max(axis=2)
-    grey = np.where(calibrated.calibration.object_mask & asked.mask, np.clip(worst, 0, 1), 0)
+        wanted = load_target(whole, size_px)
+    exposure = choose_exposure(transport, wanted.image, black, share=checked.stage.tables.solve.exposure_share)
+    reach = feasibility(transport, np.float32(exposure) * wanted.image, black)
+    worst = np.maximum(reach.too_bright, reach.too_dark).max(axis=2)
+    grey = np.where(calibrated.calibration.object_mask & wanted.mask, np.clip(worst, 0, 1), 0)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Whole or not at all: somebody may ask for the same one at the same time.
+    # Atomically: another caller may request the same map at the same time.
     write_atomically(path, cv2.imencode(".png", (255 * grey).astype(np.uint8))[1].tobytes())
     return path
 
 
 def _keep_newest(folder: Path, most: int) -> None:
-    """Every target that somebody uploads gets a map of its own, for months."""
-    with contextlib.suppress(FileNotFoundError):  # somebody else does the same at the same time
+    """Each uploaded target gets its own map, so a kiosk would collect them for months."""
+    with contextlib.suppress(FileNotFoundError):  # another caller may do the same
         for _, file in sorted((file.stat().st_mtime_ns, file) for file in folder.glob("*.png"))[:-most]:
             file.unlink()

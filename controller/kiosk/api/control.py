@@ -1,4 +1,4 @@
-"""The kiosk's own socket: the command line asks a running kiosk by JSON lines, as it asks the player (mode 0600)."""
+"""The kiosk's socket (mode 0600): the command line talks to a running kiosk in JSON lines, as it does to the player."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ NAME: Final = "kiosk.sock"
 LONGEST_LINE: Final = 1 << 20
 MOST_CONNECTIONS: Final = 16
 AGAIN_S: Final = 1.0
-"""After a connection that the system did not give us: too many open files pass, and nobody begins this thread anew."""
+"""Pause after a failed accept: too many open files is a passing state, and this thread is not restarted."""
 Operation = Callable[..., Any]
 
 
 class ControlServer:
-    """Serves ``operations`` by name; each gets the request's other keys as arguments. Use as a context manager."""
+    """Serves ``operations`` by name; the request's other keys are the arguments. Use as a context manager."""
 
     def __init__(self, path: Path, operations: Mapping[str, Operation]) -> None:
         self._operations = dict(operations)
         self._path = path
         self._ended = threading.Event()
         self._places = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        path.unlink(missing_ok=True)  # the stage's lock says that nobody else serves here
+        path.unlink(missing_ok=True)  # the stage's lock ensures that this is the only server
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         before = os.umask(0o177)
         try:
@@ -84,17 +84,19 @@ class ControlServer:
             request = json.loads(line)
             operation = self._operations[request.pop("op")]
         except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
-            return _error("request-wrong", "The kiosk does not know this request.", "See docs/reference/http-api.md.")
+            return _error("request-wrong", "The request is unknown.", "See docs/reference/http-api.md.")
         try:
             return {"ok": True, "result": plain(operation(**request))}
         except (VelaturaError, DeviceError) as error:
             return _error(error.code, error.what, error.remedy)
         except TypeError as error:
-            return _error("request-wrong", f"The request does not fit: {error}.", "See docs/reference/http-api.md.")
+            return _error(
+                "request-wrong", f"The arguments of the request are wrong: {error}.", "See docs/reference/http-api.md."
+            )
         except OSError as error:
-            return _error("cannot-write", f"A file could not be used: {error}.", "See what the disk says.")
-        except Exception as error:  # noqa: BLE001 - the last boundary of this thread: the asker is told, and it goes on
-            what = f"The kiosk met an error that it does not know ({type(error).__name__}: {error})."
+            return _error("cannot-write", f"A file could not be used: {error}.", "Check the disk and its free space.")
+        except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it answers and continues
+            what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
             return _error("crash", what, "Export the diagnostics.")
 
 
@@ -103,7 +105,7 @@ def _error(code: str, what: str, remedy: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """As JSON has it: dataclasses become objects, paths texts, tuples lists, bytes base64."""
+    """As JSON: dataclasses become objects, paths strings, tuples lists, and bytes base64."""
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, Mapping):
@@ -123,9 +125,9 @@ def is_running(stage: Path) -> bool:
 
 
 def ask(stage: Path, op: str, *, timeout_s: float = 30.0, **arguments: Any) -> Any:
-    """Ask the running kiosk of ``stage``.
+    """Send a request to the running kiosk of ``stage`` and return its result.
 
-    Raises UsageError("not-serving") where none runs, and VelaturaError with the kiosk's own code and sentences.
+    Raises UsageError("not-serving") if none runs, and VelaturaError with the kiosk's own code and sentences.
     """
     try:
         with _connected(stage, timeout_s) as channel, channel.makefile("rwb") as lines:
@@ -141,7 +143,7 @@ def ask(stage: Path, op: str, *, timeout_s: float = 30.0, **arguments: Any) -> A
     if not answer.get("ok"):
         problem = answer.get("error") or {
             "code": "not-serving",
-            "what": "The kiosk ended.",
+            "what": "The kiosk stopped before it answered.",
             "remedy": "Start it again.",
         }
         raise VelaturaError(problem["code"], what=problem["what"], remedy=problem["remedy"])

@@ -1,4 +1,4 @@
-"""What the doctor finds on a kiosk, and the devices that a search finds for a new one."""
+"""The doctor's findings on a kiosk, and the device search for a new one."""
 
 from __future__ import annotations
 
@@ -27,25 +27,24 @@ _LISTS: Final = ("projectors", "relays")
 
 
 def findings(stage: Path, service: Service | None, *, tools: Tools | None = None) -> Sequence[Finding]:
-    """What is wrong: the devices' own problems, the disk, and what the buses say."""
-    found = []
+    """Problems of the devices, the player, the disk and the buses."""
+    problems = []
     for row in () if service is None else service.rows():
         if row.problem is not None:
-            found.append(Finding("error", f"{row.kind} {row.name}", row.problem, row.remedy))
+            problems.append(Finding("error", f"{row.kind} {row.name}", row.problem, row.remedy))
     if service is not None and service.player.view.problem is not None:
         problem = service.player.view.problem
-        found.append(Finding("error", "player", problem.reason, problem.remedy))
+        problems.append(Finding("error", "player", problem.reason, problem.remedy))
     if service is not None and service.player.view.warning is not None:
         warning = service.player.view.warning
-        found.append(Finding("warning", "player", warning.reason, warning.remedy))
+        problems.append(Finding("warning", "player", warning.reason, warning.remedy))
     if shutil.disk_usage(stage).free < LOW_DISK_BYTES:
-        found.append(Finding("warning", "disk", "Less than 2 GiB are free on the stage's disk.",
-                             "Delete old runs or backups; playback goes on, calibrating may not."))  # fmt: skip
-    seen = _search(tools)
-    for one in seen.findings:
-        found.append(Finding("warning", printable(one.device or "bus"), printable(one.problem.what),
-                             printable(one.problem.remedy)))  # fmt: skip
-    return found
+        problems.append(Finding("warning", "disk", "Less than 2 GiB are free on the stage's disk.",
+                                "Delete old runs or backups. Playback continues; calibration may fail."))  # fmt: skip
+    for item in _search(tools).findings:
+        problems.append(Finding("warning", printable(item.device or "bus"), printable(item.problem.what),
+                                printable(item.problem.remedy)))  # fmt: skip
+    return problems
 
 
 def _search(tools: Tools | None) -> Examination:
@@ -54,36 +53,35 @@ def _search(tools: Tools | None) -> Examination:
 
 def find(stage: Path, *, tools: Tools | None = None) -> Sequence[FoundDevice]:
     """Every device of every bus, with its table for stage.toml."""
-    seen = _search(tools)
-    return [_found(one) for one in seen.found]
+    return [_row(device) for device in _search(tools).found]
 
 
-def _found(one: Found) -> FoundDevice:
-    table = _TABLES.get(one.kind, one.kind)
+def _row(device: Found) -> FoundDevice:
+    table = _TABLES.get(device.kind, device.kind)
     text = ""
-    if one.driver:
-        content = {"driver": one.driver, **one.settings}
+    if device.driver:
+        content = {"driver": device.driver, **device.settings}
         text = toml_text({table: [content] if table in _LISTS else content})
-    return FoundDevice(f"{one.bus}:{one.address}", one.kind, one.driver, printable(one.what), text)
+    return FoundDevice(f"{device.bus}:{device.address}", device.kind, device.driver, printable(device.what), text)
 
 
 def try_device(stage: Path, key: str, *, tools: Tools | None = None) -> TriedDevice:
-    """Open the device and ask it who it is; changes nothing."""
-    seen = _search(tools)
-    one = next((one for one in seen.found if f"{one.bus}:{one.address}" == key), None)
-    if one is None:
-        return TriedDevice(False, "It is not there any more. Plug it in and search again.")
-    if not one.driver:
-        return TriedDevice(False, "Nobody knows what drives it. Write its table into stage.toml by hand.")
+    """Open the device and read its identity; changes nothing."""
+    device = next((device for device in _search(tools).found if f"{device.bus}:{device.address}" == key), None)
+    if device is None:
+        return TriedDevice(False, "The device was not found any more. Plug it in and search again.")
+    if not device.driver:
+        return TriedDevice(False, "No driver is known for this device. Write its table into stage.toml by hand.")
     try:
         drivers = tools.drivers if tools is not None and tools.drivers is not None else load_drivers(benches=False)
-        driver = drivers.get(one.kind, one.driver)
-        opened = open_device(driver, dict(one.settings), OpenContext(stage=stage), in_seconds(20.0))
+        driver = drivers.get(device.kind, device.driver)
+        opened = open_device(driver, dict(device.settings), OpenContext(stage=stage), in_seconds(20.0))
     except (DeviceError, VelaturaError) as error:
         return TriedDevice(False, f"{error.what} {error.remedy}")
     try:
-        who = opened.identity(deadline=in_seconds(10.0))
-        return TriedDevice(True, f"It answers: {printable(f'{who.maker} {who.model} {who.serial}'.strip())}.")
+        identity = opened.identity(deadline=in_seconds(10.0))
+        text = printable(f"{identity.maker} {identity.model} {identity.serial}".strip())
+        return TriedDevice(True, f"The device answers: {text}.")
     except (DeviceError, VelaturaError) as error:
         return TriedDevice(False, f"{error.what} {error.remedy}")
     finally:

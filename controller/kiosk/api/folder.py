@@ -1,4 +1,4 @@
-"""What can be done on a stage's folder, with or without a running kiosk."""
+"""The operations that need only the stage's folder, and no running kiosk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from controller.config import load_stage
 from controller.kiosk.interface import Appearance, Comparison, EventRow, LampDay, Results, Schedule
 from controller.kiosk.store import archive, runs, settings
-from controller.kiosk.store.bundle_store import BundleStock
+from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.lamp_history import LampHistory
@@ -18,8 +18,9 @@ from controller.stage.check import check_stage
 
 
 class FolderKiosk:
-    """The methods of the operations that are declared ``offline``, for a caller that holds the stage's lock where they
-    change something. See ``controller.kiosk.interface.Kiosk`` for what each does.
+    """The methods of the ``offline`` operations; those that change something need the stage's lock.
+
+    See ``controller.kiosk.interface.Kiosk`` for what each does.
     """
 
     def __init__(self, stage: Path) -> None:
@@ -30,10 +31,10 @@ class FolderKiosk:
             return log.after(after)
 
     def appearances(self) -> Sequence[Appearance]:
-        return appearances_of(self._stock(), self.comparisons(), playing="")
+        return appearances_of(self._bundles(), self.comparisons(), playing="")
 
     def comparisons(self) -> Sequence[Comparison]:
-        return runs.comparisons(self.stage, self._stock().names())
+        return runs.comparisons(self.stage, self._bundles().names())
 
     def lamp_history(self) -> Sequence[LampDay]:
         return LampHistory(self.stage).days()
@@ -53,7 +54,7 @@ class FolderKiosk:
         return self._schedule().now
 
     def set_schedule(self, schedule: Schedule) -> None:
-        self._schedule().replace(schedule, self._stock().names())
+        self._schedule().replace(schedule, self._bundles().names())
 
     def settings(self) -> str:
         return settings.text(self.stage)
@@ -73,21 +74,21 @@ class FolderKiosk:
     def diagnostics(self) -> Path:
         return archive.diagnostics(self.stage, {"state": "no kiosk runs"})
 
-    def _stock(self) -> BundleStock:
-        return BundleStock(self.stage, stage_trust(load_stage(self.stage)))
+    def _bundles(self) -> BundleStore:
+        return BundleStore(self.stage, stage_trust(load_stage(self.stage)))
 
     def _schedule(self) -> ScheduleFile:
         return ScheduleFile(self.stage, load_stage(self.stage).tables.schedule)
 
 
-def appearances_of(stock: BundleStock, compared: Sequence[Comparison], *, playing: str) -> tuple[Appearance, ...]:
-    """Those of the installed bundle, in its order; ``playing``: the name of the one on the projectors, or empty."""
-    index = stock.index(stock.bundle())
+def appearances_of(bundles: BundleStore, compared: Sequence[Comparison], *, playing: str) -> tuple[Appearance, ...]:
+    """The appearances of the installed bundle, in its order. ``playing``: the name of the one that plays, or empty."""
+    index = bundles.index(bundles.bundle())
     if index is None:
         return ()
-    made, previews = float(index.created_unix_s), stock.previews()
-    errors = {one.name: one.history[0].delta_e for one in compared}
+    made, previews = float(index.created_unix_s), bundles.previews()
+    errors = {comparison.name: comparison.history[0].delta_e for comparison in compared}
     return tuple(
-        Appearance(one.name, made, errors.get(one.name), one.name == playing, previews.get(one.name))
-        for one in index.appearances
+        Appearance(entry.name, made, errors.get(entry.name), entry.name == playing, previews.get(entry.name))
+        for entry in index.appearances
     )

@@ -1,4 +1,4 @@
-"""A kiosk as its panel and the command line see it: ``controller.kiosk.interface.Kiosk`` over the running service."""
+"""``controller.kiosk.interface.Kiosk`` for a running service, as panel and command line use it."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ from controller.kiosk.store import archive, runs, settings, targets
 from controller.kiosk.store.accounts import Accounts, stage_accounts
 
 NOTICE_S: Final = 900.0
-"""How long a notice may stay; a lamp should not burn for it all night."""
+"""The longest time for a text on the projectors, so that no lamp burns for it all night."""
 AIMING_S: Final = 900.0
 _REVISIONS: Final = 1_000_000_000
 
 
 class StageKiosk(FolderKiosk):
-    """What is not here is done as without a service, by ``FolderKiosk``.
+    """Operations that are not defined here are those of ``FolderKiosk``.
 
-    Goes on while the service is made anew; ``service`` None while stage.toml is missing or wrong. ``accounts`` are
-    those of panel and socket, once somebody needs them; ``sessions_ended`` is the panel's, where there is one.
-    ``reload`` is set when somebody changed the settings: whoever runs the service then starts it again.
+    It outlives restarts of the service; the service is None while stage.toml is missing or wrong. ``accounts`` are
+    shared by panel and socket, and opened at the first use; ``sessions_ended`` is set by a panel. ``reload`` is set
+    when the settings have changed: its owner then restarts the service.
     """
 
     def __init__(self, stage: Path) -> None:
@@ -70,7 +70,7 @@ class StageKiosk(FolderKiosk):
         self._notice_ends_s = float("inf")
 
     def attach(self, service: Service | None, reason: str = "") -> None:
-        """The service that runs from now on, or why there is none."""
+        """Use this service from now on; None with the ``reason`` why there is none."""
         with self._lock:
             self._service = service
             if service is None:
@@ -86,22 +86,22 @@ class StageKiosk(FolderKiosk):
         self._notify()
 
     def detach(self) -> None:
-        """The service has ended, and the next one may have read its files: nothing may be asked of the one that was."""
+        """Stop using the service, which has ended: the next one may have read its files already."""
         self._service = None
 
     def held_accounts(self) -> Accounts:
-        """Those that the panel and everybody at the socket change: others would write over what they have written."""
+        """The one copy that panel and socket share: a second one would overwrite its changes."""
         with self._opening_accounts:
             if self.accounts is None:
                 self.accounts = stage_accounts(self.stage)
             return self.accounts
 
     def holders(self) -> dict[str, Any]:
-        """Who does the operations of the socket."""
+        """The holders of the socket's operations."""
         return {"kiosk": self, "accounts": AccountActions(self.held_accounts, self._end_sessions)}
 
     def _end_sessions(self, name: str) -> None:
-        # Of the panel that is there when it happens.
+        # Looked up late, because a panel may be attached after the socket.
         self.sessions_ended(name)
 
     @property
@@ -109,33 +109,33 @@ class StageKiosk(FolderKiosk):
         """Raises WorkError("not-set-up", "begins-anew")."""
         service = self._service
         if service is None and not self._last.needs_setup:
-            raise WorkError("begins-anew", what="The kiosk begins anew.", remedy="Ask again in a moment.")
+            raise WorkError("begins-anew", what="The kiosk is restarting.", remedy="Try again in a moment.")
         if service is None:
             raise WorkError("not-set-up", what=self._last.reason, remedy="Set the stage up first.")
         return service
 
     def announce(self, lines: tuple[str, ...], until: Callable[[], bool]) -> None:
-        """Show text on the projectors in turn, with their lamps lit, until ``until`` is true or it is too late.
+        """Show text on the projectors in turn, with lamps lit, until ``until`` is true or ``NOTICE_S`` have passed.
 
-        Only on a stage with nothing to play yet: its audience is whoever sets it up.
+        Only on a stage without a bundle: the text is for the person who sets it up, not for visitors.
         """
         self._notice = (lines, until)
         self._show_notice()
 
     def _show_notice(self) -> None:
         service = self._service
-        if service is not None and self._notice is not None and service.stock.bundle() is None:
+        if service is not None and self._notice is not None and service.bundles.bundle() is None:
             service.player.notice = self._notice[0]
-            service.conductor.light_for(NOTICE_S)
+            service.reconciler.light_for(NOTICE_S)
             self._notice_ends_s = time.monotonic() + NOTICE_S
 
     def _end_notice(self, service: Service) -> None:
         if self._notice is not None and (self._notice[1]() or time.monotonic() > self._notice_ends_s):
             self._notice = None
             service.player.notice = ()
-            service.conductor.light_for(0.0)
+            service.reconciler.light_for(0.0)
 
-    # -- asked often
+    # -- frequent questions
 
     def snapshot(self) -> KioskState:
         return self._last
@@ -155,7 +155,7 @@ class StageKiosk(FolderKiosk):
         self._end_notice(service)
         now = self._snapshots.of(service, self._last.revision + 1)
         with self._lock:
-            # Once: an event that is told between two looks would count as one that the panel was told of.
+            # Read once: an event logged between two reads would never be sent to the panel.
             events = service.log.number
             same = replace(now, revision=self._last.revision) == self._last and self._events == events
             self._events = events
@@ -171,46 +171,46 @@ class StageKiosk(FolderKiosk):
     # -- commands
 
     def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
-        """``projector``: all of that one, whatever ``kind``. Raises UsageError("projector-unknown"), WorkError."""
+        """``projector``: only this one, whatever ``kind``. Raises UsageError("projector-unknown"), WorkError."""
         service = self.service
         if projector is not None and projector not in service.checked.names:
             raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
-                             remedy=f"It is one of {', '.join(service.checked.names)}.")  # fmt: skip
+                             remedy=f"Choose one of {', '.join(service.checked.names)}.")  # fmt: skip
         asked = Request(kind, light=True) if projector is None else Request("projector", True, arguments=(projector,))
         return self._begun(service, asked, title_of(asked))
 
     def _begun(self, service: Service, asked: Request, name: str) -> Job:
-        # Before it is asked for: it may begin at once.
-        number = service.works.reserve()
+        # Before it is queued, because it may start at once.
+        number = service.jobs.reserve()
         service.ask(replace(asked, number=number))
         return Job(number, name)
 
     def job(self, number: int) -> Job | None:
-        """A job that was asked for; None while it waits. Raises WorkError("job-given-up") where it never will begin."""
+        """A requested job; None while it waits. Raises WorkError("job-given-up") if it will never start."""
         service = self.service
-        # In this order: what is neither waiting nor running, and yet not known then, was given up.
-        waits = service.conductor.waits(number)
-        if (found := service.works.known(number)) is None and not waits:
-            raise WorkError("job-given-up", what="The kiosk gave the work up, or began anew meanwhile.",
-                            remedy="`velatura events` tells why.")  # fmt: skip
-        return found
+        # In this order, so that a job that starts between the two calls is not taken for a lost one.
+        waits = service.reconciler.waits(number)
+        if (job := service.jobs.known(number)) is None and not waits:
+            raise WorkError("job-given-up", what="The job will not start: the kiosk cancelled it or restarted.",
+                            remedy="See `velatura events` for the reason, then start it again.")  # fmt: skip
+        return job
 
     def cancel(self) -> None:
-        self.service.conductor.cancel()
+        self.service.reconciler.cancel()
 
     def play(self, name: str) -> None:
         service = self.service
-        service.stock.check_name(name)
-        service.conductor.choose(name)
-        service.conductor.open()
+        service.bundles.check_name(name)
+        service.reconciler.choose(name)
+        service.reconciler.open()
 
     def stop(self) -> None:
-        self.service.conductor.shut()
+        self.service.reconciler.shut()
 
     def start(self) -> None:
-        for keeper in self.service.devices.projectors:
-            keeper.forgive()
-        self.service.conductor.open()
+        for supervisor in self.service.devices.projectors:
+            supervisor.forgive()
+        self.service.reconciler.open()
 
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         picture, size_px = target.read_bytes(), targets.camera_view_px(self.stage)
@@ -221,29 +221,29 @@ class StageKiosk(FolderKiosk):
         settings.check_name(name)
         picture = self.fitted(target, fit)
         kept = self.stage / "appearances" / f"{name}.png"
-        with service.conductor.idle():
+        with service.reconciler.idle():
             write_atomically(kept, picture)
             settings.add_picture(self.stage, name, kept)
             return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def appearances(self) -> Sequence[Appearance]:
-        return appearances_of(self.service.stock, self.comparisons(), playing=self._last.playing)
+        return appearances_of(self.service.bundles, self.comparisons(), playing=self._last.playing)
 
     def compare(self, name: str | None = None) -> Job:
         service = self.service
-        service.stock.check_name(name)
+        service.bundles.check_name(name)
         asked = Request("compare", light=True, arguments=() if name is None else (name,))
         return self._begun(service, asked, title_of(asked))
 
     def comparisons(self) -> Sequence[Comparison]:
-        return runs.comparisons(self.stage, self.service.stock.names())
+        return runs.comparisons(self.stage, self.service.bundles.names())
 
     def remove_appearance(self, name: str) -> None:
         service = self.service
         if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
-            raise UsageError("appearance-in-use", what=f"{name} is playing, or the schedule names it.",
-                             remedy="Play another one, and take it out of the schedule.")  # fmt: skip
-        with service.conductor.idle():
+            raise UsageError("appearance-in-use", what=f"{name} is playing, or it is in the schedule.",
+                             remedy="Play another one, and remove it from the schedule.")  # fmt: skip
+        with service.reconciler.idle():
             settings.remove_picture(self.stage, name)
             settings.forget_solved(self.stage, name)
             service.ask(Request("publish"))
@@ -255,12 +255,12 @@ class StageKiosk(FolderKiosk):
         return Schedule("UTC") if self._service is None else self._service.schedule.now
 
     def set_schedule(self, schedule: Schedule) -> None:
-        self.service.schedule.replace(schedule, self.service.stock.names())
+        self.service.schedule.replace(schedule, self.service.bundles.names())
 
     def identify(self, on: bool) -> None:
         self.service.player.identifying = on
         with self._lock:
-            # At once: whoever asked looks at the next page before the service has looked again.
+            # At once: the browser loads the next page before the service's next step.
             self._last = replace(self._last, identifying=on, revision=self._last.revision + 1)
         self._notify()
 
@@ -288,7 +288,7 @@ class StageKiosk(FolderKiosk):
             self.reload.set()
 
     def _idle(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext() if self._service is None else self._service.conductor.idle()
+        return contextlib.nullcontext() if self._service is None else self._service.reconciler.idle()
 
     def camera_picture(self) -> bytes | None:
         return None if self._service is None else aim.camera_picture(self._service.devices)
@@ -305,8 +305,8 @@ class StageKiosk(FolderKiosk):
     def test_shots(self) -> Job:
         service, asked = self.service, Request("aim", light=True)
         job = self._begun(service, asked, title_of(asked))
-        # Whoever aims takes them again and again; a lamp must not be struck for each.
-        service.conductor.light_for(AIMING_S, closed_too=True)
+        # Test shots are repeated while aiming; the lamps stay lit between them.
+        service.reconciler.light_for(AIMING_S, closed_too=True)
         return job
 
     def find_devices(self) -> Sequence[FoundDevice]:

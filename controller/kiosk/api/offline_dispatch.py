@@ -1,4 +1,4 @@
-"""What a command asks of a stage: of the running kiosk, or of the folder itself where none runs."""
+"""Commands on a stage: sent to the running kiosk, or done on its folder if none runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.accounts import AccountActions
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
-from controller.kiosk.store.bundle_store import BundleStock
+from controller.kiosk.store.bundle_store import BundleStore
 from controller.stage.calibrations import stage_trust
 from controller.stage.run import stage_lock
 
@@ -26,7 +26,7 @@ LONG_S: Final = 600.0
 
 
 def call(stage: Path, op: str, **arguments: Any) -> Any:
-    """Ask the running kiosk, or do it here. Raises UsageError("not-serving") for what only a running one can do."""
+    """Ask the running kiosk, or do it here. Raises UsageError("not-serving") for operations that need a running one."""
     if is_running(stage):
         return ask(stage, op, timeout_s=LONG_S, **arguments)
     folder = load_stage(stage).folder
@@ -34,7 +34,7 @@ def call(stage: Path, op: str, **arguments: Any) -> Any:
     if operation is None:
         raise UsageError("not-serving", what="No kiosk runs on this stage.", remedy="Start it with `velatura serve`.")
     values = local_values(operation, arguments)
-    # A kiosk that begins has read what is changed here before it answers: it would not know of the change.
+    # A starting kiosk reads these files before it answers, and would miss a change.
     with contextlib.nullcontext() if operation.effect is Effect.LOOKS else stage_lock(folder):
         return plain(operation.of(_holder(operation, folder), values))
 
@@ -49,18 +49,18 @@ def _holder(operation: Operation, folder: Path) -> object:
 
 
 def status_of(stage: Path) -> dict[str, Any]:
-    """The running kiosk's state, or that none runs."""
+    """The running kiosk's state, or a state that says that none runs."""
     if is_running(stage):
         return dict(ask(stage, "status"))
     loaded = load_stage(stage)
-    stock = BundleStock(loaded.folder, stage_trust(loaded))
+    bundles = BundleStore(loaded.folder, stage_trust(loaded))
     reason = "No kiosk runs on this stage."
     return {"stage": loaded.tables.stage.name, "state": "off", "reason": reason, "devices": [], "playing": "",
-            "appearances": list(stock.names()), "serving": False}  # fmt: skip
+            "appearances": list(bundles.names()), "serving": False}  # fmt: skip
 
 
 def status_text(state: Mapping[str, Any]) -> str:
-    """For people: what devices said in it reaches no terminal as it came."""
+    """The state as text for a terminal; control characters of devices are removed."""
     lines = [f"{state['stage']}: {state['state']}" + (f" ({state['reason']})" if state["reason"] else "")]
     if state.get("playing"):
         lines.append(f"Playing {state['playing']}.")
@@ -79,7 +79,7 @@ def status_text(state: Mapping[str, Any]) -> str:
 def changed_schedule(
     now: Mapping[str, Any], zone: str | None, hours: Sequence[str] | None, drift_check: str | None
 ) -> dict[str, Any]:
-    """The schedule with what a command line says. Raises UsageError("schedule-wrong", "schedule-zone")."""
+    """The schedule with the changes of a command line. Raises UsageError("schedule-wrong", "schedule-zone")."""
     rows = list(now["rows"]) if hours is None else [_row(text) for text in hours]
     content: dict[str, Any] = {
         "time_zone": zone if zone is not None else now["time_zone"],
@@ -94,7 +94,7 @@ def _row(text: str) -> dict[str, str]:
     day, equals, span = text.partition("=")
     opens, dash, closes = span.partition("-")
     if not equals or (span != "closed" and not dash):
-        raise UsageError("schedule-wrong", what=f"{text[:64]!r} are no opening hours.",
+        raise UsageError("schedule-wrong", what=f"{text[:64]!r} is not a valid opening time.",
                          remedy="Write DAY=HH:MM-HH:MM or DAY=closed.")  # fmt: skip
     if span == "closed":
         opens = closes = ""
@@ -102,7 +102,7 @@ def _row(text: str) -> dict[str, str]:
 
 
 def schedule_text(schedule: Mapping[str, Any]) -> str:
-    """For people."""
+    """The schedule as text for a terminal."""
     lines = [f"Time zone {schedule['time_zone']}"]
     lines += [
         f"  {row['day']:<10} {row['opens']}-{row['closes']} {row['appearance']}"
@@ -116,13 +116,13 @@ def schedule_text(schedule: Mapping[str, Any]) -> str:
     return "\n".join(map(printable, lines))
 
 
-def aiming_text(found: Mapping[str, Any]) -> str:
-    """For people."""
-    lines = [f"{one['projector']}: {one['coverage']:.0%} of the object, focus {one['focus']:.0%}"
-             for one in found["projectors"]]  # fmt: skip
-    lines.append(f"Lit by two or more {found['overlap']:.0%}, too dark {found['too_dark']:.0%}, "
-                 f"too grazing {found['too_grazing']:.0%}")  # fmt: skip
-    if not found["source"]:
+def aiming_text(aiming: Mapping[str, Any]) -> str:
+    """The measurement as text for a terminal."""
+    lines = [f"{row['projector']}: {row['coverage']:.0%} of the object, focus {row['focus']:.0%}"
+             for row in aiming["projectors"]]  # fmt: skip
+    lines.append(f"Lit by two or more {aiming['overlap']:.0%}, too dark {aiming['too_dark']:.0%}, "
+                 f"too grazing {aiming['too_grazing']:.0%}")  # fmt: skip
+    if not aiming["source"]:
         lines = ["Nothing has been measured yet. Take test shots: `velatura aim STAGE --shots`."]
-    pictures = [f"Picture: {found['picture']}"] if found["picture"] else []
-    return "\n".join(map(printable, [*lines, *found["hints"], *pictures]))
+    pictures = [f"Picture: {aiming['picture']}"] if aiming["picture"] else []
+    return "\n".join(map(printable, [*lines, *aiming["hints"], *pictures]))

@@ -1,4 +1,4 @@
-"""Everything that the panel's first page shows, taken from a running service."""
+"""The state that the panel's first page shows, read from a running service."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GRADES_EVERY_S: Final = 10.0
 
 
 class Snapshots:
-    """For one thread: that of the conductor."""
+    """Use it only in the reconciler's thread."""
 
     def __init__(self, stage: Path) -> None:
         self._stage = stage
@@ -22,8 +22,8 @@ class Snapshots:
         self._since = ("", 0.0)
 
     def of(self, service: Service, revision: int) -> KioskState:
-        """The state as of now; the grades, which are read from the disk, as of some seconds ago."""
-        machine, shown = service.conductor.machine, service.player.view.shown
+        """The state now; the grades come from the disk and may be some seconds old."""
+        machine, shown = service.reconciler.machine, service.player.view.shown
         state = machine.state.value
         if self._since[0] != state:
             self._since = (state, time.time())
@@ -31,7 +31,7 @@ class Snapshots:
         if time.monotonic() - at_s > GRADES_EVERY_S or not at_s:
             grades = runs.grades(self._stage, service.checked.stage.tables.calibration.worst_grade)
             self._grades = time.monotonic(), grades
-        index = service.stock.index(bundle := service.stock.bundle())
+        index = service.bundles.index(bundle := service.bundles.bundle())
         identity = None
         if index is not None and bundle is not None:
             identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
@@ -42,9 +42,9 @@ class Snapshots:
             reason=machine.reason,
             since_unix_s=self._since[1],
             devices=(*service.rows(), self._player_row(service), *self._disk_row(service)),
-            job=service.works.job,
+            job=service.jobs.job,
             playing=shown.appearance if shown is not None else "",
-            next_event=service.conductor.plan.next,
+            next_event=service.reconciler.plan.next,
             bundle=identity,
             lamps=service.lamps,
             grades=grades,
@@ -65,5 +65,5 @@ class Snapshots:
     def _disk_row(self, service: Service) -> tuple[DeviceRow, ...]:
         if service.log.problem is None:
             return ()
-        remedy = "Free some space on the disk; playback goes on meanwhile."
+        remedy = "Free some space on the disk. Playback continues."
         return (DeviceRow("disk", "disk", "", (), f"The event log can't be written: {service.log.problem}.", remedy),)

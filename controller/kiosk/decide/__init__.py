@@ -1,3 +1,3 @@
-"""What the kiosk does next: `reconciler` compares the wanted state with the present one; schedule, clock, job
-queue and overrides feed it.
+"""What the kiosk does next: `reconciler` compares the wanted state with the actual one. Schedule, clock, job
+queue and overrides are its inputs.
 """

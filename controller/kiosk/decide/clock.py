@@ -1,4 +1,4 @@
-"""Which time it is, as far as that can be known: the wall clock, what it said before, whether it is synchronised."""
+"""The time to plan with: the wall clock, checked against its earlier values and its synchronisation."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from controller.kiosk.store.event_log import Decision, EventLog
 _UNSYNCHRONISED: Final = 0x40
 _KEEP_EVERY_S: Final = 60.0
 _PROVE_S: Final = 3600.0
-"""A clock that jumped far ahead is remembered only when it stays there for so long: a glitch must leave no trace."""
+"""A clock that jumped far ahead is trusted only after this time, so that a glitch leaves no trace."""
 _SET_S: Final = 30.0
-"""A clock that moves by more than this between two looks was set; one that is disciplined moves by less."""
+"""A clock that jumps by more than this between two checks was set; NTP moves it by less."""
 
 
 def synchronised() -> bool:
-    """Whether the kernel says that its clock is disciplined (adjtimex(2), STA_UNSYNC)."""
+    """Whether the kernel reports a synchronised clock (adjtimex(2), STA_UNSYNC)."""
     # struct timex begins with modes, offset, freq, maxerror, esterror, status; 256 bytes hold all of it.
     buffer = (ctypes.c_long * 32)()
     try:
@@ -31,8 +31,8 @@ def synchronised() -> bool:
     return bool(state >= 0 and not status & _UNSYNCHRONISED) and os.name == "posix"
 
 
-class Clockwork:
-    """Turns clocks into the time to plan with; remembers the latest over restarts."""
+class TrustedClock:
+    """The time to plan with; remembers the latest one over restarts."""
 
     def __init__(
         self,
@@ -50,9 +50,9 @@ class Clockwork:
         self._offset_s: float | None = None
 
     def now(self) -> float | None:
-        """Unix seconds to plan with, or None while nobody knows the time; says so when that changes."""
+        """Unix seconds to plan with, or None while the time is unknown; logs when that changes."""
         wall_s = self._wall()
-        self._notice(wall_s - self._monotonic())
+        self._check_jump(wall_s - self._monotonic())
         now_s = believed(wall_s, self._latest, synchronised=self._synchronised())
         if (now_s is not None) is not self._known and (self._known is not None or now_s is None):
             self._log.tell(_LOST if now_s is None else _FOUND)
@@ -73,7 +73,7 @@ class Clockwork:
             self._log.keep("since", kept)
         return float("inf") if kept is None else float(kept)
 
-    def _notice(self, offset_s: float) -> None:
+    def _check_jump(self, offset_s: float) -> None:
         before_s, self._offset_s = self._offset_s, offset_s
         if before_s is not None and abs(offset_s - before_s) > _SET_S:
             self._log.tell(_set(offset_s - before_s))
@@ -88,22 +88,22 @@ class Clockwork:
 
 
 def beginning(log: EventLog) -> Decision:
-    """What a service says as it begins, so that the log accounts for the time in which none ran."""
+    """What a starting service logs, so that the log explains the time without one."""
     last = next((row.code for row in reversed(log.after(0)) if row.code in (_BEGAN, "service-ended")), "")
     if last != _BEGAN:
-        return Decision(_BEGAN, "The kiosk begins.")
+        return Decision(_BEGAN, "The kiosk is starting.")
     latest = log.value("latest")
-    when = "" if latest is None else f", after {datetime.fromtimestamp(float(latest), UTC):%Y-%m-%d %H:%M} UTC"
+    when = "" if latest is None else f" after {datetime.fromtimestamp(float(latest), UTC):%Y-%m-%d %H:%M} UTC"
     return Decision(
-        _BEGAN, f"The kiosk begins; the one before was cut off{when}.",
-        "If there was no power cut, see the machine's own log.", "warning",
+        _BEGAN, f"The kiosk is starting. The previous run ended unexpectedly{when}.",
+        "If there was no power cut, check the system log.", "warning",
     )  # fmt: skip
 
 
 def _set(by_s: float) -> Decision:
-    how = f"The clock was set {'ahead' if by_s > 0 else 'back'} by {_span(abs(by_s))}."
+    how = f"The clock was set {'forward' if by_s > 0 else 'back'} by {_span(abs(by_s))}."
     held = -HOLD_S <= by_s < 0
-    then = "The kiosk's time stands still until the clock has caught up." if held else ""
+    then = "The schedule waits until the clock has caught up." if held else ""
     return Decision("clock-set", how, then, "warning")
 
 
@@ -114,8 +114,8 @@ def _span(seconds: float) -> str:
 _BEGAN: Final = "service-started"
 _LOST: Final = Decision(
     "clock-unknown",
-    "Nobody knows what time it is: the clock was lost.",
-    "Set it, or connect the network; until then without_time under [schedule] says what is done.",
+    "The system time is unknown.",
+    "Set the clock, or connect the network. Until then without_time under [schedule] applies.",
     "error",
 )
-_FOUND: Final = Decision("clock-known", "The clock tells the time again.")
+_FOUND: Final = Decision("clock-known", "The system time is known again.")

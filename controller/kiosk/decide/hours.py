@@ -1,4 +1,4 @@
-"""Opening hours as moments: local times of a zone, exceptions, and the nights when clocks change. Pure."""
+"""Opening hours as Unix times: local times of a zone, exceptions, and clock changes. Pure functions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _zone(name: str) -> ZoneInfo:
 
 
 def check_schedule(schedule: Schedule, appearances: Collection[str] | None = None) -> None:
-    """Raises UsageError with the row's number; ``appearances``: those that there are, None if that is not known."""
+    """Raises UsageError with the row's number. ``appearances``: the allowed names, None if they are not known."""
     zone_of(schedule.time_zone)
     if schedule.drift_check and not _TIME.fullmatch(schedule.drift_check):
         raise _wrong("The time of the drift check", schedule.drift_check, '"HH:MM", or empty')
@@ -61,8 +61,9 @@ def check_schedule(schedule: Schedule, appearances: Collection[str] | None = Non
             if text and not _TIME.fullmatch(text):
                 raise _wrong(f"A time of row {number}", text, '"HH:MM", from 00:00 to 23:59')
         if row.appearance and appearances is not None and row.appearance not in appearances:
-            known = ", ".join(sorted(appearances)) or "there are none yet"
-            raise _wrong(f"The appearance of row {number}", row.appearance, f"one of the stage's own ({known})")
+            known = ", ".join(sorted(appearances))
+            allowed = f"one of {known}" if known else "none, because the stage has no appearances yet"
+            raise _wrong(f"The appearance of row {number}", row.appearance, allowed)
 
 
 def _wrong(what: str, value: str, allowed: str) -> UsageError:
@@ -70,17 +71,16 @@ def _wrong(what: str, value: str, allowed: str) -> UsageError:
 
 
 def _date(text: str) -> date | None:
-    """One written as ``date.isoformat`` writes it: a date's rows are found by that text, and "2026-W53-4" never is."""
+    """Only the form of ``date.isoformat``: rows are looked up by that text, and "2026-W53-4" would never match."""
     try:
-        found = date.fromisoformat(text)
+        day = date.fromisoformat(text)
     except ValueError:
         return None
-    return found if found.isoformat() == text else None
+    return day if day.isoformat() == text else None
 
 
 def moment(day: date, clock: str, zone: ZoneInfo) -> float:
-    """Unix seconds of a local time. One that a clock change skips is as long after midnight as it would have been; of
-    two, the first."""
+    """Unix seconds of a local time. Skipped times shift with the clock; of repeated times, the first counts."""
     return datetime.combine(day, time_of_day.fromisoformat(clock), tzinfo=zone).timestamp()
 
 
@@ -89,20 +89,20 @@ def local_day(unix_s: float, zone: ZoneInfo) -> date:
 
 
 def rows_of(schedule: Schedule, day: date) -> Sequence[ScheduleRow]:
-    """A date's own rows, or those of its weekday."""
+    """The rows of this date, or else those of its weekday."""
     own = [row for row in schedule.rows if row.day == day.isoformat()]
     return own or [row for row in schedule.rows if row.day == WEEKDAYS[day.weekday()]]
 
 
 def openings(schedule: Schedule, around_s: float, *, days: int = 8) -> Sequence[Opening]:
-    """Those that begin on the day before ``around_s`` or on one of ``days`` days from then on, by their beginning."""
+    """Openings that begin on the day before ``around_s`` or on the ``days`` days after it, sorted."""
     return _openings(schedule, local_day(around_s, zone_of(schedule.time_zone)) - timedelta(days=1), days)
 
 
 @lru_cache(maxsize=8)
 def _openings(schedule: Schedule, first: date, days: int) -> tuple[Opening, ...]:
-    # Asked four times a second, and the same all day.
-    zone, found = zone_of(schedule.time_zone), []
+    # Called four times a second, and the same all day.
+    zone, result = zone_of(schedule.time_zone), []
     for number in range(days + 1):
         day = first + timedelta(days=number)
         for row in rows_of(schedule, day):
@@ -111,10 +111,10 @@ def _openings(schedule: Schedule, first: date, days: int) -> tuple[Opening, ...]
             last = day + timedelta(days=1) if row.closes <= row.opens else day
             begins_s, ends_s = moment(day, row.opens, zone), moment(last, row.closes, zone)
             if ends_s > begins_s:
-                found.append(Opening(begins_s, ends_s, row.appearance))
-    return tuple(sorted(found, key=lambda opening: (opening.begins_s, opening.ends_s)))
+                result.append(Opening(begins_s, ends_s, row.appearance))
+    return tuple(sorted(result, key=lambda opening: (opening.begins_s, opening.ends_s)))
 
 
 def always_open(schedule: Schedule) -> bool:
-    """Whether there are no hours at all: such a stage plays whenever it has power."""
+    """Whether the schedule has no hours: such a stage plays whenever it has power."""
     return not schedule.rows

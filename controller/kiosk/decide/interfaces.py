@@ -1,4 +1,4 @@
-"""What the conductor asks of the rest of the kiosk, and the values that pass between them."""
+"""What the reconciler needs of the rest of the kiosk, and the values that they exchange."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hal.values import Power
 
 
 class Condition(enum.Enum):
-    """How a projector does, as far as its control line tells."""
+    """The state of a projector, as far as its control line shows it."""
 
     DARK = "dark"
     COOLING = "cooling"
@@ -25,7 +25,7 @@ class Condition(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class ProjectorView:
-    """A projector as its keeper saw it last. ``maybe_lit``: was seen lit, or struck, and not seen off since."""
+    """A projector as its supervisor saw it last. ``maybe_lit``: seen lit, or switched on, and not seen off since."""
 
     name: str
     condition: Condition = Condition.LOST
@@ -40,17 +40,17 @@ class ProjectorView:
 
     @property
     def shines(self) -> bool:
-        """Lit, or lit when its control line was last heard: a silent cable puts no lamp out."""
+        """Lit, or lit at its last answer: a silent cable switches no lamp off."""
         return self.condition is Condition.LIT or (self.condition is Condition.LOST and self.maybe_lit)
 
     @property
     def coming(self) -> bool:
-        """Waiting may bring its light."""
+        """It may give light after a while."""
         return not self.looked or self.condition in (Condition.DARK, Condition.COOLING, Condition.LIGHTING)
 
 
-class Keeper(Protocol):
-    """Keeps one projector as it is wanted; see ``ProjectorKeeper``."""
+class ProjectorPort(Protocol):
+    """Brings one projector into the wanted state; see ``ProjectorSupervisor``."""
 
     name: str
     want_lit: bool | None
@@ -72,9 +72,9 @@ BLACK: Final = Showing(None)
 
 @dataclass(frozen=True, slots=True)
 class PlayerView:
-    """``shown``: what the player showed when it was last asked; ``problem`` why it does not show what it should.
+    """``shown``: what the player showed at its last answer; ``problem``: why it does not show what it should.
 
-    ``warning``: what people must know although it plays: nobody signed its bundle.
+    ``warning``: what people must know although it plays, for example that its bundle is not signed.
     """
 
     shown: Showing | None = None
@@ -84,7 +84,7 @@ class PlayerView:
 
 
 class PlayerPort(Protocol):
-    """Keeps the player as it is wanted; ``want`` None: somebody else is using the display."""
+    """Makes the player show ``want``; None: something else uses the display."""
 
     want: Showing | None
 
@@ -92,7 +92,7 @@ class PlayerPort(Protocol):
     def view(self) -> PlayerView: ...
 
 
-class Stock(Protocol):
+class Bundles(Protocol):
     """The bundles of the stage."""
 
     def bundle(self) -> Path | None:
@@ -102,19 +102,19 @@ class Stock(Protocol):
         """The appearances of the installed bundle."""
 
     def without(self, missing: Collection[str], appearance: str) -> Path | None:
-        """The bundle that was solved for the stage without these projectors from the same calibration, or None.
+        """The bundle solved without these projectors from the same calibration, or None.
 
-        It holds ``appearance``; it need not hold all others of the installed bundle.
+        It contains ``appearance``, and not always all others of the installed bundle.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Work to be done: ``kind`` is "drift", "quick", "projector", "full", "compare", "publish", "takeover" or what
-    a caller adds.
+    """A job to run: ``kind`` is "drift", "quick", "projector", "full", "compare", "publish", "takeover" or another
+    one of the caller.
 
-    ``light``: with all lamps lit and the display to itself; ``key``: the planner's task that this does;
-    ``arguments`` are the kind's own; ``number``: the one that its job was promised, 0 for none
+    ``light``: it needs all lamps lit and the display for itself; ``key``: the planner's task that it does;
+    ``arguments`` depend on the kind; ``number``: the number reserved for its job, 0 for none
     """
 
     kind: str
@@ -126,7 +126,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """What came of a request. ``then``: what is to be done next because of it."""
+    """The result of a request. ``then``: the requests that follow from it."""
 
     request: Request
     outcome: Decision
@@ -134,11 +134,11 @@ class Finished:
     then: tuple[Request, ...] = ()
 
 
-class Works(Protocol):
-    """Does one request at a time."""
+class Jobs(Protocol):
+    """Runs one request at a time."""
 
     def refusal(self, request: Request) -> Decision | None:
-        """Why it can't be done now (no camera, nothing calibrated), or None. From memory."""
+        """Why it can't run now (no camera, no calibration), or None. From memory."""
 
     def begin(self, request: Request) -> None: ...
 

@@ -1,4 +1,4 @@
-"""Work in its order: what the schedule makes due, what people ask for, and what follows from other work."""
+"""The queue of jobs: those that are due by the schedule, those that people request, and follow-up jobs."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from dataclasses import replace
 from typing import Final
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide.interfaces import Condition, Finished, ProjectorView, Request, Works
+from controller.kiosk.decide.interfaces import Condition, Finished, Jobs, ProjectorView, Request
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import Decision, EventLog
 
 
-class Agenda:
-    """One piece of work at a time; the rest waits. For the holder of the conductor's lock."""
+class JobQueue:
+    """One job runs, the others wait. Call it only with the reconciler's lock held."""
 
-    def __init__(self, works: Works, log: EventLog, *, monotonic: Callable[[], float], patience_s: float) -> None:
-        self._works, self._log = works, log
+    def __init__(self, jobs: Jobs, log: EventLog, *, monotonic: Callable[[], float], patience_s: float) -> None:
+        self._jobs, self._log = jobs, log
         self._monotonic, self._patience_s = monotonic, patience_s
         self._waiting: tuple[Request | None, float] = (None, 0.0)
         self._queue: deque[Request] = deque()
@@ -27,22 +27,22 @@ class Agenda:
 
     @property
     def head(self) -> Request | None:
-        """What is being done, or is next."""
-        return self._works.running or (self._queue[0] if self._queue else None)
+        """The job that runs, or is next."""
+        return self._jobs.running or (self._queue[0] if self._queue else None)
 
     @property
     def needs_light(self) -> bool:
-        """Whether work waits for, or uses, the lamps."""
+        """Whether the running or next job needs the lamps."""
         return self.head is not None and self.head.light
 
     def waits(self, number: int) -> bool:
-        """Whether the job that was promised this number has not begun yet, and will."""
+        """Whether the job of this number waits to start."""
         return any(request.number == number for request in self._queue)
 
     def ask(self, *requests: Request) -> None:
-        """Queue work. Raises WorkError("busy") while there is other work, and with the reason why it can't be done."""
+        """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         self.check_idle()
-        if (why := self._works.refusal(requests[0])) is not None:
+        if (why := self._jobs.refusal(requests[0])) is not None:
             self._log.tell(why)
             raise WorkError(why.code, what=why.reason, remedy=why.remedy)
         self._queue.extend(requests)
@@ -50,35 +50,37 @@ class Agenda:
     def check_idle(self) -> None:
         """Raises WorkError("busy")."""
         if self.head is not None or self._holder not in (None, threading.get_ident()):
-            raise WorkError("busy", what="Other work is going on.", remedy="Wait for it to end, or cancel it.")
+            raise WorkError(
+                "busy", what="Another job is running or waiting.", remedy="Wait until it ends, or cancel it."
+            )
 
     def hold(self) -> None:
-        """Let no work begin, and be asked for by nobody but the caller's thread, until ``let_go``. Raises as above."""
+        """Start no job, and accept jobs only from the caller's thread, until ``release``. Raises as above."""
         self.check_idle()
         self._holder = threading.get_ident()
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         self._holder = None
 
     def offer(self, request: Request) -> bool:
-        """Queue work that nobody waits for, if there is no other; whether it was queued."""
-        if self.head is not None or self._holder is not None or self._works.refusal(request) is not None:
+        """Queue a background job if there is no other; returns whether it was queued."""
+        if self.head is not None or self._holder is not None or self._jobs.refusal(request) is not None:
             return False
         self._queue.append(request)
         return True
 
     def cancel(self) -> None:
-        """Drop what waits, and ask what runs to end: nothing follows from it any more, should it end well."""
+        """Drop the waiting jobs and cancel the running one, with its follow-up jobs."""
         if self._queue:
             self._settle("cancelled")
             self._log.tell(_CANCELLED)
-        if self._works.running is not None:
+        if self._jobs.running is not None:
             self._cancelled = True
-            self._works.cancel()
+            self._jobs.cancel()
 
     def take_finished(self) -> Finished | None:
-        """The work that ended since the last call; what follows from it stands first in the queue now."""
-        finished = self._works.finished()
+        """The job that ended since the last call; its follow-up jobs are now first in the queue."""
+        finished = self._jobs.finished()
         if finished is None:
             return None
         self._tell(finished.outcome)
@@ -87,31 +89,31 @@ class Agenda:
             self._log.tell(_CANCELLED)
         self._cancelled = False
         key = finished.request.key
-        if key and not any(one.key == key for one in finished.then):
+        if key and not any(request.key == key for request in finished.then):
             self._log.mark_done(key, finished.outcome.code)
         self._queue.extendleft(reversed(finished.then))
         return finished
 
     def take_due(self, plan: Plan, *, playing: bool) -> None:
-        """Queue what the schedule wants now, and write down what can't be done any more. Not while ``playing``."""
+        """Queue the tasks that are due, except while ``playing``, and record the expired ones."""
         for task in plan.expired:
             self._log.mark_done(task.key, "left out")
-            self._log.tell(_left_out(task))
+            self._log.tell(_expired(task))
         for task in plan.due:
             request = Request("drift", light=True, key=task.key)
             if playing or self.head is not None or self._holder is not None:
                 continue
-            if (why := self._works.refusal(request)) is not None:
+            if (why := self._jobs.refusal(request)) is not None:
                 self._log.mark_done(task.key, why.code)
-                reason = f"The {task.what} ({task.key}) is left out: {why.reason}"
+                reason = f"The {task.what} ({task.key}) is skipped. {why.reason}"
                 self._log.tell(replace(why, reason=reason, level="warning"))
             else:
-                self._log.tell(Decision("task-due", f"It is time for the {task.what} ({task.key})."))
+                self._log.tell(Decision("task-due", f"The {task.what} ({task.key}) is due."))
                 self._queue.append(request)
 
     def ready(self, views: Sequence[ProjectorView]) -> Request | None:
-        """The work that can begin with these lamps; what can't for want of a lamp is dropped, with the reason."""
-        if not self._queue or self._works.running is not None or self._holder is not None:
+        """The job that can start with these lamps; one whose lamps do not light in time is dropped with the reason."""
+        if not self._queue or self._jobs.running is not None or self._holder is not None:
             return None
         request = self._queue[0]
         if not request.light:
@@ -124,8 +126,8 @@ class Agenda:
         dark = [view.name for view in views if view.condition is not Condition.LIT]
         if dark:
             self.drop(Decision(
-                "work-needs-all-lamps", f"The work was given up: the lamp of {', '.join(dark)} is not lit.",
-                "Mend that projector first; playback goes on without it.", "error",
+                "work-needs-all-lamps", f"The job was cancelled because the lamp of {', '.join(dark)} is not lit.",
+                "Repair that projector first. Playback continues without it.", "error",
             ))  # fmt: skip
             return None
         if all(view.stable_left_s <= 0 for view in views):
@@ -135,16 +137,16 @@ class Agenda:
         return None
 
     def begin(self) -> None:
-        self._works.begin(self._queue.popleft())
+        self._jobs.begin(self._queue.popleft())
 
     def drop(self, why: Decision) -> None:
-        """Give up everything that waits."""
+        """Drop all waiting jobs."""
         if self._queue:
             self._settle(why.code)
             self._tell(why)
 
     def _tell(self, outcome: Decision) -> None:
-        """What failed stays in sight until somebody has seen it."""
+        """Log it; a failure stays on the panel until an operator confirms it."""
         (self._log.tell_failure if outcome.level == "error" else self._log.tell)(outcome)
 
     def _settle(self, how: str) -> None:
@@ -154,17 +156,17 @@ class Agenda:
         self._queue.clear()
 
 
-_CANCELLED: Final = Decision("work-cancelled", "Work that waited was cancelled.")
+_CANCELLED: Final = Decision("work-cancelled", "The waiting jobs were cancelled.")
 _TOO_LATE: Final = Decision(
-    "lamps-not-steady", "The work was given up: the lamps were not lit and steady in time.",
-    "See the projectors' own problems, or give them a longer power_up_s under [safety].", "error",
+    "lamps-not-steady", "The job was cancelled because the lamps were not lit and stable in time.",
+    "See the problems of the projectors, or increase power_up_s under [safety].", "error",
 )  # fmt: skip
 
 
-def _left_out(task: Task) -> Decision:
+def _expired(task: Task) -> Decision:
     return Decision(
         "task-left-out",
-        f"The {task.what} ({task.key}) could not be done in its time.",
-        "The events before say why: the stage was open, without power, or busy.",
+        f"The {task.what} ({task.key}) was not done in its time window.",
+        "See the earlier events: the stage was open, without power, or busy.",
         "warning",
     )

@@ -1,4 +1,4 @@
-"""What people want of a stage beside its schedule: open or closed for now, and which appearance."""
+"""What operators set against the schedule: open or closed for now, and the appearance."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from controller.kiosk.store.event_log import Decision, EventLog
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """Somebody ``wanted`` the stage open (or closed) while the schedule ``said`` otherwise.
+    """An operator ``wanted`` the stage open (or closed) while the schedule ``said`` otherwise.
 
-    ``until_s``: when the schedule's opinion changes the next time, as it stood last; None where that was not in sight.
+    ``until_s``: the next scheduled change, as last computed; None if there was none.
     """
 
     wanted: bool
@@ -23,8 +23,8 @@ class Override:
     until_s: float | None = None
 
 
-class Wishes:
-    """Kept in the event log's file, so that a restart forgets none. ``without_time``: open while nobody knows it."""
+class OperatorOverrides:
+    """Stored in the event log's file, to survive a restart. ``without_time``: open while the time is unknown."""
 
     def __init__(self, log: EventLog, *, without_time: bool) -> None:
         self._log = log
@@ -38,16 +38,16 @@ class Wishes:
         return self._override.wanted if self._override is not None else self._says(plan)
 
     def override(self, wanted: bool, plan: Plan) -> None:
-        """Open or closed until the schedule's own opinion changes the next time."""
+        """Open or closed until the next scheduled change."""
         self._set(Override(wanted, self._says(plan), plan.changes_s) if wanted is not self._says(plan) else None)
-        word = "open" if wanted else "closed"
-        self._log.tell(Decision("asked", f"Somebody asked for the stage to be {word}."))
+        action = "open" if wanted else "close"
+        self._log.tell(Decision("asked", f"An operator asked to {action} the stage."))
 
     def follow(self, plan: Plan) -> None:
-        """The schedule's opinion has been worked out anew."""
+        """Apply the newest plan of the schedule."""
         if self._override is not None:
             self._follow(self._override, plan)
-        # A clock that is lost for a while is no new opinion.
+        # While the time is unknown, the schedule says nothing new.
         if plan.open is not None and plan.appearance != self._scheduled:
             self._scheduled = plan.appearance
             self._log.keep("scheduled", plan.appearance)
@@ -55,12 +55,12 @@ class Wishes:
                 self._choose(plan.appearance)
 
     def _follow(self, override: Override, plan: Plan) -> None:
-        # A stage that stood without power while its hours began and ended, or ended and began, did not see that.
+        # A stage without power may have missed two changes that cancel each other out.
         now_s, then_s = plan.changes_s, override.until_s
         slept = self._restored and now_s is not None and then_s is not None and now_s > then_s
         if override.said is not self._says(plan) or slept:
             self._set(None)
-            self._log.tell(Decision("schedule-rules", "The schedule decides again."))
+            self._log.tell(Decision("schedule-rules", "The stage follows the schedule again."))
         elif plan.open is not None:
             self._restored = False
             if plan.changes_s != override.until_s:
@@ -68,10 +68,10 @@ class Wishes:
 
     def choose(self, appearance: str, plan: Plan) -> None:
         self._choose(appearance)
-        self._log.tell(Decision("asked", f"Somebody asked for the appearance {appearance}."))
+        self._log.tell(Decision("asked", f"An operator chose the appearance {appearance}."))
 
     def appearance(self, plan: Plan, names: Sequence[str]) -> str:
-        """The chosen one if the bundle has it, else its first; empty where it has none."""
+        """The chosen one if the bundle has it, else the scheduled one, else the first; empty if the bundle has none."""
         if self._chosen in names:
             return self._chosen
         return plan.appearance if plan.appearance in names else names[0] if names else ""
@@ -91,12 +91,12 @@ class Wishes:
 
 def _override_in(text: str | None) -> Override | None:
     try:
-        found: Any = json.loads(text or "null")
+        stored: Any = json.loads(text or "null")
     except (ValueError, RecursionError):
         return None
-    if not isinstance(found, list) or len(found) not in (2, 3):
+    if not isinstance(stored, list) or len(stored) not in (2, 3):
         return None
-    wanted, said, until_s = (*found, None)[:3]
+    wanted, said, until_s = (*stored, None)[:3]
     if not isinstance(wanted, bool) or not isinstance(said, bool):
         return None
     return Override(wanted, said, float(until_s) if isinstance(until_s, int | float) else None)

@@ -1,7 +1,7 @@
-"""What the schedule wants now: a pure function of the clock, the schedule and what was done.
+"""What the schedule wants now: a pure function of the clock, the schedule and the finished tasks.
 
-Open or closed is a level, never an event, so nothing about it can be missed. What happens once (the nightly check) has
-a key with its date; whoever did it, or could not, writes the key down, so nothing happens twice.
+Open or closed is a level, not an event, so no change can be missed. A task that runs once (the nightly check) has a key
+with its date. The key is recorded when the task was done or skipped, so no task runs twice.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from controller.kiosk.decide.hours import Opening, always_open, local_day, momen
 from controller.kiosk.interface import NextEvent, Schedule
 
 EARLIEST_S: Final = 1_735_689_600.0
-"""2025-01-01: a clock before that was never set."""
+"""2025-01-01: an earlier clock was never set."""
 HOLD_S: Final = 2 * 3600.0
-"""A clock that was set back by up to this much: time stands still until it has caught up."""
+"""For a clock that was set back by at most this, the kiosk's time waits until the clock has caught up."""
 DOUBT_S: Final = 36 * 3600.0
-"""A clock that is further back than that, and not synchronised, was lost rather than set."""
+"""An unsynchronised clock that is further back than this was lost, not set."""
 WINDOW_S: Final = 6 * 3600.0
-"""A nightly check that could not begin within this time is left out."""
+"""A nightly check that could not start within this time is skipped."""
 LOOK_BACK_DAYS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Something to be done once: ``what`` is "drift check"; possible from ``begins_s`` until ``ends_s``."""
+    """A task that runs once: ``what`` is "drift check"; it may start from ``begins_s`` until ``ends_s``."""
 
     key: str
     what: str
@@ -38,9 +38,9 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """``open`` None: nobody knows the time. ``due`` can begin now, ``expired`` can't any more and were not done.
+    """``open`` None: the time is unknown. ``due`` tasks can start now; ``expired`` ones are too late and were not done.
 
-    ``changes_s``: the next moment (Unix seconds) at which ``open`` will be another; None where none is in sight.
+    ``changes_s``: when ``open`` changes next (Unix seconds); None if no change is planned.
     """
 
     open: bool | None
@@ -52,7 +52,7 @@ class Plan:
 
 
 def believed(now_s: float, latest_s: float | None, *, synchronised: bool) -> float | None:
-    """The time to plan with, from the clock and the latest time that was ever believed; None if nobody knows it."""
+    """The time to plan with, from the clock and the latest time that was trusted; None if it is unknown."""
     if now_s < EARLIEST_S:
         return None
     if latest_s is None or now_s >= latest_s:
@@ -63,7 +63,7 @@ def believed(now_s: float, latest_s: float | None, *, synchronised: bool) -> flo
 
 
 def plan(now_s: float | None, schedule: Schedule, done: Collection[str], *, since_s: float) -> Plan:
-    """What is wanted at ``now_s`` (as ``believed``). ``since_s``: when this stage began to keep the schedule."""
+    """What is wanted at ``now_s`` (as ``believed``). ``since_s``: when this stage first knew the time."""
     if always_open(schedule):
         due, expired = _tasks(now_s, schedule, done, since_s) if now_s is not None else ((), ())
         return Plan(True, due=due, expired=expired)
@@ -77,26 +77,28 @@ def plan(now_s: float | None, schedule: Schedule, done: Collection[str], *, sinc
 
 
 def merged(known: Sequence[Opening]) -> list[Opening]:
-    """Without overlaps: times at which the stage really opens and closes."""
-    found: list[Opening] = []
+    """Without overlaps: the times at which the stage really opens and closes."""
+    result: list[Opening] = []
     for opening in known:
-        if found and opening.begins_s <= found[-1].ends_s:
-            found[-1] = Opening(found[-1].begins_s, max(found[-1].ends_s, opening.ends_s))
+        if result and opening.begins_s <= result[-1].ends_s:
+            result[-1] = Opening(result[-1].begins_s, max(result[-1].ends_s, opening.ends_s))
         else:
-            found.append(opening)
-    return found
+            result.append(opening)
+    return result
 
 
 def _changes_s(known: Sequence[Opening], now_s: float) -> float | None:
-    edges = (edge for one in merged(known) for edge in (one.begins_s, one.ends_s))
+    edges = (edge for opening in merged(known) for edge in (opening.begins_s, opening.ends_s))
     return min((edge for edge in edges if edge > now_s), default=None)
 
 
 def _next(known: Sequence[Opening], now_s: float, schedule: Schedule) -> NextEvent | None:
-    coming = [NextEvent("opens", one.begins_s) for one in merged(known)]
-    coming += [NextEvent("closes", one.ends_s) for one in merged(known)]
-    coming += [NextEvent(task.what, task.begins_s) for task in _all_tasks(now_s, schedule)]
-    return min((event for event in coming if event.at_unix_s > now_s), key=lambda event: event.at_unix_s, default=None)
+    upcoming = [NextEvent("opens", opening.begins_s) for opening in merged(known)]
+    upcoming += [NextEvent("closes", opening.ends_s) for opening in merged(known)]
+    upcoming += [NextEvent(task.what, task.begins_s) for task in _all_tasks(now_s, schedule)]
+    return min(
+        (event for event in upcoming if event.at_unix_s > now_s), key=lambda event: event.at_unix_s, default=None
+    )
 
 
 def _all_tasks(now_s: float, schedule: Schedule) -> tuple[Task, ...]:
@@ -107,12 +109,12 @@ def _all_tasks(now_s: float, schedule: Schedule) -> tuple[Task, ...]:
 
 @lru_cache(maxsize=8)
 def _checks(clock: str, zone: str, today: date) -> tuple[Task, ...]:
-    found = []
+    tasks = []
     for number in range(-LOOK_BACK_DAYS, 2):
         day = today + timedelta(days=number)
         begins_s = moment(day, clock, zone_of(zone))
-        found.append(Task(f"drift-check {day.isoformat()}", "drift check", begins_s, begins_s + WINDOW_S))
-    return tuple(found)
+        tasks.append(Task(f"drift-check {day.isoformat()}", "drift check", begins_s, begins_s + WINDOW_S))
+    return tuple(tasks)
 
 
 def _tasks(

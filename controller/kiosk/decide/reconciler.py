@@ -1,7 +1,7 @@
-"""Decides what the stage does: schedule, technician, lamps, player and work come together here, and nowhere else.
+"""Decides what the stage does, from the schedule, operators, lamps, player and jobs.
 
-``step`` looks at all of them, moves the state machine, and says what is wanted of each. It waits for nothing, so a
-device that hangs holds up only its own keeper.
+``step`` reads all of them, moves the state machine, and sets the wanted state of each. It waits for nothing, so a
+device that hangs delays only its own supervisor.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from dataclasses import dataclass
 from typing import Final
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide.clock import Clockwork
-from controller.kiosk.decide.content_selector import Pictures
+from controller.kiosk.decide.clock import TrustedClock
+from controller.kiosk.decide.content_selector import ContentSelector
 from controller.kiosk.decide.interfaces import (
     BLACK,
+    Bundles,
     Condition,
-    Keeper,
+    Jobs,
     PlayerPort,
     PlayerView,
+    ProjectorPort,
     ProjectorView,
     Request,
-    Stock,
-    Works,
 )
-from controller.kiosk.decide.job_queue import Agenda
-from controller.kiosk.decide.operator_overrides import Wishes
+from controller.kiosk.decide.job_queue import JobQueue
+from controller.kiosk.decide.operator_overrides import OperatorOverrides
 from controller.kiosk.decide.planner import Plan, plan
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.run.state_machine import Event, Machine, State
 
 RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
-"""Between attempts to come out of FAULT."""
+"""Between attempts to leave FAULT."""
 _ON: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED)
 
 
@@ -46,44 +46,44 @@ class Limits:
     cool_down_s: float = 900.0
 
 
-class Conductor:
-    """The kiosk's decisions. ``step`` is called about four times a second by one thread; commands come from any.
+class Reconciler:
+    """The kiosk's decisions. One thread calls ``step`` about four times a second; commands may come from any thread.
 
     Parameters
     ----------
-    schedule : asked at every step
+    schedule : read at every step
     clock : the time to plan with; ``monotonic``: seconds that only go up, for deadlines
-    without_time : whether the stage is open while nobody knows the time
+    without_time : whether the stage is open while the time is unknown
     """
 
     def __init__(
         self,
-        keepers: Sequence[Keeper],
+        supervisors: Sequence[ProjectorPort],
         player: PlayerPort,
-        works: Works,
-        stock: Stock,
+        jobs: Jobs,
+        bundles: Bundles,
         log: EventLog,
         *,
         schedule: Callable[[], Schedule],
-        clock: Clockwork,
+        clock: TrustedClock,
         monotonic: Callable[[], float],
         without_time: bool = False,
         limits: Limits | None = None,
     ) -> None:
-        self._keepers, self._player, self._log = keepers, player, log
+        self._supervisors, self._player, self._log = supervisors, player, log
         self._schedule, self._clock, self._monotonic = schedule, clock, monotonic
         self._limits = limits or Limits()
-        self._agenda = Agenda(works, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
+        self._queue = JobQueue(jobs, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
         self.machine = Machine(self._changed)
-        self.wishes = Wishes(log, without_time=without_time)
-        self._pictures = Pictures(stock, self.wishes, self._agenda, log)
+        self.overrides = OperatorOverrides(log, without_time=without_time)
+        self._content = ContentSelector(bundles, self.overrides, self._queue, log)
         self._lock = threading.RLock()
         self._plan = Plan(None)
         self._since_s = monotonic()
         self._attempts, self._missing = 0, frozenset[str]()
         self._lit_until_s, self._lit_closed = float("-inf"), False
 
-    # -- asked from outside
+    # -- commands and questions
 
     @property
     def plan(self) -> Plan:
@@ -91,111 +91,111 @@ class Conductor:
 
     @property
     def working(self) -> bool:
-        """Whether work runs or waits."""
+        """Whether a job runs or waits."""
         with self._lock:
-            return self._agenda.head is not None
+            return self._queue.head is not None
 
     def waits(self, number: int) -> bool:
-        """Whether the job of this number has not begun yet, and will."""
+        """Whether the job of this number waits to start."""
         with self._lock:
-            return self._agenda.waits(number)
+            return self._queue.waits(number)
 
     def open(self) -> None:
-        """Play until the schedule says otherwise the next time."""
+        """Play until the next scheduled change."""
         with self._lock:
-            self.wishes.override(True, self._plan)
+            self.overrides.override(True, self._plan)
             self._since_s = min(self._since_s, self._monotonic() - RETRY_S[-1])
 
     def shut(self) -> None:
-        """Stop, and cool the lamps, until the schedule says otherwise the next time."""
+        """Stop, and cool the lamps, until the next scheduled change."""
         with self._lock:
-            self._agenda.cancel()
+            self._queue.cancel()
             self._lit_until_s = float("-inf")
-            self.wishes.override(False, self._plan)
+            self.overrides.override(False, self._plan)
 
     def choose(self, appearance: str) -> None:
         """Play this appearance of the bundle from now on."""
         with self._lock:
-            self.wishes.choose(appearance, self._plan)
+            self.overrides.choose(appearance, self._plan)
 
     def light_for(self, seconds: float, *, closed_too: bool = False) -> None:
-        """Light, also with nothing to play, while open or ``closed_too``; 0 ends it, and so does ``shut``."""
+        """Keep the lamps lit, even with nothing to play, while open or ``closed_too``. 0 or ``shut`` ends it."""
         with self._lock:
             self._lit_until_s, self._lit_closed = self._monotonic() + seconds, closed_too
 
     def ask(self, *requests: Request) -> None:
-        """Queue work. Raises WorkError("busy") while other work runs or waits, and with the reason it can't be done."""
+        """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         with self._lock:
-            self._agenda.ask(*requests)
+            self._queue.ask(*requests)
 
     @contextlib.contextmanager
     def idle(self) -> Iterator[None]:
-        """What work reads may be changed: none begins meanwhile, and only who is here may ask for some.
+        """No job starts inside this context, so files that jobs read may be changed. Only its thread may queue jobs.
 
-        Raises WorkError("busy") while work runs or waits, and while somebody else is here.
+        Raises WorkError("busy") while a job runs or waits, and while another thread is inside.
         """
         with self._lock:
-            self._agenda.hold()
+            self._queue.hold()
         try:
             yield
         finally:
             with self._lock:
-                self._agenda.let_go()
+                self._queue.release()
 
     def cancel(self) -> None:
         """Raises WorkError("nothing-to-cancel")."""
         with self._lock:
-            if self._agenda.head is None:
-                raise WorkError("nothing-to-cancel", what="No work is going on.", remedy="There is nothing to do.")
-            self._agenda.cancel()
+            if self._queue.head is None:
+                raise WorkError("nothing-to-cancel", what="No job is running.", remedy="There is nothing to cancel.")
+            self._queue.cancel()
 
     # -- one step
 
     def step(self) -> None:
         with self._lock:
-            # First: what is done now must not be due in the plan.
+            # First: a task that has just ended must not be due in the plan.
             self._take_finished()
-            self._look_at_the_clock()
-            wanted_open = self.wishes.open(self._plan)
-            self._agenda.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
-            views = [keeper.view for keeper in self._keepers]
-            open_now = self._pictures.something(wanted_open)
+            self._update_plan()
+            wanted_open = self.overrides.open(self._plan)
+            self._queue.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
+            views = [supervisor.view for supervisor in self._supervisors]
+            open_now = self._content.something(wanted_open)
             lit_anyway = (wanted_open or self._lit_closed) and self._monotonic() < self._lit_until_s
-            light = open_now or lit_anyway or self._agenda.needs_light
+            light = open_now or lit_anyway or self._queue.needs_light
             self._move(views, light, open_now)
             cooling = self.machine.state in (State.COOLING, State.OFF)
-            for keeper in self._keepers:
-                if keeper.want_lit is not (wanted := light and not cooling):
-                    keeper.want_lit = wanted
+            for supervisor in self._supervisors:
+                if supervisor.want_lit is not (wanted := light and not cooling):
+                    supervisor.want_lit = wanted
             self._begin_work(views)
             self._show(views, open_now)
 
-    def _look_at_the_clock(self) -> None:
+    def _update_plan(self) -> None:
         now_s = self._clock.now()
         self._plan = plan(now_s, self._schedule(), self._log.done(), since_s=self._clock.since_s)
-        self.wishes.follow(self._plan)
+        self.overrides.follow(self._plan)
 
-    # -- work
+    # -- jobs
 
     def _take_finished(self) -> None:
-        finished = self._agenda.take_finished()
+        finished = self._queue.take_finished()
         if finished is not None and self.machine.state is State.CALIBRATING:
             event = Event.CANCEL if finished.failed else Event.CALIBRATED
             self._go(event, finished.outcome.reason)
 
     def _begin_work(self, views: Sequence[ProjectorView]) -> None:
-        head = self._agenda.head
+        head = self._queue.head
         state = self.machine.state
         if state is State.FAULT and head is not None and head.light:
-            self._agenda.drop(_FAULTY)
+            self._queue.drop(_FAULTY)
         if head is not None and head.light and state not in (State.READY, State.PLAYING, State.DEGRADED):
             return
-        if (request := self._agenda.ready(views)) is None:
+        if (request := self._queue.ready(views)) is None:
             return
         if request.light:
-            self._go(Event.RECALIBRATE, f"{request.kind} begins")
+            self._go(Event.RECALIBRATE, f"{request.kind} starts")
             self._player.want = None
-        self._agenda.begin()
+        self._queue.begin()
 
     # -- states
 
@@ -203,11 +203,11 @@ class Conductor:
         state = self.machine.state
         if state is State.OFF:
             if light:
-                self._go(Event.START, "the lamps are wanted")
+                self._go(Event.START, "light is needed")
         elif state is State.COOLING:
             self._cool(views)
         elif state is State.FAULT:
-            self._mend(views, light)
+            self._recover(views, light)
         elif state is State.CALIBRATING:
             return
         elif not light:
@@ -243,7 +243,7 @@ class Conductor:
                 self._go(Event.RECOVERED, "every projector gives light again")
         elif reasons or self._missing:
             self._go(Event.DEGRADE, reasons or f"{', '.join(sorted(self._missing))} gives no light.")
-        elif state is State.READY and open_now and not self._agenda.needs_light:
+        elif state is State.READY and open_now and not self._queue.needs_light:
             self._go(Event.PLAY, "open")
         elif state is State.PLAYING and not open_now:
             self._go(Event.PAUSE, "closed")
@@ -254,9 +254,9 @@ class Conductor:
             self._go(Event.COOLED, "every lamp is off or cooling by itself")
         elif self._monotonic() - self._since_s > self._limits.cool_down_s:
             names = ", ".join(view.name for view in lit)
-            self._go(Event.FAIL, f"The lamp of {names} could not be switched off. Switch it off by its remote control.")
+            self._go(Event.FAIL, f"The lamp of {names} could not be switched off. Use its remote control.")
 
-    def _mend(self, views: Sequence[ProjectorView], light: bool) -> None:
+    def _recover(self, views: Sequence[ProjectorView], light: bool) -> None:
         if not light:
             if not any(view.condition is Condition.LIT or view.maybe_lit for view in views) or self._waited(60.0):
                 self._go(Event.STOP, "closed")
@@ -264,7 +264,7 @@ class Conductor:
             RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
         ):
             self._attempts += 1
-            self._go(Event.START, "another attempt")
+            self._go(Event.START, "trying again")
 
     def _waited(self, seconds: float) -> bool:
         return self._monotonic() - self._since_s >= seconds
@@ -283,15 +283,15 @@ class Conductor:
         level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
         self._log.tell(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
 
-    # -- the picture
+    # -- the player
 
     def _show(self, views: Sequence[ProjectorView], open_now: bool) -> None:
         state = self.machine.state
         if state is State.CALIBRATING:
             return
-        # Where every lamp is dark, nobody takes over.
+        # If every lamp is dark, no projector can replace another.
         missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
-        self._player.want = self._pictures.of(self._plan, missing) if open_now and state in _ON else BLACK
+        self._player.want = self._content.of(self._plan, missing) if open_now and state in _ON else BLACK
 
     @property
     def player(self) -> PlayerView:
@@ -303,6 +303,6 @@ def _reasons(views: Sequence[ProjectorView]) -> str:
 
 
 _FAULTY: Final = Decision(
-    "work-impossible", "The work was given up: the stage is in a fault.",
-    "See what the fault is, mend that, and ask again.", "error",
+    "work-impossible", "The job was cancelled because the stage has a fault.",
+    "Correct the fault, then start the job again.", "error",
 )  # fmt: skip

@@ -1,3 +1,3 @@
-"""Long work of the kiosk: `job_runner` runs it in a thread, `job_handlers` says what each kind does, `failover`
-drops a lost projector.
+"""Long jobs of the kiosk: `job_runner` runs them in a thread, `job_handlers` has a handler for each kind, `failover`
+computes frames without a lost projector.
 """

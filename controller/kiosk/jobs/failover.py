@@ -1,4 +1,4 @@
-"""Frames for a stage that lost projectors: the appearances solved again for those that are left, in a bundle beside."""
+"""Failover frames: the appearances solved for the projectors that still work, in a separate bundle."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FOLDER: Final = "without"
 
 
 class Survivors(Calibrated):
-    """A calibration seen by some of its projectors; what is solved for them lies in ``own``, not in the run."""
+    """A calibration reduced to some of its projectors; its solutions are stored in ``own``, not in the run."""
 
     def __init__(self, run: Path, projectors: Sequence[str], own: Path) -> None:
         super().__init__(run, projectors)
@@ -54,55 +54,58 @@ class Survivors(Calibrated):
 def solve_without(
     session: StageSession, missing: Sequence[str], *, reporter: Reporter, cancel: threading.Event
 ) -> Path:
-    """Solve the installed bundle's appearances without these projectors, and install them beside it.
+    """Solve the installed bundle's appearances without these projectors, and install them as a separate bundle.
 
-    Steps that were done from the same calibration are not repeated. Returns the bundle's file. Raises what
+    Finished steps of the same calibration are not repeated. Returns the bundle's file. Raises what
     ``usable_calibration``, ``wishes_of`` and the solver raise, and UsageError("nobody-left").
     """
     checked = check_stage(session.stage)
     left = tuple(name for name in checked.names if name not in missing)
     if not left or len(left) == len(checked.names):
-        raise UsageError("nobody-left", what="Nobody would be left to take over.", remedy="Mend a projector.")
+        raise UsageError("nobody-left", what="No working projector would remain.", remedy="Repair a projector.")
     folder = checked.stage.folder
     with session.locked():
         run = usable_calibration(checked, reporter)
         own = run / FOLDER / slots_without(run, missing).name
         survivors = Survivors(run, left, own)
-        wishes = _wishes(checked, survivors, _installed(folder, checked))
+        requests = _requests(checked, survivors, _installed(folder, checked))
         table = checked.stage.tables.solve
         scale = costs.scale(size for _, size in output_sizes(checked).values())
         options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base)
-        names = [wish.name for wish in wishes]
+        names = [request.name for request in requests]
         install_step = Step(
             StepId(StepKind.PUBLISH), partial(_publish, checked, tuple(missing), run, names),
             after=tuple(StepId(StepKind.APPEARANCE, item=name) for name in names),
-            title=f"Keeping frames without {', '.join(missing)}",
+            title=f"Installing frames without {', '.join(missing)}",
             always=True,
         )  # fmt: skip
         with Journal(own) as journal:
-            steps = [*solve_steps(survivors, wishes, options, (), scale), install_step]
+            steps = [*solve_steps(survivors, requests, options, (), scale), install_step]
             Runner(steps, journal, reporter=reporter).run("takeover", deadline=in_seconds(LONGEST_RUN_S, cancel))
-    found = current(slots_without(folder, missing))
-    assert found is not None
-    return found
+    bundle = current(slots_without(folder, missing))
+    assert bundle is not None
+    return bundle
 
 
-def _wishes(checked: Checked, survivors: Survivors, names: Sequence[str]) -> list[Wish]:
-    """Of those that can be made: the others were told when they were published. Raises as ``wishes_of`` if none can."""
-    found: list[Wish] = []
+def _requests(checked: Checked, survivors: Survivors, names: Sequence[str]) -> list[Wish]:
+    """Without those that can't be solved, which were reported when they were published.
+
+    Raises as ``wishes_of`` if none can be solved.
+    """
+    solvable: list[Wish] = []
     for name in names or [table.name for table in checked.stage.tables.appearances]:
         with contextlib.suppress(VelaturaError):
-            found += wishes_of(checked.stage, survivors, (name,))
-    return found or wishes_of(checked.stage, survivors, names)
+            solvable += wishes_of(checked.stage, survivors, (name,))
+    return solvable or wishes_of(checked.stage, survivors, names)
 
 
 def _installed(folder: Path, checked: Checked) -> Sequence[str]:
-    """The installed bundle's appearances that stage.toml still has; all of stage.toml's where nothing is installed."""
+    """The installed bundle's appearances that stage.toml still has; empty if nothing is installed."""
     file, known = current(folder / "bundles"), {table.name for table in checked.stage.tables.appearances}
     if file is None:
         return ()
     with Bundle.open_trusted(file, stage_trust(checked.stage)) as bundle:
-        return [one.name for one in bundle.index.appearances if one.name in known]
+        return [appearance.name for appearance in bundle.index.appearances if appearance.name in known]
 
 
 def _publish(

@@ -1,4 +1,4 @@
-"""A job of a running kiosk, followed from another process to its end."""
+"""A job of a running kiosk, followed from another process until it ends."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def ask_and_follow(
     cancel: threading.Event,
     every_s: float = EVERY_S,
 ) -> Mapping[str, Any]:
-    """Ask for a job, and return what came of it; ``cancel`` cancels the job, too.
+    """Start a job and return its result; ``cancel`` cancels the job, too.
 
-    Raises UsageError("not-serving"), what the kiosk refuses the job with, WorkError("job-given-up") where it will
-    never begin (the lamps did not light, somebody cancelled it, the kiosk began anew), WorkError("job-failed") with the
-    kiosk's own sentence, and Cancelled.
+    Raises UsageError("not-serving"), the kiosk's refusal of the job, WorkError("job-given-up") if it will never start
+    (the lamps did not light, it was cancelled, the kiosk restarted), WorkError("job-failed") with the kiosk's own
+    sentence, and Cancelled.
     """
     number, began_s = int(ask(stage, op, **arguments)["number"]), time.monotonic()
     last: object = None
@@ -42,7 +42,7 @@ def ask_and_follow(
             last = job["steps"]
             reporter.progress(_progress(job, time.monotonic() - began_s))
         if cancel.wait(every_s):
-            with contextlib.suppress(VelaturaError):  # it may have ended meanwhile
+            with contextlib.suppress(VelaturaError):  # it may have ended in the meantime
                 ask(stage, "cancel")
             raise Cancelled
 
@@ -50,12 +50,12 @@ def ask_and_follow(
 def _ended(job: Mapping[str, Any]) -> Mapping[str, Any]:
     if job["failed"]:
         raise WorkError("job-failed", what=f"{job['name']}: {job['outcome']}",
-                        remedy="`velatura events` tells what was decided and why.")  # fmt: skip
+                        remedy="See `velatura events` for the decisions and their reasons.")  # fmt: skip
     return {"job": job["name"], "outcome": job["outcome"], **({"run": job["run"]} if job["run"] else {})}
 
 
 def _progress(job: Mapping[str, Any], elapsed_s: float) -> Progress:
-    """The kiosk's job knows the steps up to the present one; the whole is told by its time left."""
+    """The job lists only the steps so far, so the overall progress follows from the time left."""
     index, step = len(job["steps"]) - 1, job["steps"][-1]
     left_s = job["left_s"]
     share = 0.0 if left_s is None else elapsed_s / max(elapsed_s + left_s, 1e-6)

@@ -1,4 +1,4 @@
-"""Does work in a thread of its own, and keeps what the panel shows of it."""
+"""Runs one job at a time in its own thread, and keeps what the panel shows of it."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ TITLES: Final[Mapping[str, str]] = {
     "projector": "Recalibration of projector",
     "full": "Full recalibration",
     "compare": "Photographing",
-    "publish": "Appearances",
+    "publish": "Publishing appearances",
     "compute": "New appearance",
     "report": "Report of",
-    "takeover": "Frames without a projector",
+    "takeover": "Frames without projector",
     "variants": "Frames for the loss of a projector",
 }
 
 
 REMEMBERED: Final = 16
-"""Jobs that ended, for whoever follows one and looks only now and then."""
+"""Ended jobs, for a client that polls only now and then."""
 
 
 def title_of(request: Request) -> str:
-    """What people read of it."""
+    """The job's name in the panel and the log."""
     return " ".join((TITLES.get(request.kind, request.kind), *request.arguments))
 
 
@@ -62,24 +62,29 @@ class JobReporter:
 
 
 Do = Callable[[Request, JobReporter, threading.Event], Finished]
-"""Does one kind of work; raises VelaturaError, DeviceError or Cancelled."""
+"""Does one kind of job; raises VelaturaError, DeviceError or Cancelled."""
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
-    """``refusal`` says from memory why it can't be done now, or None."""
+class JobHandler:
+    """``refusal`` says from memory why the job can't run now, or None."""
 
     do: Do
     refusal: Callable[[Request], Decision | None] = lambda request: None
 
 
-class ThreadWorks:
-    """One piece of work at a time; see ``ports.Works``. ``number`` is that of the last job of the service before."""
+class JobRunner:
+    """See ``interfaces.Jobs``. ``number``: that of the last job of the previous service."""
 
     def __init__(
-        self, kinds: Mapping[str, Kind], log: EventLog, changed: Callable[[], None] = lambda: None, *, number: int = 0
+        self,
+        handlers: Mapping[str, JobHandler],
+        log: EventLog,
+        changed: Callable[[], None] = lambda: None,
+        *,
+        number: int = 0,
     ) -> None:
-        self._kinds, self._log, self._changed = kinds, log, changed
+        self._handlers, self._log, self._changed = handlers, log, changed
         self._number = number
         self._lock = threading.Lock()
         self._request: Request | None = None
@@ -91,22 +96,22 @@ class ThreadWorks:
 
     @property
     def job(self) -> Job | None:
-        """The work that is going on, or ended last."""
+        """The job that is running, or ended last."""
         return None if self._reporter is None else self._reporter.job
 
     @property
     def number(self) -> int:
-        """The last that a job has, or was promised, also in a service before."""
+        """The highest job number used or reserved, also by previous services."""
         return self._number
 
     def reserve(self) -> int:
-        """The number of a job that is asked for now, and may begin later or never; no other gets it."""
+        """A number for a job that is requested now and may start later or never; no other job gets it."""
         with self._lock:
             self._number += 1
             return self._number
 
     def known(self, number: int) -> Job | None:
-        """The job of this number, if it goes on or ended lately; None while it waits, and where it never began."""
+        """The job of this number if it runs or ended recently; None while it waits, and if it never started."""
         job = self.job
         return job if job is not None and job.number == number else self._ended.get(number)
 
@@ -115,13 +120,13 @@ class ThreadWorks:
         return self._request
 
     def refusal(self, request: Request) -> Decision | None:
-        return self._kinds[request.kind].refusal(request)
+        return self._handlers[request.kind].refusal(request)
 
     def begin(self, request: Request) -> None:
         self._request, self._cancel = request, threading.Event()
         title = title_of(request)
         self._reporter = JobReporter(Job(request.number or self.reserve(), title), self._log, self._changed)
-        self._log.tell(Decision("work-begins", f"{title} begins."))
+        self._log.tell(Decision("work-begins", f"Started: {title}."))
         thread = threading.Thread(
             target=self._run, args=(request, self._reporter, self._cancel), name=f"work-{request.kind}", daemon=True
         )
@@ -129,33 +134,33 @@ class ThreadWorks:
             thread.start()
             self._thread = thread
         except RuntimeError as error:
-            # Of a system that gives no more threads. Whoever waits for this work would do so for good.
+            # The system has no thread left. Without this the job would never end.
             self._end(_crashed(request, error), self._reporter)
 
     def finished(self) -> Finished | None:
         with self._lock:
-            found, self._finished = self._finished, None
-            if found is not None:
+            finished, self._finished = self._finished, None
+            if finished is not None:
                 self._request = None
-            return found
+            return finished
 
     def cancel(self) -> None:
         self._cancel.set()
 
     def close(self, timeout_s: float) -> None:
-        """Ask for the end, and wait for it."""
+        """Cancel the job and wait until it ends."""
         self._cancel.set()
         if self._thread is not None:
             self._thread.join(timeout_s)
 
     def _run(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> None:
         try:
-            finished = self._kinds[request.kind].do(request, reporter, cancel)
+            finished = self._handlers[request.kind].do(request, reporter, cancel)
         except Cancelled as error:
             finished = Finished(request, Decision(error.code, error.what, error.remedy), failed=True)
         except (VelaturaError, DeviceError) as error:
             finished = Finished(request, Decision(error.code, error.what, error.remedy, "error"), failed=True)
-        except BaseException as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk goes on, and says it
+        except BaseException as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk reports it and continues
             finished = _crashed(request, error)
         self._end(finished, reporter)
 
@@ -172,10 +177,10 @@ class ThreadWorks:
 
 
 def _crashed(request: Request, error: BaseException) -> Finished:
-    what = f"The work met an error that Velatura does not know ({type(error).__name__}: {error})."
+    what = f"The job failed with an unexpected error ({type(error).__name__}: {error})."
     return Finished(request, Decision("crash", what, "Export the diagnostics.", "error"), failed=True)
 
 
 def run_name(result: Mapping[str, object]) -> str:
-    """The name of the run's folder that a service returned."""
+    """The name of the run folder that a service returned."""
     return Path(str(result["run"])).name if "run" in result else ""

@@ -1,4 +1,4 @@
-"""Solve and publish all appearances of a stage; one that can't be made stops no other."""
+"""Solve and publish all appearances of a stage; one that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from controller.stage.session import StageSession
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """``names`` are in the new bundle, none where there is no new bundle; ``failed``: by name, why it is not."""
+    """``names`` are in the new bundle (empty: there is none); ``failed``: the reason for each other one."""
 
     names: tuple[str, ...]
     failed: Mapping[str, str]
 
     @property
     def failures(self) -> str:
-        """Sentences that name each."""
+        """One sentence for each."""
         return " ".join(f"{name} was not solved: {why}" for name, why in self.failed.items())
 
 
 def publish_appearances(session: StageSession, *, reporter: Reporter, cancel: threading.Event) -> Published:
-    """What stage.toml has, on the newest calibration.
+    """Solve the appearances of stage.toml on the newest calibration.
 
-    Raises what ``services.calibrate.make_appearances`` raises where that concerns every appearance, and Cancelled.
+    Raises what ``services.calibrate.make_appearances`` raises if no appearance can be solved, and Cancelled.
     """
     from controller.services.calibrate import make_appearances
 
@@ -37,18 +37,18 @@ def publish_appearances(session: StageSession, *, reporter: Reporter, cancel: th
     if failed and not names:
         return Published((), failed)
 
-    def make(some: Sequence[str]) -> None:
-        make_appearances(session=session, names=some, reporter=reporter, cancel=cancel)
+    def make(subset: Sequence[str]) -> None:
+        make_appearances(session=session, names=subset, reporter=reporter, cancel=cancel)
 
     try:
         make(names)
     except VelaturaError as error:
         if len(names) < 2:
             raise
-        whole = error
+        first_error = error
     else:
         return Published(names, failed)
-    # One of them is at fault, or all are; what is solved already is not solved again.
+    # Find out which ones fail; finished solutions are reused.
     made = []
     for name in names:
         try:
@@ -57,12 +57,12 @@ def publish_appearances(session: StageSession, *, reporter: Reporter, cancel: th
         except VelaturaError as error:
             failed[name] = f"{error.what} {error.remedy}"
     if not made:
-        raise whole
+        raise first_error
     return Published(tuple(made), failed)
 
 
 def _checked(stage: Path) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Those of stage.toml that can be begun, and why the others can't."""
+    """The appearances of stage.toml that can be solved, and why the others can't."""
     from controller.artefacts.calibrated import Calibrated
     from controller.stage.calibrations import finished_calibration
     from controller.steps.appearance.requests import wishes_of

@@ -1,1 +1,1 @@
-"""Everything that can be asked of a kiosk, declared once: `table.OPERATIONS`; every way in is made from it."""
+"""All operations of a kiosk, declared once in `table.OPERATIONS`; HTTP, socket, commands and MQTT are made from it."""

@@ -1,4 +1,4 @@
-"""Accounts and tokens as operations; ``AccountActions`` has their methods."""
+"""Accounts and tokens as operations; ``AccountActions`` implements them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from controller.kiosk.roles import ACCOUNT_NAME, LONGEST_PASSWORD, Role
 if TYPE_CHECKING:
     from controller.kiosk.store.accounts import Accounts
 
-_NAME: Final = Field("name", "1 to 32 small letters, digits, dots, dashes; begins with a letter", pattern=ACCOUNT_NAME,
-                     longest=32)  # fmt: skip
+_NAME: Final = Field(
+    "name", "1 to 32 lower-case letters, digits, dots, dashes, underscores; the first is a letter",
+    pattern=ACCOUNT_NAME, longest=32,
+)  # fmt: skip
 _ROLE: Final = Field("role", "viewer, operator or technician", choices=("viewer", "operator", "technician"),
                      usual="viewer")  # fmt: skip
 _PASSWORD: Final = Field("password", "10 characters or more", longest=LONGEST_PASSWORD, secret=True)
 
 
 class AccountActions:
-    """What may be done with accounts and tokens. ``held`` gives them when they are first needed; ``ended`` gets the
-    name of whose sessions have to end; inside ``costly`` a password is hashed.
+    """The operations on accounts and tokens. ``held`` opens the accounts at the first use; ``ended`` ends the sessions
+    of an account; ``costly`` limits how many passwords are hashed at the same time.
     """
 
     def __init__(
@@ -33,13 +35,17 @@ class AccountActions:
         self._costly = costly or contextlib.nullcontext()
 
     def accounts(self) -> Sequence[dict[str, Any]]:
-        found = self._held().all()
-        return [{"name": one.name, "role": one.role.name.lower(), "one_time": one.one_time} for one in found]
+        return [
+            {"name": account.name, "role": account.role.name.lower(), "one_time": account.one_time}
+            for account in self._held().all()
+        ]
 
     def tokens(self) -> Sequence[dict[str, Any]]:
-        """Without what they show."""
-        found = self._held().tokens()
-        return [{"name": one.name, "role": one.role.name.lower(), "made_unix_s": one.made_unix_s} for one in found]
+        """Without the secrets."""
+        return [
+            {"name": token.name, "role": token.role.name.lower(), "made_unix_s": token.made_unix_s}
+            for token in self._held().tokens()
+        ]
 
     def add_account(self, name: str, role: str, password: str) -> None:
         with self._costly:
@@ -70,21 +76,21 @@ def _declared(name: str, about: str, effect: Effect, **more: Any) -> Operation:
 
 
 ACCOUNT_OPERATIONS: Final = (
-    _declared("accounts", "Who may log in", Effect.LOOKS, within="account list"),
-    _declared("tokens", "The machines' tokens, without what they show", Effect.LOOKS, within="account list"),
-    _declared("add-account", "Make an account", Effect.CHANGES, fields=(_NAME, _ROLE, _PASSWORD),
+    _declared("accounts", "List the accounts", Effect.LOOKS, within="account list"),
+    _declared("tokens", "List the API tokens, without their secrets", Effect.LOOKS, within="account list"),
+    _declared("add-account", "Add an account", Effect.CHANGES, fields=(_NAME, _ROLE, _PASSWORD),
               answer=Answer.NOTHING, http=("POST", "/accounts"), command="account add", said="{name} may log in."),
     _declared("set-role", "Change an account's role, and end its sessions", Effect.CHANGES, fields=(_NAME, _ROLE),
               answer=Answer.NOTHING, http=("PUT", "/accounts/{name}/role"), command="account role",
-              said="{name} is {role} now."),
-    _declared("set-password", "Give an account a new password, and end its sessions", Effect.CHANGES,
+              said="{name} has the role {role} now."),
+    _declared("set-password", "Set a new password for an account, and end its sessions", Effect.CHANGES,
               fields=(_NAME, _PASSWORD), answer=Answer.NOTHING, http=("PUT", "/accounts/{name}/password"),
               command="account password", said="The new password is in use."),
     _declared("remove-account", "Remove an account, and end its sessions", Effect.CHANGES, fields=(_NAME,),
               answer=Answer.NOTHING, http=("DELETE", "/accounts/{name}"), command="account remove",
               said="{name} is removed."),
-    _declared("add-token", "Make a token; the answer shows it once", Effect.CHANGES, fields=(_NAME, _ROLE),
+    _declared("add-token", "Add an API token; it is shown only once", Effect.CHANGES, fields=(_NAME, _ROLE),
               http=("POST", "/tokens"), command="account add-token"),
-    _declared("remove-token", "Remove a token", Effect.CHANGES, fields=(_NAME,), answer=Answer.NOTHING,
+    _declared("remove-token", "Remove an API token", Effect.CHANGES, fields=(_NAME,), answer=Answer.NOTHING,
               http=("DELETE", "/tokens/{name}"), command="account remove-token", said="The token {name} is removed."),
 )  # fmt: skip

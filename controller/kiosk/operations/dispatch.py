@@ -1,4 +1,4 @@
-"""Operations by the names of the socket, for callers on this machine: files are given by their paths."""
+"""Operations by their socket names, for callers on this machine: files are given as paths."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ AT_SOCKET: Final = (*OPERATIONS, JOB)
 
 
 def on_this_machine(field: Field) -> Field:
-    """As the socket takes it: a file or a target by its path."""
+    """The field at the socket: a file or a target is given as a path."""
     if field.kind not in ("file", "target"):
         return field
     return replace(field, kind="text", pattern="", longest=LONGEST_PATH)
 
 
 def local_values(operation: Operation, sent: Mapping[str, Any]) -> Values:
-    """The checked values; None is as good as left out. Raises as ``fields.parse``."""
+    """The checked values; None counts as omitted. Raises as ``fields.parse``."""
     given = {name: value for name, value in sent.items() if value is not None}
     values = parse([on_this_machine(field) for field in operation.fields], given, strings=False)
     paths = {field.name for field in operation.fields if field.kind in ("file", "target")}
@@ -33,11 +33,15 @@ def local_values(operation: Operation, sent: Mapping[str, Any]) -> Values:
 def socket_table(
     holders: Mapping[str, Any], operations: Sequence[Operation] = AT_SOCKET
 ) -> dict[str, Callable[..., Any]]:
-    """What each name of the socket does, for the operations whose holder is there."""
-    return {one.socket_name: _asked(one, holders[one.holder]) for one in operations if one.holder in holders}
+    """The socket's operations by name, as far as ``holders`` has their holder."""
+    return {
+        operation.socket_name: _bound(operation, holders[operation.holder])
+        for operation in operations
+        if operation.holder in holders
+    }
 
 
-def _asked(operation: Operation, holder: Any) -> Callable[..., Any]:
+def _bound(operation: Operation, holder: Any) -> Callable[..., Any]:
     names = [field.name for field in operation.fields]
 
     def ask(*given: Any, **sent: Any) -> Any:
@@ -47,5 +51,5 @@ def _asked(operation: Operation, holder: Any) -> Callable[..., Any]:
 
 
 def offline_operation(op: str) -> Operation | None:
-    """The operation of this name, if it can be done where no kiosk runs."""
-    return next((one for one in AT_SOCKET if one.offline and one.socket_name == op), None)
+    """The operation of this name, if it works without a running kiosk."""
+    return next((operation for operation in AT_SOCKET if operation.offline and operation.socket_name == op), None)

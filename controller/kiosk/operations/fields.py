@@ -1,4 +1,4 @@
-"""What a caller may send: checked in one place for every way in, and described in the API's document and in helps."""
+"""The arguments of operations: checked in one place for every interface, and described in API document and help."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any, Final, Literal
 from controller.core.errors import UsageError
 
 NAME: Final = r"^[A-Za-z0-9\u00C0-\u024F][A-Za-z0-9\u00C0-\u024F ._-]{0,63}$"
-"""Names that end up in addresses and file names."""
+"""Names that are used in URLs and file names."""
 
 _NO_TEXT: Final = re.compile("[\\x00\\ud800-\\udfff]")
-"""Half a character of UTF-16 can be said in JSON, and written to no file and no answer."""
+"""JSON can contain half a UTF-16 character, but no file and no answer can."""
 
 Kind = Literal["text", "integer", "number", "boolean", "file", "target", "rows"]
 
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """How the command line asks for a value that has two: ``option`` gives ``value``; without it, ``otherwise``."""
+    """An option for a field with two values: with ``option`` it is ``value``, without it ``otherwise``."""
 
     option: str
     about: str
@@ -31,12 +31,12 @@ class Flag:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One value of a call. ``least`` and ``most`` bound a number, or the number of rows; ``columns`` are a row's
-    fields. A "file" is sent whole; a "target" is a picture: the key of an upload in the API, a file elsewhere.
+    """One argument of an operation. ``least`` and ``most`` limit a number, or the number of rows; ``columns`` are the
+    fields of a row. A "file" is sent whole; a "target" is a picture: the key of an upload in the API, a file elsewhere.
 
-    For the command line alone: a required value is an argument and any other an option, but for ``argument`` and
-    ``flag``; ``usual`` is taken where a required option is left out; ``names`` says whose names the shell completes;
-    ``secret`` is typed unseen; ``metavar`` is the argument's name in the help
+    Only for the command line: a required field is an argument and any other an option, except with ``argument`` and
+    ``flag``; ``usual``: the default of a required option; ``names``: which names the shell completes; ``secret``: the
+    input is hidden; ``metavar``: the argument's name in the help
     """
 
     name: str
@@ -82,16 +82,16 @@ def object_schema(fields: Sequence[Field]) -> dict[str, Any]:
 
 
 def parse(fields: Sequence[Field], sent: Mapping[str, Any], *, strings: bool) -> dict[str, Any]:
-    """The checked values of ``sent``; a field that is not there is left out.
+    """The checked values of ``sent``; missing fields are omitted.
 
-    ``strings`` True where everything came as text (forms, addresses): numbers are then read from text, an empty text
-    means "left out", and a box that is not ticked is False. Raises UsageError("field-unknown", "field-missing",
+    ``strings`` True if all values are text (forms, URLs): numbers are then read from text, an empty text counts as
+    omitted, and a missing boolean is False. Raises UsageError("field-unknown", "field-missing",
     "field-wrong").
     """
     known = {field.name for field in fields}
     for name in sent:
         if name not in known:
-            raise UsageError("field-unknown", what="A field that does not exist was sent.", remedy=_allowed(fields))
+            raise UsageError("field-unknown", what="The request has an unknown field.", remedy=_allowed(fields))
     values: dict[str, Any] = {}
     for field in fields:
         value = sent.get(field.name)
@@ -107,11 +107,13 @@ def parse(fields: Sequence[Field], sent: Mapping[str, Any], *, strings: bool) ->
 
 def _allowed(fields: Sequence[Field]) -> str:
     names = ", ".join(field.name for field in fields)
-    return f"Allowed here: {names}." if names else "Nothing is allowed here."
+    return f"Allowed here: {names}." if names else "No fields are allowed here."
 
 
 def _wrong(field: Field) -> UsageError:
-    return UsageError("field-wrong", what=f"'{field.name}' is not what it must be.", remedy=f"It is {field.about}.")
+    return UsageError(
+        "field-wrong", what=f"The value of '{field.name}' is not valid.", remedy=f"Allowed: {field.about}."
+    )
 
 
 def _flag(field: Field, value: object) -> bool:
@@ -145,7 +147,7 @@ def _text(field: Field, value: object) -> str:
         raise _wrong(field)
     if field.choices and value not in field.choices:
         raise _wrong(field)
-    # A text of several lines comes from a form with the line ends of the mail of 1982.
+    # Browsers send the text of a form with CRLF line ends.
     value = value.replace("\r\n", "\n")
     if field.pattern and not re.fullmatch(field.pattern.removeprefix("^").removesuffix("$"), value):
         raise _wrong(field)
@@ -161,7 +163,7 @@ def _number_in(field: Field, value: object) -> int | float:
 def _number(field: Field, value: object) -> int | float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise _wrong(field)
-    # In this order: not a number is never within bounds, and infinity is no whole number.
+    # In this order: NaN is never within bounds, and int(infinity) would raise.
     if not field.least <= value <= field.most or (field.kind == "integer" and value != int(value)):
         raise _wrong(field)
     return int(value) if field.kind == "integer" else value

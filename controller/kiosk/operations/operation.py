@@ -1,4 +1,4 @@
-"""What an operation is: everything that the HTTP API, the socket, the command line and MQTT need to offer it."""
+"""The declaration of an operation: all that HTTP, socket, command line and MQTT need to offer it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ class Effect(enum.Enum):
     LOOKS = "changes nothing"
     SHOWS = "changes what the stage shows now, and nothing that is kept"
     CHANGES = "changes what is kept"
-    WORKS = "begins a job, which it answers"
+    WORKS = "starts a job and returns it"
 
 
 class Answer(enum.Enum):
-    """What comes back, with its media type in the API."""
+    """The kind of result, with its media type in the API."""
 
     VALUE = "application/json"
     TEXT = "text"
-    """Words; the API puts them into an object."""
+    """Text; the API returns it in an object."""
     NOTHING = ""
     PICTURE = "image/png"
     """The path of a PNG or JPEG."""
     JPEG = "image/jpeg"
-    """Bytes, or None where there is no picture now."""
+    """Bytes, or None if there is no picture now."""
     PAGE = "text/html"
     """The path of one HTML file."""
     FILE = "application/octet-stream"
-    """The path of a file to be saved."""
+    """The path of a file to download."""
 
     @property
     def media(self) -> str:
@@ -56,15 +56,14 @@ def whole_answer(answer: Any, values: Values) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One thing that can be asked. A declaration and a method of its holder are all that one needs.
+    """One operation. It needs only this declaration and a method of its holder.
 
-    ``holder``: who has the method: the kiosk, its accounts, or the panel's uploaded targets (HTTP only); ``call``: the
-    method, named as the operation where left out; ``take`` makes the method's arguments of the values, and ``part``
-    takes of its answer what was asked for. ``offline``: ``api.folder.FolderKiosk`` can do it where no kiosk runs.
-    ``http``: method and path below /api/v1, ``at_socket``: its name there, ``command``: its words on the command line,
-    ``verb``: its name for building control; each follows from ``name`` where left out. ``within``: a command written by
-    hand does it, among other things. ``said``: one sentence for people when it was done; values may stand in it.
-    ``more``: sentences that the help says after ``about``
+    ``holder``: the object with the method: the kiosk, its accounts, or the panel's uploaded targets (HTTP only);
+    ``call``: the method's name; ``take`` makes its arguments from the values, ``part`` selects from its result.
+    ``offline``: ``api.folder.FolderKiosk`` has it, for use without a running kiosk. ``http``: method and path below
+    /api/v1; ``at_socket``, ``command``, ``verb``: its name at the socket, on the command line and for building control.
+    All names default to ``name``. ``within``: the hand-written command that includes it. ``said``: the sentence shown
+    when it is done, with the values as format fields; ``more``: what the help says after ``about``
     """
 
     name: str
@@ -88,7 +87,7 @@ class Operation:
 
     @property
     def method(self) -> str:
-        """GET for what only looks and costs little."""
+        """By default GET if it changes nothing."""
         return self.http[0] or ("GET" if self.effect is Effect.LOOKS else "POST")
 
     @property
@@ -101,12 +100,12 @@ class Operation:
 
     @property
     def words(self) -> str:
-        """The command, as it is typed after ``velatura``."""
+        """The command after ``velatura``."""
         return self.within or self.command or self.name
 
     @property
     def building_verb(self) -> str:
-        """Its name for building control; empty for what is not for it, which is all but what operators may show."""
+        """Its name for building control, which may only change what the stage shows; else empty."""
         allowed = self.effect is Effect.SHOWS and self.role <= Role.OPERATOR and self.holder == "kiosk"
         return (self.verb or self.name) if allowed else ""
 
@@ -117,11 +116,11 @@ class Operation:
 
     @property
     def changes(self) -> bool:
-        """Whether it is no mere GET."""
+        """Whether its method is not GET."""
         return self.method != "GET"
 
     def where(self, field: Field) -> Where:
-        """Where the field stands in a request."""
+        """The place of the field in a request."""
         if f"{{{field.name}}}" in self.path:
             return "path"
         if self.upload is not None and field.kind != "file":
@@ -129,7 +128,7 @@ class Operation:
         return "body" if self.changes else "query"
 
     def of(self, holder: Any, values: Values) -> Any:
-        """Do it. Raises what the holder's method raises."""
+        """Call the holder's method. Raises what it raises."""
         method = getattr(holder, self.call or self.name.replace("-", "_"))
         return self.part(method(**self.take(values)), values)
 

@@ -1,3 +1,3 @@
-"""What the kiosk keeps on disk: events, runs, bundles, settings, schedule, accounts, photographs and how long
-they stay.
+"""What the kiosk stores on disk: events, runs, bundles, settings, schedule, accounts; and how long photographs
+are kept.
 """

@@ -1,4 +1,4 @@
-"""Who may do what: accounts with argon2id, tokens for machines, three roles. Kept in one private file."""
+"""Accounts with argon2id passwords and API tokens, each with one of three roles, in one private file."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ SHORTEST_PASSWORD: Final = 10
 FOLDER: Final = "kiosk/panel"
 """The panel's private files, in the stage's folder."""
 FIRST_ACCOUNT: Final = "technician"
-TOKEN_PREFIX: Final = "velatura_"  # noqa: S105 - shows people what the token is for
+TOKEN_PREFIX: Final = "velatura_"  # noqa: S105 - a prefix that shows what the token is for
 
-# No letter or digit that is mistaken for another when it is read from a wall.
+# Without characters that look alike when they are projected.
 _READABLE: Final = "abcdefghkmnpqrstuvwxyz23456789"
 
 
@@ -44,7 +44,7 @@ class Account:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """What a machine shows instead of a password. Only its SHA-256 is kept: 256 random bits need no slow hash."""
+    """An API token. Only its SHA-256 is stored: 256 random bits need no slow hash."""
 
     name: str
     role: Role
@@ -53,7 +53,7 @@ class Token:
 
 
 class Accounts:
-    """The accounts of a kiosk, in ``file`` (JSON, mode 0600). Safe to use from several threads.
+    """The accounts of a kiosk, in ``file`` (JSON, mode 0600). Thread-safe.
 
     ``hasher`` argon2id; the default is RFC 9106's low-memory choice, about 50 ms.
     """
@@ -64,14 +64,14 @@ class Accounts:
         self._file, self._clock = file, clock
         self._hasher = hasher or PasswordHasher()
         self._lock = threading.RLock()
-        # An unknown name must take as long as a wrong password, or names could be guessed by the clock.
-        self._nobody = self._hasher.hash(secrets.token_urlsafe(16))
+        # An unknown name must take as long as a wrong password, else the response time would reveal names.
+        self._unknown_hash = self._hasher.hash(secrets.token_urlsafe(16))
         self._accounts, self._tokens = _read(file)
 
     def first_start(self) -> str | None:
-        """Make the first technician with a one-time password and return it; None when somebody can log in already.
+        """Make the first technician with a one-time password and return it; None if an account has its own password.
 
-        The password is kept nowhere but in whoever shows it. As long as nobody used it, every start makes a new one.
+        The password itself is not stored. Every start makes a new one until it has been used.
         """
         with self._lock:
             if self.entered:
@@ -82,7 +82,7 @@ class Accounts:
 
     @property
     def entered(self) -> bool:
-        """Whether somebody has a password of their own."""
+        """Whether an account has its own password, not a one-time password."""
         with self._lock:
             return any(not account.one_time for account in self._accounts.values())
 
@@ -95,11 +95,11 @@ class Accounts:
             return self._accounts.get(name)
 
     def verify(self, name: str, password: str) -> Account | None:
-        """The account, if the password is right. Takes as long for a name that does not exist."""
+        """The account, if the password is right. Takes the same time for an unknown name."""
         account = self.get(name)
-        stored = self._nobody if account is None else account.password_hash
+        stored = self._unknown_hash if account is None else account.password_hash
         if account is not None and account.one_time:
-            password = password.lower()  # projectors show it in capitals
+            password = password.lower()  # projectors show it in upper case
         try:
             self._hasher.verify(stored, password[:LONGEST_PASSWORD])
         except (VerificationError, InvalidHashError):
@@ -112,13 +112,13 @@ class Accounts:
             raise UsageError(
                 "account-name",
                 what="This account name is not allowed.",
-                remedy="Use 1 to 32 small letters, digits, dots, dashes; begin with a letter.",
+                remedy="Use 1 to 32 lower-case letters, digits, dots, dashes, underscores. Start with a letter.",
             )
         _check_password(name, password)
         with self._lock:
             if name in self._accounts:
                 raise UsageError(
-                    "account-exists", what=f"There is an account '{name}' already.", remedy="Choose another name."
+                    "account-exists", what=f"The account '{name}' exists already.", remedy="Choose another name."
                 )
             self._put(Account(name, role, self._hasher.hash(password)))
 
@@ -148,18 +148,18 @@ class Accounts:
             return sorted(self._tokens.values(), key=lambda token: token.name)
 
     def add_token(self, name: str, role: Role) -> str:
-        """The token, which is shown once and not kept. Raises UsageError("account-name", "token-exists")."""
+        """A new token; it is not stored in clear text. Raises UsageError("account-name", "token-exists")."""
         if not re.fullmatch(ACCOUNT_NAME, name):
             raise UsageError(
                 "account-name",
                 what="This token name is not allowed.",
-                remedy="Use 1 to 32 small letters, digits, dots, dashes; begin with a letter.",
+                remedy="Use 1 to 32 lower-case letters, digits, dots, dashes, underscores. Start with a letter.",
             )
         with self._lock:
             if name in self._tokens:
                 raise UsageError(
                     "token-exists",
-                    what=f"There is a token '{name}' already.",
+                    what=f"The token '{name}' exists already.",
                     remedy="Remove it, or choose another name.",
                 )
             token = TOKEN_PREFIX + secrets.token_urlsafe(32)
@@ -172,22 +172,22 @@ class Accounts:
         with self._lock:
             if self._tokens.pop(name, None) is None:
                 raise UsageError(
-                    "token-unknown", what="There is no such token.", remedy="Load the page again and choose another."
+                    "token-unknown", what="This token does not exist.", remedy="Load the page again and choose another."
                 )
             self._write()
 
     def by_token(self, shown: str) -> Token | None:
-        """The token that ``shown`` is, compared in constant time with every token there is."""
+        """The token of the secret ``shown``, compared in constant time with every token."""
         digest = digest_of(shown)
         with self._lock:
-            found = [token for token in self._tokens.values() if hmac.compare_digest(token.digest, digest)]
-        return found[0] if found else None
+            matching = [token for token in self._tokens.values() if hmac.compare_digest(token.digest, digest)]
+        return matching[0] if matching else None
 
     def _known(self, name: str) -> Account:
         account = self._accounts.get(name)
         if account is None:
             raise UsageError(
-                "account-unknown", what="There is no such account.", remedy="Load the page again and choose another."
+                "account-unknown", what="This account does not exist.", remedy="Load the page again and choose another."
             )
         return account
 
@@ -197,7 +197,7 @@ class Accounts:
             raise UsageError(
                 "last-technician",
                 what="This is the last technician.",
-                remedy="Make another account a technician first; otherwise nobody could mend the stage.",
+                remedy="Make another account a technician first. A stage needs at least one.",
             )
 
     def _put(self, account: Account) -> None:
@@ -213,7 +213,7 @@ class Accounts:
 
 
 def _read(file: Path) -> tuple[dict[str, Account], dict[str, Token]]:
-    """Raises UsageError("accounts-damaged") rather than starting with a door that stands open."""
+    """Raises UsageError("accounts-damaged"): a damaged file must not count as "no accounts"."""
     try:
         content: Any = json.loads(read_bytes(file))
         accounts = [Account(**{**row, "role": Role[row["role"]]}) for row in content["accounts"]]
@@ -224,7 +224,7 @@ def _read(file: Path) -> tuple[dict[str, Account], dict[str, Token]]:
         raise UsageError(
             "accounts-damaged",
             what=f"The accounts in {file} can't be read.",
-            remedy="Restore the file from a backup, or remove it: the next start makes a new one-time password.",
+            remedy="Restore the file from a copy, or delete it. The next start then makes a new one-time password.",
         ) from error
     return {account.name: account for account in accounts}, {token.name: token for token in tokens}
 
@@ -234,12 +234,12 @@ def _check_password(name: str, password: str) -> None:
         raise UsageError(
             "password-weak",
             what="This password is too easy to guess.",
-            remedy=f"Use {SHORTEST_PASSWORD} characters or more, without the account's name; a few words are good.",
+            remedy=f"Use {SHORTEST_PASSWORD} characters or more, without the account's name. A few words are good.",
         )
 
 
 def stage_accounts(stage: Path) -> Accounts:
-    """As they lie on disk; for whoever knows that nobody else holds them. Raises UsageError("accounts-damaged")."""
+    """The accounts of a stage; open them only once at a time. Raises UsageError("accounts-damaged")."""
     (stage / FOLDER).mkdir(mode=0o700, parents=True, exist_ok=True)
     return Accounts(stage / FOLDER / "accounts.json")
 

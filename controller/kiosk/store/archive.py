@@ -1,4 +1,4 @@
-"""Backup, restore and diagnostics of a stage as tar files; never with a secret in them."""
+"""Backup, restore and diagnostics of a stage as tar files without secrets."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from hal.runtime.caches import kept
 FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"
 RESTORING: Final = ".restoring"
-"""An unpacked and checked backup: while it is there, its parts are on their way to their places."""
+"""An unpacked and checked backup; while it exists, its parts are being moved into the stage."""
 REPLACED: Final = "kiosk/replaced"
 KEPT: Final = 5
 CUT_OFF_S: Final = 3600.0
-"""A backup to which nothing was written for so long is not being made any more."""
+"""An unfinished backup without changes for this time is abandoned."""
 MOST_FILES: Final = 100_000
 ROOM_SHARE: Final = 0.9
-"""Of the free space that a backup may fill when it is unpacked; the kiosk's own log needs some."""
+"""The share of the free space that an unpacked backup may fill; the event log needs some, too."""
 _SECRET: Final = ("keys", "kiosk", "run")
 _BACKED_UP: Final = ("stage.toml", "schedule.toml", "profiles", "appearances", "bundles", "bundles-without")
 
@@ -59,10 +59,10 @@ def backup(stage: Path) -> Path:
 
 
 def restore(stage: Path, file: Path) -> None:
-    """Replace settings, calibration and appearances by those of a backup; what was there stays in kiosk/replaced.
+    """Replace settings, calibration and appearances by those of a backup; the old ones are kept in kiosk/replaced.
 
-    Everything is unpacked and checked beside before anything is replaced; from then on it happens, be it by
-    ``finish_restore`` after a power cut. Raises UsageError("not-a-backup"), WorkError("no-space") and what
+    The backup is unpacked and checked first. After that nothing stops the restore: after a power cut
+    ``finish_restore`` completes it. Raises UsageError("not-a-backup"), WorkError("no-space") and what
     ``load_stage`` raises for the settings in it.
     """
     finish_restore(stage)
@@ -80,7 +80,7 @@ def restore(stage: Path, file: Path) -> None:
 
 
 def finish_restore(stage: Path) -> bool:
-    """Go on with a restore that was cut off between its parts, so that no mixture stays; whether there was one."""
+    """Complete an interrupted restore, so that old and new parts are not mixed; returns whether there was one."""
     fresh, old = stage / RESTORING, stage / REPLACED
     if not fresh.exists():
         return False
@@ -99,7 +99,7 @@ def finish_restore(stage: Path) -> bool:
 
 
 def clear_cut_off(stage: Path) -> None:
-    """Remove what a kill left of restores and backups, which may be gigabytes each. For the holder of the stage."""
+    """Delete the remains of interrupted restores and backups, which may be gigabytes. Needs the stage's lock."""
     for folder in stage.glob(".restore-*"):
         shutil.rmtree(folder, ignore_errors=True)
     for part in (stage / FOLDER).glob(".*.part"):
@@ -109,10 +109,10 @@ def clear_cut_off(stage: Path) -> None:
 
 
 def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:
-    """A new file for whoever helps from afar: ``facts``, events, journals and logs; no secret, no picture."""
+    """A new file for remote support: ``facts``, events, journals and logs, without secrets and pictures."""
     path = _new(stage, "diagnostics", "tar.gz")
     system = {"system": platform.platform(), "python": platform.python_version(), "disk": _disk(stage),
-              "outside_the_stage": [dataclasses.asdict(one) for one in kept()]}  # fmt: skip
+              "outside_the_stage": [dataclasses.asdict(cache) for cache in kept()]}  # fmt: skip
 
     def write(archive: tarfile.TarFile) -> None:
         _add(archive, "facts.json", json.dumps({**system, **facts}, indent=1, default=str).encode())
@@ -130,13 +130,13 @@ def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:
 
 def _texts(stage: Path) -> Iterable[Path]:
     runs = Path("runs/*")
-    found = (runs / FIGURES, json_path(runs, StepKind.DRIFT), json_path(runs, BUNDLE_FIGURES), Path("run/*.log"))
-    for pattern in found:
+    patterns = (runs / FIGURES, json_path(runs, StepKind.DRIFT), json_path(runs, BUNDLE_FIGURES), Path("run/*.log"))
+    for pattern in patterns:
         yield from sorted(stage.glob(str(pattern)))[-20:]
 
 
 def _copy_of(database: Path) -> bytes:
-    """As it stands now, though somebody writes to it."""
+    """A consistent copy, even while the database is written."""
     with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as source:
         return source.serialize()
 
@@ -158,7 +158,7 @@ def _written(path: Path, write: Any) -> Path:
         part.replace(path)
     except OSError as error:
         raise WorkError("cannot-write", what=f"{path.name} could not be written: {error.strerror}.",
-                        remedy="See whether there is space on the disk, and try again.") from error  # fmt: skip
+                        remedy="Check the free space on the disk, and try again.") from error  # fmt: skip
     finally:
         part.unlink(missing_ok=True)
     return path
@@ -171,7 +171,7 @@ def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def _harmless(info: tarfile.TarInfo) -> tarfile.TarInfo | None:
-    """Only files, folders, and the links of a bundle folder (to a name beside them); no key, no unfinished write."""
+    """Keeps only files, folders, and links to a name in the same folder; no keys, no unfinished files."""
     name = PurePosixPath(info.name)
     if name.suffix == ".key" or name.name.startswith("."):
         return None
@@ -199,23 +199,26 @@ def _unpack(file: Path, folder: Path) -> None:
 
 
 def _require_room(folder: Path, size: int) -> None:
-    """Raises WorkError("no-space"): what is small when packed may be large."""
+    """Raises WorkError("no-space"), because a small archive may be large when unpacked."""
     free = shutil.disk_usage(folder).free
     if size > ROOM_SHARE * free:
-        raise WorkError("no-space", what=f"The backup needs {size / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free.",
-                        remedy="Free some space on the disk of the stage.")  # fmt: skip
+        raise WorkError(
+            "no-space",
+            what=f"The backup needs {size / 1e9:.1f} GB, but only {free / 1e9:.1f} GB are free.",
+            remedy="Free some space on the stage's disk.",
+        )
 
 
 def _not_ours() -> UsageError:
     return UsageError(
         "not-a-backup",
         what="This file is not a backup of a Velatura stage, or it is damaged.",
-        remedy="Take a file that `velatura backup` or the panel made.",
+        remedy="Use a file that was made by `velatura backup` or the panel.",
     )
 
 
 def _merge_runs(fresh: Path, runs: Path) -> None:
-    """The newest finished calibration counts; a restored one that is older than what is there takes its place."""
+    """Give a restored run that is older than the existing ones a new name: the newest calibration is used."""
     runs.mkdir(exist_ok=True)
     for run in sorted(fresh.iterdir()):
         newest = max((other.name for other in runs.iterdir()), default="")

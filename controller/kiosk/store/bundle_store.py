@@ -1,4 +1,4 @@
-"""The bundles of a stage: the installed one, and those solved for the stage without some of its projectors."""
+"""The bundles of a stage: the installed one, and the failover bundles without some of its projectors."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from controller.core.storage import write_atomically
 
 PREVIEWS: Final = "kiosk/previews"
 WITHOUT: Final = "bundles-without"
-"""Folder of the stage: for each set of missing projectors a folder like ``bundles``."""
+"""Folder of the stage with a subfolder like ``bundles`` for each set of missing projectors."""
 
 
 def slots_without(stage: Path, missing: Collection[str]) -> Path:
-    """Where bundles for the stage without these projectors are installed."""
-    # "+" in a name is doubled so that no two sets meet.
+    """The install folder of bundles without these projectors."""
+    # "+" in a name is doubled, so that no two sets share a folder.
     return stage / WITHOUT / safe_name(" + ".join(name.replace("+", "++") for name in sorted(missing)))
 
 
-class BundleStock:
-    """Reads what is installed; asks the disk for links alone unless they have changed. See ``ports.Stock``."""
+class BundleStore:
+    """Reads the installed bundles, again only when their links change. See ``interfaces.Bundles``."""
 
     def __init__(self, stage: Path, trust: Trust) -> None:
         self._stage, self._trust = stage, trust
@@ -37,12 +37,12 @@ class BundleStock:
         self._previewing = threading.Lock()
 
     def bundle(self) -> Path | None:
-        """The installed bundle's file; also one that can't be read: the player's own start finds the way back."""
+        """The installed bundle's file, even if it can't be read: the player then goes back to the previous one."""
         return current(self._stage / "bundles")
 
     def names(self) -> Sequence[str]:
         index = self.index(self.bundle())
-        return () if index is None else tuple(one.name for one in index.appearances)
+        return () if index is None else tuple(entry.name for entry in index.appearances)
 
     def check_name(self, name: str | None) -> None:
         """Raises UsageError("appearance-unknown") for a name that the installed bundle does not have."""
@@ -55,12 +55,12 @@ class BundleStock:
         index = self.index(path)
         if index is None or whole is None or index.calibration != whole.calibration:
             return None
-        return path if appearance in [one.name for one in index.appearances] else None
+        return path if appearance in [entry.name for entry in index.appearances] else None
 
     def previews(self) -> dict[str, Path]:
-        """A PNG of how each appearance of the installed bundle will look, for those that it has one of.
+        """The bundle's preview PNG of each installed appearance that has one.
 
-        Written beside once a bundle; those of bundles before are removed.
+        They are extracted once per bundle; those of older bundles are deleted.
         """
         path = self.bundle()
         index = self.index(path)
@@ -70,38 +70,37 @@ class BundleStock:
         with self._previewing:
             if not folder.is_dir():
                 self._preview(path, index, folder)
-        files = {one.name: folder / f"{number}.png" for number, one in enumerate(index.appearances)}
+        files = {entry.name: folder / f"{number}.png" for number, entry in enumerate(index.appearances)}
         return {name: file for name, file in files.items() if file.exists()}
 
     def _preview(self, path: Path, index: Index, folder: Path) -> None:
         shutil.rmtree(folder.parent, ignore_errors=True)
-        # All of them or none: the folder is not looked into again. A full disk costs pictures on a page, and nothing
-        # else.
+        # All or none, because the folder is not checked again. On a full disk there are no previews.
         fresh = folder.with_name(f"{folder.name}.part")
         with (
             contextlib.suppress(BundleError, VelaturaError, OSError),
             Bundle.open_trusted(path, self._trust) as bundle,
         ):
             fresh.mkdir(parents=True)
-            for number, one in enumerate(index.appearances):
-                if (data := bundle.thumbnail(one.name)) is not None:
+            for number, entry in enumerate(index.appearances):
+                if (data := bundle.thumbnail(entry.name)) is not None:
                     write_atomically(fresh / f"{number}.png", data)
             fresh.rename(folder)
 
     def index(self, path: Path | None) -> Index | None:
-        """What an installed bundle holds; None for none, and for one that this stage would not play."""
+        """The index of an installed bundle; None without one, and for one that this stage would not play."""
         if path is None:
             return None
-        # Asked by several threads, of which each may forget what another has just read.
+        # Another thread may clear the cache at any time.
         with contextlib.suppress(KeyError):
             return self._known[path]
         if len(self._known) > 64:
             self._known.clear()
-        found = None
+        index = None
         with (
             contextlib.suppress(BundleError, VelaturaError, OSError),
             Bundle.open_trusted(path, self._trust) as bundle,
         ):
-            found = bundle.index
-        self._known[path] = found
-        return found
+            index = bundle.index
+        self._known[path] = index
+        return index

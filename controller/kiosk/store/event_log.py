@@ -1,4 +1,4 @@
-"""The kiosk's memory in SQLite: the event log, what was done, and a few values. A full disk stops nothing."""
+"""The event log, the finished tasks and some values in SQLite. A full disk stops nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CREATE TABLE IF NOT EXISTS kept (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the kiosk noticed or decided. ``reason`` and ``remedy`` are sentences; the remedy may be empty."""
+    """An observation or decision of the kiosk. ``reason`` and ``remedy`` are sentences; the remedy may be empty."""
 
     code: str
     reason: str
@@ -46,10 +46,10 @@ class Decision:
 
 
 class EventLog:
-    """Safe to use from several threads. ``problem`` says why the disk takes nothing now, or is None.
+    """Thread-safe. ``problem``: why the log can't be written now, or None.
 
-    ``durable``: what is told survives a power cut, too; without it only the end of the process.
-    What the disk refuses is kept in memory and written when there is space again. A damaged file is put aside.
+    ``durable``: events survive a power cut, too, not only the end of the process. Events that can't be written are kept
+    in memory until there is space again. A damaged file is renamed and replaced.
     """
 
     FILE: Final = "kiosk/events.sqlite"
@@ -59,7 +59,7 @@ class EventLog:
         self._lock = threading.RLock()
         self.problem: str | None = None
         self._retry_at_s = 0.0
-        self._away = False
+        self._unavailable = False
         self._database = self._opened()
         self._recent: deque[EventRow] = deque(self._load(), SHOWN)
         self._number = self._last_number()
@@ -72,7 +72,7 @@ class EventLog:
     # -- events
 
     def tell(self, decision: Decision) -> EventRow:
-        """Add one line. Never raises for the disk's sake."""
+        """Add one line. A disk error is not raised."""
         with self._lock:
             self._number += 1
             row = EventRow(self._number, self._wall(), decision.level, decision.text, decision.code)
@@ -82,18 +82,18 @@ class EventLog:
             return row
 
     def tell_failure(self, decision: Decision) -> None:
-        """Add one line, which stays among ``failures`` until somebody has seen it."""
+        """Add one line, which stays in ``failures`` until it is confirmed."""
         with self._lock:
             self._failures = (*self._failures, self.tell(decision))[-MOST_FAILURES:]
             self._keep_failures()
 
     @property
     def failures(self) -> tuple[EventRow, ...]:
-        """Those that nobody has seen yet, oldest first, at most ``MOST_FAILURES``."""
+        """The unconfirmed failures, oldest first, at most ``MOST_FAILURES``."""
         return self._failures
 
     def seen(self, number: int) -> None:
-        """Somebody has seen the failures up to this number."""
+        """Confirm the failures up to this number."""
         with self._lock:
             self._failures = tuple(row for row in self._failures if row.number > number)
             self._keep_failures()
@@ -116,14 +116,14 @@ class EventLog:
     def number(self) -> int:
         return self._number
 
-    # -- what was done, and values
+    # -- finished tasks, and values
 
     def done(self) -> frozenset[str]:
         with self._lock:
             return frozenset(self._done)
 
     def mark_done(self, key: str, how: str) -> None:
-        """Remember that ``key`` was done, or left out; in memory at once, on disk as soon as it lets us."""
+        """Record that ``key`` was done or skipped: in memory at once, on disk as soon as possible."""
         with self._lock:
             self._done[key] = how
             self._unwritten.add(("done", key))
@@ -151,8 +151,8 @@ class EventLog:
         if self.problem is not None and not now and time.monotonic() < self._retry_at_s:
             return
         try:
-            if self._away:
-                self._database, self._away = self._connected(self.path), False
+            if self._unavailable:
+                self._database, self._unavailable = self._connected(self.path), False
             with self._database as database:
                 for row in self._waiting:
                     database.execute(
@@ -185,17 +185,17 @@ class EventLog:
         except (sqlite3.DatabaseError, OSError) as error:
             self.problem = str(error)
             if isinstance(error, sqlite3.Error) and _is_damage(error):
-                # A damaged log must not keep the stage dark; it is kept for whoever wants to look into it.
+                # A damaged log must not keep the stage dark; the file is kept for analysis.
                 with contextlib.suppress(OSError, sqlite3.Error):
                     self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
                     database = self._connected(self.path)
                     self.problem = None
                     return database
-            self._away = True
+            self._unavailable = True
             return self._copied()
 
     def _copied(self) -> sqlite3.Connection:
-        """In memory, what can be read of a log that can't be opened, as on a disk without space; see ``_flush``."""
+        """An in-memory copy of a log that can be read but not opened, as on a full disk; see ``_flush``."""
         database = self._connected(Path(":memory:"))
         with (
             contextlib.suppress(sqlite3.Error),
@@ -210,7 +210,7 @@ class EventLog:
         database = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
         try:
             database.execute("PRAGMA journal_mode=WAL")
-            # What was done must not be done again after a power cut.
+            # A finished task must not run again after a power cut.
             database.execute(f"PRAGMA synchronous={'FULL' if self._durable else 'OFF'}")
             database.executescript(_SCHEMA)
         except sqlite3.Error:
@@ -223,11 +223,11 @@ class EventLog:
         return [EventRow(n, s, _LEVELS.get(level, "info"), text, code) for n, s, level, text, code in reversed(rows)]
 
     def _last_number(self) -> int:
-        found = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
-        if found:
-            return int(found[0][0])
-        # After a damaged log, and beside one that can't be read, numbers go on far above any that it can have had.
-        return int(self._wall()) if self._away or list(self.path.parent.glob("*.damaged-*")) else 0
+        rows = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
+        if rows:
+            return int(rows[0][0])
+        # After a damaged or unreadable log, numbers continue far above all that it can have had.
+        return int(self._wall()) if self._unavailable or list(self.path.parent.glob("*.damaged-*")) else 0
 
     def _query(self, statement: str) -> list[tuple]:  # type: ignore[type-arg]
         try:
@@ -238,7 +238,7 @@ class EventLog:
 
 
 def _is_damage(error: sqlite3.Error) -> bool:
-    """Whether the file is at fault, and not a disk without space, or a system without free handles."""
+    """Whether the file is damaged, and not the disk full or the file handles used up."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
     return code & 0xFF in _DAMAGE or code in _UNREADABLE
 

@@ -1,6 +1,6 @@
-"""Photographs that nobody needs any more: a kiosk that looks at itself every night must not fill its disk.
+"""Deletes old photographs, so that the nightly checks of a kiosk do not fill its disk.
 
-What was found from them stays: calibrations, grades, reports, pictures, journals.
+Their results stay: calibrations, grades, reports, pictures, journals.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from controller.run.journal import Journal
 from controller.run.journal_schema import JournalError
 
 GOING: Final = f"{CAPTURES}.going"
-"""While it is removed: a power cut then leaves no folder of photographs of which half is missing."""
+"""The name during the removal, so that a power cut leaves no incomplete folder of photographs."""
 KEPT_OF_A_KIND: Final = 2
-"""The newest good runs of each kind keep theirs: the drift check and the next calibration compare with them."""
+"""The newest good runs of each kind keep their photographs, to which drift check and calibration compare."""
 KEPT_S: Final = 14 * 86400.0
 
 
-def spent(stage: Path, *, now_s: float) -> list[Path]:
-    """Runs with photographs that were begun and ended ``KEPT_S`` ago, with ``KEPT_OF_A_KIND`` newer good ones.
+def expired(stage: Path, *, now_s: float) -> list[Path]:
+    """Runs whose photographs may be deleted: ended ``KEPT_S`` ago, with ``KEPT_OF_A_KIND`` newer good runs.
 
-    A run's kind is what its folder's name ends with; good is one that ended well. One whose journal can't be read is
-    left alone, and counts for nothing. ``now_s``: Unix seconds
+    Runs are counted by kind, the end of the folder's name; a good run ended without error. A run with an unreadable
+    journal is kept and not counted. ``now_s``: Unix seconds
     """
     kinds = defaultdict[str, list[Path]](list)
     for run in sorted((stage / "runs").glob("*-*-*"), reverse=True):
         if (run / Journal.FILE).is_file():
             kinds[run_kind(run)].append(run)
-    found: list[Path] = []
+    result: list[Path] = []
     for runs in kinds.values():
         good = 0
         for run in runs:
             outcome = _outcome(run)
             old = now_s - (run / Journal.FILE).stat().st_mtime >= KEPT_S
             if good >= KEPT_OF_A_KIND and outcome is not None and old and _has_photographs(run):
-                found.append(run)
+                result.append(run)
             good += outcome == "done"
-    return found
+    return result
 
 
-def forget(runs: Sequence[Path]) -> int:
-    """Remove the photographs of these runs; how many bytes that freed. Raises OSError."""
+def purge(runs: Sequence[Path]) -> int:
+    """Delete the photographs of these runs; returns the freed bytes. Raises OSError."""
     freed = 0
     for run in runs:
         going = run / GOING
@@ -64,7 +64,7 @@ def _has_photographs(run: Path) -> bool:
 
 
 def _outcome(run: Path) -> str | None:
-    """Of the last start; None for one that goes on, was killed, or can't be told."""
+    """The outcome of the last start; None if it is running, was killed, or is unknown."""
     try:
         with Journal(run) as journal:
             outcomes = journal.outcomes()
@@ -76,16 +76,16 @@ def _outcome(run: Path) -> str | None:
 TIDY_S: Final = 3600.0
 
 
-def forget_old_photographs(stage: Path, log: EventLog, clock: Callable[[], float]) -> None:
-    """Remove what ``spent`` names, and say so; a disk that lets nothing be removed is told, too."""
-    runs = spent(stage, now_s=clock())
+def purge_old_photographs(stage: Path, log: EventLog, clock: Callable[[], float]) -> None:
+    """Delete the photographs of the ``expired`` runs, and log it; log a disk error, too."""
+    runs = expired(stage, now_s=clock())
     if not runs:
         return
     try:
-        freed = forget(runs)
+        freed = purge(runs)
     except OSError as error:
-        log.tell(Decision("photographs-kept", f"Old photographs could not be removed: {error.strerror}.",
-                          "Check the disk and the rights of the stage's folder.", "warning"))  # fmt: skip
+        log.tell(Decision("photographs-kept", f"Old photographs could not be deleted: {error.strerror}.",
+                          "Check the disk and the permissions of the stage's folder.", "warning"))  # fmt: skip
         return
-    log.tell(Decision("photographs-removed", f"The photographs of {len(runs)} old runs were removed: "
-                      f"{freed / 1e6:.0f} MB are free again. What was found from them stays."))  # fmt: skip
+    log.tell(Decision("photographs-removed", f"The photographs of {len(runs)} old runs were deleted, "
+                      f"which freed {freed / 1e6:.0f} MB. Their results are kept."))  # fmt: skip

@@ -1,4 +1,4 @@
-"""What past runs left for the panel: grades, pictures and figures."""
+"""Grades, pictures and figures of past runs, for the panel."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ MOST: Final = 50
 _NAME: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[a-z]+")
 _PICTURES: Final = {"before": BEFORE, "resolution": RESOLUTION}
 _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
-"""What reading a file of figures raises that is damaged, or that is being removed."""
+"""Errors of reading a figures file that is damaged or just being removed."""
 
 
 def grades(stage: Path, worst_grade: float) -> tuple[Grade, ...]:
-    """Of every graded run, newest first. Without those that can't be read: the kiosk asks for this while it plays."""
+    """The grades of all graded runs that can be read, newest first."""
     try:
         finished = {run.name for run in finished_calibrations(stage)}
     except (VelaturaError, OSError):
         finished = set()
     errors = _errors(stage)
-    found = []
-    ours = (run for run in (stage / "runs").glob("*") if _NAME.fullmatch(run.name))
-    for run in sorted(ours, reverse=True)[:MOST]:
+    result = []
+    candidates = (run for run in (stage / "runs").glob("*") if _NAME.fullmatch(run.name))
+    for run in sorted(candidates, reverse=True)[:MOST]:
         try:
             grade = _grade(run, run.name in finished, worst_grade, errors.get(run.name))
         except _UNREADABLE:
             continue
-        found += [] if grade is None else [grade]
-    return tuple(found)
+        result += [] if grade is None else [grade]
+    return tuple(result)
 
 
 def _grade(run: Path, finished: bool, worst_grade: float, delta_e: float | None) -> Grade | None:
     if (worst := worst_of(run)) is None:
         return None
-    note = f"{worst[0]} is predicted with {worst[1]:.1f} % error"
+    note = f"Largest predicted error: {worst[1]:.1f} % in {worst[0]}"
     kept = finished and passes(run, worst_grade)
     return Grade(run.name, began_s(run.name), run_kind(run), worst_letter(run), kept, delta_e, note)
 
 
 def began_s(run: str) -> float:
-    """Unix seconds of the beginning, as the folder's name tells in local time; 0 for another name."""
+    """Unix seconds of the run's beginning, from the local time in the folder's name; 0 for another name."""
     try:
         return datetime.strptime(run[:15], "%Y%m%d-%H%M%S").astimezone().timestamp()
     except (ValueError, OverflowError):
@@ -58,9 +58,9 @@ def began_s(run: str) -> float:
 
 
 def names(stage: Path) -> tuple[str, ...]:
-    """Runs that have something to show, newest first."""
-    found = [run.name for run in (stage / "runs").glob("*") if _NAME.fullmatch(run.name) and _is_graded(run)]
-    return tuple(sorted(found, reverse=True)[:MOST])
+    """Runs with results, newest first."""
+    graded_runs = [run.name for run in (stage / "runs").glob("*") if _NAME.fullmatch(run.name) and _is_graded(run)]
+    return tuple(sorted(graded_runs, reverse=True)[:MOST])
 
 
 def _is_graded(run: Path) -> bool:
@@ -71,7 +71,7 @@ def _is_graded(run: Path) -> bool:
 
 
 def report(stage: Path, run: str, checked: Checked) -> Path:
-    """The run's report.html, made if it is not there yet. Seconds. Raises UsageError("run-unknown")."""
+    """The run's report.html. Seconds if it must be made first. Raises UsageError("run-unknown")."""
     if run in [folder.name for folder in all_compared(stage)]:
         return _comparison_report(stage / "runs" / run, checked)
     folder = _folder(stage, run)
@@ -93,31 +93,31 @@ def _comparison_report(folder: Path, checked: Checked) -> Path:
 
 
 def comparisons(stage: Path, appearances: Sequence[str]) -> tuple[Comparison, ...]:
-    """What these appearances achieved, in their order; without those that nobody photographed."""
-    found = []
-    for name, known in history_of(stage, appearances).items():
+    """The comparisons of the photographed ones of these appearances, in their order."""
+    result = []
+    for name, history in history_of(stage, appearances).items():
         rows = [
             Achieved(
-                one.run, one.photographed_unix_s, one.delta_e00_median, one.delta_e00_p95, one.rmse,
-                one.sharpness_lambda,
+                row.run, row.photographed_unix_s, row.delta_e00_median, row.delta_e00_p95, row.rmse,
+                row.sharpness_lambda,
             )
-            for one in reversed(known)
+            for row in reversed(history)
         ]  # fmt: skip
-        found.append(Comparison(name, tuple(rows), pictures_of(stage, known[-1])))
-    return tuple(found)
+        result.append(Comparison(name, tuple(rows), pictures_of(stage, history[-1])))
+    return tuple(result)
 
 
 def _errors(stage: Path) -> dict[str, float]:
-    """By calibration, the largest of the newest median colour differences of its appearances."""
+    """For each calibration, the largest of the newest median colour differences of its appearances."""
     newest: dict[str, dict[str, float]] = {}
     try:
         compared = all_compared(stage)
     except OSError:
-        # A run was removed between two looks.
+        # A run was removed in the meantime.
         return {}
-    for known in compared.values():
-        for one in known:
-            newest.setdefault(one.calibration, {})[one.name] = one.delta_e00_median
+    for rows in compared.values():
+        for row in rows:
+            newest.setdefault(row.calibration, {})[row.name] = row.delta_e00_median
     return {calibration: max(medians.values()) for calibration, medians in newest.items()}
 
 
@@ -137,5 +137,5 @@ def results(stage: Path, run: str, worst_grade: float) -> Results:
         if (folder / file).exists():
             pictures[name] = folder / file
     figures = [(f"Error of {name}", f"{percent:.2f} %") for name, percent in (graded(folder) or {}).items()]
-    grade = next((one for one in grades(stage, worst_grade) if one.run == run), None)
+    grade = next((grade for grade in grades(stage, worst_grade) if grade.run == run), None)
     return Results(run, grade, pictures, tuple(figures))

@@ -1,4 +1,4 @@
-"""The stage's schedule: schedule.toml, which the panel writes, or else the table [schedule] of stage.toml."""
+"""The stage's schedule: schedule.toml, written by the panel, or else the table [schedule] of stage.toml."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from controller.kiosk.decide.hours import check_schedule
 from controller.kiosk.interface import Schedule, ScheduleRow
 
 FILE: Final = "schedule.toml"
-_HEADING: Final = "# Opening hours; written by the panel. It takes the place of [schedule] in stage.toml.\n\n"
+_HEADING: Final = "# Opening hours, written by the panel. This file replaces [schedule] in stage.toml.\n\n"
 
 
 def of_table(table: ScheduleTable) -> Schedule:
@@ -31,7 +31,7 @@ def of_table(table: ScheduleTable) -> Schedule:
 
 
 class ScheduleFile:
-    """The schedule that holds now; read once, replaced by ``replace``. Safe to use from several threads."""
+    """The current schedule; read once, changed by ``replace``. Thread-safe."""
 
     def __init__(self, stage: Path, table: ScheduleTable) -> None:
         self._path, self._lock = stage / FILE, threading.Lock()
@@ -41,7 +41,7 @@ class ScheduleFile:
         try:
             self._now = self._read() or self._now
         except UsageError as error:
-            # A damaged file must not keep the stage dark; stage.toml's hours hold meanwhile.
+            # A damaged file must not keep the stage dark; the hours of stage.toml apply until it is saved again.
             self.problem = error
 
     @property
@@ -77,11 +77,13 @@ class ScheduleFile:
             raise UsageError(
                 "schedule-unreadable",
                 what=f"{FILE} can't be read: {_reason(error)}.",
-                remedy="Save the schedule anew in the panel; the one of stage.toml holds meanwhile.",
+                remedy="Save the schedule again in the panel. Until then the hours in stage.toml apply.",
             ) from error
         self._without_time = table.without_time
         return of_table(table)
 
 
 def _reason(error: Exception) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or (str(error).splitlines() or ["it is wrong"])[0]
+    return (error.strerror if isinstance(error, OSError) else None) or (str(error).splitlines() or ["it is not valid"])[
+        0
+    ]

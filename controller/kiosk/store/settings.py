@@ -1,4 +1,4 @@
-"""stage.toml as the panel changes it: validated before it is saved, the old text kept beside."""
+"""Changes to stage.toml: validated before they are saved, with a copy of the old text."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 def text(stage: Path) -> str:
-    """The text of stage.toml, empty when there is none."""
+    """The text of stage.toml, empty if there is none."""
     file = stage / FILE
     return read_bytes(file, LARGEST_TEXT).decode("utf-8-sig", errors="replace") if file.exists() else ""
 
@@ -35,14 +35,16 @@ def validate(content: str) -> None:
     try:
         parsed = tomllib.loads(content)
     except (ValueError, RecursionError) as error:
-        raise UsageError("stage-syntax", what=f"{FILE}: this is not TOML: {error}.", remedy="Mend the line.") from error
+        raise UsageError(
+            "stage-syntax", what=f"{FILE} is not valid TOML: {error}.", remedy="Correct this line."
+        ) from error
     parse_stage(parsed, Place(FILE, KeyLines(content)))
 
 
 def save(stage: Path, content: str) -> None:
-    """Validate, keep the old text as ``BEFORE``, and write; drivers' own keys are checked, too.
+    """Validate, also the keys of drivers, keep the old text as ``BEFORE``, and write.
 
-    Raises UsageError as above; stage.toml is then as it was.
+    Raises UsageError as above; stage.toml is then unchanged.
     """
     validate(content)
     before = text(stage)
@@ -62,8 +64,8 @@ def save(stage: Path, content: str) -> None:
 def check_name(name: str) -> None:
     """Raises UsageError("appearance-name")."""
     if not _NAME.fullmatch(name):
-        raise UsageError("appearance-name", what=f"{name[:64]!r} can't be an appearance's name.",
-                         remedy="Use 1 to 64 letters, digits, - and _, a letter or digit first.")  # fmt: skip
+        raise UsageError("appearance-name", what=f"{name[:64]!r} is not a valid name for an appearance.",
+                         remedy="Use 1 to 64 letters, digits, - and _. Start with a letter or digit.")  # fmt: skip
 
 
 def add_picture(stage: Path, name: str, picture: Path) -> None:
@@ -76,10 +78,10 @@ def add_picture(stage: Path, name: str, picture: Path) -> None:
 
 
 def remove_picture(stage: Path, name: str) -> None:
-    """Take an appearance out of stage.toml. Raises UsageError("appearance-unknown") and as ``rewrite_stage``."""
+    """Remove an appearance from stage.toml. Raises UsageError("appearance-unknown") and as ``rewrite_stage``."""
     content = text(stage)
     parsed = tomllib.loads(content)
-    position = next((n for n, one in enumerate(parsed.get("appearances", [])) if one.get("name") == name), None)
+    position = next((n for n, row in enumerate(parsed.get("appearances", [])) if row.get("name") == name), None)
     if position is None:
         raise UsageError("appearance-unknown", what=f"stage.toml has no appearance {name[:64]!r}.",
                          remedy="Choose another one.")  # fmt: skip
@@ -93,6 +95,6 @@ def remove_picture(stage: Path, name: str) -> None:
 
 
 def forget_solved(stage: Path, name: str) -> None:
-    """Remove an appearance's frames of the newest calibration: what is solved there stays in every new bundle."""
+    """Delete an appearance's frames of the newest calibration; otherwise every new bundle would contain it."""
     for run in finished_calibrations(stage)[:1]:
         remove_solved(run, name)

@@ -1,4 +1,4 @@
-"""Pictures that become targets: fitted to the camera's view, of which a target must be."""
+"""Fits pictures to the camera's view, because a target must have exactly its size."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ def camera_view_px(stage: Path) -> tuple[int, int] | None:
 
 
 def fitted(picture: bytes, size_px: tuple[int, int], how: Fit = "fit") -> bytes:
-    """``picture`` (PNG) as a PNG of the size of the camera's view; the same bytes where it has that size already.
+    """``picture`` (PNG) as a PNG of the size of the camera's view; unchanged if it has that size already.
 
-    "fit" shows the whole picture, and "fill" fills the view and loses the edges that are too long; "crop" keeps the
-    picture's own pixels, in the middle of the view. What is left free is transparent: it stays dark.
+    "fit" shows the whole picture; "fill" fills the view and cuts the edges; "crop" keeps the original pixels in the
+    middle of the view. Uncovered parts are transparent: they stay dark.
     Raises UsageError("target-unreadable").
     """
     import cv2
 
-    found = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED) if picture else None
-    if found is None:
+    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED) if picture else None
+    if decoded is None:
         raise UsageError("target-unreadable", what="The target can't be read as a picture.", remedy="Save it as PNG.")
-    height, width = found.shape[:2]
+    height, width = decoded.shape[:2]
     if (width, height) == size_px:
         return picture
     across, down = size_px[0] / width, size_px[1] / height
     scale = 1.0 if how == "crop" else min(across, down) if how == "fit" else max(across, down)
     if scale != 1.0:
         wanted = (max(1, round(width * scale)), max(1, round(height * scale)))
-        found = cv2.resize(found, wanted, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    return cv2.imencode(".png", _in_the_middle(_with_alpha(found), size_px))[1].tobytes()
+        decoded = cv2.resize(decoded, wanted, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    return cv2.imencode(".png", _in_the_middle(_with_alpha(decoded), size_px))[1].tobytes()
 
 
 def _with_alpha(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Keeps a device open that is looked at now and then (camera, light sensor, relays), and opens it again when lost."""
+"""Keeps a device open, polls it (camera, light sensor, relays), and reopens it when it is lost."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from hal.interfaces import Device
 OPEN_S: Final = 20.0
 LOOK_S: Final = 10.0
 _REOPEN_S: Final = (2.0, 5.0, 15.0)
-"""Not longer: who has plugged a cable in again stands there and waits."""
+"""Not longer, because a person who plugs a cable in again waits for the result."""
 
 Look = Callable[[Device, Deadline], tuple[LiveValue, ...]]
 
 
-class DeviceKeeper:
-    """One device. ``step`` is called over and over by one thread.
+class DeviceSupervisor:
+    """One device. One thread calls ``step`` repeatedly.
 
-    ``look`` asks the device something and returns what to show; ``every_s`` between two looks.
+    ``look`` polls the device and returns the values to show; ``every_s``: seconds between two polls.
     """
 
     def __init__(
@@ -57,28 +57,28 @@ class DeviceKeeper:
         return DeviceRow(self.name, self.kind, self.driver, self._values, what, remedy)
 
     def step(self) -> None:
-        """Look once if it is time to; not while somebody works with the device."""
+        """Poll the device if it is time to, except while it is lent to a job."""
         if self._monotonic() < self._next_s or not self.lent.acquire(blocking=False):
             return
         try:
             if self._device is None:
                 self._device = self._open(in_seconds(OPEN_S))
             self._values = self._look(self._device, in_seconds(LOOK_S))
-            self._well()
+            self._recovered()
         except (DeviceError, VelaturaError) as error:
             self._lost(Decision(error.code, error.what, error.remedy, "error"))
         finally:
             if self._closed:
-                # While it was opened: nobody else would ever let go of it, and the next service needs it.
-                self._let_go()
+                # Closed while it was being opened: release it, because the next service needs it.
+                self._release()
             self.lent.release()
 
     def close(self) -> None:
-        """Let go of the device, for good."""
+        """Close the device for good."""
         self._closed = True
-        self._let_go()
+        self._release()
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         device, self._device = self._device, None
         if device is not None:
             try:
@@ -86,14 +86,14 @@ class DeviceKeeper:
             except DeviceError as error:
                 self._tell(Decision(error.code, error.what, error.remedy, "warning"))
 
-    def _well(self) -> None:
+    def _recovered(self) -> None:
         if self._problem is not None:
-            self._tell(Decision("device-back", f"{self.name} is there again."))
+            self._tell(Decision("device-back", f"{self.name} is connected again."))
         self._problem, self._failures = None, 0
         self._next_s = self._monotonic() + self._every_s
 
     def _lost(self, problem: Decision) -> None:
-        self._let_go()
+        self._release()
         self._values = ()
         self._next_s = self._monotonic() + _REOPEN_S[min(self._failures, len(_REOPEN_S) - 1)]
         self._failures += 1

@@ -1,4 +1,4 @@
-"""The keepers of every device of a stage, and the rig that they lend to work."""
+"""The supervisors of all devices of a stage, and the rig that they lend to jobs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from controller.core.text import printable
 from controller.kiosk.decide.interfaces import Condition, ProjectorView
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.device_supervisor import DeviceKeeper
-from controller.kiosk.supervisors.mains_supervisor import Boards, MainsKeeper
-from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
+from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
+from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.rig.ambient_light import Darkness, LightWatch
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile
@@ -31,71 +31,75 @@ Tell = Callable[[Decision], object]
 
 
 class Devices:
-    """Made from a checked stage; opens nothing by itself. ``step`` functions are in ``steps``, one a thread.
+    """All device supervisors of a stage; the devices are opened by their ``step``.
 
-    ``scene`` names what lights the object for longer than a moment, for the light sensor; None: nothing that lasts.
+    ``scene`` names the steady picture on the object, for the light sensor; None while nothing is steady.
     """
 
     def __init__(self, checked: Checked, runtime: Path, tell: Tell) -> None:
         self._checked, self._tell = checked, tell
         self._context = OpenContext(stage=checked.stage.folder, runtime=runtime)
         self._ledger = LampFile(checked.stage.folder / LampFile.NAME)
-        self.mains = self._mains_keeper()
+        self.mains = self._mains_supervisor()
         self.projectors = tuple(self._projector(number) for number in range(len(checked.projectors)))
         if self.mains is not None:
-            self.mains.keepers = self.projectors
+            self.mains.supervisors = self.projectors
         tables = checked.stage.tables
         self.scene: Callable[[], str | None] = lambda: None
         self._room: str | None = None
-        self.camera = DeviceKeeper(
+        self.camera = DeviceSupervisor(
             "camera", "camera", tables.camera.driver, self._open_camera, _look_at_camera, tell, every_s=60.0
         )
         self.sensor = self._sensor()
 
     @property
-    def others(self) -> tuple[DeviceKeeper, ...]:
-        """Every keeper of a device that is no projector."""
-        return tuple(keeper for keeper in (self.camera, self.sensor, self.mains) if keeper is not None)
+    def others(self) -> tuple[DeviceSupervisor, ...]:
+        """The supervisors of all devices that are not projectors."""
+        return tuple(supervisor for supervisor in (self.camera, self.sensor, self.mains) if supervisor is not None)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with no device, and yet worth a look."""
+        """Problems that belong to no device."""
         return () if self._room is None else (f"{self._room} {_DARKEN}",)
 
     def rows(self) -> tuple[DeviceRow, ...]:
-        """As the panel shows them."""
+        """The rows that the panel shows."""
         drivers = [table.driver for table in self._checked.stage.tables.projectors]
         projectors = [
-            projector_row(keeper.view, driver) for keeper, driver in zip(self.projectors, drivers, strict=True)
+            projector_row(supervisor.view, driver) for supervisor, driver in zip(self.projectors, drivers, strict=True)
         ]
-        return (*projectors, *(keeper.row for keeper in self.others))
+        return (*projectors, *(supervisor.row for supervisor in self.others))
 
     def missing_for_work(self) -> Decision | None:
-        """The device that photographs need and that is away, or None."""
+        """The missing device that photographs need, or None."""
         if self.camera.device is None or self.camera.problem is not None:
-            problem = self.camera.problem or Decision("camera-missing", "The camera was not found yet.", "Wait for it.")
-            reason = f"There can be no photographs without the camera. {problem.reason}"
+            problem = self.camera.problem or Decision(
+                "camera-missing", "The camera is not connected yet.", "Wait for it."
+            )
+            reason = f"No photographs are possible without the camera. {problem.reason}"
             return replace(problem, reason=reason, level="error")
-        away = [
-            keeper.name for keeper in self.projectors if keeper.view.condition in (Condition.LOST, Condition.BROKEN)
+        missing = [
+            supervisor.name
+            for supervisor in self.projectors
+            if supervisor.view.condition in (Condition.LOST, Condition.BROKEN)
         ]
-        if away:
-            return Decision("projector-missing", f"There can be no photographs without projector {', '.join(away)}.",
-                            "Mend it first; playback goes on without it.", "error")  # fmt: skip
+        if missing:
+            return Decision("projector-missing", f"No photographs are possible without projector {', '.join(missing)}.",
+                            "Repair it first. Playback continues without it.", "error")  # fmt: skip
         return None
 
     @contextlib.contextmanager
     def lent(self) -> Iterator[Rig]:
-        """The opened devices for one piece of work. Raises DeviceGone("device-missing") and what opening raises."""
+        """The opened devices for one job. Raises DeviceGone("device-missing") and what opening raises."""
         with contextlib.ExitStack() as stack:
-            for keeper in (self.camera, *([] if self.sensor is None else [self.sensor])):
-                # The keeper looks at it from a thread of its own, and must not meanwhile.
-                stack.enter_context(keeper.lent)
-            # Not before it is ours: its keeper may let go of it while it is waited for.
-            camera, guards = self.camera.device, [keeper.guard for keeper in self.projectors]
+            for supervisor in (self.camera, *([] if self.sensor is None else [self.sensor])):
+                # The supervisor's thread must not use the device during the job.
+                stack.enter_context(supervisor.lent)
+            # Only with the lock: before that, its supervisor may close it.
+            camera, guards = self.camera.device, [supervisor.guard for supervisor in self.projectors]
             if camera is None or any(guard is None for guard in guards):
-                raise DeviceGone("device-missing", what="A device that the work needs is away.",
-                                 remedy="See the devices.")  # fmt: skip
+                raise DeviceGone("device-missing", what="A device that the job needs is missing.",
+                                 remedy="See the list of devices.")  # fmt: skip
             driver, settings = self._checked.display
             table = self._checked.stage.tables.display
             display = cast("Display", open_device(table, driver, settings, self._context, in_seconds(20)))
@@ -105,8 +109,10 @@ class Devices:
             try:
                 yield replace(rig, darkness=self._darkness())
             except DeviceGone as error:
-                # Its keeper lost it and let go of it, which is all that the work has noticed.
-                lost = any(keeper.guard is not guard for keeper, guard in zip(self.projectors, guards, strict=True))
+                # The job sees only a closed device; its supervisor knows the reason.
+                lost = any(
+                    supervisor.guard is not guard for supervisor, guard in zip(self.projectors, guards, strict=True)
+                )
                 if lost and (missing := self.missing_for_work()) is not None:
                     raise DeviceGone("device-missing", what=missing.reason, remedy=missing.remedy) from error
                 raise
@@ -114,12 +120,12 @@ class Devices:
     def close(self) -> None:
         for projector in self.projectors:
             projector.close()
-        for keeper in self.others:
-            keeper.close()
+        for supervisor in self.others:
+            supervisor.close()
 
     # -- opening
 
-    def _projector(self, number: int) -> ProjectorKeeper:
+    def _projector(self, number: int) -> ProjectorSupervisor:
         tables = self._checked.stage.tables
         table, (driver, settings) = tables.projectors[number], self._checked.projectors[number]
         at_least = tables.safety.at_least()
@@ -130,7 +136,7 @@ class Devices:
 
         silenced = None if self.mains is None else partial(self.mains.silences, table.name)
         unfed = partial(self._unfed, table.name)
-        return ProjectorKeeper(table.name, open_guard, self._tell, asleep=silenced, unfed=unfed)
+        return ProjectorSupervisor(table.name, open_guard, self._tell, asleep=silenced, unfed=unfed)
 
     def _unfed(self, projector: str) -> Decision | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]
@@ -140,32 +146,32 @@ class Devices:
         table, (driver, settings) = self._checked.stage.tables.camera, self._checked.camera
         return cast("Device", open_device(table, driver, settings, self._context, deadline))
 
-    def _sensor(self) -> DeviceKeeper | None:
+    def _sensor(self) -> DeviceSupervisor | None:
         table = self._checked.stage.tables.light_sensor
         if table is None:
             return None
 
         def open_sensor(deadline: Deadline) -> Device:
-            found = light_sensor(self._checked, self._context, contextlib.ExitStack(), deadline)
-            assert found is not None
-            return found.sensor
+            opened = light_sensor(self._checked, self._context, contextlib.ExitStack(), deadline)
+            assert opened is not None
+            return opened.sensor
 
         watch = LightWatch(table.most_lux)
 
         def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
             lux = cast("LightSensor", device).illuminance_lux(deadline=deadline)
-            self._tell_of_light(watch.saw(lux, self.scene()))
+            self._report_light(watch.saw(lux, self.scene()))
             dark = "dark enough to calibrate" if lux <= table.most_lux else "too bright to calibrate"
             return (LiveValue("Light", f"{lux:.2f} lux ({dark})"),)
 
-        return DeviceKeeper("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0)
+        return DeviceSupervisor("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0)
 
-    def _tell_of_light(self, room: str | None) -> None:
+    def _report_light(self, room: str | None) -> None:
         before, self._room = self._room, room
         if room is not None and before is None:
             self._tell(Decision("room-bright", room, _DARKEN, "warning"))
         elif room is None and before is not None:
-            self._tell(Decision("room-dark", "Nothing but the projectors lights the object any more."))
+            self._tell(Decision("room-dark", "The room is dark again."))
 
     def _darkness(self) -> Darkness | None:
         table = self._checked.stage.tables.light_sensor
@@ -173,7 +179,7 @@ class Devices:
             return None
         return Darkness(cast("LightSensor", self.sensor.device), table.most_lux)
 
-    def _mains_keeper(self) -> MainsKeeper | None:
+    def _mains_supervisor(self) -> MainsSupervisor | None:
         if not self._checked.relays:
             return None
         drivers = ", ".join(table.driver for table in self._checked.stage.tables.relays)
@@ -183,33 +189,33 @@ class Devices:
             circuits = mains_circuits(self._checked, self._context, stack, deadline)
             return Boards(circuits, stack)
 
-        return MainsKeeper(drivers, open_circuits, self._tell)
+        return MainsSupervisor(drivers, open_circuits, self._tell)
 
 
-_DARKEN: Final = "Switch the lights off and close the blinds: the appearance is pale in other light."
+_DARKEN: Final = "Switch the lights off and close the blinds. Other light makes the appearance pale."
 
 
 def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
-    """A projector as the panel shows it."""
-    hours = f"{view.hours:,.0f} h under Velatura, {view.strikes} strikes"
+    """The row of a projector on the panel."""
+    hours = f"{view.hours:,.0f} h with Velatura, {view.strikes} strikes"
     values = [LiveValue("Lamp", view.condition.value), LiveValue("Hours", hours)]
     if view.counter_hours is not None:
-        values.append(LiveValue("Its own counter", f"{view.counter_hours:,} h"))
+        values.append(LiveValue("Projector's counter", f"{view.counter_hours:,} h"))
     if view.condition is Condition.LIT and view.stable_left_s > 0:
-        values.append(LiveValue("Steady in", f"{view.stable_left_s:.0f} s"))
+        values.append(LiveValue("Stable in", f"{view.stable_left_s:.0f} s"))
     what, remedy = (None, "") if view.problem is None else (view.problem.reason, view.problem.remedy)
     return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy)
 
 
 def _look_at_camera(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
-    found = device.identity(deadline=deadline)
-    values = [LiveValue("Model", printable(f"{found.maker} {found.model}"))]
+    identity = device.identity(deadline=deadline)
+    values = [LiveValue("Model", printable(f"{identity.maker} {identity.model}"))]
     if isinstance(device, WatchedCamera):
         status = device.status(deadline=deadline)
         if status.battery_percent is not None:
             values.append(LiveValue("Battery", f"{status.battery_percent} %"))
         if status.free_pictures is not None:
-            values.append(LiveValue("Room for", f"{status.free_pictures} pictures"))
+            values.append(LiveValue("Space for", f"{status.free_pictures} pictures"))
         if status.warnings:
             values.append(LiveValue("Warnings", ", ".join(status.warnings)))
     return tuple(values)

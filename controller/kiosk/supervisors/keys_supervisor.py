@@ -1,4 +1,4 @@
-"""Keeps the technician's keys in use: opens the panel as soon as it is there, and says what is wrong with it."""
+"""Opens the technician's key panel as soon as it is connected, and reports its problems."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from hal.errors import DeviceError
 from hal.interfaces import ButtonPanel
 
 
-class KeysKeeper:
-    """One panel. ``step`` is called over and over by one thread until it is open; ``KeyService`` keeps it from then on.
+class KeysSupervisor:
+    """One key panel. One thread calls ``step`` repeatedly until it is open; then ``KeyService`` takes over.
 
-    ``open_panel`` gives the panel, and closes it at the end; ``presses``: what the keys play, stop and recalibrate do.
+    ``open_panel`` opens the panel, and closes it at the end; ``presses``: the actions of play, stop and recalibrate.
     """
 
     def __init__(
@@ -33,15 +33,15 @@ class KeysKeeper:
 
     @property
     def row(self) -> DeviceRow:
-        """As the panel shows it."""
+        """The row that the web panel shows."""
         what, remedy = (None, "") if self._problem is None else (self._problem.reason, self._problem.remedy)
         return DeviceRow("key panel", "keys", self.driver, (), what, remedy)
 
     def step(self) -> None:
-        """Look for the panel, unless it was found."""
+        """Open the panel if it is not open yet."""
         if self._opened is not None:
             return
-        # Here: it draws its keys with OpenCV, for which the first picture of a boot must not wait.
+        # Imported late: it loads OpenCV, which would delay the first picture after a boot.
         from controller.rig.key_panel import KeyService, technicians_keys
 
         with contextlib.ExitStack() as stack:
@@ -52,21 +52,21 @@ class KeysKeeper:
                 return
             commands = technicians_keys(*self._presses)
             service = KeyService(panel, commands, state=self._state, trouble=self._trouble)
-            # Before it starts: the trouble that it meets is told once, and must not be taken back here.
+            # Before the start, so that a problem of the service itself is not cleared here.
             self._trouble(None)
             service.start()
             stack.callback(service.stop)
             self._opened = stack.pop_all()
         if self._closed:
-            # While it was opened: nobody else would ever let go of it, and the next service needs it.
-            self._let_go()
+            # Closed while it was being opened: release it, because the next service needs it.
+            self._release()
 
     def close(self) -> None:
-        """Let go of the panel, for good."""
+        """Close the panel for good."""
         self._closed = True
-        self._let_go()
+        self._release()
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         opened, self._opened = self._opened, None
         if opened is not None:
             opened.close()

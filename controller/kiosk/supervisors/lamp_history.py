@@ -1,4 +1,4 @@
-"""How each lamp has burnt, day by day: one file of the stage, written when something has changed."""
+"""Hours and strikes of each lamp, day by day, in one file of the stage."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EVERY_S: Final = 600.0
 
 
 class LampHistory:
-    """Safe to use from several threads. A disk that takes nothing costs days of history, and nothing else."""
+    """Thread-safe. A disk error loses history, and nothing else."""
 
     def __init__(self, stage: Path, *, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._path, self._monotonic = stage / FILE, monotonic
@@ -35,29 +35,29 @@ class LampHistory:
             return list(self._days)
 
     def note(self, lamps: Sequence[Lamp], today: date, *, now: bool = False) -> None:
-        """What the lamps' counters say; kept every ten minutes, or at once if ``now``."""
+        """Record the lamps' counters; saved every ten minutes, or at once if ``now``."""
         if not now and self._monotonic() < self._next_s:
             return
         self._next_s = self._monotonic() + EVERY_S
         with self._lock:
             for lamp in lamps:
-                self._one(LampDay(lamp.projector, today.isoformat(), round(lamp.hours, 2), lamp.strikes))
-            content = [[one.projector, one.day, one.hours, one.strikes] for one in self._days]
+                self._add(LampDay(lamp.projector, today.isoformat(), round(lamp.hours, 2), lamp.strikes))
+            content = [[row.projector, row.day, row.hours, row.strikes] for row in self._days]
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, json.dumps(content).encode())
         except (OSError, VelaturaError):
-            # Tried again in ten minutes; the event log's own row tells of the disk.
+            # Tried again in ten minutes; the event log reports the disk error.
             return
 
-    def _one(self, found: LampDay) -> None:
-        own = [one for one in self._days if one.projector == found.projector]
+    def _add(self, entry: LampDay) -> None:
+        own = [row for row in self._days if row.projector == entry.projector]
         last = own[-1] if own else None
-        if found.strikes == 0 or (last is not None and (last.hours, last.strikes) == (found.hours, found.strikes)):
+        if entry.strikes == 0 or (last is not None and (last.hours, last.strikes) == (entry.hours, entry.strikes)):
             return
-        others = [one for one in self._days if one.projector != found.projector]
-        kept = [one for one in own if one.day != found.day][-(MOST_DAYS - 1) :]
-        self._days = sorted([*others, *kept, found], key=lambda one: one.day)
+        others = [row for row in self._days if row.projector != entry.projector]
+        kept = [row for row in own if row.day != entry.day][-(MOST_DAYS - 1) :]
+        self._days = sorted([*others, *kept, entry], key=lambda row: row.day)
 
 
 def _read(path: Path) -> list[LampDay]:

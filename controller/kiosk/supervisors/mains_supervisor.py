@@ -1,4 +1,4 @@
-"""Mains relays that follow the lamps: closed while light is wanted, opened when what is behind them has cooled."""
+"""Switches mains relays with the lamps: on while light is wanted, off when the lamps behind them have cooled."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import cast
 
 from controller.kiosk.interface import LiveValue
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceKeeper
-from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceSupervisor
+from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.mains_relays import Circuit
 from hal.deadline import Deadline, in_seconds
@@ -35,10 +35,10 @@ class Boards:
         self._stack.close()
 
 
-class MainsKeeper(DeviceKeeper):
-    """Closes the relays while light is wanted, and opens each once the lamps behind it have cooled.
+class MainsSupervisor(DeviceSupervisor):
+    """Closes the relays while light is wanted, and opens each when the lamps behind it have cooled.
 
-    One relay that fails keeps no other from being switched, and a projector that is silent costs no other its time.
+    A relay that fails, or a projector that is silent, does not delay the others.
     """
 
     def __init__(
@@ -47,24 +47,24 @@ class MainsKeeper(DeviceKeeper):
     ) -> None:  # fmt: skip
         super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0, monotonic=monotonic)
         self.want_on = True
-        self.keepers: tuple[ProjectorKeeper, ...] = ()
+        self.supervisors: tuple[ProjectorSupervisor, ...] = ()
         self._off: frozenset[str] = frozenset()
         self._booted_at_s: dict[str, float] = {}
 
     def silences(self, projector: str) -> bool:
-        """Whether the projector has no mains, or boots because it just got them: nobody need ask it anything."""
+        """Whether the projector has no mains, or is booting since it got them, so that it can't answer."""
         return projector in self._off or self._monotonic() < self._booted_at_s.get(projector, 0.0)
 
     def _switch(self, device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
         boards = cast("Boards", device)
         act: Callable[[Circuit], str]
         if self.want_on:
-            # From now on they are asked: one that stays without mains is to be told of as lost, not as dark.
+            # From now on the projectors are asked: one that stays without mains counts as lost, not as dark.
             self._off = frozenset()
-            act = self._give
+            act = self._switch_on
         else:
-            guards = {keeper.name: keeper.guard for keeper in self.keepers}
-            act = partial(self._cut, guards=guards)
+            guards = {supervisor.name: supervisor.guard for supervisor in self.supervisors}
+            act = partial(self._switch_off, guards=guards)
         values, failed = [], list[DeviceError]()
         for circuit in boards.circuits:
             try:
@@ -75,28 +75,28 @@ class MainsKeeper(DeviceKeeper):
             raise failed[0]
         return tuple(values)
 
-    def _give(self, circuit: Circuit) -> str:
+    def _switch_on(self, circuit: Circuit) -> str:
         if circuit.close(deadline=in_seconds(LOOK_S)):
             self._tell(Decision("mains-on", f"Mains on: {circuit.name}."))
             self._booted_at_s |= dict.fromkeys(circuit.feeds, self._monotonic() + circuit.boot_s)
         return "on"
 
-    def _cut(self, circuit: Circuit, guards: dict[str, LampGuard | None]) -> str:
-        # Asked although it may be known, and before anybody behind it: a board that is away is to be told of now, and
-        # not to be taken for the silence of those who have lost their mains with it.
+    def _switch_off(self, circuit: Circuit, guards: dict[str, LampGuard | None]) -> str:
+        # The board is asked first, even if its state is known: a missing board must be reported as such, not as the
+        # silence of the projectors that lost their mains with it.
         if not circuit.on(deadline=in_seconds(LOOK_S)):
             return self._is_off(circuit)
-        self._off -= frozenset(circuit.feeds)  # closed by a hand, or by another program
+        self._off -= frozenset(circuit.feeds)  # closed by hand, or by another program
         known = {name: guard for name, guard in guards.items() if guard is not None}
         if any(name not in known for name in circuit.feeds):
-            return "as it was"
+            return "unchanged"
         try:
             circuit.open(known, deadline=in_seconds(LOOK_S))
         except DeviceError as error:
             if error.code == "mains-lamp-hot":
                 return "on until the lamps have cooled"
-            if not _answer([known[name] for name in circuit.feeds]):
-                return "on, for nobody knows whether the lamps have cooled"
+            if not _all_answer([known[name] for name in circuit.feeds]):
+                return "on, because it is unknown whether the lamps have cooled"
             raise
         return self._is_off(circuit)
 
@@ -107,8 +107,8 @@ class MainsKeeper(DeviceKeeper):
         return "off"
 
 
-def _answer(guards: Sequence[LampGuard]) -> bool:
-    """Whether all these projectors do; what is wrong with one that doesn't is told by its own keeper."""
+def _all_answer(guards: Sequence[LampGuard]) -> bool:
+    """Whether all these projectors answer; the supervisor of each reports its problems."""
     try:
         for guard in guards:
             guard.status(deadline=in_seconds(guard.answer_s))

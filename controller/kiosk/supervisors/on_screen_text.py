@@ -1,4 +1,4 @@
-"""A few lines of text on a projector, by the player's inbox (docs/reference/player-protocol.md, "Frame file")."""
+"""Shows lines of text on a projector through the player's inbox (docs/reference/player-protocol.md, "Frame file")."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TALL: Final = 14
 
 
 def outputs_of(hello: Mapping[str, Any]) -> tuple[OutputSize, ...]:
-    """The outputs that a player tells in its answer to hello."""
+    """The outputs in a player's answer to hello."""
     return tuple(OutputSize(row["name"], row["width_px"], row["height_px"]) for row in hello["outputs"])
 
 
@@ -33,7 +33,7 @@ def notice(outputs: Sequence[OutputSize], lines: Sequence[str], turn: int) -> Fr
 
 
 def put(inbox: Path, outputs: Sequence[OutputSize], frames: FrameSet) -> int:
-    """Write a set into the inbox; the sequence number that ``show`` has to be sent with. Raises OSError."""
+    """Write a set into the inbox; returns the sequence number for ``show``. Raises OSError."""
     _, offsets = layout_bytes(outputs)
     with inbox.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapped:
         sequence = np.frombuffer(mapped, "<u8", 1, SEQUENCE_AT)

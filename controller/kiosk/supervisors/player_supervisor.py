@@ -74,7 +74,7 @@ class PlayerKeeper:
             if self._process is None:
                 return
         if not self._process.alive:
-            self._restart(Decision("player-died", "The player ended by itself.", "It is started again.", "error"))
+            self._restart(Decision("player-died", "The player ended unexpectedly.", "It is started again.", "error"))
             return
         try:
             self._follow(self._ask({"op": "status"}))
@@ -87,7 +87,9 @@ class PlayerKeeper:
             self._disconnect()
             self._misses += 1
             if self._misses >= MOST_MISSES + 2:
-                self._restart(Decision("player-gone", "The player let nobody in.", "It is started again.", "error"))
+                self._restart(
+                    Decision("player-gone", "The player refused the connection.", "It is started again.", "error")
+                )
         except WorkError as error:
             self._misses = 0
             self._trouble(Decision(error.code, error.what, error.remedy, "error"))
@@ -126,7 +128,7 @@ class PlayerKeeper:
         if hello.get("bundle") and installed is not None:
             # The player may have gone back to the bundle before while it started; then the link has moved, too.
             self._identities[str(hello["bundle"])] = installed.resolve()
-        self._tell(Decision("player-started", "The player runs."))
+        self._tell(Decision("player-started", "The player is running."))
 
     def _restart(self, why: Decision) -> None:
         assert self._process is not None

@@ -1,4 +1,4 @@
-"""Keeps one projector lit or dark, as it is wanted: looks, compares, does the next thing, and never stops looking."""
+"""Keeps one projector lit or dark as wanted: reads its status, compares, and does the next step, again and again."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from hal.values import Power, ProjectorStatus
 
 ANSWER_S: Final = 5.0
 PATIENCE_S: Final = 15.0
-"""A projector may be silent for so long before it counts as lost."""
+"""A projector counts as lost when it has been silent for this long."""
 MOST_STRIKES: Final = 3
-"""Strikes in a row without light, after which the lamp is left alone until the next opening."""
-ASK_ANEW_S: Final = 120.0
-"""After so long a projector that reported a fault is opened anew: many tell of one unasked, and never of its end."""
+"""Failed attempts to light the lamp in a row, after which it stays off until the next opening."""
+REOPEN_AFTER_FAULT_S: Final = 120.0
+"""A projector that reported a fault is reopened after this time: many report a fault, but never its end."""
 LIGHT_MARGIN_S: Final = 30.0
 _LOOKS: Final = {
     Power.ON: Condition.LIT, Power.WARMING: Condition.LIGHTING, Power.COOLING: Condition.COOLING,
     Power.OFF: Condition.DARK,
 }  # fmt: skip
 _REOPEN_S: Final = (2.0, 5.0, 15.0)
-"""Not longer: who has plugged a cable in again stands there and waits."""
+"""Not longer, because a person who plugs a cable in again waits for the result."""
 
 
-class ProjectorKeeper:
-    """One projector. ``step`` is called over and over by one thread; everything else may be asked by any.
+class ProjectorSupervisor:
+    """One projector. One thread calls ``step`` repeatedly; any thread may use the rest.
 
     Parameters
     ----------
-    open_guard : opens the projector; raises DeviceError or VelaturaError while that can't be done
-    tell : hears what was noticed and decided
-    asleep : whether it has no mains now, or boots, so that its silence means nothing
-    unfed : what is wrong with the relays that it gets its mains through, which may be why it is silent
+    open_guard : opens the projector; raises DeviceError or VelaturaError if that fails
+    tell : receives observations and decisions
+    asleep : whether it has no mains now, or is booting, so that its silence means nothing
+    unfed : the problem of the relays that supply it, which may be the reason for its silence
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ProjectorKeeper:
         self._silent_since_s: float | None = None
         self._reopen_at_s, self._reopened = 0.0, 0
         self._struck_at_s: float | None = None
-        self._in_vain = 0
+        self._failed_strikes = 0
         self._burning = False
         self._faulty_since_s: float | None = None
 
@@ -75,33 +75,33 @@ class ProjectorKeeper:
 
     @property
     def guard(self) -> LampGuard | None:
-        """The opened projector, for work that needs it; None while it can't be opened."""
+        """The opened projector, for jobs; None while it is not open."""
         return self._guard
 
     @property
     def may_light(self) -> bool:
-        """Whether the lamp may be lit, or a step that goes on now, and began when light was wanted, may light it."""
-        # In this order: what a step has done is in the view before the step ends.
+        """Whether the lamp may be lit, or the step that is running now may light it."""
+        # In this order: a step updates the view before it ends.
         return self._stepping or self._view.maybe_lit
 
     @property
     def want_lit(self) -> bool | None:
-        """None until somebody has said it: a lamp that burns when the service begins is left as it is until then."""
+        """None until it is set: until then a lamp stays as it is when the service starts."""
         return self._want_lit
 
     @want_lit.setter
     def want_lit(self, wanted: bool | None) -> None:
         if wanted and not self._want_lit:
-            # A lamp that was given up gets one more strike at every opening.
-            self._in_vain, self._faulty_since_s = min(self._in_vain, MOST_STRIKES - 1), float("-inf")
+            # A lamp that stays off after failed attempts gets one more attempt at every opening.
+            self._failed_strikes, self._faulty_since_s = min(self._failed_strikes, MOST_STRIKES - 1), float("-inf")
         self._want_lit = wanted
 
     def forgive(self) -> None:
-        """A technician has looked after the lamp: it gets all its strikes again, the first at once."""
-        self._in_vain, self._faulty_since_s = 0, float("-inf")
+        """After the technician's repair: allow all attempts again, the first at once."""
+        self._failed_strikes, self._faulty_since_s = 0, float("-inf")
 
     def step(self) -> None:
-        """Look once, and do what follows. Blocks for some answers at most; raises nothing that a device can cause."""
+        """Read the status once, and act on it. Blocks for a few answers at most; device errors are not raised."""
         self._stepping = True
         try:
             self._step()
@@ -126,7 +126,7 @@ class ProjectorKeeper:
             self._silent(error)
             return
         self._silent_since_s, self._reopened = None, 0
-        # Not before: a line takes seconds to open, and a lamp that nobody wants any more must not be struck.
+        # Read late: opening the line takes seconds, and the lamp may not be wanted any more.
         wanted = self._want_lit
         try:
             if wanted is None:
@@ -139,10 +139,10 @@ class ProjectorKeeper:
             self._see(self._view.condition, status, _decision(error))
 
     def close(self) -> None:
-        """Let go of the line, for good; the lamp stays as it is."""
+        """Close the line for good; the lamp stays as it is."""
         self._closed = True
         if self._guard is not None:
-            self._let_go(self._guard)
+            self._release(self._guard)
 
     # -- the line
 
@@ -152,12 +152,12 @@ class ProjectorKeeper:
                 return None
             self._guard = self._open_guard(in_seconds(ANSWER_S))
             if self._closed:
-                # While it was opened: nobody else would ever let go of the line, and the next service needs it.
-                self._let_go(self._guard)
+                # Closed while it was being opened: release the line, because the next service needs it.
+                self._release(self._guard)
                 self._guard = None
         return self._guard
 
-    def _let_go(self, guard: LampGuard) -> None:
+    def _release(self, guard: LampGuard) -> None:
         try:
             guard.close()
         except DeviceError as error:
@@ -169,12 +169,12 @@ class ProjectorKeeper:
             self._silent_since_s = now_s
         guard = self._guard
         if guard is not None and self._want_lit is False and guard.may_be_lit:
-            # Perhaps it hears, though it does not answer.
+            # It may receive the command, even if it does not answer.
             with contextlib.suppress(DeviceError, VelaturaError):
                 guard.switch_off(deadline=in_seconds(guard.switch_s))
         limit_s = PATIENCE_S
         if guard is not None and self._struck_at_s is not None:
-            # Many boot in silence.
+            # Many do not answer while they boot.
             limit_s = max(limit_s, self._struck_at_s + self._light_limit_s(guard) - self._silent_since_s)
         if guard is None or now_s - self._silent_since_s >= limit_s:
             self._lost(error)
@@ -182,7 +182,7 @@ class ProjectorKeeper:
     def _lost(self, error: DeviceError | VelaturaError) -> None:
         maybe_lit = self._guard.may_be_lit if self._guard is not None else self._view.maybe_lit
         if self._guard is not None:
-            self._let_go(self._guard)
+            self._release(self._guard)
             self._guard = None
         self._reopen_at_s = self._clock.now_s() + _REOPEN_S[min(self._reopened, len(_REOPEN_S) - 1)]
         self._reopened += 1
@@ -201,11 +201,11 @@ class ProjectorKeeper:
                 guard.switch_off(deadline=in_seconds(guard.switch_s))
             self._struck_at_s = None
             self._see(Condition.BROKEN, status, _decision(faulty(self.name, status)))
-            self._ask_anew(guard)
+            self._reopen_after_fault(guard)
         elif status.power is Power.ON or not guard.capabilities.power:
             self._struck_at_s, self._burning, self._faulty_since_s = None, True, None
             if guard.stable_left_s() <= 0:
-                self._in_vain = 0
+                self._failed_strikes = 0
             self._see(Condition.LIT, status, None)
         elif status.power is Power.WARMING:
             self._await_light(guard, status)
@@ -215,13 +215,13 @@ class ProjectorKeeper:
         else:
             self._strike(guard, status)
 
-    def _ask_anew(self, guard: LampGuard) -> None:
+    def _reopen_after_fault(self, guard: LampGuard) -> None:
         now_s = self._clock.now_s()
         if self._faulty_since_s is None:
             self._faulty_since_s = now_s
-        if self._in_vain >= MOST_STRIKES or now_s - self._faulty_since_s < ASK_ANEW_S:
+        if self._failed_strikes >= MOST_STRIKES or now_s - self._faulty_since_s < REOPEN_AFTER_FAULT_S:
             return
-        self._in_vain, self._faulty_since_s, self._burning = self._in_vain + 1, now_s, False
+        self._failed_strikes, self._faulty_since_s, self._burning = self._failed_strikes + 1, now_s, False
         guard.close()
         self._guard = None
 
@@ -229,7 +229,7 @@ class ProjectorKeeper:
         if self._struck_at_s is None:
             self._struck_at_s = self._clock.now_s()
         if self._clock.now_s() - self._struck_at_s > self._light_limit_s(guard):
-            self._vain()
+            self._strike_failed()
             guard.switch_off(deadline=in_seconds(guard.switch_s))
         self._see(Condition.LIGHTING, status, self._view.problem)
 
@@ -239,8 +239,8 @@ class ProjectorKeeper:
         if self._struck_at_s is not None:
             if now_s - self._struck_at_s <= self._light_limit_s(guard):
                 return self._see(Condition.LIGHTING, status, self._view.problem)
-            self._vain()
-        if self._in_vain >= MOST_STRIKES:
+            self._strike_failed()
+        if self._failed_strikes >= MOST_STRIKES:
             return self._see(Condition.BROKEN, status, _unlit(self.name))
         try:
             guard.switch_on(deadline=in_seconds(guard.switch_s))
@@ -249,28 +249,28 @@ class ProjectorKeeper:
                 return self._see(Condition.COOLING, status, self._view.problem)
             return self._see(Condition.BROKEN, status, _decision(error))
         except VelaturaError as error:
-            # The strike can't be written down, so it was not made.
+            # The lamp counter can't be saved, so the lamp was not switched on.
             return self._see(Condition.BROKEN, status, _decision(error))
         self._struck_at_s = now_s
-        self._tell(Decision("lamp-struck", f"The lamp of projector {self.name} is struck."))
+        self._tell(Decision("lamp-struck", f"The lamp of projector {self.name} is being switched on."))
         return self._see(Condition.LIGHTING, status, self._view.problem)
 
     def _went_dark(self, status: ProjectorStatus) -> None:
         if self._burning:
             self._burning = False
-            self._in_vain += 1
+            self._failed_strikes += 1
             self._tell(Decision(
-                "lamp-went-off", f"The lamp of projector {self.name} went off by itself; it is {status.power.value}.",
-                "It is struck again when it has cooled; if it comes back, replace the lamp.", "warning",
+                "lamp-went-off", f"The lamp of projector {self.name} went off by itself (power: {status.power.value}).",
+                "It is switched on again when it has cooled. If this happens again, replace the lamp.", "warning",
             ))  # fmt: skip
 
-    def _vain(self) -> None:
+    def _strike_failed(self) -> None:
         self._struck_at_s = None
-        self._in_vain += 1
+        self._failed_strikes += 1
+        retried = self._failed_strikes < MOST_STRIKES
         self._tell(Decision(
-            "lamp-not-lit", f"The lamp of projector {self.name} was struck and gave no light.",
-            "It is tried again when it has rested." if self._in_vain < MOST_STRIKES else "It is left alone now.",
-            "warning",
+            "lamp-not-lit", f"The lamp of projector {self.name} was switched on, but gave no light.",
+            "It is tried again after its minimum off time." if retried else "It stays off now.", "warning",
         ))  # fmt: skip
 
     def _light_limit_s(self, guard: LampGuard) -> float:
@@ -288,12 +288,12 @@ class ProjectorKeeper:
             resting = status.power is Power.COOLING or guard.rest_left_s() > 0
             self._see(Condition.COOLING if resting else Condition.DARK, status, problem)
         else:
-            # Until the next look shows it off; FAULT and UNKNOWN may hide a burning lamp.
+            # Until the next status shows it off: the lamp may be lit behind FAULT and UNKNOWN.
             self._see(Condition.BROKEN if faults else Condition.LIT, status, problem)
             if not (faults and status.power is Power.FAULT and not guard.may_be_lit):
                 guard.switch_off(deadline=in_seconds(guard.switch_s))
 
-    # -- what is seen
+    # -- the view
 
     def _see(self, condition: Condition, status: ProjectorStatus, problem: Decision | None) -> None:
         guard = self._guard
@@ -310,7 +310,7 @@ class ProjectorKeeper:
         if view.problem is not None and view.problem.code != code_before:
             self._tell(replace(view.problem, level="error"))
         elif view.problem is None and before.problem is not None:
-            self._tell(Decision("projector-back", f"Projector {self.name} is well again ({view.condition.value})."))
+            self._tell(Decision("projector-back", f"Projector {self.name} works again ({view.condition.value})."))
 
 
 def _decision(error: DeviceError | VelaturaError) -> Decision:
@@ -320,7 +320,7 @@ def _decision(error: DeviceError | VelaturaError) -> Decision:
 def _unlit(name: str) -> Decision:
     return Decision(
         "lamp-given-up",
-        f"The lamp of projector {name} gave no light in {MOST_STRIKES} strikes and is left alone.",
-        "Replace the lamp, then press Start; until the next opening it is not struck again.",
+        f"The lamp of projector {name} gave no light in {MOST_STRIKES} attempts and stays off.",
+        "Replace the lamp, then press Open. Otherwise it is tried again at the next opening.",
         "error",
     )

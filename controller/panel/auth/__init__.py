@@ -1,1 +1,1 @@
-"""Who may do what over HTTP: sessions, log-in routes, identity of a request, and the guard before every route."""
+"""Access over HTTP: sessions, log-in routes, identity of a request, and the guard before every route."""

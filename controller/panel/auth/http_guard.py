@@ -1,4 +1,4 @@
-"""What stands before every route: names we answer to, size of bodies, headers of every answer."""
+"""Checks before every route: host name and size of the body; and the security headers of every response."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 SMALL_BODY: Final = 2 << 20
-"""Bytes of a form or JSON body; uploads have limits of their own."""
+"""Bytes of a form or JSON body; uploads have their own limits."""
 
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -19,7 +19,7 @@ HEADERS: Final = {
     "content-security-policy": POLICY,
     "x-content-type-options": "nosniff",
     "x-frame-options": "DENY",
-    # "no-referrer" would also blank the Origin that changes are checked by.
+    # "no-referrer" would also remove the Origin header, which changes are checked by.
     "referrer-policy": "same-origin",
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
@@ -28,7 +28,7 @@ HEADERS: Final = {
 
 
 class BodyTooLarge(Exception):
-    """More bytes came than this route takes."""
+    """The body is larger than this route accepts."""
 
 
 class Guard:
@@ -66,7 +66,7 @@ class Guard:
         name = host if host.endswith("]") else host.rpartition(":")[0] or host
         if name not in self._hosts:
             # A page of another name that resolves to this machine must not reach it (DNS rebinding).
-            return PlainTextResponse("This machine does not answer to that name.", 421)
+            return PlainTextResponse("This host name is not allowed. Start the kiosk with --name to allow it.", 421)
         length = headers.get("content-length", "0")
         if not length.isascii() or not length.isdigit() or int(length[:18]) > self._limit(scope):
             return PlainTextResponse("Too large.", 413, headers={"connection": "close"})
@@ -74,14 +74,14 @@ class Guard:
 
 
 def _limited(receive: Receive, most: int) -> Receive:
-    """``receive``, which raises BodyTooLarge once more than ``most`` bytes came, whatever was announced."""
-    came = 0
+    """``receive``, but raising BodyTooLarge after more than ``most`` bytes, whatever Content-Length says."""
+    received = 0
 
     async def counted() -> Message:
-        nonlocal came
+        nonlocal received
         message = await receive()
-        came += len(message.get("body", b""))
-        if came > most:
+        received += len(message.get("body", b""))
+        if received > most:
             raise BodyTooLarge
         return message
 

@@ -1,6 +1,4 @@
-"""Who asks: by session cookie on pages, by token in the API. What a route needs, and what is answered when it is
-refused.
-"""
+"""The identity of a request (session cookie on pages, token in the API), and the refusal if a route needs more."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ Way = Literal["public", "session", "token"]
 
 @dataclass(frozen=True, slots=True)
 class Visitor:
-    """Somebody who may be here. ``session`` is there on pages; ``secret`` its cookie."""
+    """The identified user or token. ``session`` and its cookie ``secret`` are set on pages."""
 
     name: str
     role: Role
@@ -36,14 +34,14 @@ class Visitor:
 
 
 Endpoint = Callable[[Request, Visitor], Awaitable[Response]]
-NOBODY: Final = Visitor("", Role.VIEWER)
+ANONYMOUS: Final = Visitor("", Role.VIEWER)
 OPEN_TO_ONE_TIME: Final = frozenset({"/password", "/logout"})
-"""All that a one-time password opens."""
+"""The only paths that a one-time password gives access to."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One row of the table of routes. ``role`` None only for the few public ones."""
+    """One row of the table of routes. ``role`` is None only for public ones."""
 
     method: str
     path: str
@@ -58,7 +56,7 @@ def cookie_name(panel: Panel) -> str:
 
 
 def visitor(panel: Panel, request: Request, way: Way) -> Visitor | None:
-    """Who asks, or None."""
+    """The identity of the request, or None."""
     if way == "token":
         scheme, _, shown = request.headers.get("authorization", "").partition(" ")
         token = panel.accounts.by_token(shown.strip()) if scheme.lower() == "bearer" and shown.isascii() else None
@@ -72,9 +70,9 @@ def visitor(panel: Panel, request: Request, way: Way) -> Visitor | None:
 
 
 async def guarded(panel: Panel, entry: Entry, request: Request) -> Response:  # noqa: PLR0911 - one for each refusal
-    """Answer a route of the table, if its visitor may."""
+    """Call a route of the table if the visitor is allowed to use it."""
     if entry.way == "public":
-        return await entry.endpoint(request, NOBODY)
+        return await entry.endpoint(request, ANONYMOUS)
     address = request.client.host if request.client else ""
     if entry.way == "token" and (wait_s := panel.by_token.wait_s(address)) > 0:
         return _too_many(wait_s)
@@ -84,12 +82,14 @@ async def guarded(panel: Panel, entry: Entry, request: Request) -> Response:  # 
             return RedirectResponse("/login", 303) if _navigates(request) else _denied(401)
         if "authorization" in request.headers:
             panel.by_token.failed(address)
-        return _api_error(401, "not-known", "No valid token came with this call.", "Send 'Authorization: Bearer ...'.")
-    # Deny by default: an entry without a role is a mistake in the table, not an open door.
+        return _api_error(401, "not-known", "The request has no valid token.", "Send 'Authorization: Bearer ...'.")
+    # Deny by default: an entry without a role is a mistake in the table, and must not grant access.
     if entry.role is None or who.role < entry.role:
         if entry.way == "session":
             return _denied(403)
-        return _api_error(403, "not-allowed", "This token may not do that.", "Ask a technician for a token that may.")
+        return _api_error(
+            403, "not-allowed", "The role of this token does not allow this.", "Use a token with a higher role."
+        )
     if who.must_change_password and request.url.path not in OPEN_TO_ONE_TIME:
         return RedirectResponse("/password", 303) if _navigates(request) else _denied(403)
     return await entry.endpoint(request, who)
@@ -100,7 +100,7 @@ def _navigates(request: Request) -> bool:
 
 
 def _denied(status: int) -> Response:
-    text = "Log in first." if status == 401 else "Your role may not do that. A technician can change it."
+    text = "Log in first." if status == 401 else "Your role does not allow this. A technician can change your role."
     return PlainTextResponse(text, status)
 
 
@@ -116,8 +116,8 @@ def _too_many(wait_s: float) -> Response:
 
 
 def same_origin(headers: Headers) -> bool:
-    """Does the browser say that one of our own pages sends this? A browser that says nothing must have the CSRF token
-    anyway.
+    """Whether the browser says that the request comes from our own page. Old browsers say nothing; the CSRF token
+    protects them.
     """
     if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
         return False
@@ -126,7 +126,7 @@ def same_origin(headers: Headers) -> bool:
 
 
 def form_pair(panel: Panel) -> tuple[str, str]:
-    """Cookie and form token of the log-in form, which has no session yet."""
+    """Cookie and CSRF token of the log-in form, which has no session yet."""
     cookie = secrets.token_urlsafe(24)
     return cookie, form_token(panel, cookie)
 

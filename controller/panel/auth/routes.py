@@ -1,4 +1,4 @@
-"""Logging in and out, passwords, accounts and tokens."""
+"""The routes for log-in, log-out, passwords, accounts and tokens."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ class Entrance:
             or not same_origin(request.headers)
             or not hmac.compare_digest(expected, token.encode().decode("ascii", "replace"))
         ):
-            return self._form("This page was too old. Try again.", 403)
+            return self._form("This page was out of date. Try again.", 403)
         address = request.client.host if request.client else ""
         wait_s = max(panel.by_address.wait_s(address), panel.by_account.wait_s(name))
         if wait_s > 0:
             page = self._form(f"Too many wrong passwords. Wait {int(wait_s) + 1} seconds.", 429)
             page.headers["retry-after"] = str(int(wait_s) + 1)
             return page
-        # Counted before it is known, so that many tries at once are all counted.
+        # Counted before the check, so that many simultaneous tries are all counted.
         panel.by_address.failed(address)
         panel.by_account.failed(name)
         account = await anyio.to_thread.run_sync(panel.accounts.verify, name, password, limiter=panel.hashing)
@@ -84,12 +84,12 @@ class Entrance:
         return self._enter(request, account)
 
     def _enter(self, request: Request, account: Account) -> Response:
-        """A new session, never one that the browser brought along."""
+        """Start a new session; a session cookie of the browser is never reused."""
         panel = self._panel
         panel.sessions.end(request.cookies.get(cookie_name(panel), ""))
         secret, _ = panel.sessions.begin(account.name)
         if panel.accounts.get(account.name) != account:
-            # Its password was changed while the old one was verified, and its sessions had been ended before this one.
+            # The account was changed during the check, after its other sessions had been ended.
             panel.sessions.end(secret)
             return self._form(_WRONG, 403)
         first = "/setup" if panel.kiosk.snapshot().needs_setup and account.role is Role.TECHNICIAN else "/"
@@ -116,32 +116,32 @@ class Entrance:
                 panel.by_address.failed(address)
                 raise UsageError("password-wrong", what="The old password is wrong.", remedy="Type it again.")
             if new != sent.texts.get("again", ""):
-                raise UsageError("password-wrong", what="The two new ones differ.", remedy="Type them again.")
+                raise UsageError("password-wrong", what="The two new passwords differ.", remedy="Type them again.")
             if new == old:
-                raise UsageError("password-weak", what="This is the old password.", remedy="Choose another one.")
+                raise UsageError("password-weak", what="The new password is the old one.", remedy="Choose another one.")
             await anyio.to_thread.run_sync(panel.accounts.set_password, visitor.name, new, limiter=panel.hashing)
         except UsageError as error:
-            return await self._said(visitor, "/password", "error", f"{error.what} {error.remedy}")
+            return await self._redirect(visitor, "/password", "error", f"{error.what} {error.remedy}")
         panel.sessions.end_all(visitor.name, but=visitor.session)
         page = "/setup" if panel.kiosk.snapshot().needs_setup and visitor.role is Role.TECHNICIAN else "/"
-        return await self._said(visitor, page, "good", "Your new password is in use.")
+        return await self._redirect(visitor, page, "good", "Your new password is in use.")
 
-    async def _said(self, visitor: Visitor, page: str, level: str, text: str) -> Response:
+    async def _redirect(self, visitor: Visitor, page: str, level: str, text: str) -> Response:
         assert visitor.session is not None
         visitor.session.notes.append((level, text))
         return RedirectResponse(page, 303)
 
-    async def _changed(self, visitor: Visitor, change: Any, said: str) -> Response:
+    async def _apply(self, visitor: Visitor, change: Any, said: str) -> Response:
         try:
             await anyio.to_thread.run_sync(change, limiter=self._panel.hashing)
         except UsageError as error:
-            return await self._said(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
-        return await self._said(visitor, "/accounts", "good", said)
+            return await self._redirect(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
+        return await self._redirect(visitor, "/accounts", "good", said)
 
     async def _add(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name, password, role = (sent.texts.get(key, "") for key in ("name", "password", "role"))
-        return await self._changed(
-            visitor, lambda: self._panel.accounts.add(name, Role.named(role), password), "The account is there."
+        return await self._apply(
+            visitor, lambda: self._panel.accounts.add(name, Role.named(role), password), "The account is added."
         )
 
     async def _role(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
@@ -152,7 +152,7 @@ class Entrance:
             if name != visitor.name:
                 self._panel.sessions.end_all(name)
 
-        return await self._changed(visitor, change, "The role is changed.")
+        return await self._apply(visitor, change, "The role is changed.")
 
     async def _remove(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name = sent.texts.get("name", "")
@@ -161,17 +161,17 @@ class Entrance:
             self._panel.accounts.remove(name)
             self._panel.sessions.end_all(name)
 
-        return await self._changed(visitor, change, "The account is removed.")
+        return await self._apply(visitor, change, "The account is removed.")
 
     async def _add_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         accounts = self._panel.accounts
         try:
             shown = accounts.add_token(sent.texts.get("name", ""), Role.named(sent.texts.get("role", "")))
         except UsageError as error:
-            return await self._said(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
+            return await self._redirect(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
         facts = {"accounts": accounts.all(), "tokens": accounts.tokens(), "shown": shown, "here": "/accounts"}
         return await self._pages.show("accounts.html", visitor, facts)
 
     async def _remove_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name = sent.texts.get("name", "")
-        return await self._changed(visitor, lambda: self._panel.accounts.remove_token(name), "The token is removed.")
+        return await self._apply(visitor, lambda: self._panel.accounts.remove_token(name), "The token is removed.")

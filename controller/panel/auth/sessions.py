@@ -1,4 +1,4 @@
-"""Sessions on the server's side, and how often somebody may try to log in."""
+"""Server-side sessions, and the limit for log-in attempts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from controller.core.files import read_text
 from controller.core.storage import write_atomically
 
 LONGEST_S: Final = 12 * 3600.0
-"""After this a technician logs in again, even in the middle of work."""
+"""After this time a user must log in again, even if active."""
 
 IDLE_S: Final = 2 * 3600.0
 MOST_SESSIONS: Final = 200
@@ -28,7 +28,7 @@ MOST_SESSIONS: Final = 200
 
 @dataclass(slots=True)
 class Session:
-    """One logged-in browser. ``notes`` are (level, sentence) for its next page."""
+    """A logged-in browser. ``notes``: (level, sentence) to show on its next page."""
 
     account: str
     csrf: str
@@ -37,14 +37,14 @@ class Session:
     notes: list[tuple[str, str]] = field(default_factory=list)
 
     def matches(self, token: str) -> bool:
-        """Is ``token`` this session's token against forged requests? In constant time."""
+        """Whether ``token`` is this session's CSRF token, compared in constant time."""
         return hmac.compare_digest(self.csrf.encode(), token.encode())
 
 
 class Sessions:
-    """Sessions by the digest of the browser's cookie, so that neither memory nor ``file`` holds anything to steal.
+    """Sessions by the digest of the cookie, so that neither memory nor ``file`` contains a secret.
 
-    With ``file`` they outlive the service: whoever has a page open goes on after a restart. Safe from several threads.
+    With ``file`` they survive a restart of the service. Thread-safe.
     """
 
     def __init__(self, file: Path | None = None, *, clock: Callable[[], float] = time.time) -> None:
@@ -60,19 +60,19 @@ class Sessions:
             self._sessions[digest_of(secret)] = session
             while len(self._sessions) > MOST_SESSIONS:
                 self._sessions.popitem(last=False)
-            # A disk that takes nothing costs a login after the next start; it must not keep out who could mend it.
+            # A disk error must not prevent a login; the session is then lost at the next start.
             with contextlib.suppress(VelaturaError, OSError):
                 self._write()
         return secret, session
 
     def get(self, secret: str, *, touch: bool = True) -> Session | None:
-        """The living session of this cookie, which with ``touch`` counts as seen now."""
+        """The valid session of this cookie; with ``touch`` it counts as used now."""
         now, digest = self._clock(), digest_of(secret)
         with self._lock:
             session = self._sessions.get(digest)
             if session is None:
                 return None
-            # One from the future was begun before the clock was set back: nobody knows its age.
+            # A session from the future began before the clock was set back: its age is unknown.
             if abs(now - session.began_unix_s) > LONGEST_S or abs(now - session.seen_unix_s) > IDLE_S:
                 del self._sessions[digest]
                 return None
@@ -104,7 +104,7 @@ class Sessions:
 
 
 def _read(file: Path | None) -> dict[str, Session]:
-    """A damaged file costs a login, nothing else."""
+    """A damaged file only ends the sessions."""
     if file is None or not file.exists():
         return {}
     try:
@@ -115,9 +115,9 @@ def _read(file: Path | None) -> dict[str, Session]:
 
 
 class LoginLimit:
-    """Lets ``burst`` failures pass, then one more every ``refill_s`` seconds; counted by key (address, account).
+    """Allows ``burst`` failures, then one more every ``refill_s`` seconds, for each key (address, account).
 
-    Forgets the keys that were quiet longest beyond ``most_keys``: memory stays bounded whatever is tried.
+    Keeps at most ``most_keys`` and drops the oldest, so that memory stays bounded.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class LoginLimit:
         self._used: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def wait_s(self, *keys: str) -> float:
-        """Seconds until another try is allowed for all ``keys``; 0 now."""
+        """Seconds until another attempt is allowed for all ``keys``; 0: now."""
         with self._lock:
             excess = max((self._level(key) - (self._burst - 1) for key in keys), default=0.0)
         return max(0.0, excess * self._refill_s)

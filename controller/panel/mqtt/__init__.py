@@ -1,1 +1,1 @@
-"""The kiosk's state for an MQTT broker: `bridge`, and how the broker is named (`options`)."""
+"""MQTT: `bridge` connects a kiosk to a broker, `options` are the broker's settings."""

@@ -1,4 +1,4 @@
-"""Building control over MQTT: the kiosk's state is published, and it can be opened, closed, and told what to play."""
+"""Building control over MQTT: publishes the kiosk's state, and accepts commands such as open, close and play."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ LONGEST_PAUSE_S: Final = 60.0
 MOST_COMMANDS_WAITING: Final = 20
 LONGEST_PAYLOAD: Final = 256
 AGAIN_S: Final = 1.0
-"""After a state that could not be found out."""
+"""Pause after a state that could not be read."""
 LEAVE_S: Final = 2.0
-"""The longest that a stop waits for a broker to hear of it."""
+"""The longest time that a stop waits to publish "offline"."""
 _LOG: Final = logging.getLogger("velatura.panel")
 
 
 class BuildingControl:
-    """One connection to a broker, made again for as long as it takes, each time after a longer pause.
+    """The connection to a broker; it reconnects without end, with growing pauses.
 
-    Topics: ``T/available`` "online" or "offline" (retained; the broker's word when we vanish); ``T/state`` JSON
-    (retained); ``T/command/VERB`` for every operation that has a ``building_verb`` (open, close, play, identify): the
-    payload is its one value as text, or a JSON object where it has more; ``T/answer`` what came of it. Who may publish
-    to ``T/command`` is the broker's to decide. A broker that confirms nothing for ``patience_s`` is connected to anew.
+    Topics: ``T/available`` "online" or "offline" (retained; sent by the broker if the connection is lost); ``T/state``
+    JSON (retained); ``T/command/VERB`` for every operation with a ``building_verb`` (open, close, play, identify): the
+    payload is its one value as text, or a JSON object if it has more; ``T/answer``: the result. The broker decides who
+    may publish to ``T/command``. It reconnects to a broker that confirms nothing for ``patience_s``.
     """
 
     def __init__(
@@ -48,11 +48,11 @@ class BuildingControl:
     ) -> None:  # fmt: skip
         self._kiosk, self._options = kiosk, options
         self._first_pause_s, self._patience_s = first_pause_s, patience_s
-        self._verbs = {one.building_verb: one for one in operations if one.building_verb}
+        self._verbs = {operation.building_verb: operation for operation in operations if operation.building_verb}
         self._changed = asyncio.Event()
 
     async def run(self) -> None:
-        """Until cancelled. A broker that is not there costs nothing but tries."""
+        """Run until cancelled. A missing broker only causes retries."""
         loop = asyncio.get_running_loop()
 
         def tell() -> None:
@@ -66,12 +66,12 @@ class BuildingControl:
                 try:
                     await self._connected()
                 except* ValueError as errors:
-                    _LOG.warning("A password file that is no text, or a topic that can be none: %s", errors.exceptions)
+                    _LOG.warning("The MQTT password file is not text, or the topic is not valid: %s", errors.exceptions)
                 except* (aiomqtt.MqttError, OSError):
-                    # The kiosk goes on without the building; whoever watches "available" sees that it is cut off.
-                    _LOG.debug("No broker at %s", self._options.host, exc_info=True)
-                except* Exception:  # noqa: BLE001 - neither the panel nor the next try ends with one connection
-                    _LOG.exception("The connection to the building's broker ended; it is made again.")
+                    # The kiosk continues without the broker; "available" shows "offline" to its clients.
+                    _LOG.debug("No MQTT broker at %s", self._options.host, exc_info=True)
+                except* Exception:  # noqa: BLE001 - one connection must not end the panel or the retries
+                    _LOG.exception("The connection to the MQTT broker failed. Reconnecting.")
                 pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
                 await asyncio.sleep(pause_s)
                 pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
@@ -98,18 +98,18 @@ class BuildingControl:
             try:
                 await self._both_ways(client)
             finally:
-                # The broker says it of itself only when we vanish, not when we take our leave.
+                # The broker publishes the will only after a lost connection, not after a regular one.
                 with anyio.move_on_after(LEAVE_S, shield=True), contextlib.suppress(aiomqtt.MqttError):
                     await client.publish(f"{topic}/available", "offline", qos=1, retain=True)
 
     async def _both_ways(self, client: aiomqtt.Client) -> None:
         self._changed.set()
-        # A task group, because it cancels until it is obeyed: `asyncio.wait_for`, inside every publish, loses a
-        # cancellation that meets the broker's answer (Python 3.11), and whoever waited for that task waited for good.
+        # A task group repeats its cancellation. `asyncio.wait_for`, inside every publish, can lose one that arrives
+        # together with the broker's answer (Python 3.11); without the repetition this would wait forever.
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._publish, client)
             async for message in client.messages:
-                await self._obey(client, message)
+                await self._execute(client, message)
 
     async def _publish(self, client: aiomqtt.Client) -> None:
         last = ""
@@ -118,9 +118,9 @@ class BuildingControl:
             self._changed.clear()
             try:
                 now = json.dumps(await anyio.to_thread.run_sync(self._state))
-            except Exception:  # noqa: BLE001 - whatever it was, the next state may be told
-                # The building would see an old state for good: this task has nobody above it to start it again.
-                _LOG.exception("The state could not be told to the building; it is tried again.")
+            except Exception:  # noqa: BLE001 - the next state may succeed
+                # Nothing restarts this task, and without it the broker would keep an old state.
+                _LOG.exception("The state could not be published to MQTT. Trying again.")
                 await asyncio.sleep(AGAIN_S)
                 self._changed.set()
                 continue
@@ -140,9 +140,9 @@ class BuildingControl:
             "problems": [{"device": row.name, "problem": row.problem} for row in now.devices if row.problem],
         }
 
-    async def _obey(self, client: aiomqtt.Client, message: aiomqtt.Message) -> None:
+    async def _execute(self, client: aiomqtt.Client, message: aiomqtt.Message) -> None:
         if message.retain:
-            return  # said long ago to somebody else: a restart must not open a closed house
+            return  # an old command: a restart must not open a closed stage
         word = str(message.topic).rsplit("/", 1)[-1]
         payload = message.payload if isinstance(message.payload, bytes) else b""
         command = self._command(word, payload)
@@ -161,7 +161,7 @@ class BuildingControl:
                     "remedy": error.remedy,
                 }
             except Exception:  # noqa: BLE001 - the panel's live pages must not end with one command
-                _LOG.exception("A command of the building failed.")
+                _LOG.exception("An MQTT command failed.")
                 answer = {"command": word, "done": False, "code": "crash"}
         await client.publish(f"{self._options.topic}/answer", json.dumps(answer), qos=1)
 

@@ -1,4 +1,4 @@
-"""Where the broker of a building's control is."""
+"""The settings of the MQTT broker."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class BrokerOptions:
-    """Where the broker is. ``password_file`` holds the password and nothing else: it stands in no settings and no
-    export.
+    """The address of the broker. ``password_file`` contains only the password, so that no settings and no export do.
 
-    ``topic`` the first part of all topics; ``certificates`` the authorities (PEM) with which the broker's TLS is
-    checked.
+    ``topic``: the first part of all topics; ``certificates``: the certificate authorities (PEM) for the broker's TLS.
     """
 
     host: str

@@ -1,1 +1,1 @@
-"""The pages: `routes` answers them, `drawing` fills templates, `forms` carries out what they post."""
+"""The pages: `routes` serves them, `drawing` renders templates, `forms` handles their forms."""

@@ -1,4 +1,4 @@
-"""The next days of a schedule, for people to look at. What is done when is the supervisor's business."""
+"""The next days of a schedule, for display only; the kiosk itself decides when to open."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ SHOWN: Final = 14
 
 @dataclass(frozen=True, slots=True)
 class CalendarDay:
-    """One day: ``bars`` are (first minute, minutes, appearance) within it; ``special`` True where a date's own row
-    rules.
+    """One day: ``bars`` are (first minute, minutes, appearance) within it; ``special``: whether a row for
+    this date applies.
     """
 
     day: date
@@ -27,7 +27,7 @@ class CalendarDay:
 
 
 def days(schedule: Schedule, first: date | None = None) -> list[CalendarDay]:
-    """The next 14 days from ``first``, in the schedule's own local time; default today."""
+    """The next 14 days from ``first``, in the schedule's local time; default: today."""
     start = first or _today(schedule.time_zone)
     return [_day(schedule, start + timedelta(n)) for n in range(SHOWN)]
 
@@ -41,7 +41,7 @@ def _today(zone: str) -> date:
 
 def _day(schedule: Schedule, day: date) -> CalendarDay:
     rows, special = _rows(schedule, day)
-    # Hours past midnight belong to the day on which they began, but are seen on the next.
+    # Hours after midnight belong to the row of the day before, but are shown on this day.
     before, _ = _rows(schedule, day - timedelta(1))
     bars = [(0, end - 1440, row.appearance) for row in before for _, end in [_minutes(row)] if end > 1440]
     bars += [(start, min(end, 1440) - start, row.appearance) for row in rows for start, end in [_minutes(row)]]
@@ -62,5 +62,5 @@ def _minutes(row: ScheduleRow) -> tuple[int, int]:
 
 @functools.cache
 def zones() -> list[str]:
-    """The time zones that this machine knows, those of places only."""
+    """The time zones of places that this machine knows."""
     return sorted(name for name in zoneinfo.available_timezones() if "/" in name and not name.startswith("Etc/"))

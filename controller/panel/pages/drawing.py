@@ -1,4 +1,4 @@
-"""HTML from templates. Everything is escaped: what devices, files and people said is hostile."""
+"""Renders HTML templates. All values are escaped, because text of devices, files and users is untrusted."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ STATES: Final = {
     "publishing": ("Publishing", "busy"),
     "playing": ("Playing", "good"),
     "cooling": ("Cooling down", "busy"),
-    "degraded": ("Playing with what is left", "warn"),
+    "degraded": ("Playing with problems", "warn"),
     "fault": ("Fault", "bad"),
 }
-"""Word and tone of each state."""
+"""Label and style of each state."""
 
 EVENTS_SHOWN: Final = 200
 
 
 class Drawing:
-    """The templates. ``zone`` is the IANA name of the stage's time zone at this moment; times are shown in it."""
+    """The templates. Times are shown in the stage's time zone (``use_zone``)."""
 
     def __init__(self) -> None:
         self._zone: tzinfo = UTC
@@ -56,7 +56,7 @@ class Drawing:
         self._environment = environment
 
     def use_zone(self, name: str) -> None:
-        """Show times in this zone; a name that this machine does not know leaves UTC."""
+        """Show times in this zone (IANA name); UTC if this machine does not know it."""
         try:
             self._zone = zoneinfo.ZoneInfo(name)
         except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError):
@@ -66,7 +66,7 @@ class Drawing:
         return self._environment.get_template(template).render(values)
 
     def parts(self, state: KioskState, events: list[EventRow]) -> dict[str, str]:
-        """The live parts of all pages, by the name that the pages give them."""
+        """The HTML of the live parts of all pages, by name."""
         module: Any = self._environment.get_template("parts.html").module
         return {
             "top": str(module.top(state)),
@@ -87,7 +87,7 @@ class Drawing:
         try:
             return datetime.fromtimestamp(unix_s, self._zone).strftime(form)
         except (ValueError, OverflowError, OSError):
-            # A file or a clock says so; no page is to be lost for it.
+            # A wrong time in a file must not break a page.
             return "at an unknown time"
 
 

@@ -1,4 +1,4 @@
-"""What the pages' forms do: every operation that has a page, with the token against forged requests."""
+"""The forms of the pages: all operations that have a form, protected by the CSRF token."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ LEADS_TO: Final = {
     "test-shots": "/aiming",
     "save-settings": "/settings",
 }
-"""The operations that have a form, and the page that it goes on to."""
+"""The operations that have a form, and the page to show afterwards."""
 Handler = Callable[[Request, Visitor, "Sent"], Awaitable[Response]]
 
 
 @dataclass(slots=True)
 class Sent:
-    """What a form sent: texts by name, every name with all its texts, and at most one file."""
+    """The content of a form: text by name, all texts by name, and at most one file."""
 
     texts: dict[str, str] = field(default_factory=dict)
     many: dict[str, list[str]] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class Sent:
 
 
 class Forms:
-    """The forms of one panel that are operations."""
+    """The forms of one panel."""
 
     def __init__(self, panel: Panel, pages: Pages) -> None:
         self._panel, self._pages = panel, pages
@@ -87,17 +87,17 @@ class Forms:
         except answers.FAILURES as error:
             return await self._settings(visitor, sent, error)
         assert visitor.session is not None
-        visitor.session.notes.append(("good", "These settings are right. They are not saved yet."))
+        visitor.session.notes.append(("good", "These settings are valid. They are not saved yet."))
         return await self._settings(visitor, sent, None)
 
     async def _settings(self, visitor: Visitor, sent: Sent, error: answers.Failure | None) -> Response:
-        """The page with what was typed: nobody types it twice."""
+        """The settings page with the text that was sent."""
         facts = {"text": sent.texts.get("text", ""), "problem": error, "here": "/settings"}
         return await self._pages.show("settings.html", visitor, facts, 200 if error is None else 422)
 
 
 def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awaitable[Response]]:
-    """``handler``, called only with a form that our own page sent."""
+    """``handler``, called only for forms that our own pages sent."""
 
     async def answer(request: Request, visitor: Visitor) -> Response:
         assert visitor.session is not None
@@ -112,8 +112,8 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
             try:
                 await _read(form, sent, panel.options.folder / answers.INCOMING)
             except OSError as error:
-                told = answers.not_kept(error)
-                return PlainTextResponse(f"{told.what} {told.remedy}", answers.status_of(told))
+                failure = answers.not_saved(error)
+                return PlainTextResponse(f"{failure.what} {failure.remedy}", answers.status_of(failure))
             return await handler(request, visitor, sent)
         finally:
             if sent.file is not None:
@@ -124,7 +124,7 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
 
 
 def refused() -> Response:
-    return PlainTextResponse("This form is too old or not ours. Load the page again.", 403)
+    return PlainTextResponse("This form is out of date or comes from another site. Load the page again.", 403)
 
 
 async def _read(form: FormData, sent: Sent, folder: Path) -> None:
@@ -149,14 +149,13 @@ def _values(operation: Operation, sent: Sent) -> Values:
 
 
 def _schedule_values(operation: Operation, sent: Sent) -> Values:
-    """The rows of the form's table; one without a day is a row that was left empty.
+    """The rows of the form's table; rows without a day are ignored.
 
-    Raises UsageError("form-cut") where a column is shorter than another: hours must not be lost, or moved to another
-    row, unseen.
+    Raises UsageError("form-cut") if the columns have different lengths, because hours would move to another row.
     """
     columns = [sent.many.get(column.name, []) for column in ROW]
     if len({len(column) for column in columns}) > 1:
-        raise UsageError("form-cut", what="The table of hours did not arrive whole.", remedy="Load the page again.")
+        raise UsageError("form-cut", what="The table of hours is incomplete.", remedy="Load the page again.")
     rows = [
         {column.name: text.strip() for column, text in zip(ROW, row, strict=True)}
         for row in zip(*columns, strict=True)
@@ -172,7 +171,7 @@ def _then(operation: Operation, result: Any) -> str:
 
 
 def _back(operation: Operation, sent: Sent) -> str:
-    """Where a form that failed leads: the page on which it stands, made of nothing that was sent unchecked."""
+    """The page of a form that failed; its address contains no unchecked input."""
     if operation.name == "upload-target":
         return "/appearances/new"
     target = sent.texts.get("target", "")

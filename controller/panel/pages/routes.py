@@ -1,4 +1,4 @@
-"""The pages: each a question to the kiosk and a template."""
+"""The pages: each reads values from the kiosk and renders a template."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from controller.panel.auth.identity import Entry, Visitor
 from controller.panel.context import Panel
 from controller.panel.pages import calendar
 from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
-from controller.panel.pages.lamp_days import stories
+from controller.panel.pages.lamp_days import lamp_reports
 
 NAVIGATION: Final = (
     ("/", "Now", Role.VIEWER),
@@ -37,7 +37,7 @@ Facts = Callable[[Request], dict[str, Any]]
 
 
 class Pages:
-    """All pages of one panel. What a page asks of the kiosk runs in a thread, once a page."""
+    """All pages of one panel. The values of a page are read in a thread."""
 
     def __init__(self, panel: Panel, drawing: Drawing) -> None:
         self._panel, self._drawing = panel, drawing
@@ -76,12 +76,12 @@ class Pages:
         return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]
 
     async def show(self, template: str, visitor: Visitor, facts: dict[str, Any], status: int = 200) -> Response:
-        """A page with what stands on every page."""
+        """Render a page with the values that every page needs."""
         return HTMLResponse(await self._panel.ask(lambda: self._drawn(template, visitor, facts)), status)
 
     def _drawn(self, template: str, visitor: Visitor, facts: dict[str, Any]) -> str:
         kiosk, session = self._panel.kiosk, visitor.session
-        assert session is not None, "pages with navigation are for those who have a session"
+        assert session is not None, "pages with navigation need a session"
         notes, session.notes = session.notes, []
         common = {
             "state": kiosk.snapshot(),
@@ -96,8 +96,8 @@ class Pages:
     def _page(self, template: str, facts: Facts) -> Callable[[Request, Visitor], Awaitable[Response]]:
         async def answer(request: Request, visitor: Visitor) -> Response:
             try:
-                found = await self._panel.ask(lambda: facts(request))
-                return await self.show(template, visitor, {"here": request.url.path} | found)
+                values = await self._panel.ask(lambda: facts(request))
+                return await self.show(template, visitor, {"here": request.url.path} | values)
             except answers.FAILURES as error:
                 return await self.show(
                     "problem.html", visitor, {"here": request.url.path, "error": error}, answers.status_of(error)
@@ -108,7 +108,7 @@ class Pages:
     def _picture(self, operation: Operation) -> Callable[[Request, Visitor], Awaitable[Response]]:
         async def answer(request: Request, _: Visitor) -> Response:
             try:
-                # A browser adds a number to load a picture anew; it means nothing here.
+                # The query is ignored: pages add a number to it to reload a picture.
                 values = parse(operation.fields, request.path_params, strings=True)
                 return answers.response(operation, await answers.run(self._panel, operation, values), values)
             except answers.FAILURES as error:
@@ -136,7 +136,7 @@ class Pages:
 
     def _lamps(self, _: Request) -> dict[str, Any]:
         kiosk = self._panel.kiosk
-        return {"stories": stories(kiosk.snapshot().lamps, kiosk.lamp_history(), kiosk.events())}
+        return {"reports": lamp_reports(kiosk.snapshot().lamps, kiosk.lamp_history(), kiosk.events())}
 
     def _schedule(self, _: Request) -> dict[str, Any]:
         schedule = self._panel.kiosk.schedule()

@@ -1,4 +1,4 @@
-"""The wizard for a stage that has no stage.toml yet: find devices, try each, name the object, write the file."""
+"""The set-up of a stage without stage.toml: find devices, try them, name the object, write the file."""
 
 from __future__ import annotations
 
@@ -27,21 +27,22 @@ class Setup:
         ]
 
     async def _find(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
-        """Search, and try what was ticked."""
+        """Search devices, and try the selected ones."""
         assert visitor.session is not None
         chosen = sent.many.get("key", [])
         try:
-            found = await self._panel.ask(lambda: list(self._panel.kiosk.find_devices()))
-            tried = await self._panel.ask(lambda: self._tried(found, chosen))
+            devices = await self._panel.ask(lambda: list(self._panel.kiosk.find_devices()))
+            tried = await self._panel.ask(lambda: self._tried(devices, chosen))
         except answers.FAILURES as error:
             visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
             return RedirectResponse("/setup", 303)
-        facts = {"found": found, "tried": tried, "name": sent.texts.get("name", ""), "chosen": chosen, "here": "/setup"}
+        name = sent.texts.get("name", "")
+        facts = {"found": devices, "tried": tried, "name": name, "chosen": chosen, "here": "/setup"}
         return await self._pages.show("setup.html", visitor, facts)
 
-    def _tried(self, found: list[FoundDevice], chosen: list[str]) -> dict[str, TriedDevice]:
+    def _tried(self, devices: list[FoundDevice], chosen: list[str]) -> dict[str, TriedDevice]:
         tried: dict[str, TriedDevice] = {}
-        for device in found:
+        for device in devices:
             if device.key in chosen:
                 try:
                     tried[device.key] = self._panel.kiosk.try_device(device.key)
@@ -50,13 +51,13 @@ class Setup:
         return tried
 
     async def _write(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
-        """Put the tables of the ticked devices together; the settings page shows what is still wrong with the text."""
+        """Write the tables of the selected devices; the settings page shows what is wrong with them."""
         assert visitor.session is not None
         chosen = sent.many.get("key", [])
         text = ""
         try:
-            found = await self._panel.ask(lambda: list(self._panel.kiosk.find_devices()))
-            text = stage_text(sent.texts.get("name", ""), [device for device in found if device.key in chosen])
+            devices = await self._panel.ask(lambda: list(self._panel.kiosk.find_devices()))
+            text = stage_text(sent.texts.get("name", ""), [device for device in devices if device.key in chosen])
             await self._panel.ask(lambda: self._panel.kiosk.save_settings(text))
         except answers.FAILURES as error:
             return await self._pages.show(
@@ -67,6 +68,6 @@ class Setup:
 
 
 def stage_text(name: str, devices: list[FoundDevice]) -> str:
-    """A stage.toml of these devices. JSON's quotes are TOML's too."""
+    """A stage.toml of these devices. A JSON string is also a TOML string."""
     tables = "\n".join(device.table.strip() + "\n" for device in devices)
     return f"[stage]\nname = {json.dumps(name.strip(), ensure_ascii=False)}\n\n{tables}"

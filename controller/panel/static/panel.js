@@ -1,5 +1,5 @@
 "use strict";
-// Live parts of the page. Without this script everything works, after a reload.
+// Updates the live parts of the page. Without this script the pages work, but need a reload.
 (() => {
   const body = document.body;
   const link = document.getElementById("link");
@@ -10,14 +10,14 @@
   const measured = document.querySelector('form[action="/do/test-shots"]');
 
   function follow() {
-    // What the server sends is its own HTML, escaped by the same templates as the page.
+    // The server sends HTML that is escaped by the same templates as the page.
     const job = document.getElementById("live-job");
     const line = job && job.querySelector("[data-running]");
-    // The aiming page shows what the work has measured as soon as it is done.
+    // Reload the aiming page when the test shots are done.
     if (measured && running && !line) location.reload();
     running = Boolean(line);
-    const naming = Boolean(document.querySelector("[data-identifying]"));
-    for (const [id, hidden] of [["name-them", naming], ["end-naming", !naming]]) {
+    const identifying = Boolean(document.querySelector("[data-identifying]"));
+    for (const [id, hidden] of [["identify-on", identifying], ["identify-off", !identifying]]) {
       const place = document.getElementById(id);
       if (place) place.hidden = hidden;
     }
@@ -48,12 +48,12 @@
     source.addEventListener("error", () => {
       say("No connection, trying again");
       if (source.readyState === EventSource.CLOSED) {
-        // Refused: the session may be over, or the service is starting.
+        // Refused: the session has ended, or the service is starting.
         setTimeout(async () => {
           try {
             const answer = await fetch(body.dataset.live, { method: "HEAD", redirect: "manual" });
             if (answer.status === 401 || answer.type === "opaqueredirect") { location.assign("/login"); return; }
-          } catch { /* not there yet */ }
+          } catch { /* not reachable yet */ }
           listen();
         }, 1000);
       }
@@ -68,7 +68,7 @@
     next.src = camera.dataset.src + "?t=" + Date.now();
   }
 
-  // A second press while the first one is on its way would begin the work twice.
+  // A second press before the first one is answered would start the job twice.
   document.addEventListener("submit", (event) => {
     if (event.target.dataset.sent) { event.preventDefault(); return; }
     event.target.dataset.sent = "yes";

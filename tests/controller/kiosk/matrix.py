@@ -59,8 +59,8 @@ def words() -> list[str]:
 def _burst(name: str) -> Fault:
     def mend(kiosk: Kiosk) -> None:
         kiosk.lamps[name].dud = False
-        for keeper in kiosk.keepers:
-            keeper.forgive()
+        for supervisor in kiosk.supervisors:
+            supervisor.forgive()
 
     return Fault(f"{name} bursts", lambda kiosk: kiosk.lamps[name].burst(), mend)
 
@@ -125,8 +125,8 @@ FAULTS = (
     Fault("power cut", lambda kiosk: kiosk.power_cut(120.0), _nothing),
     Fault("service killed", _killed, _nothing),
     Fault("player hung", lambda kiosk: setattr(kiosk.player, "hung_at_s", kiosk.world.time_s), _nothing),
-    _set("player.broken", True, False), _set("works.camera", False, True), _set("shelf.full", True, False),
-    _set("stock.installed", None, Path("bundles/one.vel")),
+    _set("player.broken", True, False), _set("jobs.camera", False, True), _set("shelf.full", True, False),
+    _set("bundles.installed", None, Path("bundles/one.vel")),
     Fault("clock a day back", lambda kiosk: setattr(kiosk, "wall_offset_s", kiosk.wall_offset_s - 86_400), _nothing),
     Fault("clock lost", lambda kiosk: setattr(kiosk, "wall_offset_s", 0.0), _nothing),
 )  # fmt: skip
@@ -137,20 +137,20 @@ STEPS = ("off", "powering", "warming", "playing", "calibrating", "degraded", "co
 def reach(kiosk: Kiosk, step: str) -> None:
     """Bring the kiosk to a step of its sequence."""
     if step == "off":
-        kiosk.conductor.step()
+        kiosk.reconciler.step()
         return
     if step in ("powering", "warming"):
         kiosk.run_until(State(step))
         return
     kiosk.run_until(State.PLAYING)
     if step == "calibrating":
-        kiosk.conductor.ask(Request("quick", light=True))
+        kiosk.reconciler.ask(Request("quick", light=True))
         kiosk.run_until(State.CALIBRATING)
     elif step == "degraded":
         kiosk.lamps["right"].burst()
         kiosk.run_until(State.DEGRADED)
     elif step == "cooling":
-        kiosk.conductor.shut()
+        kiosk.reconciler.shut()
         kiosk.run_until(State.COOLING)
 
 
@@ -169,8 +169,8 @@ def judge(kiosk: Kiosk, step: str, fault: Fault) -> None:
     _explained(kiosk, f"{step}, {fault.name}")
     fault.mend(kiosk)
     kiosk.lamps["right"].dud = False
-    for keeper in kiosk.keepers:
-        keeper.forgive()
+    for supervisor in kiosk.supervisors:
+        supervisor.forgive()
     wanted = State.OFF if step == "cooling" else State.PLAYING
     kiosk.run_until(wanted, within_s=1800.0)
     assert not kiosk.sins, (step, fault.name, kiosk.sins)
@@ -181,7 +181,7 @@ def _explained(kiosk: Kiosk, case: str) -> None:
     """DEGRADED and FAULT say why; every problem in the log says what to do; no lamp was harmed."""
     assert not kiosk.sins, (case, kiosk.sins)
     if kiosk.state in (State.FAULT, State.DEGRADED):
-        assert kiosk.conductor.machine.reason.strip(), case
+        assert kiosk.reconciler.machine.reason.strip(), case
         problems = [row for row in kiosk.log.after(0) if row.level == "error"]
         assert problems or kiosk.state is State.DEGRADED, case
         assert all(row.text.count(".") >= 2 for row in problems if row.code != "state"), (case, problems)

@@ -6,12 +6,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from controller.kiosk.decide.clock import Clockwork, beginning
+from controller.kiosk.decide.clock import TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing
-from controller.kiosk.decide.reconciler import Conductor, Limits
+from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.rig.lamp_guard import LampGuard
 from controller.run.state_machine import State
 from hal.deadline import Deadline
@@ -68,7 +68,7 @@ class ModelPlayer:
 
 
 @dataclass
-class ModelWorks:
+class ModelJobs:
     """Work that takes virtual time. ``camera`` away: photographs are refused, and fail under way."""
 
     world: World
@@ -145,8 +145,8 @@ class Kiosk:
         self.lamps = {name: FragileLamp(self.world) for name in NAMES}
         self.shelf = Shelf()
         self.gone: set[str] = set()
-        self.stock = ModelStock()
-        self.works = ModelWorks(self.world)
+        self.bundles = ModelStock()
+        self.jobs = ModelJobs(self.world)
         self.player = ModelPlayer(self.world)
         self.boot()
 
@@ -154,13 +154,13 @@ class Kiosk:
         """The service begins, after whatever ended it; lamps, ledger and disk are as they were."""
         self.log = EventLog(self.folder / "events.sqlite", wall=self.wall, durable=False)
         self.log.tell(beginning(self.log))
-        self.works = ModelWorks(self.world, camera=self.works.camera, done=self.works.done, drifted=self.works.drifted)
+        self.jobs = ModelJobs(self.world, camera=self.jobs.camera, done=self.jobs.done, drifted=self.jobs.drifted)
         self.player = ModelPlayer(self.world)
-        self.keepers = [self._keeper(name) for name in NAMES]
-        self.conductor = Conductor(
-            self.keepers, self.player, self.works, self.stock, self.log,
+        self.supervisors = [self._supervisor(name) for name in NAMES]
+        self.reconciler = Reconciler(
+            self.supervisors, self.player, self.jobs, self.bundles, self.log,
             schedule=lambda: self.schedule,
-            clock=Clockwork(self.log, self.wall, self.world.now_s, lambda: False),
+            clock=TrustedClock(self.log, self.wall, self.world.now_s, lambda: False),
             monotonic=self.world.now_s,
             without_time=self.without_time,
             limits=LIMITS,
@@ -169,13 +169,13 @@ class Kiosk:
     def wall(self) -> float:
         return self.world.time_s + self.wall_offset_s
 
-    def _keeper(self, name: str) -> ProjectorKeeper:
+    def _supervisor(self, name: str) -> ProjectorSupervisor:
         def open_guard(deadline: Deadline) -> LampGuard:
             if name in self.gone:
                 raise DeviceGone("port-gone", what=f"The cable of {name} is away.", remedy="Plug it in.")
             return LampGuard(name, self.lamps[name], self.shelf, clock=self.world)
 
-        return ProjectorKeeper(name, open_guard, self.log.tell, clock=self.world)
+        return ProjectorSupervisor(name, open_guard, self.log.tell, clock=self.world)
 
     def power_cut(self, seconds: float) -> None:
         """Everything goes dark for so long."""
@@ -187,9 +187,9 @@ class Kiosk:
         self.boot()
 
     def step(self, seconds: float = STEP_S) -> None:
-        for keeper in self.keepers:
-            keeper.step()
-        self.conductor.step()
+        for supervisor in self.supervisors:
+            supervisor.step()
+        self.reconciler.step()
         self.world.time_s += seconds
 
     def run(self, seconds: float, step_s: float = STEP_S) -> None:
@@ -201,13 +201,13 @@ class Kiosk:
         """Seconds until one of these states; an assertion error if none comes in time."""
         began_s = self.world.time_s
         while self.state not in states:
-            assert self.world.time_s - began_s < within_s, f"{self.state} {self.conductor.machine.reason}\n{self.told}"
+            assert self.world.time_s - began_s < within_s, f"{self.state} {self.reconciler.machine.reason}\n{self.told}"
             self.step()
         return self.world.time_s - began_s
 
     @property
     def state(self) -> State:
-        return self.conductor.machine.state
+        return self.reconciler.machine.state
 
     @property
     def told(self) -> list[str]:
@@ -226,4 +226,4 @@ class Kiosk:
         return [sin for lamp in self.lamps.values() for sin in lamp.sins]
 
 
-__all__ = ["BUNDLE", "NAMES", "RULES", "FragileLamp", "Kiosk", "ModelPlayer", "ModelWorks", "Power"]
+__all__ = ["BUNDLE", "NAMES", "RULES", "FragileLamp", "Kiosk", "ModelJobs", "ModelPlayer", "Power"]

@@ -17,7 +17,7 @@ from controller.doctor.values import Examination
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
-from controller.kiosk.jobs.job_runner import JobReporter, Kind
+from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.stage.check import check_stage
@@ -78,14 +78,14 @@ class TestStageKiosk(Contract):
         log.tell(Decision("first", "It begins."))
         service = Service(check_stage(stage), log)
         # Work that only devices can do waits for its end instead; whether it may begin is the kiosk's own to say.
-        works = vars(service.works)
-        works["_kinds"] = {name: Kind(endless) for name in works["_kinds"]}
+        runner = vars(service.jobs)
+        runner["_handlers"] = {name: JobHandler(endless) for name in runner["_handlers"]}
         vars(service.player)["_view"] = PlayerView(Showing(current(stage / "bundles"), PLAYING))
         kiosk = StageKiosk(stage)
         kiosk.attach(service)
         service.changed()
         yield Real(kiosk, stage)
-        service.works.close(20)
+        service.jobs.close(20)
         log.close()
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job
-from controller.kiosk.jobs.job_handlers import Kinds
+from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobReporter
 from controller.kiosk.store import runs
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -22,7 +22,7 @@ from controller.services import recalibrate as drift_services
 from tests.controller.kiosk.vase import graded_run, vase
 
 ROWS = [{"name": "marble", "delta_e00_median": 1.5}, {"name": "glass", "delta_e00_median": 2.25}]
-CAMERA = Decision("camera-gone", "There can be no photographs without the camera. It is gone.", "Plug it in.", "error")
+CAMERA = Decision("camera-gone", "No photographs are possible without the camera. It is gone.", "Plug it in.", "error")
 
 
 class Stage:
@@ -35,7 +35,7 @@ class Stage:
         self.missing: Decision | None = None
         self.open = False
         self.log = EventLog(folder / EventLog.FILE)
-        self.kinds = Kinds(
+        self.handlers = JobHandlers(
             folder, self._lend, missing_device=lambda: self.missing, calibrated=lambda: True,
             open_now=lambda: self.open,
         ).table()  # fmt: skip
@@ -46,7 +46,7 @@ class Stage:
 
     def do(self, request: Request) -> Finished:
         reporter = JobReporter(Job(1, "work"), self.log, lambda: None)
-        return self.kinds[request.kind].do(request, reporter, threading.Event())
+        return self.handlers[request.kind].do(request, reporter, threading.Event())
 
 
 @pytest.fixture
@@ -102,9 +102,9 @@ def test_no_visitor_sees_the_nightly_photographs_being_taken(tmp_path: Path, ask
 def test_without_a_camera_it_says_why_it_can_not(tmp_path: Path) -> None:
     stage = Stage(tmp_path)
     request = Request("compare", light=True)
-    assert stage.kinds["compare"].refusal(request) is None
+    assert stage.handlers["compare"].refusal(request) is None
     stage.missing = CAMERA
-    assert stage.kinds["compare"].refusal(request) == CAMERA
+    assert stage.handlers["compare"].refusal(request) == CAMERA
 
 
 def compared_run(stage: Path, name: str, calibration: str, medians: dict[str, float]) -> None:

@@ -24,16 +24,16 @@ def test_the_keeper_tells_it_once_and_shows_it_as_long_as_it_plays(tmp_path: Pat
         OUTPUTS, tmp_path / "f", bundle=bundle, trusted=[tmp_path / "ours.pub"], allow_unsigned=True
     )
     told: list[Decision] = []
-    keeper = PlayerKeeper(runtime_folder(tmp_path), lambda plays: settings, told.append)
+    supervisor = PlayerKeeper(runtime_folder(tmp_path), lambda plays: settings, told.append)
     try:
         for _ in range(5):
-            keeper.step()
+            supervisor.step()
     finally:
-        keeper.close()
+        supervisor.close()
     warnings = [one for one in told if one.level == "warning"]
     if signed:
-        assert (warnings, keeper.view.warning) == ([], None)
+        assert (warnings, supervisor.view.warning) == ([], None)
     else:
-        assert warnings == [keeper.view.warning]
+        assert warnings == [supervisor.view.warning]
         assert "origin is unknown" in warnings[0].text
         assert "velatura keys" in warnings[0].remedy

@@ -154,12 +154,13 @@ class MemoryKiosk:
 
     def _check_idle(self) -> None:
         if self._state.job is not None and not self._state.job.ended:
-            raise WorkError("busy", what="Other work is going on.", remedy="Wait for it to end, or cancel it.")
+            what, remedy = "Another job is running or waiting.", "Wait until it ends, or cancel it."
+            raise WorkError("busy", what=what, remedy=remedy)
 
     def job(self, number: int) -> Job | None:
         job = self._state.job
         if job is None or job.number != number:
-            raise WorkError("job-given-up", what="The kiosk gave the work up.", remedy="See the events.")
+            raise WorkError("job-given-up", what="The job will not start.", remedy="See the events.")
         return job
 
     def close(self) -> None:
@@ -193,7 +194,7 @@ class MemoryKiosk:
     def cancel(self) -> None:
         job = self._state.job
         if job is None or job.ended:
-            raise WorkError("nothing-to-cancel", what="No work is going on.", remedy="There is nothing to do.")
+            raise WorkError("nothing-to-cancel", what="No job is running.", remedy="There is nothing to cancel.")
         self._cancel.set()
 
     def play(self, name: str) -> None:
@@ -290,7 +291,7 @@ class MemoryKiosk:
         self._check_idle()
         head, _, text = backup.read_bytes().partition(b"\n")
         if head != b"a backup":
-            raise UsageError("not-a-backup", what="This is not a backup of ours.", remedy="Choose another file.")
+            raise UsageError("not-a-backup", what="This file is not a backup.", remedy="Choose another file.")
         self._toml = text.decode()
 
     def diagnostics(self) -> Path:
@@ -349,5 +350,5 @@ class MemoryKiosk:
 
     def try_device(self, key: str) -> TriedDevice:
         if key not in [one.key for one in self.find_devices()]:
-            return TriedDevice(False, "It is not there any more. Plug it in and search again.")
+            return TriedDevice(False, "The device was not found any more. Plug it in and search again.")
         return TriedDevice(key == "usb", "It answered in 12 ms." if key == "usb" else "No answer. Check the cable.")

@@ -98,7 +98,7 @@ def test_two_technicians_see_the_same_job_and_only_one_can_begin_it(slow: Served
         first.get_by_role("button", name="Recalibrate", exact=True).click()
         expect(second.locator(".steps .now")).to_be_visible()
         second.get_by_role("button", name="Quick recalibration").click()
-        expect(second.get_by_role("alert")).to_contain_text("Other work is going on")
+        expect(second.get_by_role("alert")).to_contain_text("Another job is running or waiting")
         second.get_by_role("button", name="Cancel this job").click()
         expect(first.get_by_text("It was cancelled.")).to_be_visible()
 
@@ -127,7 +127,7 @@ def test_a_target_is_uploaded_looked_at_and_computed(fresh: Served, browser: Bro
         page.get_by_role("link", name="New appearance").click()
         page.set_input_files("#file", {"name": "t.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()})
         page.get_by_role("button", name="Upload").click()
-        for alt in ("The uploaded target", "Where the target can't be reached: the brighter, the farther off"):
+        for alt in ("The uploaded target", "Where the target can't be reached: brighter is worse"):
             expect(page.get_by_alt_text(alt)).to_have_js_property("complete", True)
             assert page.get_by_alt_text(alt).evaluate("picture => picture.naturalWidth") > 0
         assert not violations(page)
@@ -152,7 +152,7 @@ def test_hours_are_typed_saved_and_stand_in_the_calendar(fresh: Served, browser:
         expect(page.get_by_text("09:15 to 17:45").first).to_be_visible()
         page.locator("fieldset.hours").nth(2).get_by_label("Day").fill("someday")
         page.get_by_role("button", name="Save the schedule").click()
-        expect(page.get_by_role("alert")).to_contain_text("'day' is not what it must be.")
+        expect(page.get_by_role("alert")).to_contain_text("The value of 'day' is not valid.")
 
 
 def test_each_role_sees_only_what_it_may_do(panel: Served, browser: Browser) -> None:
@@ -197,7 +197,7 @@ def test_everything_works_with_the_keyboard_only(fresh: Served, browser: Browser
         page.keyboard.press("Enter")
         page.wait_for_url("**/")
         page.keyboard.press("Tab")
-        assert page.evaluate("document.activeElement.textContent") == "To the content"
+        assert page.evaluate("document.activeElement.textContent") == "Skip to the content"
         tab_to(page, "Quick recalibration")
         page.keyboard.press("Enter")
         expect(page.get_by_text("It ended well.")).to_be_visible()
@@ -228,7 +228,7 @@ def test_first_start_leads_from_the_one_time_password_to_a_stage(tmp_path: Path,
         page.get_by_role("button", name="Find devices").click()
         for device in ("Canon EOS R5 on USB", "Optoma on ttyUSB0", "One output of the graphics card"):
             page.get_by_label(device).check()
-        page.get_by_role("button", name="Try what is ticked").click()
+        page.get_by_role("button", name="Test the selected devices").click()
         expect(page.get_by_text("It answered in 12 ms.")).to_be_visible()
         assert not violations(page)
         picture(page, "setup")

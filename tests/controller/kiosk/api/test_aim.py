@@ -19,7 +19,7 @@ from controller.calibrate.values import Geometry, Pinhole
 from controller.core.errors import UsageError
 from controller.kiosk.api.aim import FIGURES, FOLDER, MAPS, aiming, camera_picture, feasibility_map, grazing_share
 from controller.kiosk.interface import Aiming, LiveValue
-from controller.kiosk.supervisors.device_supervisor import DeviceKeeper
+from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
 from controller.stage.check import check_stage
 from hal.deadline import Deadline
@@ -52,7 +52,7 @@ def test_the_hints_say_what_to_turn_and_no_more(tmp_path: Path) -> None:
     assert (found.source, found.overlap, found.exposure) == ("test shots", 0.5, 0.7)
     assert [hint.partition(":")[0] for hint in found.hints] == [
         "left lights 42% of the object", "left is out of focus.", "20% of the object is too dark",
-        "Light grazes, or is soft, on 11% of the object",
+        "Light is grazing or soft on 11% of the object",
     ]  # fmt: skip
     well = aimed(stage, projectors=SHOTS["projectors"][1:], too_dark=0.1, too_soft=0.1)
     assert well.hints == ()
@@ -152,7 +152,7 @@ def devices_with(folder: Path, camera: Camera) -> Devices:
         device.identity(deadline=deadline)
         return ()
 
-    found.camera = DeviceKeeper("camera", "camera", "model", lambda _: camera, look, lambda _: None, every_s=0.0)
+    found.camera = DeviceSupervisor("camera", "camera", "model", lambda _: camera, look, lambda _: None, every_s=0.0)
     return found
 
 

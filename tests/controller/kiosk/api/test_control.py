@@ -26,7 +26,7 @@ class Answer:
 
 
 def refuse() -> None:
-    raise WorkError("busy", what="Other work is going on.", remedy="Wait.")
+    raise WorkError("busy", what="Another job is running or waiting.", remedy="Wait.")
 
 
 def lose() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.decide.clock import Clockwork, beginning, synchronised
+from controller.kiosk.decide.clock import TrustedClock, beginning, synchronised
 from controller.kiosk.store.event_log import Decision, EventLog
 
 MAY = 1_778_000_000.0
@@ -24,14 +24,14 @@ class Clocks:
     passed_s: float = 0.0
     synchronised: bool = False
     log: EventLog = field(init=False)
-    clockwork: Clockwork = field(init=False)
+    trusted: TrustedClock = field(init=False)
 
     def __post_init__(self) -> None:
         self.boot()
 
     def boot(self) -> None:
         self.log = EventLog(self.folder / "events.sqlite", wall=lambda: self.wall_s, durable=False)
-        self.clockwork = Clockwork(self.log, lambda: self.wall_s, lambda: self.passed_s, lambda: self.synchronised)
+        self.trusted = TrustedClock(self.log, lambda: self.wall_s, lambda: self.passed_s, lambda: self.synchronised)
 
     def reboot(self, *, without_s: float = 0.0) -> None:
         self.log.close()
@@ -40,7 +40,7 @@ class Clocks:
 
     def wait(self, seconds: float) -> float | None:
         self.wall_s, self.passed_s = self.wall_s + seconds, self.passed_s + seconds
-        return self.clockwork.now()
+        return self.trusted.now()
 
     def told(self, code: str) -> list[str]:
         return [row.text for row in self.log.after(0) if row.code == code]
@@ -67,7 +67,7 @@ def test_a_clock_that_is_disciplined_by_seconds_is_not_told(clocks: Clocks) -> N
 
 
 @pytest.mark.parametrize(
-    ("by_s", "said"), [(5400.0, "ahead by 90 min"), (-5400.0, "back by 90 min"), (-3 * DAY_S, "3 days")]
+    ("by_s", "said"), [(5400.0, "forward by 90 min"), (-5400.0, "back by 90 min"), (-3 * DAY_S, "3 days")]
 )
 def test_a_clock_that_somebody_sets_is_told_once(clocks: Clocks, by_s: float, said: str) -> None:
     clocks.wait(60.0)
@@ -76,7 +76,7 @@ def test_a_clock_that_somebody_sets_is_told_once(clocks: Clocks, by_s: float, sa
     clocks.wait(0.25)
     (told,) = clocks.told("clock-set")
     assert said in told
-    assert ("stands still" in told) is (by_s == -5400.0)
+    assert ("The schedule waits" in told) is (by_s == -5400.0)
 
 
 def test_set_back_a_little_time_stands_still_until_the_clock_has_caught_up(clocks: Clocks) -> None:
@@ -118,12 +118,12 @@ def test_what_was_believed_outlives_a_boot_into_a_clock_without_battery(clocks: 
 
 
 def test_the_stages_first_time_is_kept(clocks: Clocks) -> None:
-    assert clocks.clockwork.since_s == float("inf")
+    assert clocks.trusted.since_s == float("inf")
     clocks.wait(1.0)
-    assert clocks.clockwork.since_s == MAY + 1.0
+    assert clocks.trusted.since_s == MAY + 1.0
     clocks.wait(DAY_S)
     clocks.reboot()
-    assert clocks.clockwork.since_s == MAY + 1.0
+    assert clocks.trusted.since_s == MAY + 1.0
 
 
 def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
@@ -132,10 +132,10 @@ def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
     clocks.reboot(without_s=5 * HOUR_S)
     cut = clocks.log.tell(beginning(clocks.log))
     assert cut.level == "warning"
-    assert "cut off, after 2026-05-05 17:03 UTC" in cut.text
-    clocks.log.tell(Decision("service-ended", "The kiosk ends."))
+    assert "ended unexpectedly after 2026-05-05 17:03 UTC" in cut.text
+    clocks.log.tell(Decision("service-ended", "The kiosk has stopped."))
     clocks.reboot(without_s=5 * HOUR_S)
-    assert clocks.log.tell(beginning(clocks.log)).text == "The kiosk begins."
+    assert clocks.log.tell(beginning(clocks.log)).text == "The kiosk is starting."
 
 
 def test_asking_the_kernel_gives_an_answer() -> None:

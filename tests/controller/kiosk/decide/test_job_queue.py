@@ -1,4 +1,4 @@
-"""Work in its order, with works and lamps that are models: what is left out is told, and nothing waits for ever."""
+"""The queue of jobs, with models of jobs and lamps: skipped tasks are reported, and nothing waits forever."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import Condition, Finished, ProjectorView, Request
-from controller.kiosk.decide.job_queue import Agenda
+from controller.kiosk.decide.job_queue import JobQueue
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import Decision, EventLog
 
@@ -28,7 +28,7 @@ PATIENCE_S = 100.0
 
 
 @dataclass
-class Works:
+class Jobs:
     """Ends when it is told to."""
 
     refused: Decision | None = None
@@ -62,15 +62,15 @@ class Works:
 class Desk:
     def __init__(self) -> None:
         self.now_s = 0.0
-        self.works = Works()
+        self.jobs = Jobs()
         self.log = EventLog(Path(":memory:"), durable=False)
-        self.agenda = Agenda(self.works, self.log, monotonic=lambda: self.now_s, patience_s=PATIENCE_S)
+        self.queue = JobQueue(self.jobs, self.log, monotonic=lambda: self.now_s, patience_s=PATIENCE_S)
 
     def begin(self, *views: ProjectorView) -> Request | None:
         """What begins with these lamps."""
-        request = self.agenda.ready(views)
+        request = self.queue.ready(views)
         if request is not None:
-            self.agenda.begin()
+            self.queue.begin()
         return request
 
     @property
@@ -86,105 +86,105 @@ def desk() -> Iterator[Desk]:
 
 
 def test_what_follows_comes_before_what_waits_and_in_its_order(desk: Desk) -> None:
-    desk.agenda.ask(FULL, REPORT)
+    desk.queue.ask(FULL, REPORT)
     assert desk.begin(LIT) == FULL
-    desk.works.end(PUBLISH, QUICK)
-    desk.agenda.take_finished()
+    desk.jobs.end(PUBLISH, QUICK)
+    desk.queue.take_finished()
     assert desk.told == ["ended"]
     for expected in (PUBLISH, QUICK, REPORT):
         assert desk.begin(LIT) == expected
         assert desk.begin(LIT) is None, "one at a time"
-        desk.works.end()
-        desk.agenda.take_finished()
-    assert desk.agenda.head is None
+        desk.jobs.end()
+        desk.queue.take_finished()
+    assert desk.queue.head is None
 
 
 def test_other_work_is_refused_while_some_waits_or_runs_and_a_refusal_is_told(desk: Desk) -> None:
-    desk.agenda.ask(FULL)
+    desk.queue.ask(FULL)
     for _ in range(2):
         with pytest.raises(WorkError) as caught:
-            desk.agenda.ask(QUICK)
+            desk.queue.ask(QUICK)
         assert caught.value.code == "busy"
-        assert not desk.agenda.offer(PUBLISH)
+        assert not desk.queue.offer(PUBLISH)
         desk.begin(LIT)
-    desk.works.end()
-    desk.agenda.take_finished()
-    desk.works.refused = Decision("camera-gone", "No camera.", "Plug it in.", "error")
+    desk.jobs.end()
+    desk.queue.take_finished()
+    desk.jobs.refused = Decision("camera-gone", "No camera.", "Plug it in.", "error")
     with pytest.raises(WorkError) as caught:
-        desk.agenda.ask(QUICK)
+        desk.queue.ask(QUICK)
     assert (caught.value.code, desk.told[-1]) == ("camera-gone", "camera-gone")
-    assert not desk.agenda.offer(PUBLISH)
-    assert desk.agenda.head is None
-    desk.works.refused = None
-    assert desk.agenda.offer(PUBLISH)
-    assert desk.agenda.head == PUBLISH
+    assert not desk.queue.offer(PUBLISH)
+    assert desk.queue.head is None
+    desk.jobs.refused = None
+    assert desk.queue.offer(PUBLISH)
+    assert desk.queue.head == PUBLISH
 
 
 def test_only_what_failed_stays_in_sight(desk: Desk) -> None:
-    desk.agenda.ask(QUICK)
+    desk.queue.ask(QUICK)
     desk.begin(LIT)
-    desk.works.end()
-    desk.agenda.take_finished()
+    desk.jobs.end()
+    desk.queue.take_finished()
     assert not desk.log.failures
-    desk.agenda.ask(QUICK)
+    desk.queue.ask(QUICK)
     desk.begin(LIT)
-    desk.works.result = Finished(QUICK, Decision("lost", "The camera is gone.", "Plug it in.", "error"), True)
-    desk.agenda.take_finished()
-    desk.agenda.ask(QUICK)
-    desk.agenda.drop(Decision("dark", "A lamp is not lit.", "", "error"))
+    desk.jobs.result = Finished(QUICK, Decision("lost", "The camera is gone.", "Plug it in.", "error"), True)
+    desk.queue.take_finished()
+    desk.queue.ask(QUICK)
+    desk.queue.drop(Decision("dark", "A lamp is not lit.", "", "error"))
     assert [row.code for row in desk.log.failures] == ["lost", "dark"]
 
 
 def test_nothing_follows_from_work_that_was_cancelled_though_it_ended_well(desk: Desk) -> None:
-    desk.agenda.ask(replace(FULL, key="night"), REPORT)
+    desk.queue.ask(replace(FULL, key="night"), REPORT)
     desk.begin(LIT)
-    desk.agenda.cancel()
-    assert desk.works.cancelled == 1
+    desk.queue.cancel()
+    assert desk.jobs.cancelled == 1
     assert desk.told == ["work-cancelled"], "what waited"
-    desk.works.end(replace(PUBLISH, key="night"))
-    finished = desk.agenda.take_finished()
+    desk.jobs.end(replace(PUBLISH, key="night"))
+    finished = desk.queue.take_finished()
     assert finished is not None
     assert finished.then == ()
-    assert desk.agenda.head is None
+    assert desk.queue.head is None
     assert desk.log.done() == {"night"}
     # The next work is another matter.
-    desk.agenda.ask(QUICK)
+    desk.queue.ask(QUICK)
     desk.begin(LIT)
-    desk.works.end(PUBLISH)
-    desk.agenda.take_finished()
-    assert desk.agenda.head == PUBLISH
+    desk.jobs.end(PUBLISH)
+    desk.queue.take_finished()
+    assert desk.queue.head == PUBLISH
 
 
 def test_cancelling_nothing_tells_nothing(desk: Desk) -> None:
-    desk.agenda.cancel()
-    assert (desk.told, desk.works.cancelled) == ([], 0)
+    desk.queue.cancel()
+    assert (desk.told, desk.jobs.cancelled) == ([], 0)
 
 
 def test_a_nightly_task_is_done_when_the_last_work_with_its_key_is(desk: Desk) -> None:
-    desk.agenda.take_due(Plan(False, due=(DRIFT,)), playing=False)
-    desk.agenda.take_due(Plan(False, due=(DRIFT,)), playing=False)
+    desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
+    desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
     assert desk.told == ["task-due"], "once"
     assert desk.begin(LIT) == Request("drift", light=True, key=DRIFT.key)
-    desk.works.end(replace(QUICK, key=DRIFT.key))
-    desk.agenda.take_finished()
+    desk.jobs.end(replace(QUICK, key=DRIFT.key))
+    desk.queue.take_finished()
     assert desk.log.done() == frozenset()
     desk.begin(LIT)
-    desk.works.end(REPORT)
-    desk.agenda.take_finished()
+    desk.jobs.end(REPORT)
+    desk.queue.take_finished()
     assert desk.log.done() == {DRIFT.key}
 
 
 def test_a_task_is_not_due_while_the_stage_plays_and_is_left_out_when_its_time_is_over(desk: Desk) -> None:
-    desk.agenda.take_due(Plan(True, due=(DRIFT,)), playing=True)
-    assert desk.agenda.head is None
-    desk.agenda.take_due(Plan(True, expired=(DRIFT,)), playing=True)
+    desk.queue.take_due(Plan(True, due=(DRIFT,)), playing=True)
+    assert desk.queue.head is None
+    desk.queue.take_due(Plan(True, expired=(DRIFT,)), playing=True)
     assert desk.log.done() == {DRIFT.key}
     assert desk.told == ["task-left-out"]
 
 
 def test_a_task_that_can_not_be_done_is_left_out_with_the_reason(desk: Desk) -> None:
-    desk.works.refused = Decision("camera-gone", "No camera.", "Plug it in.", "error")
-    desk.agenda.take_due(Plan(False, due=(DRIFT,)), playing=False)
+    desk.jobs.refused = Decision("camera-gone", "No camera.", "Plug it in.", "error")
+    desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
     assert desk.log.done() == {DRIFT.key}
     (row,) = desk.log.after(0)
     assert (row.level, row.code) == ("warning", "camera-gone")
@@ -200,7 +200,7 @@ def test_a_task_that_can_not_be_done_is_left_out_with_the_reason(desk: Desk) -> 
 def test_work_waits_for_its_light_so_long_and_is_then_given_up(
     desk: Desk, views: tuple[ProjectorView, ...], code: str
 ) -> None:
-    desk.agenda.ask(replace(FULL, key="night"), REPORT)
+    desk.queue.ask(replace(FULL, key="night"), REPORT)
     coming = replace(LIT, condition=Condition.LIGHTING)
     assert desk.begin(coming, LIT) is None
     desk.now_s = PATIENCE_S
@@ -209,21 +209,21 @@ def test_work_waits_for_its_light_so_long_and_is_then_given_up(
     desk.now_s += 1.0
     assert desk.begin(*views) is None
     assert desk.told == [code]
-    assert desk.agenda.head is None
+    assert desk.queue.head is None
     assert desk.log.done() == {"night"}
 
 
 def test_the_next_work_has_all_the_patience_again(desk: Desk) -> None:
-    desk.agenda.ask(FULL)
+    desk.queue.ask(FULL)
     assert desk.begin(WARM) is None
-    desk.agenda.cancel()
+    desk.queue.cancel()
     desk.now_s = 2 * PATIENCE_S
-    desk.agenda.ask(QUICK)
+    desk.queue.ask(QUICK)
     assert desk.begin(WARM) is None
     assert desk.begin(LIT) == QUICK
 
 
 def test_work_without_light_begins_in_the_dark(desk: Desk) -> None:
-    desk.agenda.ask(PUBLISH)
-    assert not desk.agenda.needs_light
+    desk.queue.ask(PUBLISH)
+    assert not desk.queue.needs_light
     assert desk.begin(DARK) == PUBLISH

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.kiosk.decide.operator_overrides import Wishes
+from controller.kiosk.decide.operator_overrides import OperatorOverrides
 from controller.kiosk.decide.planner import Plan, plan
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.store.event_log import EventLog
@@ -34,10 +34,10 @@ class Memory:
         self.path = folder / "events.sqlite"
         self.log = EventLog(self.path, durable=False)
 
-    def wishes(self, *, without_time: bool = False) -> Wishes:
+    def overrides(self, *, without_time: bool = False) -> OperatorOverrides:
         self.log.close()
         self.log = EventLog(self.path, durable=False)
-        return Wishes(self.log, without_time=without_time)
+        return OperatorOverrides(self.log, without_time=without_time)
 
 
 @pytest.fixture
@@ -47,25 +47,25 @@ def memory(tmp_path: Path) -> Iterator[Memory]:
     found.log.close()
 
 
-def open_at(wishes: Wishes, *moments: str) -> list[bool]:
+def open_at(overrides: OperatorOverrides, *moments: str) -> list[bool]:
     found = []
     for moment in moments:
-        wishes.follow(at(moment))
-        found.append(wishes.open(at(moment)))
+        overrides.follow(at(moment))
+        found.append(overrides.open(at(moment)))
     return found
 
 
 def test_who_closes_or_opens_by_hand_is_heard_until_the_hours_say_something_new(memory: Memory) -> None:
-    wishes = memory.wishes()
-    assert open_at(wishes, "04T15:00") == [True]
-    wishes.override(False, at("04T15:00"))
-    assert open_at(wishes, "04T15:00", "04T17:59", "04T18:00", "05T09:59", "05T10:00") == [
+    overrides = memory.overrides()
+    assert open_at(overrides, "04T15:00") == [True]
+    overrides.override(False, at("04T15:00"))
+    assert open_at(overrides, "04T15:00", "04T17:59", "04T18:00", "05T09:59", "05T10:00") == [
         False, False, False, False, True,
     ]  # fmt: skip
-    wishes.override(True, at("05T20:00"))
-    assert open_at(wishes, "05T20:00", "06T09:59", "06T10:00", "06T18:00") == [True, True, True, False]
-    wishes.override(False, at("06T20:00"))
-    assert open_at(wishes, "07T10:00") == [True], "what the schedule says anyway binds nobody"
+    overrides.override(True, at("05T20:00"))
+    assert open_at(overrides, "05T20:00", "06T09:59", "06T10:00", "06T18:00") == [True, True, True, False]
+    overrides.override(False, at("06T20:00"))
+    assert open_at(overrides, "07T10:00") == [True], "what the schedule says anyway binds nobody"
     told = [row.code for row in memory.log.after(0)]
     assert told == ["asked", "schedule-rules", "asked", "schedule-rules", "asked"]
 
@@ -85,62 +85,62 @@ def test_who_closes_or_opens_by_hand_is_heard_until_the_hours_say_something_new(
 def test_a_power_cut_outlives_no_wish_that_had_ended_meanwhile(
     memory: Memory, asked_at: str, wanted: bool, woken_at: str, is_open: bool
 ) -> None:
-    wishes = memory.wishes()
-    wishes.follow(at(asked_at))
-    wishes.override(wanted, at(asked_at))
-    assert open_at(wishes, asked_at) == [wanted]
-    assert open_at(memory.wishes(), woken_at, woken_at) == [is_open, is_open]
+    overrides = memory.overrides()
+    overrides.follow(at(asked_at))
+    overrides.override(wanted, at(asked_at))
+    assert open_at(overrides, asked_at) == [wanted]
+    assert open_at(memory.overrides(), woken_at, woken_at) == [is_open, is_open]
 
 
 def test_a_wish_is_kept_while_nobody_knows_the_time_after_a_power_cut(memory: Memory) -> None:
-    wishes = memory.wishes(without_time=True)
-    wishes.follow(at("04T15:00"))
-    wishes.override(False, at("04T15:00"))
-    wishes = memory.wishes(without_time=True)
-    wishes.follow(Plan(None))
-    assert not wishes.open(Plan(None))
-    assert open_at(wishes, "04T16:00") == [False]
-    wishes = memory.wishes(without_time=True)
-    wishes.follow(Plan(None))
-    assert open_at(wishes, "05T11:00") == [True]
+    overrides = memory.overrides(without_time=True)
+    overrides.follow(at("04T15:00"))
+    overrides.override(False, at("04T15:00"))
+    overrides = memory.overrides(without_time=True)
+    overrides.follow(Plan(None))
+    assert not overrides.open(Plan(None))
+    assert open_at(overrides, "04T16:00") == [False]
+    overrides = memory.overrides(without_time=True)
+    overrides.follow(Plan(None))
+    assert open_at(overrides, "05T11:00") == [True]
 
 
 def test_hours_that_are_edited_end_no_wish_of_the_same_day(memory: Memory) -> None:
     longer = Schedule("Europe/Vienna", tuple(ScheduleRow(day, "10:00", "20:00") for day in DAYS))
-    wishes = memory.wishes()
-    wishes.follow(at("04T15:00"))
-    wishes.override(False, at("04T15:00"))
+    overrides = memory.overrides()
+    overrides.follow(at("04T15:00"))
+    overrides.override(False, at("04T15:00"))
     for schedule in (longer, HOURS):
-        wishes.follow(at("04T15:01", schedule))
-        assert not wishes.open(at("04T15:01", schedule))
-    wishes.follow(at("04T15:02", longer))
-    wishes = memory.wishes()
-    wishes.follow(at("04T16:00", longer))
-    assert not wishes.open(at("04T16:00", longer))
+        overrides.follow(at("04T15:01", schedule))
+        assert not overrides.open(at("04T15:01", schedule))
+    overrides.follow(at("04T15:02", longer))
+    overrides = memory.overrides()
+    overrides.follow(at("04T16:00", longer))
+    assert not overrides.open(at("04T16:00", longer))
 
 
 def test_an_appearance_is_played_until_the_schedule_names_another(memory: Memory) -> None:
     names = ("shine", "marble", "glass")
     rows = [ScheduleRow("mon", "10:00", "12:00", "marble"), ScheduleRow("mon", "12:00", "18:00", "gone")]
     schedule = Schedule("Europe/Vienna", (*rows, ScheduleRow("tue", "10:00", "18:00")))
-    wishes = memory.wishes()
+    overrides = memory.overrides()
 
     def shown(moment: str) -> str:
         now = at(moment, schedule)
-        wishes.follow(now)
-        return wishes.appearance(now, names)
+        overrides.follow(now)
+        return overrides.appearance(now, names)
 
     assert shown("04T09:00") == "shine"
     assert shown("04T10:00") == "marble"
-    wishes.choose("glass", at("04T11:00", schedule))
+    overrides.choose("glass", at("04T11:00", schedule))
     assert shown("04T11:00") == "glass"
-    wishes = memory.wishes()
+    overrides = memory.overrides()
     assert shown("04T11:30") == "glass", "a restart is no new opinion of the schedule"
-    wishes.follow(Plan(None))
+    overrides.follow(Plan(None))
     assert shown("04T11:31") == "glass", "nor is a clock that was lost for a while"
     assert shown("04T12:00") == "shine", "the bundle has none of that name"
     assert shown("05T12:00") == "shine"
-    assert wishes.appearance(at("05T12:00", schedule), ()) == ""
+    assert overrides.appearance(at("05T12:00", schedule), ()) == ""
 
 
 @given(st.one_of(st.text(max_size=12), st.recursive(
@@ -151,13 +151,13 @@ def test_an_appearance_is_played_until_the_schedule_names_another(memory: Memory
 def test_whatever_the_log_holds_a_service_begins(text: str) -> None:
     log = EventLog(Path(":memory:"), durable=False)
     log.keep("override", text)
-    wishes = Wishes(log, without_time=False)
+    overrides = OperatorOverrides(log, without_time=False)
     for moment in ("04T15:00", "04T18:00", "05T10:00"):
-        wishes.follow(at(moment))
-    assert wishes.open(at("05T10:00"))
+        overrides.follow(at(moment))
+    assert overrides.open(at("05T10:00"))
     log.close()
 
 
 def test_a_log_of_the_version_before_is_understood(memory: Memory) -> None:
     memory.log.keep("override", "[false, true]")
-    assert open_at(memory.wishes(), "04T15:00", "04T18:00", "05T10:00") == [False, False, True]
+    assert open_at(memory.overrides(), "04T15:00", "04T18:00", "05T10:00") == [False, False, True]

@@ -24,13 +24,13 @@ def test_boots_from_nothing_to_playing(kiosk: Kiosk) -> None:
 
 
 def test_pictures_are_on_the_outputs_before_any_lamp_has_answered(kiosk: Kiosk) -> None:
-    kiosk.conductor.step()
-    kiosk.conductor.step()
+    kiosk.reconciler.step()
+    kiosk.reconciler.step()
     assert kiosk.player.view.shown == Showing(BUNDLE, "shine")
 
 
 def test_without_a_bundle_the_lamps_stay_off_and_the_log_says_why(kiosk: Kiosk) -> None:
-    kiosk.stock.installed = None
+    kiosk.bundles.installed = None
     kiosk.run(30)
     assert kiosk.state is State.OFF
     assert not kiosk.lit
@@ -39,26 +39,26 @@ def test_without_a_bundle_the_lamps_stay_off_and_the_log_says_why(kiosk: Kiosk) 
 
 def test_stops_on_request_and_cools_and_starts_again_only_when_asked(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.conductor.shut()
+    kiosk.reconciler.shut()
     kiosk.run_until(State.OFF)
     kiosk.run(60)
     assert kiosk.state is State.OFF
     assert kiosk.player.view.shown == BLACK
-    kiosk.conductor.open()
+    kiosk.reconciler.open()
     kiosk.run_until(State.PLAYING)
     assert not kiosk.sins
 
 
 def test_a_request_survives_a_restart_of_the_service(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.conductor.choose("marble")
-    kiosk.conductor.shut()
+    kiosk.reconciler.choose("marble")
+    kiosk.reconciler.shut()
     kiosk.run_until(State.OFF)
     kiosk.log.close()
     kiosk.boot()
     kiosk.run(60)
     assert kiosk.state is State.OFF
-    kiosk.conductor.open()
+    kiosk.reconciler.open()
     kiosk.run_until(State.PLAYING)
     assert kiosk.player.view.shown == Showing(BUNDLE, "marble")
 
@@ -68,10 +68,10 @@ def test_a_dead_lamp_degrades_and_the_others_take_over_with_their_own_frames(kio
     kiosk.run_until(State.PLAYING)
     kiosk.lamps["left"].burst()
     kiosk.run_until(State.DEGRADED)
-    assert "left" in kiosk.conductor.machine.reason
+    assert "left" in kiosk.reconciler.machine.reason
     kiosk.run(15)
-    assert [kind for _, kind, _ in kiosk.works.done] == ["takeover"]
-    kiosk.stock.beside[frozenset({"left"})] = beside
+    assert [kind for _, kind, _ in kiosk.jobs.done] == ["takeover"]
+    kiosk.bundles.beside[frozenset({"left"})] = beside
     kiosk.run(2)
     assert kiosk.player.view.shown == Showing(beside, "shine")
     kiosk.lamps["left"].dud = False
@@ -105,7 +105,7 @@ def test_when_every_lamp_fails_it_is_a_fault_with_reason_and_it_comes_back_when_
     for lamp in kiosk.lamps.values():
         lamp.reports = ProjectorStatus(Power.FAULT, ("lamp-failed",))
     kiosk.run_until(State.FAULT)
-    assert "lamp-failed" in kiosk.conductor.machine.reason
+    assert "lamp-failed" in kiosk.reconciler.machine.reason
     for lamp in kiosk.lamps.values():
         lamp.reports = None
     kiosk.run_until(State.PLAYING, within_s=1200)
@@ -114,49 +114,49 @@ def test_when_every_lamp_fails_it_is_a_fault_with_reason_and_it_comes_back_when_
 def test_a_lamp_that_can_not_be_switched_off_is_a_fault(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
     kiosk.lamps["right"].trouble = "refuse"
-    kiosk.conductor.shut()
+    kiosk.reconciler.shut()
     kiosk.run_until(State.FAULT)
-    assert "right" in kiosk.conductor.machine.reason
+    assert "right" in kiosk.reconciler.machine.reason
     assert kiosk.lit == ["right"]
     kiosk.lamps["right"].trouble = ""
     kiosk.run_until(State.OFF)
 
 
 def test_without_a_camera_playback_goes_on_and_recalibration_says_why_it_cannot(kiosk: Kiosk) -> None:
-    kiosk.works.camera = False
+    kiosk.jobs.camera = False
     kiosk.run_until(State.PLAYING)
     with pytest.raises(WorkError, match="no camera"):
-        kiosk.conductor.ask(Request("quick", light=True))
+        kiosk.reconciler.ask(Request("quick", light=True))
     kiosk.run(5)
     assert kiosk.state is State.PLAYING
 
 
 def test_recalibrates_on_request_and_plays_again(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.conductor.ask(Request("quick", light=True))
-    with pytest.raises(WorkError, match="Other work"):
-        kiosk.conductor.ask(Request("quick", light=True))
+    kiosk.reconciler.ask(Request("quick", light=True))
+    with pytest.raises(WorkError, match="Another job"):
+        kiosk.reconciler.ask(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
     assert kiosk.player.want is None
     kiosk.run_until(State.PLAYING)
-    assert [how for *_, how in kiosk.works.done] == ["done"]
+    assert [how for *_, how in kiosk.jobs.done] == ["done"]
 
 
 def test_work_is_cancelled_and_playing_goes_on(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.conductor.ask(Request("quick", light=True))
+    kiosk.reconciler.ask(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
-    kiosk.conductor.cancel()
+    kiosk.reconciler.cancel()
     kiosk.run_until(State.PLAYING, within_s=5)
-    with pytest.raises(WorkError, match="No work"):
-        kiosk.conductor.cancel()
+    with pytest.raises(WorkError, match="No job is running"):
+        kiosk.reconciler.cancel()
 
 
 def test_a_camera_that_dies_in_a_calibration_ends_the_work_and_not_the_playing(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.conductor.ask(Request("quick", light=True))
+    kiosk.reconciler.ask(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
-    kiosk.works.camera = False
+    kiosk.jobs.camera = False
     kiosk.run_until(State.PLAYING, within_s=5)
 
 

@@ -20,7 +20,7 @@ from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job, Schedule
 from controller.kiosk.jobs.follow_job import ask_and_follow
-from controller.kiosk.jobs.job_runner import JobReporter, Kind, ThreadWorks, run_name
+from controller.kiosk.jobs.job_runner import JobHandler, JobReporter, JobRunner, run_name
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service
 from controller.kiosk.store import archive
@@ -37,11 +37,11 @@ def well(request: Request, reporter: JobReporter, cancel: threading.Event) -> Fi
     return Finished(request, Decision("done", "It is done."))
 
 
-def raising(error: BaseException) -> Kind:
+def raising(error: BaseException) -> JobHandler:
     def do(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         raise error
 
-    return Kind(do)
+    return JobHandler(do)
 
 
 @pytest.fixture
@@ -52,24 +52,24 @@ def log(tmp_path: Path) -> Iterator[EventLog]:
 
 
 class Ended(threading.Event):
-    """Set by the works' last change of a job."""
+    """Set by the runner's last change of a job."""
 
-    works: ThreadWorks
+    runner: JobRunner
 
     def changed(self) -> None:
-        if self.works.job is not None and self.works.job.ended:
+        if self.runner.job is not None and self.runner.job.ended:
             self.set()
 
 
-def worked(log: EventLog, kind: Kind, number: int = 0) -> tuple[ThreadWorks, Finished]:
+def worked(log: EventLog, kind: JobHandler, number: int = 0) -> tuple[JobRunner, Finished]:
     ended = Ended()
-    works = ended.works = ThreadWorks({"work": kind}, log, ended.changed, number=number)
-    works.begin(Request("work"))
+    runner = ended.runner = JobRunner({"work": kind}, log, ended.changed, number=number)
+    runner.begin(Request("work"))
     assert ended.wait(20)
-    works.close(20)
-    finished = works.finished()
+    runner.close(20)
+    finished = runner.finished()
     assert finished is not None
-    return works, finished
+    return runner, finished
 
 
 @pytest.mark.parametrize(
@@ -84,70 +84,72 @@ def worked(log: EventLog, kind: Kind, number: int = 0) -> tuple[ThreadWorks, Fin
     ],
 )
 def test_whatever_ends_the_work_is_its_outcome(log: EventLog, error: BaseException, code: str, level: str) -> None:
-    works, finished = worked(log, raising(error))
+    runner, finished = worked(log, raising(error))
     assert finished.failed
     assert (finished.outcome.code, finished.outcome.level) == (code, level)
-    assert works.running is None
-    assert works.job is not None
-    assert (works.job.ended, works.job.failed, works.job.outcome) == (True, True, finished.outcome.text)
+    assert runner.running is None
+    assert runner.job is not None
+    assert (runner.job.ended, runner.job.failed, runner.job.outcome) == (True, True, finished.outcome.text)
 
 
-@pytest.mark.parametrize("how", [lambda works: works.cancel(), lambda works: works.close(20)], ids=["cancel", "close"])
-def test_work_is_asked_to_end(log: EventLog, how: Callable[[ThreadWorks], None]) -> None:
+@pytest.mark.parametrize(
+    "how", [lambda runner: runner.cancel(), lambda runner: runner.close(20)], ids=["cancel", "close"]
+)
+def test_work_is_asked_to_end(log: EventLog, how: Callable[[JobRunner], None]) -> None:
     def waits(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         if not cancel.wait(20):
             raise AssertionError("nobody asked")
         raise Cancelled
 
     ended = Ended()
-    works = ended.works = ThreadWorks({"work": Kind(waits)}, log, ended.changed)
-    works.begin(Request("work"))
-    assert works.running == Request("work")
-    how(works)
+    runner = ended.runner = JobRunner({"work": JobHandler(waits)}, log, ended.changed)
+    runner.begin(Request("work"))
+    assert runner.running == Request("work")
+    how(runner)
     assert ended.wait(20)
-    finished = works.finished()
+    finished = runner.finished()
     assert finished is not None
     assert finished.outcome.code == Cancelled().code
-    works.close(20)
+    runner.close(20)
 
 
 def test_it_is_finished_once_and_can_be_asked_for_by_its_number(log: EventLog) -> None:
-    works, finished = worked(log, Kind(well), number=41)
-    assert works.finished() is None
+    runner, finished = worked(log, JobHandler(well), number=41)
+    assert runner.finished() is None
     assert not finished.failed
-    assert works.number == 42
-    job = works.known(42)
+    assert runner.number == 42
+    job = runner.known(42)
     assert job is not None
     assert (job.ended, job.outcome) == (True, "It is done.")
-    assert works.known(41) is None
-    assert works.known(43) is None
+    assert runner.known(41) is None
+    assert runner.known(43) is None
 
 
 def test_work_for_which_the_system_has_no_thread_has_failed(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
     def start(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
-    works = ThreadWorks({"work": Kind(well)}, log)
+    runner = JobRunner({"work": JobHandler(well)}, log)
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", start)
-        works.begin(Request("work"))
-    finished = works.finished()
+        runner.begin(Request("work"))
+    finished = runner.finished()
     assert finished is not None
     assert (finished.failed, finished.outcome.code) == (True, "crash")
-    assert works.running is None
-    works.close(20)
+    assert runner.running is None
+    runner.close(20)
 
 
 def test_only_the_last_jobs_are_remembered(log: EventLog) -> None:
     ended = Ended()
-    works = ended.works = ThreadWorks({"work": Kind(well)}, log, ended.changed)
+    runner = ended.runner = JobRunner({"work": JobHandler(well)}, log, ended.changed)
     for _ in range(20):
         ended.clear()
-        works.begin(Request("work"))
+        runner.begin(Request("work"))
         assert ended.wait(20)
-        works.close(20)
-        works.finished()
-    assert [number for number in range(25) if works.known(number) is not None] == list(range(5, 21))
+        runner.close(20)
+        runner.finished()
+    assert [number for number in range(25) if runner.known(number) is not None] == list(range(5, 21))
 
 
 def test_the_steps_of_a_job_are_those_up_to_the_present_one(log: EventLog) -> None:
@@ -187,7 +189,7 @@ def kiosk(tmp_path: Path) -> Iterator[StageKiosk]:
     found = StageKiosk(stage)
     found.attach(Service(check_stage(stage), log))
     yield found
-    found.service.works.close(20)
+    found.service.jobs.close(20)
     log.close()
 
 
@@ -199,8 +201,8 @@ def test_jobs_are_numbered_on_over_restarts_of_the_service(kiosk: StageKiosk) ->
     job = asked(kiosk)
     assert job.number == 8
     assert kiosk.job(8) is None, "it waits"
-    kiosk.service.conductor.step()
-    kiosk.service.works.close(20)
+    kiosk.service.reconciler.step()
+    kiosk.service.jobs.close(20)
     ended = kiosk.job(8)
     assert ended is not None
     assert (ended.number, ended.ended, ended.failed) == (8, True, True)
@@ -233,7 +235,7 @@ def test_who_stops_following_a_job_that_ends_at_that_moment_has_stopped(kiosk: S
 
     with pytest.raises(Cancelled):
         followed(kiosk, cancel, job=job)
-    assert not kiosk.service.conductor.working
+    assert not kiosk.service.reconciler.working
 
 
 def test_who_stops_following_cancels_the_job(kiosk: StageKiosk) -> None:
@@ -241,7 +243,7 @@ def test_who_stops_following_cancels_the_job(kiosk: StageKiosk) -> None:
     cancel.set()
     with pytest.raises(Cancelled):
         followed(kiosk, cancel)
-    assert not kiosk.service.conductor.working
+    assert not kiosk.service.reconciler.working
 
 
 def test_who_follows_work_that_never_begins_does_not_wait_for_ever(kiosk: StageKiosk) -> None:
@@ -258,11 +260,11 @@ def test_who_follows_work_that_never_begins_does_not_wait_for_ever(kiosk: StageK
 def test_who_follows_hears_of_his_own_job_though_another_one_has_begun_since(kiosk: StageKiosk) -> None:
     def compute(name: str, target: str) -> Job:
         first = asked(kiosk)
-        kiosk.service.conductor.step()
-        kiosk.service.works.close(20)
-        kiosk.service.conductor.step()
+        kiosk.service.reconciler.step()
+        kiosk.service.jobs.close(20)
+        kiosk.service.reconciler.step()
         asked(kiosk)
-        kiosk.service.conductor.step()
+        kiosk.service.reconciler.step()
         return first
 
     with pytest.raises(WorkError) as caught:
@@ -335,12 +337,12 @@ def test_no_work_begins_while_a_backup_takes_the_place_of_what_it_reads(
 
     def restore(stage: Path, backup: Path) -> None:
         refused.append(elsewhere(lambda: kiosk.service.ask(Request("publish"))))
-        kiosk.service.conductor.step()
+        kiosk.service.reconciler.step()
 
     monkeypatch.setattr(archive, "restore", restore)
     kiosk.restore(kiosk.stage / "backup.tar.gz")
     assert refused == ["busy"]
-    assert kiosk.service.works.job is None
+    assert kiosk.service.jobs.job is None
     assert asked(kiosk).name == "New appearance", "and then it may"
 
 

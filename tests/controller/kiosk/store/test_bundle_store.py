@@ -1,4 +1,4 @@
-"""What the stock finds in bundles: pictures for the panel, and frames for a stage that lost a projector."""
+"""What the store finds in bundles: pictures for the panel, and frames for a stage that lost a projector."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.store import bundle_store as stock_module
-from controller.kiosk.store.bundle_store import PREVIEWS, BundleStock, slots_without
+from controller.kiosk.store.bundle_store import PREVIEWS, BundleStore, slots_without
 from tests.controller.artefacts.names import projectors as stages
 
 UNSIGNED = Trust((), allow_unsigned=True)
@@ -38,30 +38,30 @@ def installed(stage: Path, revision: int, names: tuple[str, ...], slots: Path | 
 
 
 def test_each_appearance_has_the_picture_of_its_own_bundle_or_none(tmp_path: Path) -> None:
-    stock = BundleStock(tmp_path, UNSIGNED)
-    assert stock.previews() == {}
+    bundles = BundleStore(tmp_path, UNSIGNED)
+    assert bundles.previews() == {}
     first = installed(tmp_path, 1, ("marble", "a name with spaces", "bare"))
-    found = stock.previews()
+    found = bundles.previews()
     assert sorted(found) == ["a name with spaces", "marble"]
     assert {file.read_bytes() for file in found.values()} == {first}
     second = installed(tmp_path, 2, ("marble", "bare"))
-    assert {name: file.read_bytes() for name, file in stock.previews().items()} == {"marble": second}
+    assert {name: file.read_bytes() for name, file in bundles.previews().items()} == {"marble": second}
     assert len(list((tmp_path / PREVIEWS).iterdir())) == 1, "those of the bundle before are gone"
 
 
 def test_a_disk_that_takes_nothing_costs_the_pictures_alone(tmp_path: Path) -> None:
     installed(tmp_path, 1, ("marble", "bare"))
     (tmp_path / "kiosk").write_text("a file where a folder should be")
-    assert BundleStock(tmp_path, UNSIGNED).previews() == {}
+    assert BundleStore(tmp_path, UNSIGNED).previews() == {}
 
 
 def test_frames_without_a_projector_serve_what_they_hold(tmp_path: Path) -> None:
     installed(tmp_path, 1, ("marble", "bare"))
-    stock = BundleStock(tmp_path, UNSIGNED)
-    assert stock.without({"left"}, "marble") is None
+    bundles = BundleStore(tmp_path, UNSIGNED)
+    assert bundles.without({"left"}, "marble") is None
     installed(tmp_path, 1, ("marble",), slots_without(tmp_path, {"left"}))
-    assert stock.without({"left"}, "marble") is not None
-    assert stock.without({"left"}, "bare") is None
+    assert bundles.without({"left"}, "marble") is not None
+    assert bundles.without({"left"}, "bare") is None
 
 
 def test_pictures_that_the_disk_did_not_take_are_made_when_there_is_space_again(
@@ -76,23 +76,23 @@ def test_pictures_that_the_disk_did_not_take_are_made_when_there_is_space_again(
         write_atomically(path, data)
 
     monkeypatch.setattr(stock_module, "write_atomically", write)
-    stock = BundleStock(tmp_path, UNSIGNED)
-    stock.previews()
+    bundles = BundleStore(tmp_path, UNSIGNED)
+    bundles.previews()
     assert not failures
-    assert sorted(stock.previews()) == ["marble", "wood"]
+    assert sorted(bundles.previews()) == ["marble", "wood"]
 
 
 def test_what_is_read_while_others_are_forgotten_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     installed(tmp_path, 1, ("marble", "bare"))
-    stock, close = BundleStock(tmp_path, UNSIGNED), Bundle.close
+    bundles, close = BundleStore(tmp_path, UNSIGNED), Bundle.close
 
     def closing(bundle: Bundle) -> None:
         close(bundle)
         for number in range(66):  # another thread, months later: one after the other of these is installed
-            stock.index(tmp_path / f"{number}.vel")
+            bundles.index(tmp_path / f"{number}.vel")
 
     monkeypatch.setattr(Bundle, "close", closing)
-    assert list(stock.names()) == ["marble", "bare"]
+    assert list(bundles.names()) == ["marble", "bare"]
 
 
 @given(stages)

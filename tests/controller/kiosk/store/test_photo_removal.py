@@ -8,7 +8,7 @@ from pathlib import Path
 
 from controller.artefacts.names import CAPTURES
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.store.photo_retention import forget_old_photographs
+from controller.kiosk.store.photo_retention import purge_old_photographs
 from controller.run.journal import Journal
 
 DAY_S = 86400.0
@@ -35,7 +35,7 @@ def test_nightly_photographs_take_no_more_room_after_a_month_than_after_a_fortni
     for day in range(30):
         now_s = FIRST_S + day * DAY_S
         night(tmp_path, now_s)
-        forget_old_photographs(tmp_path, log, lambda now_s=now_s: now_s)  # type: ignore[misc]
+        purge_old_photographs(tmp_path, log, lambda now_s=now_s: now_s)  # type: ignore[misc]
         kept.append(len(photographs(tmp_path)))
     assert max(kept) == 14 == kept[-1]
     assert len(list((tmp_path / "runs").iterdir())) == 30
@@ -50,9 +50,9 @@ def test_what_can_not_be_removed_is_told_and_tried_again(tmp_path: Path) -> None
     run = sorted((tmp_path / "runs").iterdir())[0]
     (run / f"{CAPTURES}.going").write_text("a file that somebody put there")
     later_s = FIRST_S + 100 * DAY_S
-    forget_old_photographs(tmp_path, log, lambda: later_s)
+    purge_old_photographs(tmp_path, log, lambda: later_s)
     assert log.after(0)[-1].code == "photographs-kept"
     (run / f"{CAPTURES}.going").unlink()
-    forget_old_photographs(tmp_path, log, lambda: later_s)
+    purge_old_photographs(tmp_path, log, lambda: later_s)
     assert log.after(0)[-1].code == "photographs-removed"
     assert len(photographs(tmp_path)) == 2

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from controller.artefacts.names import CAPTURES
-from controller.kiosk.store.photo_retention import GOING, KEPT_S, forget, spent
+from controller.kiosk.store.photo_retention import GOING, KEPT_S, expired, purge
 from controller.run.journal import Journal
 
 NOW_S = 1_800_000_000.0
@@ -31,7 +31,7 @@ def run_of(stage: Path, name: str, *, age_s: float = 2 * KEPT_S, outcome: str = 
 
 
 def names(stage: Path) -> list[str]:
-    return sorted(run.name for run in spent(stage, now_s=NOW_S))
+    return sorted(run.name for run in expired(stage, now_s=NOW_S))
 
 
 def test_the_newest_two_of_each_kind_keep_their_photographs(tmp_path: Path) -> None:
@@ -70,9 +70,9 @@ def test_only_photographs_go_and_it_is_told_how_much_that_was(tmp_path: Path) ->
     old = run_of(tmp_path, "20260101-020000-drift")
     for day in (2, 3):
         run_of(tmp_path, f"2026010{day}-020000-drift")
-    assert forget(spent(tmp_path, now_s=NOW_S)) == 1000
+    assert purge(expired(tmp_path, now_s=NOW_S)) == 1000
     assert sorted(path.name for path in old.iterdir()) == [Journal.FILE, "verification.json"]
-    assert spent(tmp_path, now_s=NOW_S) == []
+    assert expired(tmp_path, now_s=NOW_S) == []
 
 
 def test_what_a_power_cut_left_half_removed_is_removed_the_next_time(tmp_path: Path) -> None:
@@ -80,9 +80,9 @@ def test_what_a_power_cut_left_half_removed_is_removed_the_next_time(tmp_path: P
     for day in (2, 3):
         run_of(tmp_path, f"2026010{day}-020000-drift")
     (old / CAPTURES).rename(old / GOING)
-    assert forget(spent(tmp_path, now_s=NOW_S)) == 1000
+    assert purge(expired(tmp_path, now_s=NOW_S)) == 1000
     assert not (old / GOING).exists()
 
 
 def test_a_stage_without_runs_has_nothing_to_remove(tmp_path: Path) -> None:
-    assert spent(tmp_path, now_s=NOW_S) == []
+    assert expired(tmp_path, now_s=NOW_S) == []

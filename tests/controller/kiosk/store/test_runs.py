@@ -34,7 +34,7 @@ def test_a_damaged_grade_hides_its_own_run_alone(tmp_path: Path, how: str) -> No
     (damaged / "verification.json").write_text(DAMAGE[how])
     (grade,) = runs.grades(tmp_path, 8.0)
     assert (grade.run, grade.grade, grade.kept) == (FIRST, "D", True)
-    assert grade.note == "right is predicted with 3.1 % error"
+    assert grade.note == "Largest predicted error: 3.1 % in right"
     assert runs.names(tmp_path) == (FIRST,)
     with pytest.raises(UsageError) as caught:
         runs.results(tmp_path, SECOND, 8.0)

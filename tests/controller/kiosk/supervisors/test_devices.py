@@ -15,8 +15,8 @@ import pytest
 from controller.kiosk import service
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.supervisors import projector_supervisor as projector_keeper
-from controller.kiosk.supervisors.device_supervisor import DeviceKeeper
+from controller.kiosk.supervisors import projector_supervisor
+from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
 from controller.stage.check import check_stage
 from hal.deadline import Deadline
@@ -36,8 +36,8 @@ def devices(models: Models, tmp_path: Path) -> Iterator[Devices]:
     told: list[Decision] = []
     found = Devices(check_stage(models.folder, drivers=models.drivers), tmp_path, told.append)
     found.camera.step()
-    for keeper in found.projectors:
-        keeper.step()
+    for supervisor in found.projectors:
+        supervisor.step()
     with contextlib.closing(found):
         yield found
 
@@ -51,27 +51,27 @@ def test_work_whose_projector_is_lost_meanwhile_says_which_and_not_that_somebody
     def closed() -> DeviceGone:
         return DeviceGone("projector-closed", what="The projector at A is no longer open.", remedy="Open the stage.")
 
-    monkeypatch.setattr(projector_keeper, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(projector_supervisor, "PATIENCE_S", 0.0)
     with pytest.raises(DeviceGone, match="no longer open"), devices.lent():
         raise closed()
-    with pytest.raises(DeviceGone) as caught, devices.lent():  # noqa: PT012 - the keeper works meanwhile
+    with pytest.raises(DeviceGone) as caught, devices.lent():  # noqa: PT012 - the supervisor works meanwhile
         monkeypatch.setattr(QuickLamp, "status", silent)
         devices.projectors[0].step()
         assert not models.lamps["A"].open
         raise closed()
     assert caught.value.code == "device-missing"
     assert "without projector left" in caught.value.what
-    assert "Mend it" in caught.value.remedy
+    assert "Repair it first." in caught.value.remedy
 
 
 class LosesItMeanwhile:
-    """A keeper's lock that somebody waits for while the keeper's look finds the device gone."""
+    """A supervisor's lock that somebody waits for while the supervisor's look finds the device gone."""
 
-    def __init__(self, keeper: DeviceKeeper) -> None:
-        self._keeper = keeper
+    def __init__(self, supervisor: DeviceSupervisor) -> None:
+        self._supervisor = supervisor
 
     def __enter__(self) -> None:
-        self._keeper.close()
+        self._supervisor.close()
 
     def __exit__(self, *_: object) -> None:
         """Free again."""
@@ -90,14 +90,14 @@ def test_a_device_that_opens_after_its_keeper_was_closed_is_let_go_of() -> None:
     opened: list[QuickLamp] = []
 
     def open_slowly(deadline: Deadline) -> QuickLamp:
-        keeper.close()  # the service ends while the device is still being opened
+        supervisor.close()  # the service ends while the device is still being opened
         opened.append(QuickLamp())
         return opened[0]
 
-    keeper = DeviceKeeper("camera", "camera", "model", open_slowly, lambda *_: (), lambda _: None)
-    keeper.step()
+    supervisor = DeviceSupervisor("camera", "camera", "model", open_slowly, lambda *_: (), lambda _: None)
+    supervisor.step()
     assert [one.open for one in opened] == [False]
-    assert keeper.device is None
+    assert supervisor.device is None
 
 
 def test_devices_that_fail_to_close_or_raise_anything_are_told_and_the_others_go_on(
@@ -107,11 +107,11 @@ def test_devices_that_fail_to_close_or_raise_anything_are_told_and_the_others_go
     models.unclosable = {"A"}
     models.odd_in = "The lamp hours of projector left stay unknown."
     found = Devices(check_stage(models.folder, drivers=models.drivers), tmp_path, told.append)
-    for keeper in found.projectors:
-        keeper.step()
+    for supervisor in found.projectors:
+        supervisor.step()
     models.lamps["A"].odd = ZeroDivisionError("a mistake")
-    for keeper in found.projectors:
-        keeper.step()
+    for supervisor in found.projectors:
+        supervisor.step()
     right = found.projectors[1].view
     assert right.problem is None
     assert right.looked
@@ -153,12 +153,12 @@ def test_a_service_that_ends_in_the_middle_of_a_strike_waits_for_the_lamp_to_go_
     projectors = Driver("projector", "model", "A lamp.", lambda *_: lamp, {"port": "the port"}, ("port",))
     drivers = Drivers((projectors, models.drivers.get("camera", "model"), models.drivers.get("display", "model")))
     found = Service(check_stage(models.folder, drivers=drivers), log)
-    keeper, over = found.devices.projectors[0], threading.Event()
-    keeper.want_lit = True
+    supervisor, over = found.devices.projectors[0], threading.Event()
+    supervisor.want_lit = True
 
     def looking() -> None:
         while not over.wait(0.1):
-            keeper.step()
+            supervisor.step()
 
     def answered(seconds: float) -> None:
         lamp.answered.set()

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.keys_supervisor import KeysKeeper
+from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.rig.key_panel import KeyService
 from controller.run.state_machine import State
 from hal.deadline import Deadline
@@ -54,7 +54,7 @@ class Kept:
         self.panel, self.told, self.done = Panel(), list[Decision](), queue.SimpleQueue[str]()
         self.meanwhile: Callable[[], None] = lambda: None
         presses = tuple(self._press(name) for name in ("play", "stop", "recalibrate"))
-        self.keeper = KeysKeeper("model", self._opened, presses, lambda: State.PLAYING, self.told.append)  # type: ignore[arg-type]
+        self.supervisor = KeysSupervisor("model", self._opened, presses, lambda: State.PLAYING, self.told.append)  # type: ignore[arg-type]
 
     def _press(self, name: str) -> Callable[[], None]:
         return lambda: self.done.put(name)
@@ -81,43 +81,46 @@ class Kept:
 def kept() -> Iterator[Kept]:
     made = Kept()
     yield made
-    made.keeper.close()
+    made.supervisor.close()
 
 
 def test_a_panel_that_is_missing_at_the_start_is_told_of_once_and_is_used_when_it_comes(kept: Kept) -> None:
     kept.panel.there = False
     for _ in range(3):
-        kept.keeper.step()
+        kept.supervisor.step()
     assert kept.codes == ["hid-unplugged"]
-    assert (kept.keeper.row.problem, kept.keeper.row.remedy) == ("No key panel is plugged in.", "Check its cable.")
+    assert (kept.supervisor.row.problem, kept.supervisor.row.remedy) == (
+        "No key panel is plugged in.",
+        "Check its cable.",
+    )
     kept.panel.there = True
-    kept.keeper.step()
+    kept.supervisor.step()
     assert kept.codes == ["hid-unplugged", "keys-back"]
-    assert kept.keeper.row.problem is None
+    assert kept.supervisor.row.problem is None
     kept.panel.pressed.put(2)
     assert kept.done.get(timeout=30) == "stop"
 
 
 def test_a_panel_that_leaves_is_shown_as_away_until_it_is_back(kept: Kept) -> None:
-    kept.keeper.step()
+    kept.supervisor.step()
     kept.panel.there = False
-    assert kept.until(lambda: kept.keeper.row.problem is not None)
+    assert kept.until(lambda: kept.supervisor.row.problem is not None)
     kept.panel.there = True
-    assert kept.until(lambda: kept.keeper.row.problem is None)
+    assert kept.until(lambda: kept.supervisor.row.problem is None)
     assert kept.codes == ["hid-unplugged", "keys-back"]
 
 
 def test_closing_closes_the_panel_and_one_that_never_came_needs_none(kept: Kept) -> None:
-    kept.keeper.close()
+    kept.supervisor.close()
     assert kept.panel.closed == 0
-    kept.keeper.step()
-    kept.keeper.close()
+    kept.supervisor.step()
+    kept.supervisor.close()
     assert kept.panel.closed == 1
 
 
 def test_a_panel_that_opens_after_its_keeper_was_closed_is_let_go_of(kept: Kept) -> None:
-    kept.meanwhile = kept.keeper.close
-    kept.keeper.step()
+    kept.meanwhile = kept.supervisor.close
+    kept.supervisor.step()
     assert kept.panel.closed == 1
 
 
@@ -130,5 +133,5 @@ def test_a_panel_that_leaves_at_once_is_shown_as_away(kept: Kept, monkeypatch: p
         assert kept.until(lambda: "hid-unplugged" in kept.codes)
 
     monkeypatch.setattr(KeyService, "start", start)
-    kept.keeper.step()
-    assert kept.keeper.row.problem == "No key panel is plugged in."
+    kept.supervisor.step()
+    assert kept.supervisor.row.problem == "No key panel is plugged in."

@@ -9,9 +9,9 @@ import pytest
 
 from controller.kiosk.interface import LiveValue
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.device_supervisor import DeviceKeeper
-from controller.kiosk.supervisors.mains_supervisor import Boards, MainsKeeper
-from controller.kiosk.supervisors.projector_supervisor import ProjectorKeeper
+from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
+from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
+from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.mains_relays import Circuit
 from hal.deadline import Deadline
@@ -67,32 +67,32 @@ class Mains:
 
     def begin(self) -> None:
         """The service begins."""
-        self.keepers = {name: self._keeper(name) for name in self.lamps}
-        self.relays = MainsKeeper("model", self._open, self.told.append, monotonic=self.world.now_s)
-        self.relays.keepers = tuple(self.keepers.values())
+        self.supervisors = {name: self._supervisor(name) for name in self.lamps}
+        self.relays = MainsSupervisor("model", self._open, self.told.append, monotonic=self.world.now_s)
+        self.relays.supervisors = tuple(self.supervisors.values())
 
     def _open(self, deadline: Deadline) -> Device:
         return Boards(tuple(Circuit(name, 1, (name,), BOOT_S, board) for name, board in self.boards.items()),
                       contextlib.ExitStack())  # fmt: skip
 
-    def _keeper(self, name: str) -> ProjectorKeeper:
+    def _supervisor(self, name: str) -> ProjectorSupervisor:
         def open_guard(deadline: Deadline) -> LampGuard:
             return LampGuard(name, self.lamps[name], self.shelf, clock=self.world)
 
-        return ProjectorKeeper(name, open_guard, self.told.append, clock=self.world,
+        return ProjectorSupervisor(name, open_guard, self.told.append, clock=self.world,
                                asleep=lambda: self.relays.silences(name))  # fmt: skip
 
     def run(self, seconds: float) -> None:
         for _ in range(int(seconds)):
             self.relays.step()
-            for keeper in self.keepers.values():
-                keeper.step()
+            for supervisor in self.supervisors.values():
+                supervisor.step()
             self.world.time_s += 1.0
 
     def want(self, light: bool) -> None:
         self.relays.want_on = light
-        for keeper in self.keepers.values():
-            keeper.want_lit = light
+        for supervisor in self.supervisors.values():
+            supervisor.want_lit = light
 
     @property
     def values(self) -> dict[str, str]:
@@ -124,7 +124,7 @@ def test_mains_are_cut_when_the_lamps_have_cooled_and_the_projectors_are_left_in
     assert mains.values == {"left": "off", "right": "off"}
     mains.lamps["left"].trouble = "silent"
     mains.run(60)
-    assert mains.keepers["left"].view.problem is None, "it has no mains"
+    assert mains.supervisors["left"].view.problem is None, "it has no mains"
     assert [one.code for one in mains.told].count("mains-off") == 2
 
 
@@ -189,7 +189,7 @@ def test_a_projector_whose_mains_can_not_be_given_is_told_of_as_lost(mains: Main
     mains.boards["left"].gone, mains.lamps["left"].trouble = True, "silent"
     mains.want(True)
     mains.run(60)
-    assert mains.keepers["left"].view.problem is not None
+    assert mains.supervisors["left"].view.problem is not None
     assert mains.lamps["right"].lit_at_s is not None
 
 
@@ -199,7 +199,7 @@ def test_a_board_that_leaves_while_its_mains_are_cut_is_told_of_before_the_next_
     mains.boards["left"].gone = True
     mains.run(10)
     assert mains.relays.problem is not None
-    assert mains.keepers["left"].view.problem is None
+    assert mains.supervisors["left"].view.problem is None
     mains.boards["left"].gone = False
     mains.run(20)
     assert mains.values == {"left": "off", "right": "off"}
@@ -214,7 +214,7 @@ def test_a_board_that_takes_its_projectors_mains_with_it_is_told_of_and_not_thei
     mains.boards["left"].gone = False
     mains.run(20)
     assert mains.values == {"left": "off", "right": "off"}
-    assert mains.keepers["left"].view.problem is None, "it has no mains"
+    assert mains.supervisors["left"].view.problem is None, "it has no mains"
 
 
 def test_mains_that_somebody_else_gave_are_cut_again_once_the_lamps_are_known_to_be_cold(mains: Mains) -> None:
@@ -274,32 +274,32 @@ def test_a_device_is_opened_again_less_and_less_often_and_told_of_once_a_trouble
     def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
         return (LiveValue("Model", device.identity(deadline=deadline).model),)
 
-    keeper = DeviceKeeper("sensor", "sensor", "model", sensor.opened, look, told.append, every_s=10.0,
+    supervisor = DeviceSupervisor("sensor", "sensor", "model", sensor.opened, look, told.append, every_s=10.0,
                           monotonic=world.now_s)  # fmt: skip
 
     def run(seconds: int) -> None:
         for _ in range(seconds):
-            keeper.step()
+            supervisor.step()
             world.time_s += 1.0
 
     run(200)
     assert [one.code for one in told] == ["missing"]
-    assert keeper.device is None
+    assert supervisor.device is None
     sensor.opens = True
     run(60)
     assert [one.code for one in told] == ["missing", "device-back"]
-    assert [value.text for value in keeper.row.values] == ["Sensor"]
+    assert [value.text for value in supervisor.row.values] == ["Sensor"]
     sensor.trouble, sensor.looks = "silent", 0
     run(100)
     assert sensor.looks == 9, "and after 2, 5 and every 15 s"
     assert sensor.open == 0, "what does not answer is let go of"
-    assert (keeper.row.problem, keeper.row.remedy, keeper.row.values) == ("It is silent.", "Mend it.", ())
+    assert (supervisor.row.problem, supervisor.row.remedy, supervisor.row.values) == ("It is silent.", "Mend it.", ())
     sensor.trouble = "burning"
     run(100)
     assert [one.code for one in told] == ["missing", "device-back", "silent", "burning"]
     sensor.trouble = ""
     run(70)
-    with keeper.lent:
+    with supervisor.lent:
         sensor.looks = 0
         run(50)
         assert sensor.looks == 0, "somebody works with it"

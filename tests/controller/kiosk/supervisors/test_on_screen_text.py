@@ -40,23 +40,23 @@ def test_the_player_shows_the_lines_on_one_output_after_the_other_and_black_when
     told: list[Decision] = []
     frames, now_s = tmp_path / "outputs.frame", 0.0
     settings = PlayerSettings([(one.name, one.width_px, one.height_px) for one in OUTPUTS], frames)
-    keeper = PlayerKeeper(runtime_folder(tmp_path), lambda plays: settings, told.append, monotonic=lambda: now_s)
+    supervisor = PlayerKeeper(runtime_folder(tmp_path), lambda plays: settings, told.append, monotonic=lambda: now_s)
 
     def wait_for(wanted: FrameSet) -> None:
         until_s = time.monotonic() + 60
         while not all(map(np.array_equal, shown(frames).pixels, wanted.pixels)):
             assert time.monotonic() < until_s, [one.text for one in told]
-            keeper.step()
+            supervisor.step()
 
     try:
-        keeper.notice = LINES
+        supervisor.notice = LINES
         for turn in (0, 1):
             now_s = turn * NOTICE_TURN_S
             wait_for(notice(OUTPUTS, LINES, turn))
-        keeper.notice = ()
+        supervisor.notice = ()
         wait_for(FrameSet.black(OUTPUTS))
     finally:
-        keeper.close()
+        supervisor.close()
 
 
 def test_every_line_has_its_place_and_fits() -> None:
@@ -81,15 +81,15 @@ def test_a_one_time_password_is_taken_as_the_projectors_show_it(tmp_path: Path) 
 def test_lamps_stay_lit_for_whoever_aims_also_when_closed_and_until_somebody_closes(tmp_path: Path) -> None:
     kiosk = Kiosk(tmp_path)
     kiosk.run_until(State.PLAYING)
-    kiosk.conductor.shut()
+    kiosk.reconciler.shut()
     kiosk.run_until(State.OFF)
-    kiosk.conductor.light_for(600.0)
+    kiosk.reconciler.light_for(600.0)
     kiosk.run(60)
     assert kiosk.state is State.OFF, "a notice is nothing for a closed stage"
-    kiosk.conductor.light_for(600.0, closed_too=True)
+    kiosk.reconciler.light_for(600.0, closed_too=True)
     kiosk.run_until(State.READY)
     assert kiosk.player.view.shown == BLACK
-    kiosk.conductor.shut()
+    kiosk.reconciler.shut()
     kiosk.run_until(State.OFF)
     assert not kiosk.lit
     assert not kiosk.sins
@@ -97,8 +97,8 @@ def test_lamps_stay_lit_for_whoever_aims_also_when_closed_and_until_somebody_clo
 
 def test_lamps_are_lit_for_a_notice_and_cool_when_it_is_over(tmp_path: Path) -> None:
     kiosk = Kiosk(tmp_path)
-    kiosk.stock.installed = None
-    kiosk.conductor.light_for(600.0)
+    kiosk.bundles.installed = None
+    kiosk.reconciler.light_for(600.0)
     kiosk.run_until(State.READY)
     assert kiosk.lit == list(NAMES)
     kiosk.run(500)

@@ -6,7 +6,7 @@ import pytest
 
 from controller.kiosk.decide.interfaces import Condition
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.projector_supervisor import ASK_ANEW_S, MOST_STRIKES, ProjectorKeeper
+from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES, REOPEN_AFTER_FAULT_S, ProjectorSupervisor
 from controller.rig.lamp_guard import LampGuard
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
@@ -50,7 +50,7 @@ class ShutMeanwhile(FragileLamp):
 
 
 class Kept:
-    """A keeper with its lamp, in virtual time."""
+    """A supervisor with its lamp, in virtual time."""
 
     def __init__(self, kind: type[FragileLamp] = FragileLamp) -> None:
         self.world = World()
@@ -58,7 +58,7 @@ class Kept:
         self.there = True
         self.told: list[Decision] = []
         self.shelf = Shelf()
-        self.keeper = ProjectorKeeper("left", self._opened, self.told.append, clock=self.world)
+        self.supervisor = ProjectorSupervisor("left", self._opened, self.told.append, clock=self.world)
 
     def _opened(self, deadline: Deadline) -> LampGuard:
         if not self.there:
@@ -68,10 +68,10 @@ class Kept:
     def run(self, seconds: float) -> Condition:
         ends_s = self.world.time_s + seconds
         while self.world.time_s < ends_s:
-            self.keeper.step()
+            self.supervisor.step()
             self.world.time_s += 1.0
         assert not self.lamp.sins
-        return self.keeper.view.condition
+        return self.supervisor.view.condition
 
     @property
     def codes(self) -> list[str]:
@@ -89,9 +89,9 @@ def test_nothing_is_done_until_somebody_says_what_is_wanted(kept: Kept) -> None:
 
 
 def test_lights_and_darkens_as_it_is_wanted(kept: Kept) -> None:
-    kept.keeper.want_lit = True
+    kept.supervisor.want_lit = True
     assert kept.run(5) is Condition.LIT
-    kept.keeper.want_lit = False
+    kept.supervisor.want_lit = False
     assert kept.run(3) is Condition.COOLING
     assert kept.run(20) is Condition.DARK
     assert kept.lamp.strikes == 1
@@ -99,12 +99,12 @@ def test_lights_and_darkens_as_it_is_wanted(kept: Kept) -> None:
 
 def test_a_fault_that_was_told_once_is_asked_about_anew_and_the_mended_lamp_lights() -> None:
     kept = Kept(TellingLamp)
-    kept.keeper.want_lit = True
+    kept.supervisor.want_lit = True
     assert kept.run(10) is Condition.LIT
     kept.lamp.burst()
     assert kept.run(10) is Condition.BROKEN
     kept.lamp.dud = False
-    assert kept.run(ASK_ANEW_S - 15) is Condition.BROKEN
+    assert kept.run(REOPEN_AFTER_FAULT_S - 15) is Condition.BROKEN
     assert kept.run(30) is Condition.LIT
     assert kept.codes[-1] == "projector-back"
 
@@ -112,34 +112,34 @@ def test_a_fault_that_was_told_once_is_asked_about_anew_and_the_mended_lamp_ligh
 def test_a_lamp_that_stays_dead_and_says_so_is_struck_as_often_as_one_that_does_not() -> None:
     kept = Kept(TellingLamp)
     kept.lamp.dud = True
-    kept.keeper.want_lit = True
+    kept.supervisor.want_lit = True
     assert kept.run(3600) is Condition.BROKEN
     assert kept.lamp.strikes <= MOST_STRIKES + 1
     struck = kept.lamp.strikes
-    kept.keeper.want_lit = False
+    kept.supervisor.want_lit = False
     kept.run(60)
-    kept.keeper.want_lit = True
+    kept.supervisor.want_lit = True
     kept.run(3600)
     assert kept.lamp.strikes == struck + 1
 
 
 def test_a_technician_who_looked_after_it_needs_not_wait() -> None:
     kept = Kept(TellingLamp)
-    kept.keeper.want_lit = True
+    kept.supervisor.want_lit = True
     kept.run(10)
     kept.lamp.burst()
     kept.run(20)
     kept.lamp.dud = False
-    kept.keeper.forgive()
+    kept.supervisor.forgive()
     assert kept.run(15) is Condition.LIT
 
 
 def test_a_cable_that_is_away_is_tried_again_and_the_lamp_not_struck_twice(kept: Kept) -> None:
-    kept.keeper.want_lit = True
+    kept.supervisor.want_lit = True
     kept.run(10)
     kept.there, kept.lamp.trouble = False, "gone"
     assert kept.run(40) is Condition.LOST
-    assert kept.keeper.view.maybe_lit
+    assert kept.supervisor.view.maybe_lit
     kept.there, kept.lamp.trouble = True, ""
     assert kept.run(70) is Condition.LIT
     assert kept.lamp.strikes == 1
@@ -149,7 +149,7 @@ def test_a_cable_that_is_away_is_tried_again_and_the_lamp_not_struck_twice(kept:
 
 
 def test_a_short_silence_is_no_event(kept: Kept) -> None:
-    kept.keeper.want_lit = True
+    kept.supervisor.want_lit = True
     kept.run(10)
     kept.lamp.trouble = "silent"
     assert kept.run(8) is Condition.LIT
@@ -161,7 +161,7 @@ def test_a_short_silence_is_no_event(kept: Kept) -> None:
 def test_without_mains_it_counts_as_dark_and_nobody_asks_it() -> None:
     kept = Kept()
     kept.there = False
-    asleep = ProjectorKeeper("left", kept._opened, kept.told.append, clock=kept.world, asleep=lambda: True)
+    asleep = ProjectorSupervisor("left", kept._opened, kept.told.append, clock=kept.world, asleep=lambda: True)
     asleep.want_lit = True
     asleep.step()
     assert asleep.view.condition is Condition.DARK
@@ -172,30 +172,30 @@ def test_a_projector_behind_a_relay_board_that_is_away_says_so(kept: Kept) -> No
     kept.there = False
     board = Decision("hid-unplugged", "No relay board is plugged in.", "Check its hub.", "error")
     fed: list[Decision] = []
-    keeper = ProjectorKeeper(
+    supervisor = ProjectorSupervisor(
         "left", kept._opened, kept.told.append, clock=kept.world, unfed=lambda: fed[0] if fed else None
     )
-    keeper.step()
-    assert keeper.view.problem is not None
-    assert keeper.view.problem.text == "The cable is away. Plug it in."
+    supervisor.step()
+    assert supervisor.view.problem is not None
+    assert supervisor.view.problem.text == "The cable is away. Plug it in."
     fed.append(board)
     kept.world.time_s += 2.0
-    keeper.step()
-    assert keeper.view.problem.text == "The cable is away. No relay board is plugged in. Check its hub."
+    supervisor.step()
+    assert supervisor.view.problem.text == "The cable is away. No relay board is plugged in. Check its hub."
 
 
 def test_a_projector_that_got_its_mains_back_is_spoken_to_at_once(kept: Kept) -> None:
     kept.there, dark = False, False
-    keeper = ProjectorKeeper("left", kept._opened, kept.told.append, clock=kept.world, asleep=lambda: dark)
+    supervisor = ProjectorSupervisor("left", kept._opened, kept.told.append, clock=kept.world, asleep=lambda: dark)
     for _ in range(60):
-        keeper.step()
+        supervisor.step()
         kept.world.time_s += 1.0
-    assert keeper.view.condition is Condition.LOST
+    assert supervisor.view.condition is Condition.LOST
     kept.there = dark = True
-    keeper.step()
+    supervisor.step()
     dark = False
-    keeper.want_lit = True
-    keeper.step()
+    supervisor.want_lit = True
+    supervisor.step()
     assert kept.lamp.strikes == 1
 
 
@@ -209,9 +209,9 @@ def test_a_projector_that_was_plugged_in_again_is_found_within_a_quarter_of_a_mi
 def test_a_stage_that_is_shut_while_a_projector_is_looked_at_costs_no_strike() -> None:
     kept = Kept(ShutMeanwhile)
     assert isinstance(kept.lamp, ShutMeanwhile)
-    kept.keeper.want_lit = True
-    kept.lamp.meanwhile = lambda: setattr(kept.keeper, "want_lit", False)
-    kept.keeper.step()
+    kept.supervisor.want_lit = True
+    kept.lamp.meanwhile = lambda: setattr(kept.supervisor, "want_lit", False)
+    kept.supervisor.step()
     assert kept.lamp.strikes == 0
 
 
@@ -220,13 +220,13 @@ def test_a_line_that_opens_after_its_keeper_was_closed_is_let_go_of_and_no_lamp_
     closed: list[str] = []
 
     def opened_slowly(deadline: Deadline) -> LampGuard:
-        keeper.close()  # the service ends while the line is still being opened
+        supervisor.close()  # the service ends while the line is still being opened
         return LampGuard("left", kept.lamp, kept.shelf, clock=kept.world)
 
     kept.lamp.close = lambda: closed.append("left")  # type: ignore[method-assign]
-    keeper = ProjectorKeeper("left", opened_slowly, kept.told.append, clock=kept.world)
-    keeper.want_lit = True
-    keeper.step()
+    supervisor = ProjectorSupervisor("left", opened_slowly, kept.told.append, clock=kept.world)
+    supervisor.want_lit = True
+    supervisor.step()
     assert closed == ["left"]
     assert kept.lamp.strikes == 0
-    assert keeper.guard is None
+    assert supervisor.guard is None

@@ -48,7 +48,7 @@ def test_test_shots_are_begun_from_the_aiming_page(fresh: Served) -> None:
         answer = client.post(
             "/do/test-shots", data={"csrf": csrf(page)}, headers={"origin": fresh.address}, follow_redirects=True
         )
-        assert "The test shots have begun." in answer.text
+        assert "The test shots have started." in answer.text
         assert answer.url.path == "/aiming"
 
 
@@ -68,7 +68,7 @@ def test_the_lamps_page_tells_each_days_hours_and_what_happened(panel: Served) -
     page = text_of(panel, "/lamps", "vera")
     assert "2026-01-05" in page
     assert "7.0 h" in page
-    assert "13.7 hours a strike" in page
+    assert "13.7 hours per strike" in page
 
 
 def test_a_report_is_saved_and_never_shown_as_a_page_of_ours(panel: Served) -> None:
@@ -124,7 +124,7 @@ def compared(running: Served, **fields: str) -> str:
 
 
 def test_appearances_are_photographed_and_the_results_show_the_newest_and_the_history(fresh: Served) -> None:
-    assert "No appearance was photographed yet." in text_of(fresh, "/results", "otto")
+    assert "No appearance has been photographed yet." in text_of(fresh, "/results", "otto")
     page = compared(fresh)
     assert page.count("CIEDE2000") == 2
     again = compared(fresh, name="warm wood")
@@ -168,7 +168,7 @@ def test_what_failed_stays_on_every_page_until_an_operator_has_seen_it(fresh: Se
         form = {"csrf": csrf(client.get("/").text), "number": "7"}
         answer = client.post("/do/seen", data=form, headers={"origin": fresh.address}, follow_redirects=True)
         assert "not</b> solved" not in html.unescape(answer.text)
-        assert "marked as seen" in answer.text
+        assert "The failures are confirmed." in answer.text
 
 
 def test_an_upload_is_fitted_to_the_cameras_view_as_was_chosen(fresh: Served) -> None:
@@ -190,7 +190,7 @@ def test_an_upload_is_fitted_to_the_cameras_view_as_was_chosen(fresh: Served) ->
 
 def test_the_naming_has_a_button_each_that_keeps_its_label(fresh: Served) -> None:
     with fresh.entered("otto") as client:
-        for on, shown, hidden in (("true", "end-naming", "name-them"), ("false", "name-them", "end-naming")):
+        for on, shown, hidden in (("true", "identify-off", "identify-on"), ("false", "identify-on", "identify-off")):
             form = {"csrf": csrf(client.get("/").text), "on": on}
             page = client.post("/do/identify", data=form, headers={"origin": fresh.address}, follow_redirects=True).text
             assert f'id="{shown}">' in page
