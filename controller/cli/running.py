@@ -1,4 +1,4 @@
-"""What the commands share: their common parameters, and how work is called and its result shown."""
+"""Shared by all commands: common parameters, running the work, showing the result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
 StageFolder = Annotated[Path, typer.Argument(metavar="STAGE", help="The stage's folder, which holds stage.toml.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object a line, for machines.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON lines for programs.")]
 
 
 def projector_names(incomplete: str) -> list[str]:

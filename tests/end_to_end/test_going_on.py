@@ -165,7 +165,7 @@ def test_ctrl_c_ends_soon_with_a_sentence_and_every_lamp_off(story: Story, name:
     assert chapter.outcome is not None
     assert chapter.outcome.code == 130
     assert chapter.outcome.error["what"] == "The work was stopped on request."
-    assert chapter.outcome.error["remedy"] == "The same command goes on from here."
+    assert chapter.outcome.error["remedy"] == "Run the same command to continue from here."
     assert chapter.outcome.stderr == ""
     assert chapter.seconds < 15
     assert set(chapter.powers.values()) <= {Power.OFF, Power.COOLING}
