@@ -41,7 +41,7 @@ class Exposures:
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """``delay.json``, in seconds: ``wait_s`` after its presentation a picture is photographed whole.
+    """``delay.json``, in seconds: ``wait_s`` after its presentation a picture is completely visible.
 
     ``delay_s`` after which it begins to be there; ``tries`` as ``capture.latency`` tells them, each of ``exposure_s``
     """

@@ -1,4 +1,4 @@
-"""What was found, into stage.toml: new devices, and settings that the devices themselves contradict."""
+"""Writes new devices, and settings that the devices contradict, to stage.toml."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from controller.doctor.values import Examination
 from hal.finding import Found
 
 CORRECTIONS: Final = ("serial-wrong-baud", "serial-other-profile")
-"""Problems whose remedy is a setting that the finder has put into its table."""
+"""Problems that a setting in the finder's table corrects."""
 SINGLE: Final[Mapping[str, str]] = {"camera": "camera", "light_sensor": "light_sensor", "button_panel": "key_panel"}
-"""Kinds of which a stage has one, with the name of its table."""
+"""Kinds of which a stage has at most one, with the name of the table."""
 FIRST_ISO: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What would be written: changes of keys, further tables, and both in words."""
+    """Planned changes: keys, new tables, and both in words."""
 
     changes: list[KeyChange] = field(default_factory=list)
     tables: dict[str, Any] = field(default_factory=dict)
@@ -33,7 +33,7 @@ class Plan:
 
 
 def plan_for(stage: Stage, seen: Examination) -> Plan:
-    """What to write into a stage that has a stage.toml."""
+    """The changes for an existing stage.toml."""
     plan = Plan()
     _correct(stage, seen.found, plan)
     outputs = _outputs(stage.tables, seen.found)
@@ -55,7 +55,7 @@ def plan_for(stage: Stage, seen: Examination) -> Plan:
 
 
 def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str]]:
-    """The content of a first stage.toml, and what it says in words. Raises UsageError("doctor-not-enough")."""
+    """The content of a first stage.toml, and a description. Raises UsageError("doctor-not-enough")."""
     outputs = [table for one in seen.found if one.kind == "display" for table in one.settings["outputs"]]
     projectors = [one for one in seen.new if one.kind == "projector"]
     cameras = [one for one in seen.new if one.kind == "camera"]
@@ -71,8 +71,8 @@ def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str
     if missing:
         raise UsageError(
             "doctor-not-enough",
-            what=f"A stage needs {', '.join(missing)} more than was found, so no stage.toml was written.",
-            remedy="Plug in and switch on what is missing, or write stage.toml by hand (docs/reference/stage-toml.md).",
+            what=f"No stage.toml was written, because the stage still needs {', '.join(missing)}.",
+            remedy="Connect the missing devices and switch them on, or see docs/reference/stage-toml.md.",
         )
     content: dict[str, Any] = {
         "stage": {"name": folder.resolve().name},
@@ -91,10 +91,10 @@ def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str
 
 
 def write(folder: Path, stage: Stage | None, seen: Examination) -> tuple[str, ...]:
-    """Write what was found into the stage's folder; what was written, in words.
+    """Write the devices found to stage.toml; returns a description of the changes.
 
-    Raises UsageError where the result would not be a stage ("doctor-not-enough", or as ``load_stage``); the file is
-    then as it was.
+    Raises UsageError if the result would not be a valid stage ("doctor-not-enough", or as ``load_stage``); the file
+    is then unchanged.
     """
     if stage is None:
         content, words = new_stage(folder, seen)

@@ -117,7 +117,7 @@ def story(tmp_path_factory: pytest.TempPathFactory, bumpy_ball: Path) -> Story:
     toml.write_text(toml.read_text().replace("power_down_s = 10.0", "power_down_s = 3.0") + QUICK)
     story = Story(out / "stage")
     with Bench(story.stage) as bench, truth_away(story.stage):
-        story.stop("stopped while the lamps warm up", "Waiting for steady light")
+        story.stop("stopped while the lamps warm up", "Waiting for stable light")
         story.fill_the_disk("disk full", "Photographing the light of left", 0.3)
         story.kill("killed", "Photographing the light of right", 0.3)
         story.stop("stopped while photographing", "Photographing the light of above", 0.3)

@@ -1,4 +1,4 @@
-"""Test shots: what aims projectors and camera, photographed in seconds and judged by ``calibrate.verify.aim``."""
+"""Test shots for aiming projectors and camera, taken in seconds and evaluated by ``calibrate.verify.aim``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LONGEST_PX: Final = 960
 def take_test_shots(
     rig: Rig, *, longest_exposure_s: float, deadline: Deadline, advance: Callable[[float, str], None]
 ) -> Path:
-    """Photograph 2 N + 2 pictures or a few more, judge them, and leave figures and picture in ``FOLDER``.
+    """Photograph 2 N + 2 pictures or a few more, evaluate them, and write figures and picture to ``FOLDER``.
 
     Returns that folder. Raises what the devices raise.
     """
@@ -61,7 +61,7 @@ def take_test_shots(
             for inverse in (False, True)
         )
         boards.append((first, second))
-    advance(0.9, "looking at the pictures")
+    advance(0.9, "evaluating the pictures")
     aim = assess_aim(black, boards)
     _keep_picture(folder, aim_overview(picture, aim))
     projectors = [{"projector": one.name, **asdict(found)}
