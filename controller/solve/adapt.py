@@ -115,8 +115,8 @@ def _check_strength(strength: float, given_up: float) -> None:
     if not (0 <= strength <= 1 and 0 <= given_up < 1):
         raise UsageError(
             "adapt-strength",
-            what=f"A contrast adaptation of strength {strength} was asked for, with {given_up} of the pixels given up.",
-            remedy="Ask for a strength from 0 to 1, and give up a share from 0 to below 1.",
+            what=f"A contrast adaptation can't have strength {strength} and give up a share {given_up} of the pixels.",
+            remedy="Give a strength from 0 to 1, and a share of given-up pixels from 0 to below 1.",
         )
 
 

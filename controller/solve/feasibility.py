@@ -70,8 +70,8 @@ def choose_exposure(
     if not 0 < share <= 1:
         raise UsageError(
             "share-out-of-range",
-            what=f"A share of {share} reachable pixels was asked for.",
-            remedy="Ask for a share above 0 and up to 1, for example 0.95.",
+            what=f"A share of {share} reachable pixels is not possible.",
+            remedy="Give a share above 0 and up to 1, for example 0.95.",
         )
     drive = DriveLevels(transport) if drive is None else drive
     mask = drive.mask
@@ -88,8 +88,8 @@ def choose_exposure(
     if not 0 < exposure < np.inf:
         raise WorkError(
             "no-light",
-            what="No exposure fits this target: it is black, or the projectors bring no light to the object.",
-            remedy="Check the target, and that the calibration saw the projectors' light on the object.",
+            what="No exposure fits this target: it is black, or no projector lights the object.",
+            remedy="Check the target. Check that the projectors lit the object during the calibration.",
         )
     return exposure
 

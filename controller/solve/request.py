@@ -30,7 +30,7 @@ from controller.solve.targets.values import Target
 from controller.transport import LightTransport
 
 ADVICE_FULL_SOLVE = (
-    'The target has finer detail than one projector can scale; mode "full" or base "high-pass" would keep it.'
+    'The target has finer detail than one projector can scale. To keep it, use mode "full" or base "high-pass".'
 )
 
 

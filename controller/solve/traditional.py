@@ -24,7 +24,7 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
     if not 0 <= n < len(calibration.projectors):
         raise UsageError(
             "projector-unknown",
-            what=f"There is no projector number {n + 1}.",
+            what=f"Projector number {n + 1} does not exist.",
             remedy=f"Choose one from 1 to {len(calibration.projectors)}.",
         )
     if target.shape != calibration.black.shape:

@@ -46,7 +46,7 @@ def solve_box(solver: str, problem: BoxProblem) -> Float64:
     if solver not in SOLVERS:
         raise UsageError(
             "solver-unknown",
-            what=f"There is no solver {solver} for regions.",
+            what=f"The solver {solver} for regions is unknown.",
             remedy=f"Choose one of {', '.join(SOLVERS)}.",
         )
     x = SOLVERS[solver](problem)

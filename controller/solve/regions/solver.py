@@ -163,7 +163,7 @@ def solve_regions(
             if progress is not None:
                 progress(done / total)
             if cancelled is not None and cancelled():
-                raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again when wanted.")
+                raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again to repeat it.")
     light = transport.forward_planes(x)
     objective = weighted_residual(light, problem.target, problem.weights, np.empty_like(light)) + smoothness_term(
         problem, x

@@ -68,7 +68,7 @@ def shipped_photograph(name: Literal["astronaut", "chelsea", "coffee"] = "astron
     if name not in PHOTOGRAPHS:
         raise UsageError(
             "photograph-unknown",
-            what=f"There is no photograph called {name!r}.",
+            what=f"The photograph {name!r} is unknown.",
             remedy=f"Choose one of {', '.join(PHOTOGRAPHS)}, or give a file.",
         )
     return srgb_to_linear(np.asarray(getattr(skimage.data, name)()))

@@ -55,8 +55,8 @@ def object_space(
     if not wanted.any():
         raise WorkError(
             "target-no-geometry",
-            what="No camera pixel of the object has a known position, so nothing can be put on it.",
-            remedy="Calibrate with the geometry step, and check that the object mask lies on the object.",
+            what="No camera pixel of the object has a known 3D position, so nothing can be wrapped on it.",
+            remedy="Calibrate with the geometry step, and check that the object mask covers the object.",
         )
     frame = _upright_frame(geometry.points_m[wanted], up)
     local = (geometry.points_m[wanted] @ frame.T).astype(np.float64)
