@@ -20,7 +20,7 @@ ANSWER_S: Final = 8.0
 
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
-    """Projectors that answer the search (class 2), and those that stage.toml names (any class)."""
+    """Projectors that answer the search (class 2), and those in stage.toml (any class)."""
     known = {str(settings.get("address", "")): settings for settings in wanted.of("projector", "pjlink")}
     found = [_tried(address, settings, wanted, deadline) for address, settings in known.items()]
     hosts = {host for address in known if (host := _host(address))}
