@@ -27,7 +27,7 @@ from controller.transport import LightTransport
 
 Value = TypeVar("Value")
 _RUNNING: Final = threading.Lock()
-_CODE: Final = ("core/arrays.py", "core/jit.py", "solve", "transport")
+_CODE: Final = ("controller/core/arrays.py", "hal/runtime/jit.py", "controller/solve", "controller/transport")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def code_digest() -> str:
 
 def _digest_of_code() -> str:
     hashed = hashlib.sha256(np.__version__.encode())
-    folder = Path(__file__).resolve().parent.parent
+    folder = Path(__file__).resolve().parents[2]
     for name in _CODE:
         path = folder / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:

@@ -138,7 +138,7 @@ class PlayerLink:
         if spoken != _PROTOCOL:
             raise DeviceRefused(
                 "player-protocol",
-                what=f"The player speaks protocol {spoken}; this driver has {_PROTOCOL}.",
+                what=f"The player has protocol {spoken}, but this driver has {_PROTOCOL}.",
                 remedy="Install player and controller of the same release, and restart the player.",
             )
         if self._expected is not None and self._expected != outputs:
