@@ -143,7 +143,7 @@ def below_grade(folder: Path, worst_grade: float) -> CalibrationError:
         "calibration-below-grade",
         what=f"The calibration {folder.name} is not good enough to be published: projector {name} is predicted with "
         f"{percent:.1f} % error, and {worst_grade:g} % is the limit (worst_grade under [calibration]).{because}",
-        remedy=f"Look at {folder / PICTURE}, mend what it shows and calibrate again; or publish all the same with "
+        remedy=f"Check {folder / PICTURE}, correct the cause and calibrate again. To publish it anyway, use "
         "--accept-grade.",
     )
 
