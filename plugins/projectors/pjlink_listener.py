@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Final
 
 from hal.codecs.projectors.pjlink import PORT
-from hal.codecs.projectors.pjlink_udp import LONGEST_DATAGRAM, SEARCH, Here, Told, parse_datagram
+from hal.codecs.projectors.pjlink_udp import LONGEST_DATAGRAM, SEARCH, Here, Notification, parse_datagram
 from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, ProtocolError
 
@@ -34,7 +34,7 @@ class Heard:
     """A notification from ``host``. The sender of UDP can't be trusted: query the projector before acting."""
 
     host: str
-    told: Told
+    notification: Notification
 
 
 class PjLinkListener:
@@ -101,8 +101,8 @@ class PjLinkListener:
         while not patience.passed and len(found) < MOST_FOUND:
             patience.sleep(0)
             for heard in self._received(patience):
-                if isinstance(heard.told, Here):
-                    found.setdefault(heard.told.mac, FoundProjector(heard.host, heard.told.mac))
+                if isinstance(heard.notification, Here):
+                    found.setdefault(heard.notification.mac, FoundProjector(heard.host, heard.notification.mac))
                 elif len(self._kept) < MOST_FOUND:
                     self._kept.append(heard)
         return tuple(found.values())
@@ -136,7 +136,7 @@ class PjLinkListener:
                 "pjlink-listener-closed", what="The listener was closed.", remedy="Open it again."
             ) from error
         try:
-            return [Heard(str(sender[0]), told) for told in parse_datagram(data)] if data != SEARCH else []
+            return [Heard(str(sender[0]), sent) for sent in parse_datagram(data)] if data != SEARCH else []
         except ProtocolError:
             self.ignored += 1
             return []

@@ -55,10 +55,10 @@ class InputChanged:
     input: str
 
 
-Told = Here | CameUp | TroubleChanged | PowerChanged | InputChanged
+Notification = Here | CameUp | TroubleChanged | PowerChanged | InputChanged
 
 
-def parse_datagram(data: bytes) -> tuple[Told, ...]:
+def parse_datagram(data: bytes) -> tuple[Notification, ...]:
     """Read a datagram: one line or several, each with its CR.
 
     Raises ProtocolError for anything else; nothing of a datagram counts then.
@@ -66,7 +66,7 @@ def parse_datagram(data: bytes) -> tuple[Told, ...]:
     lines = data[: LONGEST_DATAGRAM + 1].rstrip(b"\0").split(b"\r")
     if len(data) > LONGEST_DATAGRAM or len(lines) < 2 or lines.pop() != b"":
         raise _garbage(data)
-    return tuple(_told(line) for line in lines)
+    return tuple(_parsed(line) for line in lines)
 
 
 def is_notification(line: bytes) -> bool:
@@ -76,7 +76,7 @@ def is_notification(line: bytes) -> bool:
     return match is not None and match[1].upper() in (b"ACKN", b"LKUP")
 
 
-def _told(line: bytes) -> Told:
+def _parsed(line: bytes) -> Notification:
     match = _LINE.fullmatch(line)
     if match is None:
         raise _garbage(line)
