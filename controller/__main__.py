@@ -265,7 +265,7 @@ def run(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
     except SystemExit as exiting:  # raised by the command-line library when the reader of our output has closed it
         return exiting.code if isinstance(exiting.code, int) else FAILED
-    except BaseException as error:  # noqa: BLE001 - the last boundary: nobody above could show it
+    except BaseException as error:  # noqa: BLE001 - the last boundary: no caller could show it
         return _told(error, as_json=as_json)
     return outcome if isinstance(outcome, int) else DONE
 

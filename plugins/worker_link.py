@@ -60,7 +60,7 @@ class _Worker(Generic[Opened]):
         while (job := self._jobs.get()) is not None:
             try:
                 job.result.append(job.work(self))
-            except BaseException as error:  # noqa: BLE001 - it is raised again by whoever waits for the job
+            except BaseException as error:  # noqa: BLE001 - it is raised again in the waiting thread
                 job.error = error
             job.done.set()
         self.drop()

@@ -45,7 +45,7 @@ def _completed(incomplete: str, tables: str) -> list[str]:
 
 
 Work = Callable[["Reporter", "threading.Event"], Mapping[str, Any] | str | None]
-"""What a command does, told where to report and what is set when it is to stop; it imports what it needs."""
+"""The work of a command, with a reporter and the event that requests a stop; it imports what it needs."""
 
 
 def work(do: Work, *, as_json: bool) -> None:

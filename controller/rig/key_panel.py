@@ -95,7 +95,7 @@ class KeyService:
                     self._trouble(None)
             except Cancelled:
                 return
-            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
+            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: reported, and it continues
                 if not failed:
                     failed = True
                     self._trouble(error if isinstance(error, DeviceError) else _unknown(error))

@@ -212,7 +212,7 @@ def _switch_off(guard: LampGuard, deadline: Deadline, clock: Clock) -> None:
                 return
         except Cancelled:
             raise
-        except Exception as error:  # noqa: BLE001 - whatever it is, the lamp must go off; told when time is over
+        except Exception as error:  # noqa: BLE001 - in every case the lamp must go off; reported at the time limit
             last = error
         if deadline.passed or (last is not None and not guard.may_be_lit):
             raise last or DeviceTimeout(

@@ -179,7 +179,7 @@ class Machine:
             for listener in tuple(self._listeners):
                 try:
                     listener(change)
-                except Exception as error:  # noqa: BLE001 - raised below, when every listener has been told
+                except Exception as error:  # noqa: BLE001 - raised below, after all listeners were called
                     failure = failure or error
             if failure is not None:
                 raise failure

@@ -26,7 +26,7 @@ _LOW_BATTERY: Final = 25
 class Channel:
     """A link, the capabilities of its camera, and time limits.
 
-    ``exposing_until_s``: when, on the monotonic clock, an exposure will be over that nobody waits for any more.
+    ``exposing_until_s``: the end, on the monotonic clock, of an abandoned exposure.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Channel:
         self._properties = properties
 
     def patience(self, deadline: Deadline) -> Deadline:
-        """Until when a busy camera is asked again: beyond any exposure that goes on without us."""
+        """Time limit for asking a busy camera again: after the end of any abandoned exposure."""
         return deadline.within(max(0.0, self.exposing_until_s - time.monotonic()) + self.timing.busy_s)
 
     def has(self, operation: int) -> bool:

@@ -13,9 +13,9 @@ class Timing:
     """The driver's time limits, in seconds.
 
     ``answer_s``: for an ordinary answer; ``busy_s``: with a busy camera; ``margin_s``: for a picture, beyond twice its
-    exposure; ``grace_s``: for an event, before asking for what it would have told; ``come_back_s``: for a lost camera
+    exposure; ``grace_s``: for an event, before its information is requested; ``come_back_s``: for a lost camera
     to answer again, ``reconnect_s``: the same during a picture; ``keep_alive_s``: between two signs of life while it
-    works, ``idle_s``: while nobody asks for anything; ``slow_s``: an answer that took longer is noted.
+    works, ``idle_s``: without any call; ``slow_s``: an answer that took longer is noted.
     """
 
     answer_s: float = 15.0

@@ -140,7 +140,7 @@ class PtpCamera:
                 self._lock.release()
 
     def _close(self, *, farewell: bool) -> None:
-        """``farewell``: nobody else is on the link, whose answer could be taken for ours and ours for his."""
+        """``farewell``: no other call uses the link, so answers can't be mixed up."""
         deadline = in_seconds(_CLOSE_S)
         body, channel, self._body, self._channel = self._body, self._channel, None, None
         if channel is not None:

@@ -35,10 +35,10 @@ MOST_ITERATIONS: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """What a solve found.
+    """Result of a solve.
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
-    ``light`` (camera rows, columns, 3) float32: T p, what the frames add to the black image
+    ``light`` (camera rows, columns, 3) float32: T p, the frames' light without the black image
     ``objective``: weighted squared residual plus smoothness, in camera units squared
     ``kkt``: rms of the last projected, scaled gradient step, in units of projector light; 0 at the optimum
     ``converged``: the KKT residual fell below the tolerance before the cap on iterations
@@ -184,7 +184,7 @@ def initial_point(problem: Problem) -> FloatImage:
 
 
 def smoothness_term(problem: Problem, x: FloatImage) -> float:
-    """What the smoothness equations add to the objective at ``x`` (3, pixels)."""
+    """The smoothness term of the objective at ``x`` (3, pixels)."""
     total = 0.0
     for n in range(len(problem.transport.sizes)):
         frame, across, down = (_frame_view(problem.transport, n, v) for v in (x, problem.across, problem.down))

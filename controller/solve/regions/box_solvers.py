@@ -19,7 +19,7 @@ from controller.core.errors import UsageError, WorkError
 
 TOLERANCE: Final = 1e-8
 OSQP_TOLERANCE: Final = 1e-5
-"""Splitting converges slowly; this is as near as it comes at its usual price."""
+"""Splitting converges slowly; this is its accuracy at the usual cost."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,7 +107,7 @@ def _read_encoded(path: Path) -> FloatImage:
     jpeg = data.startswith(b"\xff\xd8\xff")
     if not jpeg and not data.startswith(b"\x89PNG\r\n\x1a\n"):
         raise _unreadable(path, f"it is not an {_ALLOWED} file")
-    # decoders fill what is missing with grey and only print a warning
+    # decoders fill missing parts with grey and only print a warning
     if (jpeg and b"\xff\xd9" not in data[-4096:]) or (not jpeg and b"IEND" not in data[-4096:]):
         raise _unreadable(path, "its end is missing")
     try:

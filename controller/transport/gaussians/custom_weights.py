@@ -24,7 +24,7 @@ from controller.transport.gaussians.patches import (
 from controller.transport.simd.gaussians import LANES
 
 MOST_BYTES: Final = 8 << 30
-"""Of the boxes and what products need beside them; beyond it a machine stops answering instead of saying so."""
+"""Limit of memory for the boxes and the products; above it the machine would hang."""
 
 
 def patches_of_weights(weights: Sequence[sp.csr_matrix[np.float64]], camera_shape: tuple[int, int]) -> Patches:

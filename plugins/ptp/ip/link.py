@@ -44,7 +44,7 @@ class PtpIpLink:
     def connect(cls, address: PtpIpAddress, *, transcript: Transcript | None = None, deadline: Deadline) -> Self:
         """Open both connections and introduce this computer; ``transcript`` records all but picture data.
 
-        Raises DeviceGone("camera-off") where nobody listens, DeviceBusy where another computer holds the camera,
+        Raises DeviceGone("camera-off") without an answer, DeviceBusy if another computer uses the camera,
         DeviceRefused where the camera does not know this one, DeviceTimeout.
         """
         link = cls(Wire.connect(address.host, address.command_port, deadline=deadline), transcript)
