@@ -80,7 +80,7 @@ class Wanted:
 
     def of(self, kind: str, driver: str) -> tuple[Mapping[str, Any], ...]:
         """The settings of every known device of this driver."""
-        return tuple(one.settings for one in self.known if (one.kind, one.driver) == (kind, driver))
+        return tuple(device.settings for device in self.known if (device.kind, device.driver) == (kind, driver))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,9 @@ def load_finders(found: Iterable[EntryPoint] | None = None) -> tuple[tuple[Finde
     """Every installed finder (or those of the given entry points), by bus; and the problems of loading."""
     finders: dict[tuple[str, str], Finder] = {}
     problems = []
-    for entry in sorted(entry_points(group=GROUP) if found is None else found, key=lambda one: (one.name, one.value)):
+    for entry in sorted(
+        entry_points(group=GROUP) if found is None else found, key=lambda entry: (entry.name, entry.value)
+    ):
         try:
             loaded = entry.load()
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything, and stops no other

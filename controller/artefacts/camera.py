@@ -30,7 +30,7 @@ class Exposures:
     @staticmethod
     def write(run: Path, found: Mapping[str, Exposures]) -> Path:
         """``exposure.json``, by projector name."""
-        return write_json(run / _EXPOSURES, {name: asdict(one) for name, one in found.items()})
+        return write_json(run / _EXPOSURES, {name: asdict(exposures) for name, exposures in found.items()})
 
     @staticmethod
     def read(run: Path) -> dict[str, Exposures]:

@@ -116,9 +116,9 @@ def history_of(stage: Path, names: Collection[str]) -> dict[str, tuple[Compared,
     """Each of these appearances with its results, oldest first; without those that were never photographed."""
     found: dict[str, list[Compared]] = {}
     for known in all_compared(stage).values():
-        for one in known:
-            if one.name in names:
-                found.setdefault(one.name, []).append(one)
+        for comparison in known:
+            if comparison.name in names:
+                found.setdefault(comparison.name, []).append(comparison)
     return {name: tuple(found[name]) for name in names if name in found}
 
 

@@ -71,12 +71,12 @@ class PhotographSet:
         """Write the index, in the order in which they were taken."""
         rows = [
             {
-                "name": one.name,
-                "projector": one.projector,
-                "path": str(one.path.relative_to(run)),
-                "exposure_s": one.exposure_s,
+                "name": photograph.name,
+                "projector": photograph.projector,
+                "path": str(photograph.path.relative_to(run)),
+                "exposure_s": photograph.exposure_s,
             }
-            for one in taken
+            for photograph in taken
         ]
         return write_json(self.index(run), rows)
 
@@ -90,11 +90,11 @@ class PhotographSet:
 
     def by_name(self, run: Path) -> dict[str, Taken]:
         """As ``read``, by name; for a set of one projector or of none, whose names differ."""
-        return {one.name: one for one in self.read(run)}
+        return {photograph.name: photograph for photograph in self.read(run)}
 
     def by_projector(self, run: Path, name: str = PATTERN) -> dict[str | None, Taken]:
         """As ``read``, those of this name by their lit projector."""
-        return {one.projector: one for one in self.read(run) if one.name == name}
+        return {photograph.projector: photograph for photograph in self.read(run) if photograph.name == name}
 
     def _taken(self, run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> Taken:
         name, projector = (row["name"], row["projector"]) if "projector" in row else self._of_format_1(row["name"])
@@ -146,7 +146,7 @@ def white_name(number: int) -> str:
 
 def white_bracket(taken: Sequence[Taken]) -> list[Taken]:
     """The bracket of white among the photographs of a projector's light."""
-    found = {one.name: one for one in taken}
+    found = {photograph.name: photograph for photograph in taken}
     names = (white_name(number) for number in range(len(found)))
     return [found[name] for name in names if name in found]
 

@@ -190,7 +190,7 @@ def _read_figures(path: Path) -> Any:
 
 
 def _names(kind: type[Light | Pixels | DotMetapixels]) -> list[str]:
-    return [one.name for one in fields(kind)]
+    return [field.name for field in fields(kind)]
 
 
 def _save(path: Path, value: Light | Pixels | DotMetapixels) -> Path:

@@ -28,7 +28,11 @@ NoWait = Annotated[bool, typer.Option("--no-wait", help="Do not wait for the end
 
 def commands(group: str = "", operations: Sequence[Operation] = OPERATIONS) -> tuple[Callable[..., None], ...]:
     """The commands of one group, "" for those of one word."""
-    words = ((one, one.words.rpartition(" ")) for one in operations if not one.within and one.holder != "targets")
+    words = (
+        (operation, operation.words.rpartition(" "))
+        for operation in operations
+        if not operation.within and operation.holder != "targets"
+    )
     return tuple(command(one, name) for one, (first, _, name) in words if first == group)
 
 
@@ -52,7 +56,7 @@ def command(operation: Operation, name: str) -> Callable[..., None]:
         parameters.append(_parameter("no_wait", NoWait, False))
     parameters.append(_parameter("as_json", Json, False))
     vars(run)["__signature__"] = inspect.Signature(parameters)
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     run.__name__, run.__doc__ = name.replace("-", "_"), _help(operation)
     return run
 

@@ -59,7 +59,10 @@ def _diagnosed(path: Any, _: Mapping[str, Any], as_json: bool) -> Mapping[str, A
     from hal.runtime.caches import kept, summary
 
     outside = kept()
-    rows = [{"path": str(one.path), "what": one.what, "bytes": one.size_bytes, "in_use": one.in_use} for one in outside]
+    rows = [
+        {"path": str(folder.path), "what": folder.what, "bytes": folder.size_bytes, "in_use": folder.in_use}
+        for folder in outside
+    ]
     text = "\n".join([f"Written: {path}", *(f"Stored outside the stage: {line}" for line in summary(outside))])
     return {"file": path, "outside_the_stage": rows} if as_json else text
 

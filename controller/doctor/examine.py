@@ -96,7 +96,7 @@ def _search(
     found: list[Found] = []
     reporter.say(f"Searching {', '.join(finder.bus for finder in finders)}.")
     with ThreadPoolExecutor(max(1, len(finders)), thread_name_prefix="doctor") as pool:
-        for finder, search in [(one, pool.submit(search_bus, one, wanted, deadline)) for one in finders]:
+        for finder, search in [(finder, pool.submit(search_bus, finder, wanted, deadline)) for finder in finders]:
             try:
                 found += search.result()
             except Cancelled:
@@ -131,23 +131,23 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
 
 def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
     told = []
-    for one in new:
-        if one.kind == "power_switch":
+    for device in new:
+        if device.kind == "power_switch":
             remedy = (
                 "Add it by hand, with the projector of each relay: [[relays]] with driver, serial and "
                 "[[relays.mains]] (docs/how-to/relays-sensor-keys.md)."
             )
-        elif one.kind == "camera" and "camera" in kinds:
-            remedy = f"If it is the one to use, write address = {one.settings.get('address', '')!r} into [camera]."
+        elif device.kind == "camera" and "camera" in kinds:
+            remedy = f"If it is the one to use, write address = {device.settings.get('address', '')!r} into [camera]."
         else:
             remedy = "Add it with `velatura doctor STAGE --write`, or unplug it if it is not part of this stage."
-        told.append(Finding(one.address, Problem("not-in-stage", f"{one.what} is not in stage.toml.", remedy)))
+        told.append(Finding(device.address, Problem("not-in-stage", f"{device.what} is not in stage.toml.", remedy)))
     return told
 
 
 def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Finding]:
     """Outputs of stage.toml that the X server does not have; empty without an X server."""
-    there = {one.address for one in found if one.kind == "display"}
+    there = {device.address for device in found if device.kind == "display"}
     if not there:
         return []
     return [
@@ -166,9 +166,9 @@ def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Findin
 def _tried(checked: Checked, seen: Examination, deadline: Deadline, reporter: Reporter) -> Examination:
     reporter.say("Testing the stage's own devices; no lamp is switched on.")
     failed = {
-        one.address: one.problems[0]
-        for one in seen.found
-        if one.problems and not one.problems[0].code.endswith("may-be-taken")
+        device.address: device.problems[0]
+        for device in seen.found
+        if device.problems and not device.problems[0].code.endswith("may-be-taken")
     }
     tried, findings = [], list(seen.findings)
     for one, finding in Trying(checked, deadline).each(failed):

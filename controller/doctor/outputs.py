@@ -100,14 +100,16 @@ def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Shown]
     """Light one output after the other, and find the shutter that removes the light."""
     look = _Camera(rig, folder, deadline)
     exposure_s = look.exposure_s()
-    with_shutter = [one for one in rig.projectors if one.guard.capabilities.shutter]
+    with_shutter = [projector for projector in rig.projectors if projector.guard.capabilities.shutter]
     shown = []
     for projector in rig.projectors:
         frames = rig.on_outputs({projector.name: np.full_like(projector.black(), 255)})
         bright = look.brightness(frames, exposure_s)
         # First the one in stage.toml: if the cables are right, one photograph per output is enough.
         suspects = sorted(with_shutter, key=lambda one: one is not projector)
-        owner = next((one.name for one in suspects if look.goes_dark(one, frames, bright, exposure_s)), None)
+        owner = next(
+            (suspect.name for suspect in suspects if look.goes_dark(suspect, frames, bright, exposure_s)), None
+        )
         shown.append(Shown(projector.output, owner))
     return shown
 
@@ -115,15 +117,15 @@ def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Shown]
 def judge(projectors: Sequence[RigProjector], shown: Sequence[Shown]) -> list[Finding]:
     """Problems with the cables, by output."""
     findings = []
-    for projector, one in zip(projectors, shown, strict=True):
-        if one.projector is None:
-            what = f"The projector on output {one.output} could not be found: no shutter made the photograph darker."
+    for projector, output in zip(projectors, shown, strict=True):
+        if output.projector is None:
+            what = f"The projector on output {output.output} could not be found: no shutter made the photograph darker."
             remedy = "Check that the lamp is on and the camera sees the picture, or compare the numbers yourself."
-            findings.append(Finding(one.output, Problem("output-unseen", what, remedy)))
-        elif one.projector != projector.name:
-            what = f"Output {one.output} is shown by projector {one.projector}, not by {projector.name}."
-            remedy = f'Swap the cables, or write output = "{one.output}" for {one.projector} into stage.toml.'
-            findings.append(Finding(one.output, Problem("output-swapped", what, remedy)))
+            findings.append(Finding(output.output, Problem("output-unseen", what, remedy)))
+        elif output.projector != projector.name:
+            what = f"Output {output.output} is shown by projector {output.projector}, not by {projector.name}."
+            remedy = f'Swap the cables, or write output = "{output.output}" for {output.projector} into stage.toml.'
+            findings.append(Finding(output.output, Problem("output-swapped", what, remedy)))
     return findings
 
 

@@ -55,17 +55,17 @@ class Examination:
             "healthy": self.healthy,
             "found": [
                 {
-                    "bus": one.bus,
-                    "address": printable(one.address),
-                    "what": printable(one.what),
-                    "kind": one.kind,
-                    "driver": one.driver,
-                    "settings": dict(one.settings),
-                    "new": one in self.new,
+                    "bus": device.bus,
+                    "address": printable(device.address),
+                    "what": printable(device.what),
+                    "kind": device.kind,
+                    "driver": device.driver,
+                    "settings": dict(device.settings),
+                    "new": device in self.new,
                 }
-                for one in self.found
+                for device in self.found
             ],
-            "tried": [{"name": one.name, "kind": one.kind, "answer": one.answer} for one in self.tried],
+            "tried": [{"name": tried.name, "kind": tried.kind, "answer": tried.answer} for tried in self.tried],
             "problems": [finding.as_json() for finding in self.findings],
             "written": list(self.written),
         }
@@ -74,12 +74,12 @@ class Examination:
         """For people: devices, their states, and what to correct, the most important last."""
         lines = [f"Found {len(self.found)} devices." if self.found else "Nothing was found."]
         lines += [
-            f"  {one.bus:<8} {one.address:<28} {one.what}{'  (not in stage.toml)' * (one in self.new)}"
-            for one in self.found
+            f"  {device.bus:<8} {device.address:<28} {device.what}{'  (not in stage.toml)' * (device in self.new)}"
+            for device in self.found
         ]
         if self.tried:
             lines += ["", "The stage's devices:"]
-            lines += [f"  {one.name:<16} {one.answer or 'failed, see below'}" for one in self.tried]
+            lines += [f"  {tried.name:<16} {tried.answer or 'failed, see below'}" for tried in self.tried]
         for number, finding in enumerate(self.findings, 1):
             where = f"{finding.device}: " if finding.device else ""
             lines += ["", f"{number}. {where}{finding.problem.what} [{finding.problem.code}]",

@@ -39,26 +39,26 @@ def plan_for(stage: Stage, seen: Examination) -> Plan:
     outputs = _outputs(stage.tables, seen.found)
     free = [name for name in outputs if name not in {projector.output for projector in stage.tables.projectors}]
     names = {projector.name for projector in stage.tables.projectors}
-    for one in seen.new:
-        if one.kind == "projector" and free:
+    for device in seen.new:
+        if device.kind == "projector" and free:
             name = next(f"projector-{n}" for n in range(1, 1000) if f"projector-{n}" not in names)
             names.add(name)
-            table = {"name": name, "output": free.pop(0), "driver": one.driver, **one.settings}
+            table = {"name": name, "output": free.pop(0), "driver": device.driver, **device.settings}
             plan.tables.setdefault("projectors", []).append(table)
-            plan.words.append(f"projector {name} at {one.address} on output {table['output']}")
-        elif one.kind in ("light_sensor", "button_panel") and not getattr(stage.tables, SINGLE[one.kind]):
-            table_name = SINGLE[one.kind]
+            plan.words.append(f"projector {name} at {device.address} on output {table['output']}")
+        elif device.kind in ("light_sensor", "button_panel") and not getattr(stage.tables, SINGLE[device.kind]):
+            table_name = SINGLE[device.kind]
             if table_name not in plan.tables:
-                plan.tables[table_name] = {"driver": one.driver, **one.settings}
-                plan.words.append(f"[{table_name}] {one.what}")
+                plan.tables[table_name] = {"driver": device.driver, **device.settings}
+                plan.words.append(f"[{table_name}] {device.what}")
     return plan
 
 
 def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str]]:
     """The content of a first stage.toml, and a description. Raises UsageError("doctor-not-enough")."""
-    outputs = [table for one in seen.found if one.kind == "display" for table in one.settings["outputs"]]
-    projectors = [one for one in seen.new if one.kind == "projector"]
-    cameras = [one for one in seen.new if one.kind == "camera"]
+    outputs = [table for device in seen.found if device.kind == "display" for table in device.settings["outputs"]]
+    projectors = [device for device in seen.new if device.kind == "projector"]
+    cameras = [device for device in seen.new if device.kind == "camera"]
     missing = [
         word
         for word, there in (
@@ -83,9 +83,9 @@ def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str
         "camera": {"driver": cameras[0].driver, "iso": FIRST_ISO, **cameras[0].settings},
         "display": {"driver": "player", "outputs": outputs},
     }
-    for one in seen.new:
-        if one.kind in ("light_sensor", "button_panel"):
-            content.setdefault(SINGLE[one.kind], {"driver": one.driver, **one.settings})
+    for device in seen.new:
+        if device.kind in ("light_sensor", "button_panel"):
+            content.setdefault(SINGLE[device.kind], {"driver": device.driver, **device.settings})
     return content, [f"[{name}]" if not isinstance(table, list) else f"{len(table)} [[{name}]]"
                      for name, table in content.items()]  # fmt: skip
 
@@ -107,14 +107,14 @@ def write(folder: Path, stage: Stage | None, seen: Examination) -> tuple[str, ..
 
 
 def _correct(stage: Stage, found: Sequence[Found], plan: Plan) -> None:
-    for one in found:
-        if not any(problem.code in CORRECTIONS for problem in one.problems):
+    for device in found:
+        if not any(problem.code in CORRECTIONS for problem in device.problems):
             continue
         for position, projector in enumerate(stage.tables.projectors):
             written = projector.model_dump()
-            if projector.driver != one.driver or written.get("port") != one.settings.get("port"):
+            if projector.driver != device.driver or written.get("port") != device.settings.get("port"):
                 continue
-            wanted = {key: value for key, value in one.settings.items() if written.get(key) != value}
+            wanted = {key: value for key, value in device.settings.items() if written.get(key) != value}
             for key, value in wanted.items():
                 plan.changes.append(KeyChange(("projectors", position), key, value))
                 plan.words.append(f"{key} = {value!r} for projector {projector.name}")
@@ -122,4 +122,6 @@ def _correct(stage: Stage, found: Sequence[Found], plan: Plan) -> None:
 
 def _outputs(tables: StageTables, found: Sequence[Found]) -> list[str]:
     own = [output.name for output in tables.display.outputs]
-    return own or [table["name"] for one in found if one.kind == "display" for table in one.settings["outputs"]]
+    return own or [
+        table["name"] for device in found if device.kind == "display" for table in device.settings["outputs"]
+    ]

@@ -192,7 +192,7 @@ def _identity(file: Path, trust: Trust) -> dict[str, Any]:
         return {
             "revision": bundle.index.revision,
             "signed_by": "nobody" if bundle.signed_by is None else bundle.signed_by.hex(),
-            "appearances": ", ".join(one.name for one in bundle.index.appearances),
+            "appearances": ", ".join(appearance.name for appearance in bundle.index.appearances),
             **_warning(bundle.signed_by, trust),
         }
 

@@ -56,9 +56,10 @@ def photograph(
     run = session.run(checked, steps, name=COMPARE, reporter=reporter, cancel=cancel, dark=True)
     html = comparison_report(run, checked)
     rows = [
-        {"name": one.name, "delta_e00_median": one.delta_e00_median, "delta_e00_p95": one.delta_e00_p95,
-         "rmse": one.rmse, "sharpness_lambda": one.sharpness_lambda}
-        for one in compared_in(run) if one.name in found.names
+        {"name": comparison.name, "delta_e00_median": comparison.delta_e00_median,
+         "delta_e00_p95": comparison.delta_e00_p95, "rmse": comparison.rmse,
+         "sharpness_lambda": comparison.sharpness_lambda}
+        for comparison in compared_in(run) if comparison.name in found.names
     ]  # fmt: skip
     return {"run": str(run), "report": str(html), "appearances": rows}
 
@@ -76,14 +77,14 @@ def installed(checked: Checked, names: Sequence[str], reporter: Reporter) -> Ins
                          remedy="Run `velatura appearance` on it first.")  # fmt: skip
     with Bundle.open_trusted(file, stage_trust(checked.stage)) as bundle:
         index = bundle.index
-    held = [one.name for one in index.appearances]
+    held = [appearance.name for appearance in index.appearances]
     for name in names:
         if name not in held:
             raise UsageError("appearance-unknown", what=f"The installed bundle has no appearance {name[:64]!r}.",
                              remedy=f"Available: {', '.join(held) or 'none'}.")  # fmt: skip
     wanted = tuple(dict.fromkeys(names)) or tuple(held)
     # A bundle may come from another computer, so look for its appearances in the runs of this stage.
-    run = next((one for one in finished_calibrations(folder) if one.name == index.calibration), None)
+    run = next((finished for finished in finished_calibrations(folder) if finished.name == index.calibration), None)
     known = () if run is None else tuple(name for name in wanted if is_solved(run, name))
     missing = [name for name in wanted if name not in known]
     if run is None or not known or (names and missing):

@@ -86,7 +86,7 @@ def _page(
     figures: Mapping[str, Any],
 ) -> Page:
     goal = tables.aims()
-    placements = [one.placement for one in best.candidates]
+    placements = [candidate.placement for candidate in best.candidates]
     room = ReportPicture("The room", layout(placements, surface, audience), "metres from the centre of the object")
     galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Projector places", "", (room,))]
     for number, eye in enumerate(audience):
@@ -140,12 +140,12 @@ def _maps(
 ) -> tuple[ReportPicture, ...]:
     view = seen_from(target_object, eye, rows=VIEW_ROWS)
     lit = [lit_by(placement, view.surface, target_object) for placement in placements]
-    useful = np.stack([one.useful(goal.steepest_degrees) for one in lit])
+    useful = np.stack([values.useful(goal.steepest_degrees) for values in lit])
     found = together(lit, useful)
     reached = found.count > 0
     finest = np.where(reached, found.detail_mm, np.nan)
-    sharp = np.where(reached, np.where(useful, [one.blur_px for one in lit], np.inf).min(axis=0), np.nan)
-    steep = np.degrees(np.arccos(np.clip(np.where(useful, [one.cosine for one in lit], 0.0).max(axis=0), 0, 1)))
+    sharp = np.where(reached, np.where(useful, [values.blur_px for values in lit], np.inf).min(axis=0), np.nan)
+    steep = np.degrees(np.arccos(np.clip(np.where(useful, [values.cosine for values in lit], 0.0).max(axis=0), 0, 1)))
     maps = (
         ("Light", "lux", found.lux, 0.0, max(1.5 * goal.lux, float(np.quantile(found.lux, 0.95)))),
         ("Finest detail", "mm", finest, 0.0, 2 * goal.detail_mm),

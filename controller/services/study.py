@@ -64,11 +64,12 @@ def study(
         )
     out = out.resolve()
     pages = (out / "pages" if pages is None else pages).resolve()
-    index = publish([_without_stage(one, out, size, seed, reporter) for one in wanted if one.scene is None], pages,
+    free = [experiment for experiment in wanted if experiment.scene is None]
+    index = publish([_without_stage(experiment, out, size, seed, reporter) for experiment in free], pages,
                     EXPERIMENTS)  # fmt: skip
-    for scene in dict.fromkeys(one.scene for one in wanted if one.scene is not None):
-        here = [one for one in wanted if one.scene == scene]
-        reporter.say(f"On {SCENES[scene].title}: {', '.join(one.name for one in here)}.")
+    for scene in dict.fromkeys(experiment.scene for experiment in wanted if experiment.scene is not None):
+        here = [experiment for experiment in wanted if experiment.scene == scene]
+        reporter.say(f"On {SCENES[scene].title}: {', '.join(experiment.name for experiment in here)}.")
         # After each stage, so that a failing one does not cost the pages of the previous ones.
         index = publish(_on_scene(SCENES[scene], here, out, size, seed, reporter, cancel), pages, EXPERIMENTS)
     return {"index": str(index)}
@@ -103,7 +104,7 @@ def _on_scene(
     )
     session = OwnSession(stage, around=bench, again=True)
     run = session.run(checked, steps, name="study", reporter=reporter, cancel=cancel)
-    return [run / RESULTS / f"{one.name}.json" for one in experiments]
+    return [run / RESULTS / f"{experiment.name}.json" for experiment in experiments]
 
 
 def _steps(
@@ -115,20 +116,20 @@ def _steps(
     calibrated = Calibrated(run, checked.names)
     steps = list(calibrating(rig, run, checked=checked, calibrated=calibrated))
     after = [StepId(StepKind.GEOMETRY), *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS)]
-    if any(one.dots for one in experiments):
+    if any(experiment.dots for experiment in experiments):
         steps += dot_steps(rig, longest_exposure_s=longest_s)
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     told = {"scene": scene.title, "size": size, "seed": seed}
-    for one in experiments:
-        dots = of_projectors(checked.names, StepKind.STUDY_DOTS) if one.dots else ()
+    for experiment in experiments:
+        dots = of_projectors(checked.names, StepKind.STUDY_DOTS) if experiment.dots else ()
         steps.append(
             Step(
-                StepId("study", item=one.name),
-                partial(_experiment, rig, checked, calibrated, one, told, longest_s, disturb),
-                inputs={"size": size, "seed": str(seed), "code": one.code_sha256()},
+                StepId("study", item=experiment.name),
+                partial(_experiment, rig, checked, calibrated, experiment, told, longest_s, disturb),
+                inputs={"size": size, "seed": str(seed), "code": experiment.code_sha256()},
                 after=(*after, *dots),
-                title=one.title,
-                weight=one.cost_s * scale,
+                title=experiment.title,
+                weight=experiment.cost_s * scale,
             )
         )
     return steps

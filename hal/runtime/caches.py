@@ -103,9 +103,9 @@ def kept() -> list[Kept]:
 
 def remove() -> list[Kept]:
     """Remove the folders that no running program uses; returns the removed ones."""
-    removed = [one for one in kept() if not one.in_use]
-    for one in removed:
-        shutil.rmtree(one.path, ignore_errors=True)
+    removed = [folder for folder in kept() if not folder.in_use]
+    for folder in removed:
+        shutil.rmtree(folder.path, ignore_errors=True)
     return removed
 
 
@@ -147,11 +147,11 @@ def _size(folder: Path) -> int:
 def summary(found: Sequence[Kept]) -> list[str]:
     """One sentence for each kind of folder, with its path if there is only one."""
     lines = []
-    for what in dict.fromkeys(one.what for one in found):
-        same = [one for one in found if one.what == what]
+    for what in dict.fromkeys(folder.what for folder in found):
+        same = [folder for folder in found if folder.what == what]
         where = str(same[0].path) if len(same) == 1 else f"{len(same)} folders like {same[0].path}"
-        used = sum(one.in_use for one in same)
-        lines.append(f"{where}: {what}, {sum(one.size_bytes for one in same) / 1e6:.1f} MB, {used} in use.")
+        used = sum(folder.in_use for folder in same)
+        lines.append(f"{where}: {what}, {sum(folder.size_bytes for folder in same) / 1e6:.1f} MB, {used} in use.")
     return lines
 
 

@@ -60,7 +60,9 @@ class Compilation:
         self._lock = threading.Lock()
         self._closed = False
         self._processes = [_begin() for _ in range(processes or usable_cpus())]
-        self._threads = [threading.Thread(target=self._feed, args=(one,), daemon=True) for one in self._processes]
+        self._threads = [
+            threading.Thread(target=self._feed, args=(process,), daemon=True) for process in self._processes
+        ]
         for thread in self._threads:
             thread.start()
 
@@ -155,7 +157,7 @@ def _modules() -> Iterator[Module]:
 def _stamp() -> Path:
     """Exists when all is compiled: named after the tables and the sources of every module in them."""
     content = hashlib.sha256(f"{sys.version_info[:2]}".encode())
-    for module in sorted(_modules(), key=lambda one: one.name):
+    for module in sorted(_modules(), key=lambda module: module.name):
         content.update(repr(module).encode())
         content.update(digest_of(_source(module.name)).encode())
     return kernel_folder() / f"all-{content.hexdigest()[:16]}"

@@ -164,12 +164,12 @@ def _order(
         yield written, [own], False
     usual: dict[int, list[ProjectorProfile]] = {}
     # Last those whose queries do not end in a carriage return: other devices wait for the rest of such a line.
-    for profile in sorted(profiles, key=lambda one: not _question(one)[1].endswith(END)):
+    for profile in sorted(profiles, key=lambda profile: not _question(profile)[1].endswith(END)):
         if profile.serial is not None:
             usual.setdefault(profile.serial.baud, []).append(profile)
     yield from ((baud, known, False) for baud, known in usual.items())
     for baud in BAUDS:
-        others = [one for one in profiles if one.serial is not None and one.serial.baud != baud]
+        others = [profile for profile in profiles if profile.serial is not None and profile.serial.baud != baud]
         yield baud, others if own is None else [own], True
 
 

@@ -80,13 +80,13 @@ class HidLink(WorkerLink[OpenHid]):
         if len(matching) == 1:
             self._serial = matching[0].serial
             return matching[0]
-        for one in matching:
-            one.handle.close()
+        for device in matching:
+            device.handle.close()
         if matching:
             raise DeviceRefused(
                 "hid-several",
                 what=f"There are {len(matching)} devices that could be the {self._kind.name}"
-                f" ({', '.join(one.serial or 'no serial number' for one in matching)}).",
+                f" ({', '.join(device.serial or 'no serial number' for device in matching)}).",
                 remedy="Write the serial number of the right one into stage.toml, or unplug the others.",
             )
         which = f" with serial number {self._serial}" if self._serial else ""
@@ -111,8 +111,8 @@ class HidLink(WorkerLink[OpenHid]):
                 refused = self.not_opened(error)
                 if self._serial:
                     continue  # another one may be the right device, and work
-                for one in opened:
-                    self.let_go(one)
+                for device in opened:
+                    self.let_go(device)
                 raise refused from error
             except BaseException:
                 handle.close()
@@ -133,7 +133,7 @@ class HidLink(WorkerLink[OpenHid]):
             HidFound(path, *(_name(entry[key]) for key in ("manufacturer_string", "product_string", "serial_number")))
             for path, entry in by_path.items()
         ]
-        return [one for one in found if self._kind.suits(one)]
+        return [device for device in found if self._kind.suits(device)]
 
 
 def _name(text: object) -> str:

@@ -131,8 +131,8 @@ class Channel:
             infos = [self.once(Operation.GET_STORAGE_INFO, store, deadline=deadline) for store in present[:8]]
             cards = [StorageInfo.parse(info.data) for info in infos if info.ok]
             if cards:
-                free_bytes, free_pictures = sum(one.free for one in cards), sum(one.free_images for one in cards)
-            if not any(one.writable for one in cards):
+                free_bytes, free_pictures = sum(card.free for card in cards), sum(card.free_images for card in cards)
+            if not any(card.writable for card in cards):
                 warnings.append("card-unusable")
             elif free_bytes is not None and free_bytes < _LITTLE_SPACE:
                 warnings.append("card-nearly-full")

@@ -69,7 +69,7 @@ def _named(address: str) -> str:
 def _choice(settings: Mapping[str, Any], key: str, *allowed: str) -> str:
     value = str(settings.get(key, allowed[0]))
     if value not in allowed:
-        raise _wrong_setting(key, value, " or ".join(f'"{one}"' for one in allowed))
+        raise _wrong_setting(key, value, " or ".join(f'"{choice}"' for choice in allowed))
     return value
 
 

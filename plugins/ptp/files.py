@@ -98,12 +98,12 @@ def commit_all(pending: Iterable[PendingFile]) -> list[CapturedFile]:
     Raises ProtocolError for an empty file, and DeviceError where the disk fails.
     """
     files = list(pending)
-    for one in files:
-        if one.size == 0:
-            raise broken(f"an empty picture for {one.path.name}")
-        one.sync()
-    named = [one.commit() for one in files]
-    for folder in {one.path.parent for one in files}:
+    for file in files:
+        if file.size == 0:
+            raise broken(f"an empty picture for {file.path.name}")
+        file.sync()
+    named = [file.commit() for file in files]
+    for folder in {file.path.parent for file in files}:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(handle)

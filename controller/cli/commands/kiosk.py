@@ -23,7 +23,7 @@ def results(
     """Show grade and figures of one calibration, or list all calibrations and the quality of the appearances."""
     if run is None:
         names, compared = _call(stage, "runs"), _call(stage, "comparisons")
-        lines = [*names, *(_achieved(one) for one in compared)]
+        lines = [*names, *(_achieved(result) for result in compared)]
         found = {"runs": names, "comparisons": compared}
         console.show_result(found if as_json else "\n".join(lines) or "There are none yet.", as_json=as_json)
         return

@@ -28,7 +28,7 @@ class Spreading:
         """The result of one request."""
         context.advance(0.0, f"{self._cluster.workers} workers")
         spread = self._spread or self._opened()
-        names = [one.name for one in self._wishes]
+        names = [other.name for other in self._wishes]
         for other in self._wishes[names.index(wish.name) :]:
             if other.name == wish.name or other.prepare is None:
                 context.check()

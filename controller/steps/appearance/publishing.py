@@ -105,14 +105,21 @@ def _publish(
     )  # fmt: skip
     installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
     raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
-    stored = sum(blob.length for one in index.appearances for blobs in one.stripes.values() for blob in blobs)
+    stored = sum(
+        blob.length for appearance in index.appearances for blobs in appearance.stripes.values() for blob in blobs
+    )
     figures = BundleFigures(built.stat().st_size, raw / stored, installed.name, names)
     return [figures.write(context.folder), built]
 
 
 def _tell_dropped(slots: Path, names: Sequence[str], reporter: Reporter) -> None:
     """Report appearances of the installed bundle that the new one lacks, because they have another calibration."""
-    dropped = [one.name for index in _installed(slots) for one in index.appearances if one.name not in names]
+    dropped = [
+        appearance.name
+        for index in _installed(slots)
+        for appearance in index.appearances
+        if appearance.name not in names
+    ]
     if dropped:
         several = len(dropped) > 1
         reporter.say(
@@ -282,7 +289,9 @@ def take_hdr(
             identity = ShotId(kind, f"{name}-{number}")
             row.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
     taken = row.taken
-    merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
+    merged = merge_brackets(
+        [photograph.read().measured() for photograph in taken], [photograph.exposure_s for photograph in taken]
+    ).radiance
     return taken, merged
 
 

@@ -98,7 +98,7 @@ def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     calibration = calibrated.calibration
     taken = TAKEN.read(context.folder)
     alone = TAKEN.by_projector(context.folder)
-    together = {one.name: one for one in taken if one.projector is None}
+    together = {photograph.name: photograph for photograph in taken if photograph.projector is None}
     seen = DriftPhotographs(
         black=together["black"].per_second(),
         white=together["white"].per_second(),

@@ -119,9 +119,9 @@ def way_of(step: StepId, drift: Drift, mode: str = "fast") -> Way:
         return Way.RUN
     if step.kind == StepKind.GEOMETRY:
         return Way.RUN if drift.moved else Way.KEEP
-    for one in drift.projectors:
-        if step.projector == one.name:
-            return _way_of(step.kind, one, mode)
+    for moved in drift.projectors:
+        if step.projector == moved.name:
+            return _way_of(step.kind, moved, mode)
     return Way.KEEP
 
 

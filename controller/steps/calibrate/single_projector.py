@@ -37,7 +37,7 @@ def one_projector_steps(
 
     ``last`` and ``full`` as for ``steps.calibrate.quick.quick_steps``; ``projector``: the name of one of the rig's.
     """
-    own = tuple(one for one in rig.projectors if one.name == projector)
+    own = tuple(device for device in rig.projectors if device.name == projector)
     alone = capture_steps(dataclasses.replace(rig, projectors=own), longest_exposure_s=longest_exposure_s)
     exposing = next(step for step in alone if step.id == EXPOSURE)
     # A continued run for another projector, or from another calibration, must not count these steps as done.
@@ -52,7 +52,7 @@ def one_projector_steps(
     now = Calibrated(run, last.projectors)
     done = [step.id for step in steps]
     steps.append(verification_photographs_step(rig, now, done))
-    scale = costs.scale(one.size_px for one in rig.projectors)
+    scale = costs.scale(device.size_px for device in rig.projectors)
     steps.append(verify_step(now, [*done, steps[-1].id], scale))
     return steps
 

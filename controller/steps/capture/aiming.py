@@ -43,7 +43,7 @@ def take_test_shots(
     folder.mkdir(parents=True, exist_ok=True)
     available = [value for value in rig.acquirer.exposures_s() if value <= longest_exposure_s]
     take = partial(_take, rig, folder, deadline)
-    white = {one.name: np.full_like(one.black(), 255) for one in rig.projectors}
+    white = {projector.name: np.full_like(projector.black(), 255) for projector in rig.projectors}
     exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_exposure_s)[0]
     for number in range(TRIES):
         advance(0.04 * number, "exposure")
@@ -54,10 +54,14 @@ def take_test_shots(
         exposure_s = choice.exposure_s
     black = take("black", {}, exposure_s)
     boards = []
-    for number, one in enumerate(rig.projectors):
-        advance(0.2 + 0.7 * number / len(rig.projectors), one.name)
+    for number, projector in enumerate(rig.projectors):
+        advance(0.2 + 0.7 * number / len(rig.projectors), projector.name)
         first, second = (
-            take(f"projector-{number}-{inverse}", {one.name: checkerboard(one.size_px, inverse=inverse)}, exposure_s)
+            take(
+                f"projector-{number}-{inverse}",
+                {projector.name: checkerboard(projector.size_px, inverse=inverse)},
+                exposure_s,
+            )
             for inverse in (False, True)
         )
         boards.append((first, second))

@@ -87,7 +87,7 @@ def camera_step(rig: Rig) -> Step:
 
 def _exposure_of_all(rig: Rig, context: Context) -> float:
     """Exposure at which white of all projectors together is certainly not clipped."""
-    shortest = min(one.base_s for one in Exposures.read(context.folder).values())
+    shortest = min(exposure.base_s for exposure in Exposures.read(context.folder).values())
     wanted = BRIGHTNESS_OF_ALL * shortest / len(rig.projectors)
     available = rig.acquirer.exposures_s()
     return max((value for value in available if value <= wanted), default=min(available))
@@ -139,8 +139,8 @@ def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
     plan = [Planned(str(number), lambda: whites, value) for number, value in enumerate(sorted(wanted))]
     paths = take_all(rig, context, plan, into=CAMERA_RESPONSE)
     taken = CAMERA_RESPONSE.read(context.folder)
-    images = [read_jpeg_values(one.path) for one in taken]
-    found = measure_response(images, [one.exposure_s for one in taken])
+    images = [read_jpeg_values(photograph.path) for photograph in taken]
+    found = measure_response(images, [photograph.exposure_s for photograph in taken])
     saved = CameraProfile(response=found.table).save(context.folder)
     content = {"misfit": found.misfit, "seen": found.seen, "black": found.black, "photographs": len(images)}
     figures = write_response_figures(context.folder, content)

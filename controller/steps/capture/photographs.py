@@ -71,7 +71,7 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, into: Photo
             one, before = _take(rig, context, planned, into.shot(planned.name, planned.projector), before)
             row.add(one)
             watch.look(context)
-    return [into.write(context.folder, row.taken), *(one.path for one in row.taken)]
+    return [into.write(context.folder, row.taken), *(photograph.path for photograph in row.taken)]
 
 
 @dataclass(slots=True)
@@ -92,16 +92,16 @@ class Row:
 
     def look(self, deadline: Deadline) -> None:
         """Check the lamps; if one fails, discard the photographs since the last check. Raises as ``check_light``."""
-        if not any(one.fresh for one in self.taken[self._sure :]):
+        if not any(photograph.fresh for photograph in self.taken[self._sure :]):
             return
         try:
             self.rig.check_light(deadline=deadline)
         except Cancelled:
             raise
         except DeviceError:
-            for one in self.taken[self._sure :]:
-                if one.fresh:
-                    one.path.unlink(missing_ok=True)
+            for photograph in self.taken[self._sure :]:
+                if photograph.fresh:
+                    photograph.path.unlink(missing_ok=True)
             del self.taken[self._sure :]
             raise
         self._sure, self._looked_at_s = len(self.taken), time.monotonic()

@@ -122,8 +122,8 @@ class EosState:
         known = self._formats
         if not known and (current := self.current_format()):
             known = (current,)
-        able = [one for one in known if any(part.raw == raw for part in one)]
-        return min(able, default=None, key=lambda one: (both and raw and len(one) == 1, _rank(one, raw)))
+        able = [format_ for format_ in known if any(part.raw == raw for part in format_)]
+        return min(able, default=None, key=lambda format_: (both and raw and len(format_) == 1, _rank(format_, raw)))
 
     def _manual(self) -> bool:
         return not self.knows(EosProperty.EXPOSURE_MODE) or self.number(EosProperty.EXPOSURE_MODE) == MANUAL_EXPOSURE

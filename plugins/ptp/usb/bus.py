@@ -72,7 +72,7 @@ class UsbCamera:
 def usb_cameras() -> list[UsbCamera]:
     """Every still camera on every bus, by port. Raises DeviceRefused without libusb."""
     try:
-        return sorted(_cameras(), key=lambda one: one.port)
+        return sorted(_cameras(), key=lambda camera: camera.port)
     except usb.core.NoBackendError as error:
         raise DeviceRefused(
             "usb-no-library",
@@ -101,11 +101,13 @@ class UsbFinder:
     def _choose(self, cameras: list[UsbCamera]) -> UsbCamera:
         wanted = self._address
         if self._known:
-            fitting = [one for one in cameras if one.serial.lstrip("0") == self._known.lstrip("0")]
+            fitting = [camera for camera in cameras if camera.serial.lstrip("0") == self._known.lstrip("0")]
         elif wanted.port:
-            fitting = [one for one in cameras if one.port == wanted.port]
+            fitting = [camera for camera in cameras if camera.port == wanted.port]
         elif wanted.vendor:
-            fitting = [one for one in cameras if (one.vendor, one.product) == (wanted.vendor, wanted.product)]
+            fitting = [
+                camera for camera in cameras if (camera.vendor, camera.product) == (wanted.vendor, wanted.product)
+            ]
         else:
             fitting = cameras
         if len(fitting) == 1:
