@@ -1,6 +1,6 @@
-"""The command line. Each command is thin: it parses, calls one function elsewhere, and prints what that returns.
+"""The command line. A command parses its arguments, calls one function elsewhere and prints the result.
 
-Heavy imports happen inside the commands, so that ``velatura --help`` answers at once.
+Heavy imports are inside the commands, so that ``velatura --help`` is fast.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from controller.core.extras import EXTRA_OF, extra_missing
 
 try:
     import typer
-except ModuleNotFoundError as missing:  # a plain installation, which has the player alone
+except ModuleNotFoundError as missing:  # an installation with only the player
     if missing.name not in EXTRA_OF:
         raise
     sys.exit(run_without_commands(sys.argv[1:], missing.name))
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 __all__ = ["COMMANDS", "GROUPS", "Json", "StageFolder", "application", "main", "run", "work"]
 
 AcceptGrade = Annotated[
-    bool, typer.Option("--accept-grade", help="Accept a calibration that is worse than stage.toml asks for.")
+    bool, typer.Option("--accept-grade", help="Accept a calibration below the grade in stage.toml.")
 ]
 
 DONE, FAILED, WRONG_USE, DEVICE_FAILED, STOPPED = 0, 1, 2, 3, 130
@@ -62,9 +62,9 @@ SUMMARY: Final = "Gives a physical object a new appearance with light from sever
 
 
 def states(
-    mermaid: Annotated[bool, typer.Option("--mermaid", help="Print the diagram in Mermaid's language.")] = False,
+    mermaid: Annotated[bool, typer.Option("--mermaid", help="Print a Mermaid diagram.")] = False,
 ) -> None:
-    """Show the states of a stage and what leads from one to the next."""
+    """Show the states of a stage and the events between them."""
     from controller.run.state_machine import TRANSITIONS
     from controller.run.state_machine import mermaid as diagram
 
@@ -75,14 +75,14 @@ def states(
 def demo(
     size: Annotated[str, typer.Option(help="small, medium or paper.")] = "small",
     object: Annotated[  # noqa: A002 - the option's name is fixed
-        Path | None, typer.Option(help="A mesh to put on the stage, .obj or .ply; else a vase and a bust.")
+        Path | None, typer.Option(help="Mesh of the object, .obj or .ply (default: a vase and a bust).")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Where the stage and the report go.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(help="Which of the random stages.", min=0, max=2**32 - 1)] = 1,
-    prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Write OUT/stage and stop there.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the stage and the report.")] = Path("demo"),
+    seed: Annotated[int, typer.Option(help="Random seed of the stage.", min=0, max=2**32 - 1)] = 1,
+    prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Only write OUT/stage.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Do the whole job on an emulated stage, from cold lamps to a report."""
+    """Run a complete job on an emulated stage, from cold lamps to the report."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.demo.job import demo
@@ -98,21 +98,21 @@ def demo(
 def emulate(
     stage: StageFolder,
     scenario: Annotated[
-        Path | None, typer.Option(help="A script of faults (docs/how-to/emulated-devices.md) that the devices play.")
+        Path | None, typer.Option(help="A script of faults (see docs/how-to/emulated-devices.md).")
     ] = None,
     until_input_ends: Annotated[
-        bool, typer.Option("--until-input-ends", help="End, too, when standard input is closed.")
+        bool, typer.Option("--until-input-ends", help="Also stop when standard input is closed.")
     ] = False,
     as_json: Json = False,
 ) -> int:
-    """Serve the emulated devices of a stage, and print the address of each, until Ctrl-C."""
+    """Run the emulated devices of a stage and print their addresses, until Ctrl-C."""
     from controller.stage.bench import bench_of, terminated_when_input_ends
 
     if not stage.is_dir():
         raise UsageError(
             "stage-missing",
-            what=f"There is no folder {stage}.",
-            remedy="Give the stage's folder; `velatura demo --prepare-only` makes one.",
+            what=f"The folder {stage} does not exist.",
+            remedy="Give the stage's folder. `velatura demo --prepare-only` creates one.",
         )
     if until_input_ends:
         terminated_when_input_ends()
@@ -122,22 +122,20 @@ def emulate(
 def calibrate(
     stage: StageFolder,
     mode: Annotated[
-        str, typer.Option(help="fast (sinusoids), paper (dots everywhere) or auto (dots at depth edges).")
+        str, typer.Option(help="fast (sinusoids), paper (dots everywhere), auto (dots at depth edges).")
     ] = "fast",
     dot_spacing: Annotated[
-        str | None, typer.Option(help='Projector pixels between dots, or "auto" for what the blur needs.')
+        str | None, typer.Option(help='Projector pixels between dots, or "auto" (from the blur).')
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Look what has changed, and repeat only that.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Redo only what changed since the last calibration.")] = False,
     projector: Annotated[
         str | None,
-        typer.Option(
-            help="Measure this projector anew, and keep what is known of the others.", autocompletion=projector_names
-        ),
+        typer.Option(help="Recalibrate only this projector.", autocompletion=projector_names),
     ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
-    """Photograph patterns and calibrate the stage; goes on with an unfinished calibration."""
+    """Photograph patterns and calibrate the stage. Continues an unfinished calibration."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.calibrate import calibrate
@@ -159,26 +157,22 @@ def calibrate(
 
 def appearance(
     stage: StageFolder,
-    names: Annotated[
-        list[str] | None, typer.Argument(help="Names from stage.toml; all of them if none is given.")
-    ] = None,
+    names: Annotated[list[str] | None, typer.Argument(help="Names from stage.toml (default: all).")] = None,
     blender: Annotated[
         list[str] | None,
-        typer.Option(help="Instead, a scene that Blender renders: builtin:marble, ..., or a .blend file."),
+        typer.Option(help="Instead: a scene for Blender, builtin:marble, ... or a .blend file."),
     ] = None,
     base: Annotated[
-        str | None, typer.Option(help="The base image: minimum, white or high-pass; else as stage.toml says.")
+        str | None, typer.Option(help="Base image: minimum, white or high-pass (default: from stage.toml).")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="A preview: base times scale alone, whatever detail the target has.")
-    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Only a quick preview, with base times scale.")] = False,
     scheduler: Annotated[
-        str | None, typer.Option(help="Solve on the workers of a Dask scheduler: tcp://host:8786 or tls://host:8786.")
+        str | None, typer.Option(help="Solve on a Dask cluster: tcp://host:8786 or tls://host:8786.")
     ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
-    """Solve appearances on the last calibration and publish them in a signed bundle."""
+    """Solve appearances with the latest calibration and publish them in a signed bundle."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.calibrate import make_appearances
@@ -194,16 +188,16 @@ def appearance(
 
 def play(
     stage: StageFolder,
-    names: Annotated[list[str] | None, typer.Argument(help="The appearances to show, in turn if several.")] = None,
-    sequence: Annotated[Path | None, typer.Option(help="Instead, a TOML file of [[item]] tables.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(help="The appearances to show, one after the other.")] = None,
+    sequence: Annotated[Path | None, typer.Option(help="Instead: a TOML file with [[item]] tables.")] = None,
     seconds: Annotated[
-        float, typer.Option(help="How long each; without it one until Ctrl-C, of several each 10 s.", min=0)
+        float, typer.Option(help="Seconds per appearance (several: 10; one: until Ctrl-C).", min=0)
     ] = 0.0,
-    fade: Annotated[float, typer.Option(help="Seconds in which each comes in.", min=0, max=600)] = 0,
-    repeat: Annotated[int, typer.Option(help="Rounds of several; without it until Ctrl-C.", min=0)] = 0,
+    fade: Annotated[float, typer.Option(help="Cross-fade in seconds.", min=0, max=600)] = 0,
+    repeat: Annotated[int, typer.Option(help="How often the playlist repeats (default: until Ctrl-C).", min=0)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Light the projectors and show appearances of the installed bundle."""
+    """Switch the projectors on and show appearances of the installed bundle."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.play import play
@@ -237,7 +231,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     *kiosk_commands.COMMANDS,
     *derived.commands(),
 )
-"""Every command. The function's name is the command's, its docstring the help, its annotated parameters the options."""
+"""Every command: the function's name is the command, its docstring the help, its parameters the options."""
 
 GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
     "account": (account_commands.SUMMARY, account_commands.COMMANDS),
@@ -248,7 +242,7 @@ GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
 
 
 def application() -> typer.Typer:
-    """The command line with every command of the table, and every group of commands."""
+    """The command line with all commands and groups."""
     app = group("velatura", SUMMARY, COMMANDS, completion=True)
     for name, (summary, commands) in GROUPS.items():
         app.add_typer(group(name, summary, commands), name=name)
@@ -264,20 +258,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command and return its exit code; every error has been shown by then."""
+    """Run one command and return its exit code. Errors have been shown."""
     as_json = "--json" in arguments
     try:
         outcome = application()(args=list(arguments) or ["--help"], prog_name="velatura", standalone_mode=False)
         sys.stdout.flush()
-    except SystemExit as exiting:  # by the command-line library, when the reader of our output went away
+    except SystemExit as exiting:  # raised by the command-line library when the reader of our output has closed it
         return exiting.code if isinstance(exiting.code, int) else FAILED
-    except BaseException as error:  # noqa: BLE001 - the last boundary: nobody above could show it
+    except BaseException as error:  # noqa: BLE001 - the last boundary: no caller could show it
         return _told(error, as_json=as_json)
     return outcome if isinstance(outcome, int) else DONE
 
 
 def _told(error: BaseException, *, as_json: bool) -> int:
-    """Show ``error`` as two sentences and return the exit code; where the output is lost, say that instead."""
+    """Show ``error`` as two sentences and return the exit code. If output was lost, show that instead."""
     if isinstance(error, typer.Exit):
         return error.exit_code
     if isinstance(error, OSError) and console.output_lost():
@@ -304,12 +298,14 @@ class _Shown:
 
 
 def _explained(error: BaseException) -> _Shown | None:
-    """What to tell of ``error``; None for one that should never happen."""
+    """The message for ``error``; None for one that should never happen."""
     from hal.deadline import Cancelled
     from hal.errors import DeviceError
 
     if isinstance(error, KeyboardInterrupt | typer.Abort | Cancelled) or getattr(error, "code", None) == "cancelled":
-        return _Shown("cancelled", "The work was stopped on request.", "The same command goes on from here.", STOPPED)
+        return _Shown(
+            "cancelled", "The work was stopped on request.", "Run the same command to continue from here.", STOPPED
+        )
     if isinstance(error, typer.TyperException):
         message = error.format_message()
         sentence = message if message.endswith((".", "?")) else f"{message}."
@@ -330,13 +326,13 @@ def _as_velatura_error(error: BaseException) -> VelaturaError | DeviceError | No
     if isinstance(error, OSError):
         return file_error(error)
     if isinstance(error, MemoryError):
-        return WorkError("no-memory", what="The memory of this machine did not suffice.",
-                         remedy="End other programs, or give a smaller stage, picture or mesh.")  # fmt: skip
+        return WorkError("no-memory", what="This computer has too little memory.",
+                         remedy="Close other programs, or use a smaller stage, picture or mesh.")  # fmt: skip
     return None
 
 
 def _crashed(error: BaseException, *, as_json: bool) -> int:
-    """For what should never happen: the traceback goes into a file, a sentence to the person."""
+    """For an unexpected error: write the traceback to a file and show a short message."""
     report = "".join(
         [
             f"time: {time.strftime('%Y-%m-%d %H:%M:%S%z')}\n",
@@ -348,8 +344,10 @@ def _crashed(error: BaseException, *, as_json: bool) -> int:
     path = _kept(report, name)
     console.show_error(
         "crash",
-        f"Velatura met an error that it does not know ({type(error).__name__}).",
-        f"Send {path} to the maintainers; it says what happened." if path else "No report of it could be written.",
+        f"An unexpected error occurred ({type(error).__name__}).",
+        f"Send {path} to the maintainers. It contains the details."
+        if path
+        else "The error report could not be written.",
         as_json=as_json,
     )
     return FAILED
@@ -361,7 +359,7 @@ def _kept(report: str, name: str) -> Path | None:
             place = folder()
             place.mkdir(parents=True, exist_ok=True)
             path = place / name
-            # Only a new file, and only for this user: the folder may be shared with others.
+            # Only a new file, readable only for this user: the folder may be shared.
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
                 file.write(report)
         except (OSError, RuntimeError):  # RuntimeError: the user has no home folder

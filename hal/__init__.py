@@ -1,3 +1,3 @@
-"""What a device is: `interfaces`, `values`, `errors`, `registry`, byte links, protocol codecs (`codecs`), and
-the tests for drivers (`conformance`).
+"""The hardware layer: `interfaces`, `values`, `errors`, `registry`, byte links, protocol codecs (`codecs`), and
+tests for drivers (`conformance`).
 """

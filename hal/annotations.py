@@ -1,4 +1,4 @@
-"""Whether a value is what its annotation says. Drivers of other authors are not type-checked, so their answers are."""
+"""Checks values against annotations at run time, because drivers of other authors are not type-checked."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
 
 def mismatch(value: object, annotation: Any) -> str:
-    """What is wrong with ``value``, in a few words, e.g. ``"power is a str, not a Power"``; "" if nothing is.
+    """The problem with ``value``, e.g. ``"power is a str, not a Power"``; "" if there is none.
 
     Knows classes, dataclasses (field by field), unions, ``list``, ``tuple``, ``Sequence``, ``Mapping``, ``Callable``
-    and ``Any``. An ``int`` is taken as a ``float``, a ``bool`` as neither; numbers must be finite.
+    and ``Any``. An ``int`` is accepted as a ``float``, a ``bool`` as neither; numbers must be finite.
     """
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Union, types.UnionType):
@@ -68,5 +68,5 @@ def _first(problems: Iterable[str]) -> str:
 
 def _not_a(value: object, wanted: str) -> str:
     if value is None:
-        return f"nothing (None) where a {wanted} is due"
-    return f"a {type(value).__name__} where a {wanted} is due"
+        return f"nothing (None) instead of a {wanted}"
+    return f"a {type(value).__name__} instead of a {wanted}"

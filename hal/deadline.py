@@ -19,14 +19,14 @@ class Cancelled(DeviceError):
     """The caller asked for the work to stop."""
 
     def __init__(self) -> None:
-        super().__init__("cancelled", what="The work was stopped on request.", remedy="Start it again to go on.")
+        super().__init__("cancelled", what="The work was stopped on request.", remedy="Start it again to continue.")
 
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """A moment on the monotonic clock by which a call must have ended, and the means to end it sooner.
+    """The time on the monotonic clock by which a call must end, and an event to end it sooner.
 
-    ``at_s`` is in seconds of ``time.monotonic()``; ``cancel``, where given, is shared with whoever may stop the work.
+    ``at_s`` is in seconds of ``time.monotonic()``; ``cancel``, if given, is shared with code that may stop the work.
     """
 
     at_s: float
@@ -62,9 +62,9 @@ class Deadline:
 
 @contextlib.contextmanager
 def turn(lock: threading.Lock | threading.RLock, deadline: Deadline, check: Callable[[], object]) -> Iterator[None]:
-    """One caller at a time has ``lock``. ``check`` is called while others have it.
+    """Hold ``lock``. ``check`` is called while waiting for it.
 
-    It raises Cancelled, and what says that ``deadline`` has passed (``Deadline.check``).
+    It raises Cancelled, and the error for a passed ``deadline`` (``Deadline.check``).
     """
     while not lock.acquire(timeout=min(SLICE_S, deadline.left_s())):
         check()

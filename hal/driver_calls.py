@@ -1,7 +1,7 @@
-"""Calls into drivers. Whatever a driver raises, and any wrong object that it returns, becomes a ``DeviceError``.
+"""Calls into drivers. Every error of a driver, and every wrong object that it returns, becomes a ``DeviceError``.
 
-Our drivers keep to ``hal.errors``. One of another author may raise anything, and must neither end the program nor keep
-another device from being looked after: above all, no lamp stays on because of it.
+Our drivers use ``hal.errors``. One of another author may raise anything, but must not end the program or block
+other devices: above all, no lamp may stay on because of it.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ INTERFACES: Final[Mapping[str, tuple[type, ...]]] = {
     "light_sensor": (LightSensor,),
     "button_panel": (ButtonPanel,),
 }
-"""What a device of each kind must be (first), and what it may be besides."""
+"""The interface of each kind of device (first), and its optional interfaces."""
 _LONGEST_TEXT: Final = 200
 
 
 class Caller:
-    """Calls functions of one plugin. ``who`` begins every error, e.g. ``The driver 'acme' of projector left``."""
+    """Calls functions of one plugin. ``who`` starts every message, e.g. ``The driver 'acme' of projector left``."""
 
     def __init__(self, who: str) -> None:
         self._who = who
 
     def call(self, name: str, function: Callable[..., Any], returns: Any, *args: Any, **kwargs: Any) -> Any:
-        """What ``function`` returns, which must be as the annotation ``returns`` says.
+        """Call ``function``; its result must fit the annotation ``returns``.
 
-        Raises the driver's own DeviceError as it is, and DriverFault("driver-fault") for all else but Ctrl-C.
+        Raises the driver's own DeviceError unchanged, and DriverFault("driver-fault") for other errors except Ctrl-C.
         """
         try:
             value = function(*args, **kwargs)
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            # SystemExit and the cancellation of asyncio are no Exceptions, and yet a driver may let them out.
+            # A driver may also raise SystemExit and asyncio's cancellation, which are not Exceptions.
             if isinstance(error, DeviceError) and _is_whole(error):
                 raise
             raise self.fault(f"raised {_described(error)} in {name}") from error
@@ -64,17 +64,17 @@ class Caller:
         return value
 
     def device(self, kind: str, made: object) -> Any:
-        """``made`` behind calls that are checked; it has the methods of its kind, and optional ones where it has them.
+        """``made`` with checked calls: the methods of its kind, and the optional ones that it has.
 
-        Raises DriverFault("driver-fault") for an object that is no device of this ``kind``.
+        Raises DriverFault("driver-fault") for an object that is not a device of this ``kind``.
         """
         needed, *optional = INTERFACES[kind]
         if missing := [name for name in _members(needed) if not _has(made, name)]:
-            # It may hold a port that is needed again; what its close does or raises is of no more interest.
+            # It may hold a port that is needed again; errors of its close do not matter.
             with contextlib.suppress(Exception):
                 made.close()  # type: ignore[attr-defined]
             told = f"a {type(made).__name__} without {', '.join(missing)}"
-            raise self.fault(f"returned from open: {told}, which is no {kind.replace('_', ' ')}")
+            raise self.fault(f"returned from open: {told}, which is not a {kind.replace('_', ' ')}")
         also = tuple(extra for extra in optional if all(_has(made, name) for name in _members(extra)))
         return _checked_class(needed, *also)(made, self)
 
@@ -82,7 +82,7 @@ class Caller:
         return DriverFault(
             "driver-fault",
             what=f"{self._who} {did}.",
-            remedy="This is a mistake in that driver: update it, or report this to its author.",
+            remedy="This is a mistake in the driver: update it, or report it to its author.",
         )
 
 
@@ -127,7 +127,7 @@ def _members(interface: type) -> Mapping[str, Any]:
 
 
 def _has(made: object, name: str) -> bool:
-    """Without running a property of the driver's, which may fail."""
+    """Without running a property of the driver, which may fail."""
     absent = object()
     if inspect.getattr_static(made, name, absent) is not absent:
         return True

@@ -1,4 +1,4 @@
-"""The error tree of the hardware layer.
+"""The errors of the hardware layer.
 
 Every error carries a stable ``code`` (for logs, tests and translation), ``what`` happened in one sentence, and the
 ``remedy`` in one sentence. Both sentences are for the technician, not for the programmer.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 
 class DeviceError(Exception):
-    """A device, or the way to it, failed.
+    """A device, or the connection to it, failed.
 
     Parameters
     ----------
@@ -25,11 +25,11 @@ class DeviceError(Exception):
 
 
 class DeviceGone(DeviceError):
-    """The device left its bus, or was never there."""
+    """The device is not on its bus (any more)."""
 
 
 class DeviceBusy(DeviceError):
-    """The device is there and asked to be left alone; trying again later may work."""
+    """The device is busy; trying again later may work."""
 
 
 class DeviceTimeout(DeviceError):
@@ -37,7 +37,7 @@ class DeviceTimeout(DeviceError):
 
 
 class DeviceRefused(DeviceError):
-    """The device understood, and will not do it."""
+    """The device refused the command."""
 
 
 class ProtocolError(DeviceError):
@@ -53,4 +53,4 @@ class PluginError(DeviceError):
 
 
 class DriverFault(DeviceError):
-    """A driver broke its promise: it raised what is no ``DeviceError``, or returned a wrong object."""
+    """A driver broke its interface: it raised something else than ``DeviceError``, or returned a wrong object."""

@@ -1,4 +1,4 @@
-r"""Bytes as printable ASCII, for transcripts and messages: nothing is lost, and nothing can move a terminal's cursor.
+r"""Bytes as printable ASCII, for transcripts and messages: without loss, and safe for a terminal.
 
 Bytes 0x20 to 0x7e stand for themselves except the backslash; ``\r``, ``\n``, ``\t`` and ``\\`` are as in C; every other
 byte is ``\xNN``.
@@ -28,14 +28,14 @@ def unescaped(text: str) -> bytes:
     if not text.isascii() or b"\\" in _ESCAPE.sub(b"", data):
         raise ProtocolError(
             "transcript-wrong",
-            what=f"The bytes {text[:80]!r} of the transcript are not escaped as they should be.",
-            remedy="Record it again; its format is described in hal/transcript.py.",
+            what=f"The bytes {text[:80]!r} of the transcript are not escaped correctly.",
+            remedy="Record it again. Its format is described in hal/transcript.py.",
         )
     return _ESCAPE.sub(lambda m: bytes.fromhex(m[1].decode()) if m[1] else _LONG[m[2]], data)
 
 
 def toml_value(value: object) -> str:
-    """A value of a TOML file as an error repeats it: not as Python writes it, and text in single quotes."""
+    """A value of a TOML file for messages: in TOML's notation, with text in single quotes."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):

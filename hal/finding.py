@@ -1,7 +1,7 @@
-"""Finding devices: what `velatura doctor` asks of every bus, and how a bus answers. No I/O here but loading finders.
+"""Finding devices: the interface between `velatura doctor` and the finders of each bus. No I/O except loading finders.
 
-A finder looks at one bus, and changes nothing there: it lists, reads and asks; it lights no lamp and moves no relay.
-Distributions name theirs under the entry-point group ``velatura.finders``.
+A finder searches one bus without changing anything: it lights no lamp and moves no relay.
+Distributions list theirs under the entry-point group ``velatura.finders``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GROUP: Final = "velatura.finders"
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something that a person should mend: a stable ``code``, one sentence on what it is, one on what to do."""
+    """A problem that a person should correct: a stable ``code``, one sentence on the problem, one on what to do."""
 
     code: str
     what: str
@@ -34,11 +34,11 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Something on a bus.
+    """A device on a bus.
 
-    ``address``: how a person finds it; ``what``: what it is, in a few words. ``kind`` and ``driver`` (see
-    ``hal.registry``) are "" where nobody knows what would drive it; ``settings`` is then empty, else the table that
-    the driver needs in stage.toml. ``identity`` is the same for the same device after it was plugged in elsewhere.
+    ``address``: its place, for people; ``what``: a short description. ``kind`` and ``driver`` (see
+    ``hal.registry``) are "" if the driver is unknown; ``settings`` is then empty, else the driver's table for
+    stage.toml. ``identity`` stays the same after the device was plugged in elsewhere.
     """
 
     bus: str
@@ -53,7 +53,7 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A device that stage.toml names: a finder looks there too, and need not guess what it is."""
+    """A device of stage.toml: a finder also searches at its address, and knows its kind."""
 
     kind: str
     driver: str
@@ -62,11 +62,11 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What to look for. ``stage``: relative paths start there; ``known``: the devices of its stage.toml.
+    """Where to search. ``stage``: relative paths start there; ``known``: the devices of its stage.toml.
 
-    ``serial_ports``: the folder with stable names of serial ports; ``search``: (host, UDP port) to which the search
-    for projectors goes, None: nowhere; ``listen``: (host, port) at which their answers arrive. ``answer_s``: how long
-    an answer on a serial line is waited for; projectors that are well need a tenth of a second.
+    ``serial_ports``: the folder with stable names of serial ports; ``search``: (host, UDP port) of the search
+    for projectors, None: no search; ``listen``: (host, port) for their answers. ``answer_s``: time limit for
+    an answer on a serial line; healthy projectors need a tenth of a second.
     """
 
     stage: Path
@@ -80,28 +80,30 @@ class Wanted:
 
     def of(self, kind: str, driver: str) -> tuple[Mapping[str, Any], ...]:
         """The settings of every known device of this driver."""
-        return tuple(one.settings for one in self.known if (one.kind, one.driver) == (kind, driver))
+        return tuple(device.settings for device in self.known if (device.kind, device.driver) == (kind, driver))
 
 
 @dataclass(frozen=True, slots=True)
 class Finder:
-    """What an entry point names. ``find`` raises DeviceError where the bus itself can't be looked at, and Cancelled."""
+    """The object of an entry point. ``find`` raises DeviceError if the bus itself can't be searched, and Cancelled."""
 
     bus: str
     find: Callable[[Wanted, Deadline], Sequence[Found]]
 
 
 def search_bus(finder: Finder, wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
-    """What ``finder`` finds. Raises as ``Finder.find``, and DriverFault for all else that it raises or returns."""
-    caller = Caller(f"What looks for devices on {finder.bus}")
+    """The devices of ``finder``. Raises as ``Finder.find``, and DriverFault for other errors or wrong results."""
+    caller = Caller(f"The finder for {finder.bus}")
     return cast("Sequence[Found]", caller.call("find", finder.find, Sequence[Found], wanted, deadline))
 
 
 def load_finders(found: Iterable[EntryPoint] | None = None) -> tuple[tuple[Finder, ...], tuple[Problem, ...]]:
-    """Every finder that is installed (or of the given entry points), by bus; and what could not be loaded."""
+    """Every installed finder (or those of the given entry points), by bus; and the problems of loading."""
     finders: dict[tuple[str, str], Finder] = {}
     problems = []
-    for entry in sorted(entry_points(group=GROUP) if found is None else found, key=lambda one: (one.name, one.value)):
+    for entry in sorted(
+        entry_points(group=GROUP) if found is None else found, key=lambda entry: (entry.name, entry.value)
+    ):
         try:
             loaded = entry.load()
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything, and stops no other
@@ -112,8 +114,8 @@ def load_finders(found: Iterable[EntryPoint] | None = None) -> tuple[tuple[Finde
             problems.append(
                 Problem(
                     "finder-broken",
-                    what=f"What looks for devices under the name {entry.name} can't be used: {loaded}.",
-                    remedy="Reinstall the distribution that it comes from.",
+                    what=f"The finder {entry.name} can't be used: {loaded}.",
+                    remedy="Reinstall its Python package.",
                 )
             )
     return tuple(finders[key] for key in sorted(finders)), tuple(problems)

@@ -1,4 +1,4 @@
-"""What each kind of device does. Nothing else lives here.
+"""The interfaces of all kinds of devices.
 
 Every blocking call takes a ``Deadline`` and fails with an error of ``hal.errors``:
 ``DeviceGone``, ``DeviceBusy``, ``DeviceTimeout``, ``DeviceRefused`` or ``ProtocolError``.
@@ -34,10 +34,10 @@ class Device(Protocol):
     """Anything that can be opened, named and closed. Opened by its driver (see ``hal.registry``)."""
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        """Ask the device who it is."""
+        """Ask the device for its identity."""
 
     def close(self) -> None:
-        """Release the bus. Harmless when called twice; never blocks for more than a second; never raises."""
+        """Release the bus. May be called twice; never blocks for more than a second; never raises."""
 
 
 @runtime_checkable
@@ -48,27 +48,27 @@ class Projector(Device, Protocol):
     def capabilities(self) -> ProjectorCapabilities: ...
 
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
-        """Power, faults and lamp hours as the device answers now; never a remembered answer."""
+        """Power, faults and lamp hours as the device answers now; never a stored answer."""
 
     def switch_on(self, *, deadline: Deadline) -> None:
         """Ask for power on; returns once the device has accepted (it may still warm up).
 
-        Harmless when already on. Raises DeviceRefused while the lamp cools.
+        No effect if it is on already. Raises DeviceRefused while the lamp cools.
         """
 
     def switch_off(self, *, deadline: Deadline) -> None:
-        """Ask for standby; returns once accepted (the fans may still cool the lamp). Harmless when already off."""
+        """Ask for standby; returns once accepted (the fans may still cool the lamp). No effect if it is off already."""
 
     def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
-        """Block (AV mute) or pass the light. Raises DeviceRefused where ``capabilities.shutter`` is false."""
+        """Block (AV mute) or pass the light. Raises DeviceRefused if ``capabilities.shutter`` is false."""
 
 
 @runtime_checkable
 class WatchedProjector(Projector, Protocol):
-    """A projector whose driver tells what it could not understand."""
+    """A projector whose driver reports answers that it could not understand."""
 
     def troubles(self) -> list[tuple[str, str]]:
-        """What was odd since the last call, each thing once: (stable code, one sentence). Nothing of it stops work."""
+        """Unexpected answers since the last call, each once: (stable code, one sentence). They do not stop the work."""
 
 
 @runtime_checkable
@@ -97,24 +97,24 @@ class Camera(Device, Protocol):
 
 @runtime_checkable
 class WatchedCamera(Camera, Protocol):
-    """A camera that tells how long it can go on."""
+    """A camera that reports its battery and card."""
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
         """Battery, card and warnings as the camera answers now."""
 
     def troubles(self) -> list[tuple[str, str]]:
-        """What went wrong and was mended since the last call: (stable code, one sentence), for the journal."""
+        """Corrected faults since the last call: (stable code, one sentence), for the journal."""
 
 
 @runtime_checkable
 class LiveViewCamera(Camera, Protocol):
-    """A camera that may show what it sees without taking a picture, for aiming: see ``capabilities.live_view``."""
+    """A camera that may have live view, for aiming: see ``capabilities.live_view``."""
 
     def live_view(self, *, deadline: Deadline) -> bytes:
         """One frame, a JPEG; the first one starts it. Raises DeviceRefused without ``capabilities.live_view``."""
 
     def end_live_view(self, *, deadline: Deadline) -> None:
-        """Close the shutter again. Harmless when it is not on; ``capture`` does it by itself."""
+        """End live view. No effect if it is off; ``capture`` does it automatically."""
 
 
 @runtime_checkable
@@ -125,10 +125,10 @@ class Display(Device, Protocol):
         """The outputs in stage order."""
 
     def show(self, frames: Mapping[str, npt.NDArray[np.uint8]], *, deadline: Deadline) -> Presented:
-        """Show one 8-bit frame an output, and return once all are presented.
+        """Show one 8-bit frame per output, and return once all are presented.
 
         ``frames`` maps an output's name to (rows, columns, 3) uint8, device values (already linearised); an output
-        that is not named shows black. Raises DeviceRefused for a wrong name, shape or dtype, before anything is shown.
+        without a frame shows black. Raises DeviceRefused for a wrong name, shape or dtype, before anything is shown.
         """
 
     def play(self, appearance: str, *, deadline: Deadline) -> Presented:
@@ -137,7 +137,7 @@ class Display(Device, Protocol):
 
 @runtime_checkable
 class BundleDisplay(Display, Protocol):
-    """A display that plays bundles by itself, at its own pace: the player."""
+    """A display that plays bundles by itself: the player."""
 
     def load_bundle(self, path: Path, *, deadline: Deadline) -> str:
         """Use another bundle from now on; return its identity (hex). Raises DeviceRefused for one it does not trust."""
@@ -150,23 +150,23 @@ class BundleDisplay(Display, Protocol):
         repeat: int = 0,
         rate_hz: float | None = None,
     ) -> Presented:
-        """Show appearances in turn, ``repeat`` times (0: for ever); return when the first is whole.
+        """Show appearances one after the other, ``repeat`` times (0: without end); return when the first is complete.
 
-        Each is (name, seconds) or (name, seconds, fade_s); it comes in over the one before in the first ``fade_s``.
+        Each is (name, seconds) or (name, seconds, fade_s); it fades in during the first ``fade_s``.
         """
 
     def stop(self, *, deadline: Deadline) -> Presented:
         """Show black."""
 
     def live(self, file: Path, *, deadline: Deadline, white: float | None = None) -> None:
-        """Show what is written to a shared frame file as it comes, until something else is asked for.
+        """Show pictures live from a shared frame file, until the next command.
 
-        The file holds one 8-bit frame an output; with ``white`` it holds targets (sRGB) instead, whose white has this
-        radiance, and the display makes the frames of the bundle's live section. Raises DeviceRefused where it can't.
+        The file has one 8-bit frame per output; with ``white`` it has targets (sRGB) instead, whose white has this
+        radiance, and the display makes the frames with the bundle's live section. Raises DeviceRefused if it can't.
         """
 
     def playing(self, *, deadline: Deadline) -> PlaybackStatus:
-        """What is shown now, and how evenly."""
+        """What is shown now, and the timing."""
 
 
 @runtime_checkable
@@ -198,33 +198,33 @@ class ButtonPanel(Device, Protocol):
     def show(self, key: int, picture: npt.NDArray[np.uint8], *, deadline: Deadline) -> None:
         """Put a picture on a key (0-based): (rows, columns, 3) uint8 sRGB of the size in ``capabilities``.
 
-        It stays there, also after the panel was unplugged. Raises DeviceRefused for a key or a picture that does not
-        fit, and where keys have no pictures.
+        It stays there, also after the panel was unplugged. Raises DeviceRefused for a wrong key or picture,
+        and for keys without pictures.
         """
 
     def wait_pressed(self, *, deadline: Deadline) -> int | None:
-        """The key pressed next (0-based), or None when the deadline passes. Presses are kept until asked for."""
+        """The next pressed key (0-based), or None when the deadline passes. Presses are kept until they are read."""
 
 
 class Bench(Protocol):
-    """A whole emulated stage in a process of its own: what ``velatura emulate`` runs."""
+    """A whole emulated stage in its own process, for ``velatura emulate``."""
 
     def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
         """Write the bench's own files into ``stage`` and return the device tables for stage.toml.
 
         The mapping has the stage.toml keys ``projectors`` (list), ``camera`` and ``display``, holding only what a
-        technician of a real stage would know. The truth stays in the bench's own file, which no controller reads.
+        technician of a real stage would know. The truth stays in the bench's own file, never read by the controller.
         """
 
     def disturb(self, stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:
-        """Do to a stage what somebody might: bump, dim or turn its things. Replaces what was done before; () mends all.
+        """Change a stage: bump, dim or turn its parts. Replaces earlier changes; () undoes all.
 
-        Each change is a table that the bench explains; one that serves the stage follows within a second or two. Raises
-        DeviceError for a change that it does not know.
+        Each change is a table that the bench explains; a running bench applies it within two seconds. Raises
+        DeviceError for an unknown change.
         """
 
     def serve(self, stage: Path, *, json_lines: bool, scenario: Path | None = None) -> int:
         """Serve every device of ``stage`` until SIGINT/SIGTERM, printing each address; return the exit code.
 
-        ``scenario``: a script of the faults that its devices shall have.
+        ``scenario``: a script of faults of its devices.
         """

@@ -1,7 +1,7 @@
 """Byte links: how bytes reach a device and come back, always with a deadline.
 
-A link knows nothing of protocols; a codec knows nothing of links. ``hal.serial_link`` holds the link over a serial
-port, ``hal.transcript`` the one that replays a recording.
+Links and protocol codecs are independent. ``hal.serial_link`` has the link over a serial port, ``hal.transcript``
+the one that replays a recording.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _LARGEST_DRAIN: Final = 1 << 20
 class ByteLink(Protocol):
     """A two-way stream of bytes to one device.
 
-    Every call raises DeviceGone when the link is lost, DeviceTimeout when the deadline passes, Cancelled when asked
-    to stop. What was read in part stays readable.
+    Every call raises DeviceGone when the link is lost, DeviceTimeout when the deadline passes, Cancelled on a stop
+    request. Bytes of an incomplete read stay readable.
     """
 
     def read_until(self, terminator: bytes, *, limit: int, deadline: Deadline) -> bytes:
@@ -41,11 +41,11 @@ class ByteLink(Protocol):
         """Take everything that has arrived, without waiting."""
 
     def close(self) -> None:
-        """Let go of the port or connection; harmless when called twice."""
+        """Close the port or connection; may be called twice."""
 
 
 class BufferedLink(ABC):
-    """What all real links share: a buffer, deadlines in short waits, and the transcript.
+    """Base of all real links: a buffer, deadlines with short waits, and the transcript.
 
     A subclass waits and moves bytes in ``_receive`` and ``_send``, and turns its errors into ``hal.errors``.
     """
@@ -118,7 +118,7 @@ class BufferedLink(ABC):
         deadline.check(
             "link-no-answer",
             what=f"{self.name} {failing} in time.",
-            remedy="Check that the device has power and that its cable is plugged in at both ends.",
+            remedy="Check that the device has power and its cable is connected at both ends.",
         )
 
 
@@ -127,7 +127,7 @@ class TcpLink(BufferedLink):
 
     Raises
     ------
-    DeviceGone     nothing listens there, or the host is not reachable
+    DeviceGone     no program listens there, or the host is not reachable
     DeviceTimeout  no connection before the deadline
     """
 
@@ -175,7 +175,7 @@ class TcpLink(BufferedLink):
         reason = getattr(error, "strerror", None) or "the connection was closed"
         return DeviceGone(
             "link-lost",
-            what=f"{self.name} is not there: {reason}.",
+            what=f"{self.name} can't be reached: {reason}.",
             remedy="Check the address, the network cable and that the device has power.",
         )
 
@@ -193,8 +193,8 @@ def host_and_port(address: str, default_port: int) -> tuple[str, int]:
     if not host or not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise DeviceError(
             "address-wrong",
-            what=f"The address {address!r} is not of the form host:port.",
-            remedy=f'Write it like "192.168.0.20:{default_port}" in stage.toml.',
+            what=f"The address {address!r} does not have the form host:port.",
+            remedy=f'Write it in stage.toml like this: "192.168.0.20:{default_port}".',
         )
     return host, int(port)
 
@@ -204,5 +204,5 @@ def taken(name: str) -> DeviceBusy:
     return DeviceBusy(
         "port-taken",
         what=f"{name} is in use by another program.",
-        remedy="Stop the other program (another velatura, a terminal, a modem manager) and start again.",
+        remedy="Stop that program (another velatura, a terminal, a modem manager) and start again.",
     )

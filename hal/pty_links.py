@@ -1,8 +1,8 @@
-"""Links to pseudo terminals that know their owner.
+"""Links to pseudo terminals with a lock of their owner.
 
-The system gives the number of a closed terminal to the next program that asks for one. A link that a killed program
-left then leads to a stranger's terminal, into which nothing may be written. So whoever makes such a link holds a lock
-beside it for as long as the terminal is its own.
+The system gives the number of a closed terminal to the next program. The link of a killed program then leads to
+another program's terminal, into which nothing may be written. So the owner of a link holds a lock as long as it owns
+the terminal.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ TERMINALS: Final = "/dev/pts/"
 
 
 class PtyLink:
-    """The link ``port`` to the terminal at ``path``, and its lock; made at once, and there until ``remove``.
+    """The link ``port`` to the terminal at ``path``, and its lock; created at once, kept until ``remove``.
 
-    Raises ``OSError`` where it can't be made.
+    Raises ``OSError`` if it can't be created.
     """
 
     def __init__(self, port: Path, path: str) -> None:
         self._port = port
         port.parent.mkdir(parents=True, exist_ok=True)
         self._owner = _locked(_owner_of(port))
-        # Before the link, so that whoever follows the link finds its owner.
+        # Before the link, so that a program that follows the link finds its owner.
         self._owner.write(path.encode())
         self._owner.flush()
         temporary = port.with_name(f".{port.name}.new")
@@ -35,14 +35,14 @@ class PtyLink:
         temporary.replace(port)
 
     def remove(self) -> None:
-        """Remove the link, then let go of the lock."""
+        """Remove the link, then release the lock."""
         self._port.unlink(missing_ok=True)
         _owner_of(self._port).unlink(missing_ok=True)
         self._owner.close()
 
 
 def leads_to_its_owner(port: Path) -> bool:
-    """Whether ``port`` may be opened: no link of ours, or one whose owner lives. One without its owner is removed."""
+    """Whether ``port`` may be opened: not our link, or one with a running owner. A link without owner is removed."""
     if not port.is_symlink():
         return True
     target = os.readlink(port)  # noqa: PTH115 - the text of the link, however it is written
@@ -51,13 +51,13 @@ def leads_to_its_owner(port: Path) -> bool:
     try:
         owner = _owner_of(port).open("rb")
     except OSError:
-        return True  # made by another program, which says nothing of itself
+        return True  # made by another program, without a lock
     with owner:
         try:
             fcntl.flock(owner, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return owner.read().decode(errors="replace") == target
-        # A folder that can't be written to keeps its stale link, which is not followed all the same.
+        # A read-only folder keeps its stale link, which is not followed either.
         with contextlib.suppress(OSError):
             port.unlink(missing_ok=True)
             _owner_of(port).unlink(missing_ok=True)
@@ -77,4 +77,4 @@ def _locked(path: Path) -> BinaryIO:
             if path.stat().st_ino == os.fstat(file.fileno()).st_ino:
                 file.truncate(0)
                 return file
-        file.close()  # somebody removed it between the two
+        file.close()  # it was removed between the two calls

@@ -1,4 +1,4 @@
-"""Finding drivers: everything that a distribution lists under the entry-point group ``velatura.devices``."""
+"""Finds drivers in the entry-point group ``velatura.devices``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hal.escapes import toml_value
 
 GROUP = "velatura.devices"
 BENCH = "-bench"
-"""How the names of entry points end that offer a bench."""
+"""Suffix of the entry points of a bench."""
 KINDS = ("projector", "camera", "display", "power_switch", "light_sensor", "button_panel", "bench")
 
 
@@ -29,7 +29,7 @@ _KIND_WORDS: Final[Mapping[type, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class OpenContext:
-    """What a driver may know of the stage: its folder (relative paths in settings start there), and where to log.
+    """The stage's folders for a driver: relative paths in settings start at the stage's folder.
 
     ``transcripts``: folder for byte transcripts, or None to keep none. ``runtime``: short private folder for sockets.
     """
@@ -41,12 +41,12 @@ class OpenContext:
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """What an entry point names.
+    """The object of an entry point.
 
     ``open`` gets the device's table of stage.toml (without ``name`` and ``driver``), and returns an opened device of
     ``kind`` (see ``hal.interfaces``; for ``"bench"`` it is called with no settings and returns a ``Bench``).
-    ``settings`` explains each key that ``open`` understands; keys in ``required`` must be there. ``check`` raises
-    PluginError for values that ``open`` would refuse whatever is plugged in; it reads files at most, and no device.
+    ``settings`` explains each key of ``open``; keys in ``required`` must be given. ``check`` raises
+    PluginError for values that ``open`` would always refuse; it may read files, but uses no device.
     """
 
     kind: str
@@ -60,23 +60,23 @@ class Driver:
 
 @dataclass(frozen=True, slots=True)
 class BrokenPlugin:
-    """An entry point that could not be used: its name and value, its distribution, why, and what to do.
+    """An entry point that can't be used: its name and value, its distribution, the reason, and the remedy.
 
-    ``claims``: the kind and name that two plugins claim, of which therefore neither is used; None for another reason.
-    ``missing``: the Python module that was not found, if that is why.
+    ``claims``: the kind and name of two plugins, of which neither is used; None for another reason.
+    ``missing``: the missing Python module, if that is the reason.
     """
 
     entry_point: str
     distribution: str
     reason: str
-    remedy: str = "Reinstall that distribution."
+    remedy: str = "Reinstall its Python package."
     claims: tuple[str, str] | None = None
     missing: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Drivers:
-    """Every driver found, and every plugin that failed. Made by ``load_drivers``."""
+    """All drivers, and all plugins that failed. Created by ``load_drivers``."""
 
     list: tuple[Driver, ...]
     broken: tuple[BrokenPlugin, ...] = ()
@@ -84,8 +84,8 @@ class Drivers:
     def get(self, kind: str, name: str) -> Driver:
         """The driver ``name`` of ``kind``.
 
-        Raises PluginError("driver-unknown"), which says which there are, and PluginError("driver-twice") where two
-        plugins claim this kind and name: neither may win by chance.
+        Raises PluginError("driver-unknown"), which lists the available ones, and PluginError("driver-twice") if two
+        plugins have this kind and name: the choice must not be random.
         """
         for driver in self.list:
             if (driver.kind, driver.name) == (kind, name):
@@ -106,7 +106,7 @@ class Drivers:
         )
 
     def missing_for(self, name: str) -> str:
-        """The Python module whose absence keeps the driver ``name`` from being loaded; "" if it is not that."""
+        """The missing Python module that the driver ``name`` needs; "" if there is none."""
         return next((plugin.missing for plugin in self.broken if plugin.entry_point.startswith(name)), "")
 
     def _broken_sentence(self) -> str:
@@ -116,11 +116,11 @@ class Drivers:
 def load_drivers(found: Iterable[EntryPoint] | None = None, *, benches: bool = True) -> Drivers:
     """Load every entry point of the group ``velatura.devices`` (or the given ones).
 
-    ``benches`` False: not those whose name ends in ``-bench``. A bench is asked for by name and never stands in
-    stage.toml, and its optics take longer to load than everything that a stage needs.
+    ``benches`` False: not those whose name ends in ``-bench``. A bench is loaded by name, is never in
+    stage.toml, and its optics take longer to load than everything else.
 
-    A plugin that cannot be imported, or is not a ``Driver``, is reported in ``broken`` and stops no other; so are all
-    plugins that claim a kind and name which another claims too.
+    A plugin that can't be imported, or is not a ``Driver``, is reported in ``broken``; so are all
+    plugins with the same kind and name. Other plugins are still loaded.
     """
     claims: dict[tuple[str, str], list[tuple[Driver, BrokenPlugin]]] = {}
     broken: list[BrokenPlugin] = []
@@ -146,7 +146,7 @@ def load_drivers(found: Iterable[EntryPoint] | None = None, *, benches: bool = T
 
 
 def _distinct(found: Iterable[EntryPoint]) -> Iterable[EntryPoint]:
-    """An installed and a source copy of one distribution list the same entry points: that is one plugin, not two."""
+    """Without duplicates: an installed and a source copy of one distribution list the same entry points."""
     seen: dict[tuple[str, str, str], EntryPoint] = {}
     for entry in found:
         owner = entry.dist.name.replace("_", "-").lower() if entry.dist is not None else ""
@@ -155,7 +155,7 @@ def _distinct(found: Iterable[EntryPoint]) -> Iterable[EntryPoint]:
 
 
 def _load(entry: EntryPoint) -> Driver | ModuleNotFoundError | str:
-    """The driver, or the reason why there is none."""
+    """The driver, or the reason why it can't be used."""
     try:
         driver = entry.load()
     except ModuleNotFoundError as error:
@@ -166,7 +166,7 @@ def _load(entry: EntryPoint) -> Driver | ModuleNotFoundError | str:
 
 
 def _problem_of(driver: Any) -> str:
-    """Why what an entry point names cannot be used; empty if it can."""
+    """Why the object of an entry point can't be used; empty if it can."""
     if not isinstance(driver, Driver):
         return f"it names a {type(driver).__name__}, not a hal.registry.Driver"
     if driver.kind not in KINDS:
@@ -178,7 +178,7 @@ def _problem_of(driver: Any) -> str:
 
 
 def check_settings(driver: Driver, settings: Mapping[str, Any]) -> None:
-    """Check the keys of a device's table against what its driver understands.
+    """Check the keys of a device's table against the driver's settings.
 
     Raises PluginError("setting-unknown") or PluginError("setting-missing"), naming the key and what is allowed. Values
     are checked by the driver when it opens.
@@ -190,7 +190,7 @@ def check_settings(driver: Driver, settings: Mapping[str, Any]) -> None:
             raise PluginError(
                 "setting-unknown",
                 what=f"The {driver.kind} driver {driver.name!r} has no setting {key!r}.{hint}",
-                remedy=f"It understands: {_explained(driver)}.",
+                remedy=f"Its settings: {_explained(driver)}.",
             )
     for key in driver.required:
         if key not in settings:
@@ -211,10 +211,10 @@ def check_device(driver: Driver, settings: Mapping[str, Any], context: OpenConte
 def open_device(
     driver: Driver, settings: Mapping[str, Any], context: OpenContext, deadline: Deadline, *, name: str = ""
 ) -> Any:
-    """Check ``settings``, then open the device. ``name``: how the stage calls it, for messages.
+    """Check ``settings``, then open the device. ``name``: its name in the stage, for messages.
 
-    What the device raises or returns later is checked too (see ``hal.driver_calls``). Raises PluginError for the
-    settings, the driver's own DeviceError, and DriverFault("driver-fault") for anything else that it raises or returns.
+    Later calls of the device are checked, too (see ``hal.driver_calls``). Raises PluginError for the
+    settings, the driver's own DeviceError, and DriverFault("driver-fault") for other errors or wrong results.
     """
     check_settings(driver, settings)
     caller = _caller(driver, name)
@@ -240,4 +240,4 @@ def setting(settings: Mapping[str, Any], key: str, kind: type | tuple[type, ...]
 
 
 def _explained(driver: Driver) -> str:
-    return ", ".join(f"{key} ({text})" for key, text in driver.settings.items()) or "no settings at all"
+    return ", ".join(f"{key} ({text})" for key, text in driver.settings.items()) or "none"

@@ -25,12 +25,12 @@ _BLOCK = 4096
 class SerialLink(BufferedLink):
     """A serial port at ``port``, 8 data bits, no parity, 1 stop bit, no flow control, held exclusively.
 
-    ``port`` should be a stable name (``/dev/serial/by-id/...``): it is resolved anew at every opening, so that a device
-    which came back as another tty is found again.
+    ``port`` should be a stable name (``/dev/serial/by-id/...``): it is resolved at every opening, so that a device
+    that came back as another tty is found again.
 
     Raises
     ------
-    DeviceGone     there is no such port, or it was unplugged
+    DeviceGone     the port does not exist, or was unplugged
     DeviceBusy     another program holds it
     DeviceRefused  this user may not open it
     """
@@ -68,8 +68,8 @@ class SerialLink(BufferedLink):
     def _unplugged(self) -> DeviceGone:
         return DeviceGone(
             "port-lost",
-            what=f"The serial port {self.name} went away.",
-            remedy="Plug the adapter back in; the port is found again by its name.",
+            what=f"The serial port {self.name} was disconnected.",
+            remedy="Plug the adapter in again. Velatura then finds the port by its name.",
         )
 
     def _not_opened(self, error: BaseException | None) -> DeviceError:
@@ -84,6 +84,6 @@ class SerialLink(BufferedLink):
             )
         return DeviceGone(
             "port-missing",
-            what=f"There is no serial port {self.name}.",
-            remedy="Check that the adapter is plugged in, and the name of the port in stage.toml.",
+            what=f"The serial port {self.name} does not exist.",
+            remedy="Check that the adapter is plugged in. Check the name of the port in stage.toml.",
         )

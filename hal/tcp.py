@@ -1,4 +1,4 @@
-"""TCP connections with a deadline, the search for the host's name included."""
+"""TCP connections with a deadline that includes the lookup of the host's name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.deadline import SLICE_S, Deadline
 _Places = list[tuple[Any, ...]]
 _turn = threading.Lock()
 _looked_up: dict[tuple[str, int], Future[_Places]] = {}
-"""What is being looked up now."""
+"""Lookups that are running."""
 
 
 def connected(host: str, port: int, deadline: Deadline) -> socket.socket:
@@ -23,14 +23,14 @@ def connected(host: str, port: int, deadline: Deadline) -> socket.socket:
 
     Raises
     ------
-    OSError    the host has no address, or nothing listens there; TimeoutError: no connection before the deadline
+    OSError    the host has no address, or no program listens there; TimeoutError: no connection before the deadline
     Cancelled  asked to stop
     """
     places = _places(host, port, deadline)
     failure = OSError(errno.EHOSTUNREACH, os.strerror(errno.EHOSTUNREACH))
     for number, place in enumerate(places):
         try:
-            # Of several addresses none may use up the time of the others.
+            # With several addresses, each gets its share of the time.
             return _connected(place, deadline.within(deadline.left_s() / (len(places) - number)))
         except OSError as error:
             failure = error
@@ -38,20 +38,20 @@ def connected(host: str, port: int, deadline: Deadline) -> socket.socket:
 
 
 def _places(host: str, port: int, deadline: Deadline) -> _Places:
-    """What ``getaddrinfo`` finds. Without a name server it may wait for half a minute, so it does on another thread."""
+    """The result of ``getaddrinfo``, on another thread, because without a name server it may wait for half a minute."""
     try:
         return list(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_NUMERICHOST))
     except socket.gaierror:  # a name
         found = _begun(host, port)
     except ValueError as error:
-        raise OSError(errno.EINVAL, f"{host!r} cannot be a host's name") from error
+        raise OSError(errno.EINVAL, f"{host!r} is not a valid host name") from error
     while not wait((found,), min(SLICE_S, deadline.left_s())).done:
         _still_time(deadline)
     return found.result()
 
 
 def _begun(host: str, port: int) -> Future[_Places]:
-    """The search for a name; one at a time for each, however often somebody gives up on it."""
+    """The lookup of a name; only one at a time for each name, even if callers give up."""
 
     def look() -> None:
         try:

@@ -1,4 +1,4 @@
-r"""Transcripts: every byte sent and received, with times, as a text file that can be read, compared and replayed.
+r"""Transcripts: all bytes sent and received, with times, as a text file to read, compare and replay.
 
 The file is ASCII. Its first line is ``velatura transcript 1``; then one line an event:
 
@@ -48,7 +48,7 @@ class Entry:
 
 
 class Transcript:
-    """Collects what passes over a link; with ``path`` each line is written at once and survives a crash.
+    """Records the bytes of a link; with ``path`` each line is written at once and survives a crash.
 
     The entries kept in memory are bounded by ``keep``; the file is not.
     """
@@ -89,7 +89,7 @@ class Transcript:
             self._entries.append(entry)
             del self._entries[: -self._keep]
             if self._file is not None:
-                # A full disk must not stop a show: the transcript ends, the device goes on.
+                # A full disk must not stop a show: the transcript ends, the device continues.
                 try:
                     self._file.write(line_of(entry) + "\n")
                 except OSError:
@@ -121,16 +121,16 @@ def _not_a_transcript(why: str) -> ProtocolError:
     return ProtocolError(
         "transcript-wrong",
         what=f"This is not a transcript: {why}.",
-        remedy="Record it again; its format is described in hal/transcript.py.",
+        remedy="Record it again. Its format is described in hal/transcript.py.",
     )
 
 
 class ReplayLink:
-    """A link that plays the device's part of a transcript, and holds the caller to its own part.
+    """A link that plays the device's part of a transcript, and checks the caller's part.
 
-    What was received before the next bytes were sent can be read; sending must follow the record byte for byte, or
-    ProtocolError("replay-departed") is raised with ``theirs=False``. Reading more than the record holds raises
-    DeviceTimeout at once: nothing more came then either.
+    The bytes received before the next sent bytes can be read; sent bytes must equal the record, or
+    ProtocolError("replay-departed") is raised with ``theirs=False``. Reading more than the record has raises
+    DeviceTimeout at once.
     """
 
     def __init__(self, entries: Iterable[Entry]) -> None:
@@ -161,7 +161,7 @@ class ReplayLink:
             if not common or expected[:common] != data[:common]:
                 raise ProtocolError(
                     "replay-departed",
-                    what=f"The driver sent {escaped(data)!r} where the record has {escaped(expected)!r}.",
+                    what=f"The driver sent {escaped(data)!r} instead of the recorded {escaped(expected)!r}.",
                     remedy="Compare the driver with the transcript, or record a new one.",
                     theirs=False,
                 )
@@ -173,7 +173,7 @@ class ReplayLink:
         return self._take(len(self._buffer))
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to close."""
 
     def _advance(self) -> None:
         while self._script and (self._script[0][0] is Way.RECEIVED or not self._script[0][1]):
@@ -189,6 +189,6 @@ class ReplayLink:
     def _nothing_more(self) -> DeviceTimeout:
         return DeviceTimeout(
             "link-no-answer",
-            what="The record holds no further answer here.",
+            what="The record has no further answer here.",
             remedy="Compare the driver with the transcript, or record a new one.",
         )

@@ -1,4 +1,4 @@
-"""Values that pass between drivers and their callers: frozen, with units in their names."""
+"""Values between drivers and their callers: frozen, with units in their names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class DeviceIdentity:
-    """Who a device says it is. Every string comes from the device: escape it before showing it in a page."""
+    """A device's identity. Every string comes from the device: escape it before showing it in a page."""
 
     maker: str
     model: str
@@ -18,7 +18,7 @@ class DeviceIdentity:
 
 
 class Power(enum.Enum):
-    """Power state of a projector as far as the device tells."""
+    """Power state of a projector as reported by the device."""
 
     OFF = "off"
     WARMING = "warming"
@@ -30,7 +30,7 @@ class Power(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class LampRules:
-    """What a lamp needs so that it is not harmed; times in seconds.
+    """Times that protect a lamp, in seconds.
 
     ``warm_up_s``: from strike to light; ``stable_s``: from strike until photometric work is allowed;
     ``cool_down_s``: fans run on after off; ``minimum_off_s``: from off to the next strike.
@@ -44,12 +44,12 @@ class LampRules:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorCapabilities:
-    """What a projector's driver can do; callers ask, never guess by model.
+    """Capabilities of a projector's driver; callers use these, never the model's name.
 
-    ``power``: it can be switched, and tells whether it burns. Without it ``switch_on`` and ``switch_off`` raise
-    DeviceRefused, and the power state is UNKNOWN or COOLING. ``answer_s``: the longest that ``status`` may take in any
-    state; ``switch_s``: the same of ``switch_on`` and ``switch_off``. A caller with less patience sees time-outs of
-    projectors that are well.
+    ``power``: it can be switched, and reports whether it is lit. Without it ``switch_on`` and ``switch_off`` raise
+    DeviceRefused, and the power state is UNKNOWN or COOLING. ``answer_s``: the longest time of ``status`` in any
+    state; ``switch_s``: the same for ``switch_on`` and ``switch_off``. With a shorter deadline, a healthy projector
+    may time out.
     """
 
     lamp_hours: bool
@@ -88,7 +88,7 @@ class ExposureSettings:
 
 @dataclass(frozen=True, slots=True)
 class CameraCapabilities:
-    """What a camera's driver can do. Lists are ascending; empty means not settable."""
+    """Capabilities of a camera's driver. Lists are ascending; empty means not settable."""
 
     exposures_s: tuple[float, ...]
     isos: tuple[int, ...]
@@ -101,11 +101,11 @@ class CameraCapabilities:
 
 @dataclass(frozen=True, slots=True)
 class CameraStatus:
-    """How long a camera can go on; None for what it does not tell.
+    """Battery and card of a camera; None for unknown values.
 
     ``battery_percent`` 0 to 100; ``free_bytes`` and ``free_pictures`` on its card. ``warnings``: ``"battery-low"``,
     ``"card-nearly-full"``, ``"card-unusable"``, ``"autofocus-on"``, ``"mode-dial"`` (not on M), ``"target-changed"``
-    (it sent pictures elsewhere than it was told to, and was told again).
+    (it stored pictures at the wrong place, and the setting was sent again).
     """
 
     battery_percent: int | None = None
@@ -151,11 +151,11 @@ class Presented:
 
 @dataclass(frozen=True, slots=True)
 class LiveStatus:
-    """How a display shows what comes live.
+    """Figures of a display in live mode.
 
-    ``shown`` pictures so far; ``source_there`` whether somebody still writes them; ``delay_p50_s``, ``delay_p99_s``
-    from when one was written to when it was presented, None before any; ``by``: who makes frames ("shaders"), or that
-    they come made ("frames").
+    ``shown`` pictures so far; ``source_there``: whether the source still writes; ``delay_p50_s``, ``delay_p99_s``
+    from writing to presentation, None before any; ``by``: the display makes the frames ("shaders"), or gets
+    finished ones ("frames").
     """
 
     shown: int
@@ -167,11 +167,11 @@ class LiveStatus:
 
 @dataclass(frozen=True, slots=True)
 class PlaybackStatus:
-    """How a display plays its bundle.
+    """Figures of a display that plays its bundle.
 
     ``swaps`` since its start, the last ``presented_at_s`` (monotonic clock); ``running`` whether a sequence has more
     items; ``late`` items presented more than a tick after their time in this sequence; intervals between presentations
-    of this or the last sequence, None before any; ``live`` is None where nothing comes live.
+    of this or the last sequence, None before any; ``live`` is None outside live mode.
     """
 
     swaps: int

@@ -1,7 +1,7 @@
 """Calls of a library that may hang, with deadlines: they run on a thread of their own.
 
-A call that outlives its deadline is left behind with its thread; the next one waits for that thread to end before
-anything is opened anew, so that at most one is ever left behind.
+A call that exceeds its deadline stays behind with its thread. The next call waits for that thread to end before it
+opens anything, so that at most one thread stays behind.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 
 _CLOSE_S: Final = 0.7
 _LISTED_S: Final = 2.0
-"""So long a device may be listed that cannot be opened: it has just left, or udev's rules are not yet applied to it."""
+"""Time limit for a listed device that can't be opened: it was just unplugged, or udev has not applied its rules yet."""
 
 
 @dataclass(slots=True)
@@ -35,7 +35,7 @@ class _Job(Generic[Result]):
 
 
 class _Worker(Generic[Opened]):
-    """One thread, and the device that it has open. Whatever becomes of it, it closes what it opened."""
+    """One thread and its open device. It always closes what it opened."""
 
     def __init__(self, close: Callable[[Opened], None]) -> None:
         self.open: Opened | None = None
@@ -60,7 +60,7 @@ class _Worker(Generic[Opened]):
         while (job := self._jobs.get()) is not None:
             try:
                 job.result.append(job.work(self))
-            except BaseException as error:  # noqa: BLE001 - it is raised again by whoever waits for the job
+            except BaseException as error:  # noqa: BLE001 - it is raised again in the waiting thread
                 job.error = error
             job.done.set()
         self.drop()
@@ -71,7 +71,7 @@ class NotOpened(DeviceRefused):
 
 
 class WorkerLink(ABC, Generic[Opened]):
-    """The way to one device that is opened when needed, and again after it was lost. Callers take turns.
+    """The connection to one device: opened when needed, and again after it was lost. One caller at a time.
 
     ``name``: of the device, for sentences, e.g. "relay board"; ``broken``: what the library raises when the way to the
     device breaks.
@@ -98,7 +98,7 @@ class WorkerLink(ABC, Generic[Opened]):
         """Close the device; on the worker's thread. Raises nothing."""
 
     def call(self, work: Callable[[Opened], Result], *, deadline: Deadline) -> Result:
-        """Do ``work`` with the open device; once more where the connection had broken, so it must bear repetition.
+        """Do ``work`` with the open device; again if the connection had broken, so it must be repeatable.
 
         Raises what ``find`` and ``work`` raise, DeviceGone for one that was closed, DeviceTimeout, ProtocolError where
         the device is there and fails the transfer, or Cancelled.
@@ -111,7 +111,7 @@ class WorkerLink(ABC, Generic[Opened]):
             return self._on_worker(lambda worker: self._try(worker, work, theirs), deadline, given_up)
 
     def close(self) -> None:
-        """Close the device; a call that hangs is left behind after 0.7 s."""
+        """Close the device; a hanging call is left behind after 0.7 s."""
         with self._opening:
             self._closed = True
             worker, self._worker = self._worker, None
@@ -124,7 +124,7 @@ class WorkerLink(ABC, Generic[Opened]):
             try:
                 if worker.open is None:
                     worker.open = self._found(deadline)
-                deadline.sleep(0.0)  # nobody wants it done any more: a relay must not move minutes later
+                deadline.sleep(0.0)  # the caller has given up: a relay must not move minutes later
                 return work(worker.open)
             except self._broken as error:
                 worker.drop()
@@ -148,7 +148,7 @@ class WorkerLink(ABC, Generic[Opened]):
                 listed.sleep(SLICE_S)
 
     def _check_there(self, worker: _Worker[Opened], deadline: Deadline) -> None:
-        """Raises DeviceGone where the device was pulled while it was used for the second time."""
+        """Raises DeviceGone if the device was unplugged during the second attempt."""
         with contextlib.suppress(*self._broken):
             try:
                 worker.open = self._found(deadline)
@@ -196,14 +196,14 @@ class WorkerLink(ABC, Generic[Opened]):
         deadline.check(
             "hid-no-answer",
             what=f"The {self._name} did not answer in time.",
-            remedy="Unplug it and plug it in again; use another cable or hub if it happens often.",
+            remedy="Unplug it and plug it in again. If this happens often, use another cable or hub.",
         )
 
     def not_opened(self, error: Exception) -> NotOpened:
         """For ``find``: the device is listed, and ``error`` came of opening it."""
         return NotOpened(
             "hid-not-opened",
-            what=f"The {self._name} is plugged in, but cannot be opened ({error}).",
+            what=f"The {self._name} is plugged in, but can't be opened ({error}).",
             remedy="Unplug it and plug it in again. If that does not help, end other programs that use it, and install"
             " firmware_configs/udev/70-velatura-hid.rules.",
         )
@@ -211,8 +211,8 @@ class WorkerLink(ABC, Generic[Opened]):
     def _failed(self, error: Exception) -> ProtocolError:
         return ProtocolError(
             "hid-transfer",
-            what=f"The {self._name} is plugged in, but refuses what it is asked ({error}).",
-            remedy="Unplug it and plug it in again; if it happens again, replace it.",
+            what=f"The {self._name} is plugged in, but refuses commands ({error}).",
+            remedy="Unplug it and plug it in again. If this happens again, replace it.",
         )
 
 

@@ -14,17 +14,10 @@ from typing import Final
 import pytest
 
 ROOT: Final = Path(__file__).parents[1]
-FOLDERS: Final = (
-    "controller/blender", "controller/bundle", "controller/calibrate", "controller/capture", "controller/config",
-    "controller/kiosk", "controller/live", "controller/panel", "controller/plan", "controller/play",
-    "controller/report", "controller/study", "plugins/emulated",
-)  # fmt: skip
+FOLDERS: Final = ("controller", "hal", "plugins")
 """Folders whose messages, help and templates are in plain words."""
-PAGES: Final = (
-    "docs/explanation/kiosk.md", "docs/how-to/panel.md", "docs/reference/http-api.md", "docs/study",
-    "docs/tutorials/first-kiosk.md",
-)  # fmt: skip
-"""Pages of docs, and folders of pages, in plain words; docs/decisions keep their wording."""
+PAGES: Final = ("docs/explanation", "docs/how-to", "docs/reference", "docs/study", "docs/tutorials", "README.md")
+"""Pages, and folders of them, in plain words; docs/decisions keep their wording."""
 LONGEST: Final = 25
 """Words in a sentence of ``what`` and ``remedy``."""
 

@@ -10,15 +10,15 @@ Light is linear everywhere: a value twice as large is twice as much light. Image
 red, green, blue. Sizes in pixels are (width, height), pixel positions are (x, y) = (column, row), and the centre of the
 first pixel is (0, 0). Other number types are converted to float32. Lengths are in metres, exposure times in seconds.
 
-What goes wrong raises ``VelaturaError``, with a stable ``code``, a sentence ``what`` happened and a ``remedy``.
+Errors are ``VelaturaError``, with a stable ``code``, a sentence ``what`` happened and a ``remedy``.
 
-What is stable: all names in ``controller.api.__all__``, the parameters and attributes that this page documents, the
-file formats that ``export`` writes, and the error codes. Versions follow semantic versioning (semver.org): from 1.0 on
-they change only with a new major version; before 1.0 only with a new minor version. What is deprecated warns with
-``DeprecationWarning`` and stays for at least one more minor release. All other modules of ``controller`` may change
+The stable interface: all names in ``controller.api.__all__``, the parameters and attributes on this page, the
+file formats of ``export``, and the error codes. Versions follow semantic versioning (semver.org): from 1.0 on
+the interface changes only with a new major version; before 1.0 only with a new minor version. Deprecated names warn
+with ``DeprecationWarning`` and stay for at least one more minor release. All other modules of ``controller`` may change
 with every release.
 
-Read ``captures`` first where you have photographs, ``transport`` where you have matrices.
+Read ``captures`` first if you have photographs, ``transport`` if you have matrices.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From captures to a calibration, step by step or at once, and what a run of Velatura left in its folder."""
+"""From captures to a calibration, step by step or at once; and reading the folder of a Velatura run."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from controller.transport import LightTransport
 
 
 def decode(captures: CaptureSet) -> Correspondence:
-    """Where on the projector's picture each camera pixel looks, from Gray code and phase shift.
+    """The position in the projector's picture that each camera pixel sees, from Gray code and phase shift.
 
-    The Gray code says in which period of the 24-pixel sinusoid a camera pixel lies, the phase of that one in which
-    period of the fine sinusoids, and these where in it. Positions are fitted by planes over neighbours on one surface.
+    The Gray code gives the period of the 24-pixel sinusoid, the phase of that sinusoid gives the period of the fine
+    sinusoids, and their phase gives the position. Positions are fitted by planes over neighbours on one surface.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def decode(captures: CaptureSet) -> Correspondence:
 
 
 def measure_response(captures: CaptureSet) -> Radiometry:
-    """How the projector turns device values into light, from mosaics of coloured tiles.
+    """The projector's light for each device value, from mosaics of coloured tiles.
 
     Parameters
     ----------
@@ -65,12 +65,12 @@ def measure_response(captures: CaptureSet) -> Radiometry:
 
 
 def fit_metapixels(captures: CaptureSet, correspondence: Correspondence) -> FittedPixels:
-    """Where the light of each projector pixel lands in the camera picture (metapixels, paper 4.2.2, eq. 8).
+    """Position and shape of each projector pixel's light in the camera picture (metapixels, paper 4.2.2, eq. 8).
 
     Parameters
     ----------
     captures : needs ``black`` and ``blur-*``
-    correspondence : what ``decode`` found in the same captures
+    correspondence : from ``decode``, of the same captures
 
     Returns
     -------
@@ -103,9 +103,7 @@ def calibrate(captures: Mapping[str, CaptureSet]) -> Calibration:
     ``captures-missing``.
     """
     if not captures:
-        raise UsageError(
-            "captures-missing", what="There are no captures of any projector.", remedy="Give at least one CaptureSet."
-        )
+        raise UsageError("captures-missing", what="No captures were given.", remedy="Give at least one CaptureSet.")
     parts, mosaics = [], []
     for name, one in captures.items():
         part, mosaic = _calibrated(name, one)
@@ -125,7 +123,7 @@ def _calibrated(name: str, captures: CaptureSet) -> tuple[ProjectorCalibration, 
         raise CalibrationError(
             "projector-reaches-nothing",
             what=f"No pixel of projector {name} was found on the object.",
-            remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
+            remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
         )
     fitted = fit_metapixels(captures, correspondence)
     white = np.nan_to_num(np.maximum(captures.pictures["white"] - captures.pictures["black"], 0)).astype(np.float32)
@@ -133,7 +131,7 @@ def _calibrated(name: str, captures: CaptureSet) -> tuple[ProjectorCalibration, 
 
 
 class CalibratedRun:
-    """What a calibration run left in its folder; each part is read when it is first asked for, and kept.
+    """The folder of a calibration run; each part is read at its first use, and kept.
 
     ``folder``: the run's; ``projectors``: their names
     """
@@ -150,7 +148,7 @@ class CalibratedRun:
 
     @property
     def transport(self) -> LightTransport:
-        """The light transport, with the corrections at depth edges where the run has measured them."""
+        """The light transport, with the corrections at depth edges if the run has measured them."""
         return self._calibrated.transport
 
     @cached_property
@@ -162,12 +160,12 @@ class CalibratedRun:
 
     @cached_property
     def camera(self) -> CameraProfile | None:
-        """What the run has measured of its camera; None where it has not."""
+        """The run's measurements of its camera; None if there are none."""
         return load_profile(self.folder)
 
     @cached_property
     def grade(self) -> dict[str, float]:
-        """Error of the prediction by projector name, per cent of the light; empty where the run was not graded."""
+        """Error of the prediction by projector name, per cent of the light; empty if the run was not graded."""
         return graded(self.folder) or {}
 
 
@@ -191,7 +189,7 @@ def read_run(folder: Path | str, projectors: Sequence[str] | None = None) -> Cal
     except (OSError, ValueError, KeyError) as error:
         raise UsageError(
             "not-calibrated",
-            what=f"{folder} holds no finished calibration.",
+            what=f"{folder} has no finished calibration.",
             remedy="Give the folder of a finished calibration: STAGE/runs/...",
         ) from error
     unknown = next((name for name in projectors or () if name not in found), None)

@@ -1,4 +1,4 @@
-"""The photographs of one projector's patterns: what to show, and a folder of pictures that says which is which."""
+"""The patterns of one projector to show, and a folder with their photographs."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ Pictures = Mapping[str, "str | Sequence[tuple[str, float]]"]
 
 @dataclass(frozen=True, slots=True)
 class CaptureSet:
-    """What a camera saw of one projector's patterns.
+    """Camera pictures of one projector's patterns.
 
     ``pictures``: by pattern name (``draw_patterns``), (rows, columns) or (rows, columns, 3) float32 linear light, in
-    one unit, NaN where saturated. A dictionary of arrays, or a mapping that loads each when it is asked for.
+    one unit, NaN where saturated. A dictionary of arrays, or a mapping that loads each at its use.
     ``projector_px``: (width, height) of the projector
-    ``camera_to_xyz`` (3, 3) float64: linear camera RGB to CIE XYZ (D65); None where it is not known
-    ``from_bayer``: the pictures were interpolated bilinearly from a Bayer pattern, as ``develop`` does it
+    ``camera_to_xyz`` (3, 3) float64: linear camera RGB to CIE XYZ (D65); None if it is unknown
+    ``from_bayer``: the pictures were interpolated bilinearly from a Bayer pattern, as by ``develop``
     """
 
     pictures: Mapping[str, FloatImage]
@@ -39,7 +39,7 @@ class CaptureSet:
 
 
 def draw_patterns(projector_px: tuple[int, int], *, response: npt.ArrayLike | None = None) -> dict[str, ByteImage]:
-    """The pictures to show, one after the other, to calibrate one projector; the others are black meanwhile.
+    """The pictures to show, one after the other, to calibrate one projector while the others show black.
 
     ``black``, ``white``; ``gray-x-0``.., ``gray-y-0``..: Gray code of cells 12 projector pixels wide, coarsest bit
     first; ``mosaic-0``..: coloured tiles, from which the response is measured; ``phase-x-0`` to ``2``, ``phase-y-..``:
@@ -77,15 +77,15 @@ def read_captures(
     exposure_s: float | None = None,
     camera: CameraProfile | None = None,
 ) -> CaptureSet:
-    """The photographs of one projector's patterns from a folder. Each is developed when it is asked for.
+    """The photographs of one projector's patterns from a folder. Each is developed at its use.
 
-    ``captures.toml`` in the folder says which file is which pattern; arguments count before it. Without a table
-    ``[pictures]``, each file is the pattern that it is named after, for example ``gray-x-0.CR2``.
+    ``captures.toml`` in the folder lists the file of each pattern; arguments take precedence. Without a table
+    ``[pictures]``, each file has the name of its pattern, for example ``gray-x-0.CR2``.
 
     ::
 
         projector_px = [1400, 1050]     # width, height
-        exposure_s = 0.05               # of every picture that gives none of its own
+        exposure_s = 0.05               # of every picture without its own
 
         [pictures]
         black = "IMG_0001.CR2"
@@ -99,20 +99,20 @@ def read_captures(
     ----------
     projector_px : (width, height)
     pictures : by pattern name, a file's name in the folder, or several (file name, exposure in seconds) that are merged
-    exposure_s : seconds; 1 where nothing says it
+    exposure_s : seconds; 1 if it is given nowhere
     camera : as ``develop``
 
     Returns
     -------
     ``CaptureSet``: (rows, columns, 3) float32 pictures in full scales per second
 
-    Errors: ``captures-description-wrong``, ``capture-file-missing``; those of ``develop`` when a picture is asked for.
+    Errors: ``captures-description-wrong``, ``capture-file-missing``; those of ``develop`` when a picture is used.
     """
     folder = Path(folder)
     said = _description(folder / DESCRIPTION)
     size = projector_px or said.get("projector_px")
     if size is None:
-        raise _wrong(folder, "it does not say the size of the projector", "Give projector_px = [width, height].")
+        raise _wrong(folder, "it does not give the size of the projector", "Give projector_px = [width, height].")
     named = pictures if pictures is not None else _pictures(folder, said.get("pictures"))
     each_s = float(exposure_s if exposure_s is not None else said.get("exposure_s", 1.0))
     files: dict[str, list[tuple[Path, float]]] = {}
@@ -123,12 +123,12 @@ def read_captures(
         if missing is not None:
             raise UsageError(
                 "capture-file-missing",
-                what=f"There is no file {missing} for the pattern {name}.",
+                what=f"The file {missing} for the pattern {name} does not exist.",
                 remedy="Correct its name in captures.toml, or copy the file into the folder.",
             )
     first = next(iter(files.values()), None)
     if first is None:
-        raise _wrong(folder, "it holds no picture of a pattern", "Name the files after the patterns, or list them.")
+        raise _wrong(folder, "it has no picture of a pattern", "Name the files after the patterns, or list them.")
     sample = develop(first[0][0], camera=camera)
     width, height = size
     return CaptureSet(
@@ -137,7 +137,7 @@ def read_captures(
 
 
 class _Folder(Mapping[str, FloatImage]):
-    """Photographs by pattern name, developed each time they are asked for."""
+    """Photographs by pattern name, developed at each use."""
 
     def __init__(self, files: Mapping[str, Sequence[tuple[Path, float]]], camera: CameraProfile | None) -> None:
         self._files = files
@@ -181,7 +181,7 @@ def _description(path: Path) -> dict[str, Any]:
 
 
 def _pictures(folder: Path, table: Any) -> Pictures:
-    """Files by pattern from the table ``[pictures]``; without one, from the names of the files."""
+    """Files by pattern from the table ``[pictures]``; without it, from the names of the files."""
     if table is None:
         return {path.stem: path.name for path in sorted(folder.iterdir()) if path.is_file() and _is_pattern(path.stem)}
     if not isinstance(table, dict):

@@ -30,10 +30,10 @@ class Developed:
     ``image`` (rows, columns, 3) float32 camera RGB: 0 at the black level, 1 at full scale; noise may go below 0; NaN
     where the photograph is saturated
     ``saturated`` (rows, columns) bool: a sample that this pixel is made of was saturated
-    ``noise``: variance of a sample of value v is ``noise.shot`` v + ``noise.read`` squared; None where it is not known
-    ``camera_to_xyz`` (3, 3) float64: linear camera RGB to CIE XYZ (D65); None where the file does not say it
-    ``bayer`` (2, 2) int64: colours of the samples that the image was interpolated from (0 red, 1 green, 2 blue) at even
-    and odd rows and columns; None where each pixel had three colours
+    ``noise``: variance of a sample of value v is ``noise.shot`` v + ``noise.read`` squared; None if it is unknown
+    ``camera_to_xyz`` (3, 3) float64: linear camera RGB to CIE XYZ (D65); None if the file does not contain it
+    ``bayer`` (2, 2) int64: colours of the interpolated samples (0 red, 1 green, 2 blue) at even
+    and odd rows and columns; None if each pixel had three colours
     """
 
     image: FloatImage
@@ -52,9 +52,9 @@ def develop(path: Path | str, *, camera: CameraProfile | None = None) -> Develop
 
     Parameters
     ----------
-    path : the file; its name's ending says what it is
-    camera : what was measured of the camera (black level, clipping, bad pixels, response, noise), for example
-        ``read_run(folder).camera``; where it is given, it counts before what the file says
+    path : the file; the end of its name gives its kind
+    camera : measurements of the camera (black level, clipping, bad pixels, response, noise), for example
+        ``read_run(folder).camera``; they take precedence over the values in the file
 
     Errors: ``photograph-unreadable``, ``raw-not-bayer``, ``jpeg-response-missing``, ``target-unreadable`` (EXR).
     """
@@ -70,7 +70,7 @@ def develop(path: Path | str, *, camera: CameraProfile | None = None) -> Develop
 
 
 def _plain(path: Path) -> tuple[FloatImage, Mask]:
-    """(rows, columns, 3) of 0 to 1, and which pixels are at the largest number."""
+    """(rows, columns, 3) from 0 to 1, and the mask of the pixels with the largest number."""
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
         decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
@@ -84,7 +84,7 @@ def _plain(path: Path) -> tuple[FloatImage, Mask]:
 
 
 def _exr(path: Path) -> tuple[FloatImage, Mask]:
-    """Linear light as it is; a pixel that is not finite counts as saturated."""
+    """Unchanged linear light; a pixel that is not finite counts as saturated."""
     image = np.ascontiguousarray(read_picture(path)[..., :3])
     return image, np.asarray(~np.isfinite(image).all(axis=2))
 
@@ -100,7 +100,7 @@ def _unreadable(path: Path, reason: object) -> WorkError:
 def merge_brackets(
     images: Sequence[npt.ArrayLike], exposures_s: Sequence[float], *, noise: CameraNoise | None = None
 ) -> MergedBracket:
-    """Merge exposures of one still scene into one image without a ceiling (HDR).
+    """Merge exposures of one still scene into one HDR image.
 
     Each sample is weighted by the inverse of its variance, which the noise model gives from a first estimate.
 

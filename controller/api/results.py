@@ -1,4 +1,4 @@
-"""How near a result is to its target, and files that other programs open."""
+"""Compares a result with its target, and writes files for other programs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def compare(
     white: float = 1.0,
     camera_to_xyz: Float64 | None = None,
 ) -> Comparison:
-    """How near ``achieved`` is to ``target``: CIEDE2000, RMSE and sharpness (paper 6, eq. 9).
+    """Compare ``achieved`` with ``target``: CIEDE2000, RMSE and sharpness (paper 6, eq. 9).
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def export(
     picture: ByteImage | None = None,
     step: int = 1,
 ) -> Path:
-    """Write a file that other programs open; the name's ending says which. The file appears whole or not at all.
+    """Write a file for other programs; the end of its name gives the kind. It is written whole or not at all.
 
     ``.npz`` arrays by name; ``.exr`` an image as 32-bit linear light; ``.png`` an image of 8 bits; ``.ply`` and
     ``.glb`` (glTF) the surface of a geometry as a mesh.
@@ -73,10 +73,10 @@ def export(
     ----------
     path : the file; an existing one is replaced
     content : for ``.npz`` a mapping of arrays; for ``.exr`` (rows, columns, 3) linear light; for ``.png`` the same,
-        clipped to 0 to 1 and encoded as sRGB, or uint8, which is written as it is; for ``.ply`` and ``.glb`` a
+        clipped to 0 to 1 and encoded as sRGB, or uint8, which is written unchanged; for ``.ply`` and ``.glb`` a
         ``Geometry``, in metres
     picture : (camera rows, columns, 3) uint8 sRGB, the colours or the texture of a mesh
-    step : a mesh has a vertex for every so many camera pixels
+    step : every n-th camera pixel becomes a vertex of a mesh
 
     Returns the path.
 
@@ -87,7 +87,7 @@ def export(
     if kind not in (".npz", ".exr", ".png", ".ply", ".glb"):
         raise UsageError(
             "export-kind-unknown",
-            what=f"{path.name} does not end in a known kind of file.",
+            what=f"The file type of {path.name} is unknown.",
             remedy="Give a name that ends in .npz, .exr, .png, .ply or .glb.",
         )
     if kind == ".npz" and isinstance(content, Mapping):

@@ -26,7 +26,7 @@ class ReachableTarget:
 
     ``radiance`` (camera rows, columns, 3) float32: what the camera should see, black image included
     ``exposure``: light of a white pixel of the picture
-    ``reachable`` (camera rows, columns) bool: on the object, and neither too bright, too dark nor too saturated
+    ``reachable`` (camera rows, columns) bool: on the object, and not too bright, too dark or too saturated
     ``share``: the part of the object's pixels that is reachable, 0 to 1
     """
 
@@ -106,7 +106,7 @@ def solve(
 
 
 def base_image(calibration: Calibration, kind: Literal["white", "minimum"] = "white") -> FloatImage:
-    """A base image C_b, from which other targets can be scaled (paper 3.1, 5).
+    """A base image C_b, from which other targets are scaled (paper 3.1, 5).
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def solve_base(
     smoothness: float = SMOOTHNESS,
     tolerance: float = TOLERANCE,
 ) -> Base:
-    """Solve a base image once, so that ``scale`` can make many targets of it quickly.
+    """Solve a base image once, so that ``scale`` can make many targets from it quickly.
 
     Parameters
     ----------

@@ -23,11 +23,11 @@ def build_transport(calibration: Calibration) -> LightTransport:
     """The light transport T of a calibration: camera picture = black + T p (paper 2.1, eq. 1; 4.2.3).
 
     For projector n with the picture p_n, T_n p_n = W_n (.) G_n (p_n M_n'): W_n is its white image, M_n its colour
-    mixing, and G_n says which share of each camera pixel's light comes from each projector pixel.
+    mixing, and G_n gives the share of each camera pixel's light that comes from each projector pixel.
 
     Parameters
     ----------
-    calibration : of ``calibrate`` or ``read_run``, or made of arrays. Where every projector has a phase map, the shares
+    calibration : of ``calibrate`` or ``read_run``, or made of arrays. If every projector has a phase map, the shares
         come from it, else from the metapixels' Gaussians
 
     Returns
@@ -117,7 +117,7 @@ def _largest_one(matrix: sp.csr_matrix[np.float64]) -> sp.csr_matrix[np.float64]
 
 
 def _without_metapixels(projector_px: tuple[int, int]) -> Metapixels:
-    """Metapixels that say nothing but the projector's size: the shares come from the matrices."""
+    """Metapixels with only the projector's size: the shares come from the matrices."""
     shape = (projector_px[1], projector_px[0])
     nothing = np.full((*shape, 3), np.nan, np.float32)
     return Metapixels(nothing[..., :2], nothing, np.zeros(shape, np.bool_))

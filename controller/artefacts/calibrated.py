@@ -16,7 +16,7 @@ from controller.transport import LightTransport, build_transport
 
 
 class Calibrated:
-    """The calibration of a run and its transport, read when they are first needed and kept while steps need them."""
+    """The calibration of a run and its transport, read at the first use and kept."""
 
     def __init__(self, folder: Path, projectors: Sequence[str]) -> None:
         self.folder = folder
@@ -28,7 +28,7 @@ class Calibrated:
 
     @property
     def base_folder(self) -> Path:
-        """Where the base image lies."""
+        """The folder of the base image."""
         return self.folder
 
     @property

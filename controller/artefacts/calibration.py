@@ -1,4 +1,4 @@
-"""The whole calibration that a run left in its folder, read back."""
+"""Reads the complete calibration from a run's folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from controller.capture.raw import CAMERA_BLUR_PX
 from controller.core.arrays import FloatImage, Mask
 
 LIT_SHARE = 0.004
-"""A camera pixel counts as lit where a projector's white is above this share of the brightest white there is."""
+"""A camera pixel counts as lit if a projector's white is above this share of the brightest white."""
 
 
 def merge_photographs(taken: Sequence[Taken]) -> FloatImage:
@@ -43,7 +43,7 @@ def read_captures(folder: Path, projector: str) -> dict[str, Taken]:
 
 
 def read_correspondence(folder: Path, projector: str) -> Correspondence:
-    """What was decoded from the sinusoids of a projector."""
+    """The correspondences decoded from the sinusoids of a projector."""
     return Pixels.read(folder, projector).correspondence
 
 
@@ -53,7 +53,7 @@ def projectors_of(folder: Path) -> list[str]:
 
 
 def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
-    """The calibration that a finished run left in ``folder``."""
+    """The calibration of the finished run in ``folder``."""
     parts = []
     for name in projectors:
         light = Light.read(folder, name)
@@ -70,7 +70,7 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
 
 
 def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.NDArray[np.int64] | None]:
-    """A projector's phase map and the camera's mosaic; None where the run has none, or its metapixels are from dots."""
+    """A projector's phase map and the camera's mosaic; None if the run has none, or its metapixels are from dots."""
     if mode_of(folder) == "paper":
         return None, None
     pixels = Pixels.read(folder, projector)
@@ -78,7 +78,7 @@ def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.N
 
 
 def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:
-    """Camera pixels that some projector lights noticeably in every channel."""
+    """Camera pixels that any projector lights noticeably in every channel."""
     brightest = max(float(np.percentile(part.white, 99.9)) for part in parts)
     masks = [part.white.min(axis=2) > LIT_SHARE * brightest for part in parts]
     lit: Mask = np.logical_or.reduce(masks)

@@ -1,6 +1,6 @@
-"""How a run photographs: the exposures it found, the stage's delay, and figures of the camera.
+"""A run's settings for photographs: exposures, the stage's delay, and figures of the camera.
 
-What was measured of the camera itself, ``camera.npz``, is ``capture.profile.CameraProfile``.
+Measurements of the camera itself, ``camera.npz``, are in ``capture.profile.CameraProfile``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _RESPONSE_FIGURES: Final = "camera-response-figures.json"
 
 @dataclass(frozen=True, slots=True)
 class Exposures:
-    """In seconds: ``base_s`` at which a projector's white is well exposed; ``white_s`` the bracket of its HDR white."""
+    """In seconds: ``base_s``, where a projector's white is well exposed; ``white_s``, the bracket of its HDR white."""
 
     base_s: float
     white_s: tuple[float, ...]
@@ -30,20 +30,20 @@ class Exposures:
     @staticmethod
     def write(run: Path, found: Mapping[str, Exposures]) -> Path:
         """``exposure.json``, by projector name."""
-        return write_json(run / _EXPOSURES, {name: asdict(one) for name, one in found.items()})
+        return write_json(run / _EXPOSURES, {name: asdict(exposures) for name, exposures in found.items()})
 
     @staticmethod
     def read(run: Path) -> dict[str, Exposures]:
-        """What the step of the exposures found, by projector name."""
+        """The exposures by projector name."""
         rows = read_json(run / _EXPOSURES)
         return {name: Exposures(float(row["base_s"]), tuple(map(float, row["white_s"]))) for name, row in rows.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """``delay.json``, in seconds: ``wait_s`` after its presentation a picture is photographed whole.
+    """``delay.json``, in seconds: ``wait_s`` after its presentation a picture is completely visible.
 
-    ``delay_s`` after which it begins to be there; ``tries`` as ``capture.latency`` tells them, each of ``exposure_s``
+    ``delay_s`` after which it starts to appear; ``tries`` as in ``capture.latency``, each of ``exposure_s``
     """
 
     wait_s: float
@@ -56,20 +56,20 @@ class Delay:
 
 
 def raise_delay(run: Path, wait_s: float) -> None:
-    """Note that later more time proved necessary than was measured, in seconds; that is no artefact of a step."""
+    """Store that a longer delay than measured was needed, in seconds. This is not an artefact of a step."""
     write_json(run / _RAISED, {"wait_s": wait_s})
 
 
 def longest_wait_s(run: Path) -> float | None:
-    """The seconds between presentation and photograph that the run has found necessary; None before it has."""
+    """The delay between presentation and photograph that the run needs, in seconds; None before it is measured."""
     waits = [float(read_json(path)["wait_s"]) for path in (run / _DELAY, run / _RAISED) if path.exists()]
     return max(waits, default=None)
 
 
 def inherit_camera(calibrated: Path, run: Path) -> None:
-    """Give a run what the one in ``calibrated`` measured of its camera and of the stage's delay.
+    """Copy the measurements of camera and delay from the run in ``calibrated`` to another run.
 
-    What the run has measured itself stays.
+    The run's own measurements stay.
     """
     for name in (FILE_NAME, _DELAY, _RAISED):
         if (calibrated / name).exists() and not (run / name).exists():

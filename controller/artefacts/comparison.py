@@ -1,8 +1,8 @@
-"""What photographs of appearances were found to achieve, read from the runs' folders.
+"""Reads from the runs' folders how well photographed appearances match their targets.
 
 ``steps.appearance.compare`` writes them.
 
-Light on purpose: the kiosk asks for this while it plays, with nothing loaded that calibrates.
+It imports little: the kiosk uses it while it plays, without the calibration code.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 COMPARE: Final = "compare"
-"""What such runs are called; their folders' names end with it."""
+"""Name of such runs; their folders' names end with it."""
 PICTURES: Final = ("before", "target", "achieved", "error", "resolution")
 MOST: Final = 50
-"""So many runs are looked at, the newest."""
+"""Number of newest runs that are read."""
 _KIND: Final = "compared"
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """One appearance in one run: ``photographed_unix_s`` when, on which ``calibration`` it was solved, and how near.
+    """One appearance in one run: when it was photographed, the run of its ``calibration``, and the differences.
 
     ``delta_e00_median``, ``delta_e00_p95``: CIEDE2000; ``rmse`` of the target's white; ``sharpness_lambda`` 0 to 1
     (paper 6, eq. 9), all over the reachable pixels of the object; ``reachable_share`` of its pixels, if it is known;
@@ -74,7 +74,7 @@ def write_compared(run: Path, one: Compared, images: ComparedImages) -> list[Pat
 
 
 def read_images(run: Path, name: str) -> ComparedImages:
-    """What ``write_compared`` wrote of an appearance."""
+    """The result of ``write_compared`` for an appearance."""
     from controller.core.arrays import load_arrays
 
     return ComparedImages(**load_arrays(npz_path(run, _KIND, name)))
@@ -86,7 +86,7 @@ def picture_path(run: Path, name: str, picture: str) -> Path:
 
 
 def compared_in(run: Path) -> tuple[Compared, ...]:
-    """What a run holds, by name; a file that can't be read is left out, since the others say something without it."""
+    """The results of a run, by name; unreadable files are skipped."""
     found = []
     for path in sorted(run.glob(f"{_KIND}-*.json")):
         try:
@@ -98,9 +98,9 @@ def compared_in(run: Path) -> tuple[Compared, ...]:
 
 
 def all_compared(stage: Path) -> dict[Path, tuple[Compared, ...]]:
-    """The runs that have photographed anything, oldest first, at most ``MOST``, each with what it holds.
+    """The newest runs with photographs, oldest first, at most ``MOST``, each with its results.
 
-    A run is read again only when something in its folder was replaced: the kiosk asks every few seconds.
+    A run is read again only when its folder has changed, because the kiosk asks every few seconds.
     """
     folders = sorted((stage / "runs").glob(f"*-{COMPARE}"))[-MOST:]
     held = {folder: _remembered(folder, folder.stat().st_mtime_ns) for folder in folders}
@@ -113,17 +113,17 @@ def _remembered(run: Path, changed_ns: int) -> tuple[Compared, ...]:
 
 
 def history_of(stage: Path, names: Collection[str]) -> dict[str, tuple[Compared, ...]]:
-    """Each of these appearances with what was found of it, oldest first; without those that nobody photographed."""
+    """Each of these appearances with its results, oldest first; without those that were never photographed."""
     found: dict[str, list[Compared]] = {}
     for known in all_compared(stage).values():
-        for one in known:
-            if one.name in names:
-                found.setdefault(one.name, []).append(one)
+        for comparison in known:
+            if comparison.name in names:
+                found.setdefault(comparison.name, []).append(comparison)
     return {name: tuple(found[name]) for name in names if name in found}
 
 
 def pictures_of(stage: Path, one: Compared) -> dict[str, Path]:
-    """The pictures of it that the run holds, by ``PICTURES``."""
+    """Its pictures in the run, by ``PICTURES``."""
     run = stage / "runs" / one.run
     files = {picture: picture_path(run, one.name, picture) for picture in PICTURES}
     return {picture: file for picture, file in files.items() if file.exists()}

@@ -1,4 +1,4 @@
-"""What dots measured at depth edges, in a run's folder."""
+"""Files of the measurements with dots at depth edges."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PROJECTORS: Final = "projectors"
 
 @dataclass(frozen=True, slots=True)
 class EdgeDots:
-    """``edge-dots-PROJECTOR.npz`` and ``.json``: what was shown to measure the depth edges of a projector.
+    """``edge-dots-PROJECTOR.npz`` and ``.json``: the patterns that measure the depth edges of a projector.
 
     ``pattern`` (projector rows, columns) int16: in which photograph each pixel is lit, -1 for none
     ``spacing_px`` of the pixels lit together, in projector pixels; ``exposure_s``; ``photographs``: how many
@@ -66,7 +66,7 @@ def write_edges(
 
 
 def read_edges(run: Path, projectors: Sequence[str]) -> tuple[EdgeShares, ...]:
-    """What was measured at the depth edges of each projector."""
+    """The measurements at the depth edges of each projector."""
     found = []
     for name in projectors:
         arrays = load_arrays(npz_path(run, StepKind.EDGES, name))
@@ -82,7 +82,7 @@ def write_terms(run: Path, projectors: Sequence[str], terms: Sequence[EdgeTerm])
 
 
 def edged(model: LightTransport, run: Path, projectors: Sequence[str]) -> LightTransport:
-    """The run's transport: ``model``, with what dots say at depth edges where the automatic mode has measured them.
+    """The run's transport: ``model``, corrected at depth edges if the automatic mode has measured them.
 
     ``projectors``: the model's, in its order; the run may have others, too.
     """

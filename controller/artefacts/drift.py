@@ -1,4 +1,4 @@
-"""What a drift check found, ``drift.json`` in its run's folder (docs/explanation/drift.md)."""
+"""The result of a drift check, ``drift.json`` in its run's folder (docs/explanation/drift.md)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from controller.calibrate.verify.drift_report import drift_from_json, drift_to_j
 
 
 def write_drift(run: Path, drift: Drift, *, calibration: str, photographs: int) -> Path:
-    """``calibration``: the name of the run that it was compared with; lengths are in camera pixels, light in shares."""
+    """``calibration``: the name of the run to compare with; lengths are in camera pixels, light in shares."""
     content = drift_to_json(drift, calibration=calibration, photographs=photographs)
     return write_json(json_path(run, StepKind.DRIFT), content)
 
 
 def read_drift(run: Path) -> Drift:
-    """What the check found."""
+    """The result of the check."""
     return drift_from_json(read_drift_figures(run))
 
 

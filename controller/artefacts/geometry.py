@@ -17,7 +17,7 @@ from controller.core.arrays import FloatImage, load_arrays, save_arrays
 
 
 def write_geometry(run: Path, projectors: Sequence[str], found: Reconstruction) -> list[Path]:
-    """Points and normals in the camera's frame, metres; poses, and how sure they are (docs/reference/report.md)."""
+    """Points and normals in the camera's frame, metres; poses and their uncertainty (docs/reference/report.md)."""
     geometry = found.geometry
     arrays = npz_path(run, StepKind.GEOMETRY)
     save_arrays(arrays, {"points_m": geometry.points_m, "normals": geometry.normals, "sigma_m": found.sigma_m})
@@ -42,7 +42,7 @@ def has_geometry(run: Path) -> bool:
 
 
 def read_geometry(run: Path, projectors: Sequence[str] | None = None) -> Geometry:
-    """The geometry that a finished run left; ``projectors``: in this order, else as the run has them."""
+    """The geometry of a finished run; ``projectors``: in this order, else as in the run."""
     arrays = load_arrays(npz_path(run, StepKind.GEOMETRY))
     poses = read_geometry_figures(run)
     geometry = Geometry(
@@ -66,7 +66,7 @@ def read_points_m(run: Path) -> FloatImage:
 
 
 def read_geometry_figures(run: Path) -> Any:
-    """The content of ``geometry.json``; {} where there is none."""
+    """The content of ``geometry.json``; {} if it is missing."""
     path = json_path(run, StepKind.GEOMETRY)
     return read_json(path) if path.exists() else {}
 

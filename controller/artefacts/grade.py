@@ -1,4 +1,4 @@
-"""The grade that a run was given, in its folder; what gives it is in ``steps.calibrate.grade``."""
+"""The grade files of a run; ``steps.calibrate.grade`` computes the grade."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from controller.core.arrays import load_arrays, save_arrays
 from controller.core.storage import write_atomically
 
 PICTURE: Final = "verification.png"
-"""The map of where the calibration is bad, and why: the projectors one above the other."""
+"""The map of errors and their reasons: the projectors one above the other."""
 FIGURES: Final = "verification.json"
 BEFORE, RESOLUTION = "before.png", "resolution.png"
-"""Pictures of the report, for the panel: all projectors at white, and the finest metapixel around."""
+"""Pictures of the report, for the panel: all projectors at white, and the finest metapixel at each pixel."""
 _MAPS: Final = "verification.npz"
 _ACCEPTED: Final = "accepted.json"
 
@@ -27,8 +27,8 @@ _ACCEPTED: Final = "accepted.json"
 class ErrorMaps:
     """Of one projector, (camera rows, columns).
 
-    ``error`` float32: difference of photograph and prediction over the light around, NaN where not compared
-    ``reasons``: which reason the data give (``calibrate.verify.error_attribution``)
+    ``error`` float32: difference of photograph and prediction over the local light, NaN where not compared
+    ``reasons``: the reason for the error (``calibrate.verify.error_attribution``)
     """
 
     error: npt.NDArray[Any]
@@ -50,7 +50,7 @@ def write_grade(
 
 
 def is_graded(run: Path) -> bool:
-    """Whether the run was graded; its file may yet be damaged."""
+    """Whether the run was graded; its file may still be damaged."""
     return (run / FIGURES).exists()
 
 
@@ -87,11 +87,11 @@ def worst_of(run: Path) -> tuple[str, float] | None:
 
 
 def write_accepted(run: Path, projector: str, percent: float) -> Path:
-    """``accepted.json``: a person lets the run pass although this projector has this error, in per cent."""
+    """``accepted.json``: a person accepted the run with this projector's error, in per cent."""
     return write_json(run / _ACCEPTED, {"projector": projector, "percent": percent})
 
 
 def passes(run: Path, worst_grade: float) -> bool:
-    """Whether a run's calibration may be used: good enough, accepted by a person, or graded only later."""
+    """Whether a run's calibration may be used: good enough, accepted by a person, or not graded yet."""
     worst = worst_of(run)
     return worst is None or worst[1] <= worst_grade or (run / _ACCEPTED).exists()

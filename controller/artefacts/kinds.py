@@ -1,4 +1,4 @@
-"""The kinds of steps whose artefacts or identity others ask for, and short ways to write their identities."""
+"""Kinds of steps that other code uses, and short functions for their identities."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from controller.run.step_id import StepId
 
 
 class StepKind(enum.StrEnum):
-    """The ``kind`` of a ``StepId``. A file of the step is usually called after it: see ``artefacts.names``."""
+    """The ``kind`` of a ``StepId``. A step's file usually has this name: see ``artefacts.names``."""
 
     EXPOSURE = "exposure"
     DELAY = "delay"
@@ -53,7 +53,7 @@ OF_PROJECTORS: Final = (
 """Kinds of which there is one step for each projector."""
 
 CALIBRATED: Final = StepId(StepKind.CALIBRATED)
-"""The step whose row in the journal says that the run's calibration is complete."""
+"""The step whose row in the journal marks the run's calibration as complete."""
 
 
 def of_projectors(names: Iterable[str], *kinds: StepKind) -> tuple[StepId, ...]:

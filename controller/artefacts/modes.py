@@ -1,4 +1,4 @@
-"""How a calibration measured its metapixels, and which of a run's metapixels count."""
+"""Calibration modes: how metapixels are measured, and which of a run's metapixels are used."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class DotOptions:
     spacing_px: int | None = PAPER_SPACING_PX
 
     def inputs(self) -> dict[str, str]:
-        """What the steps depend on."""
+        """Inputs of the steps."""
         return {"mode": self.mode, "spacing_px": AUTO if self.spacing_px is None else str(self.spacing_px)}
 
 
 def dot_options(mode: str, spacing: str | None) -> DotOptions:
-    """Options from what a person typed; ``spacing`` is a number, "auto", or None for the mode's own.
+    """Options from the command line; ``spacing`` is a number, "auto", or None for the mode's default.
 
     Raises UsageError("calibration-mode-unknown", "dot-spacing-wrong" or "dot-spacing-unused").
     """
@@ -48,8 +48,8 @@ def dot_options(mode: str, spacing: str | None) -> DotOptions:
     if spacing is not None and known == "fast":
         raise UsageError(
             "dot-spacing-unused",
-            what="The mode fast shows no dots, so --dot-spacing has no effect in it.",
-            remedy="Leave it out, or give --mode auto or --mode paper as well.",
+            what="The mode fast shows no dots, so --dot-spacing has no effect.",
+            remedy="Remove it, or add --mode auto or --mode paper.",
         )
     if spacing is None:
         return DotOptions(known, PAPER_SPACING_PX if known == "paper" else None)
@@ -59,13 +59,13 @@ def dot_options(mode: str, spacing: str | None) -> DotOptions:
         raise UsageError(
             "dot-spacing-wrong",
             what=f"Dots can't be {spacing} pixels apart.",
-            remedy=f'Give a whole number from {LEAST_SPACING_PX} to 64, or "{AUTO}" to choose it by the blur.',
+            remedy=f'Give a whole number from {LEAST_SPACING_PX} to 64, or "{AUTO}" to choose it from the blur.',
         )
     return DotOptions(known, int(spacing))
 
 
 def mode_step(options: DotOptions, after: Sequence[StepId]) -> Step:
-    """The step that says in ``mode.json`` which metapixels count; a run may hold those of several modes."""
+    """The step that writes to ``mode.json`` which metapixels are used; a run may hold those of several modes."""
 
     def write(context: Context) -> Sequence[Path]:
         return [write_json(json_path(context.folder, StepKind.MODE), options.inputs())]
@@ -81,13 +81,13 @@ def mode_step(options: DotOptions, after: Sequence[StepId]) -> Step:
 
 
 def mode_of(folder: Path) -> str:
-    """The mode of a run; "fast" for one that does not tell."""
+    """The mode of a run; "fast" if it is not stored."""
     path = json_path(folder, StepKind.MODE)
     return str(read_json(path)["mode"]) if path.exists() else "fast"
 
 
 def read_metapixels(folder: Path, projector: str) -> Metapixels:
-    """The metapixels that count in a run: from dots in the paper's mode, else from the sinusoids."""
+    """The metapixels that a run uses: from dots in the paper's mode, else from the sinusoids."""
     if mode_of(folder) == "paper":
         return DotMetapixels.read(folder, projector).metapixels
     return Pixels.read(folder, projector).metapixels

@@ -1,6 +1,6 @@
-"""Names of files in a run's folder, made from kinds and names of projectors and appearances; never read back.
+"""Names of files in a run's folder, made from kinds and names of projectors and appearances; never parsed.
 
-Light on purpose, as what the kiosk asks for while it plays.
+It imports little, because the kiosk uses it while it plays.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import Any, Final
 from controller.core.storage import write_atomically
 
 CAPTURES: Final = "captures"
-"""The folder of a run that holds its photographs."""
+"""The folder with a run's photographs."""
 REPORT_PAGE, REPORT_FIGURES = "report.html", "report.json"
 """A run's report, for people and for machines."""
 MOST_BYTES: Final = 200
-"""Of a name inside a file's name: kind, number, suffix and what a half-written file has beside fit into 255 bytes."""
+"""Maximum bytes of a name in a file's name: with kind, number and suffixes it must fit into 255 bytes."""
 
 
 def safe_name(name: str) -> str:
-    """``name`` as it stands in the names of files: different for different names, and the same for ordinary ones.
+    """``name`` for use in file names: different for different names, unchanged for ordinary ones.
 
-    Percent signs and what can't be printed are written as %XX, as are the names "." and "..", which are folders. What
-    is longer than ``MOST_BYTES`` is cut, and told apart by its SHA-256.
+    Percent signs, unprintable characters, and the names "." and ".." are written as %XX. A name
+    longer than ``MOST_BYTES`` is cut and gets its SHA-256 as a suffix.
     """
     if name in (".", ".."):
         return _escaped(name)
@@ -40,26 +40,26 @@ def _escaped(one: str) -> str:
 
 
 def stem(kind: str, name: str | None = None, *, part: int | None = None) -> str:
-    """A file's name without its suffix: KIND, KIND-NAME, or KIND.NNN-NAME where a file has numbered parts.
+    """A file's name without its suffix: KIND, KIND-NAME, or KIND.NNN-NAME for numbered parts.
 
-    The name comes last and no kind begins as another one with a dash does, so that no two have the same.
+    The name comes last, and no kind is the beginning of another kind with a dash, so all names differ.
     """
     whole = kind if part is None else f"{kind}.{part:03d}"
     return whole if name is None else f"{whole}-{safe_name(name)}"
 
 
 def npz_path(run: Path, kind: str, name: str | None = None) -> Path:
-    """The arrays of a kind in a run's folder: those of one projector or appearance, or of all."""
+    """The file with a kind's arrays in a run's folder: for one projector or appearance, or for all."""
     return run / f"{stem(kind, name)}.npz"
 
 
 def json_path(run: Path, kind: str, name: str | None = None) -> Path:
-    """As ``npz_path``, its figures."""
+    """As ``npz_path``, for the figures."""
     return run / f"{stem(kind, name)}.json"
 
 
 def run_kind(run: Path) -> str:
-    """What was done in a run, from its folder's name, DATE-TIME-KIND."""
+    """The kind of a run, from its folder's name, DATE-TIME-KIND."""
     return run.name.rpartition("-")[2]
 
 
@@ -70,5 +70,5 @@ def write_json(path: Path, content: object) -> Path:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds. Raises OSError and ValueError for one that can't be read."""
+    """The content of a JSON file. Raises OSError and ValueError if it can't be read."""
     return json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""The photographs of a run: where they lie, the index that lists them, and the note beside each."""
+"""The photographs of a run: their paths, their index, and the note for each."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from controller.core.arrays import FloatImage
 from controller.run.step_id import ShotId
 
 PATTERN: Final = "pattern"
-"""The name of a projector's photograph where each projector has one."""
+"""The name of a projector's photograph, if each projector has one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Taken:
     """A photograph on disk, with the exposure that the camera confirmed, in seconds.
 
-    ``fresh``: it was taken just now, not by an earlier run.
+    ``fresh``: it was taken by this run, not by an earlier one.
     """
 
     name: str
@@ -32,9 +32,9 @@ class Taken:
     exposure_s: float
     fresh: bool = False
     profile: CameraProfile | None = field(default=None, compare=False, repr=False)
-    """What the run has measured of the camera, where it has."""
+    """The run's measurements of the camera, if any."""
     projector: str | None = None
-    """The projector that shone alone; None for several, or none."""
+    """The only lit projector; None for several, or none."""
 
     def read(self) -> Photograph:
         return read_photograph(self.path, profile=self.profile)
@@ -50,9 +50,9 @@ class Taken:
 
 @dataclass(frozen=True, slots=True)
 class PhotographSet:
-    """Photographs that are listed together, in one index: KIND.json, KIND-PROJECTOR.json, KIND.NNN-PROJECTOR.json.
+    """Photographs in one index: KIND.json, KIND-PROJECTOR.json or KIND.NNN-PROJECTOR.json.
 
-    ``projector``: the one that shines alone in all of them; ``batch``: which part of a long list it is, from 0
+    ``projector``: the only one lit in all of them; ``batch``: the part of a long list, from 0
     """
 
     kind: str
@@ -64,37 +64,37 @@ class PhotographSet:
         return run / f"{stem(self.kind, self.projector, part=self.batch)}.json"
 
     def shot(self, name: str, projector: str | None = None) -> ShotId:
-        """The identity of one of them; ``projector`` where the set has none itself."""
+        """The identity of one of them; ``projector`` if the set itself has none."""
         return ShotId(str(self.kind), name, projector or self.projector)
 
     def write(self, run: Path, taken: Sequence[Taken]) -> Path:
-        """List them, in the order in which they were taken; the index."""
+        """Write the index, in the order in which they were taken."""
         rows = [
             {
-                "name": one.name,
-                "projector": one.projector,
-                "path": str(one.path.relative_to(run)),
-                "exposure_s": one.exposure_s,
+                "name": photograph.name,
+                "projector": photograph.projector,
+                "path": str(photograph.path.relative_to(run)),
+                "exposure_s": photograph.exposure_s,
             }
-            for one in taken
+            for photograph in taken
         ]
         return write_json(self.index(run), rows)
 
     def read(self, run: Path) -> tuple[Taken, ...]:
-        """What the index lists, with the run's word on how long exposures truly are."""
+        """The photographs in the index, with the run's corrected exposure times."""
         profile = load_profile(run)
         index = self.index(run)
-        if self.batch is not None and not index.exists():  # as journal format 1 had it
+        if self.batch is not None and not index.exists():  # as in journal format 1
             index = run / f"{self.kind}-{self.projector}-{self.batch:03d}.json"
         return tuple(self._taken(run, row, profile) for row in read_json(index))
 
     def by_name(self, run: Path) -> dict[str, Taken]:
         """As ``read``, by name; for a set of one projector or of none, whose names differ."""
-        return {one.name: one for one in self.read(run)}
+        return {photograph.name: photograph for photograph in self.read(run)}
 
     def by_projector(self, run: Path, name: str = PATTERN) -> dict[str | None, Taken]:
-        """As ``read``, those of this name by the projector that shone alone."""
-        return {one.projector: one for one in self.read(run) if one.name == name}
+        """As ``read``, those of this name by their lit projector."""
+        return {photograph.projector: photograph for photograph in self.read(run) if photograph.name == name}
 
     def _taken(self, run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> Taken:
         name, projector = (row["name"], row["projector"]) if "projector" in row else self._of_format_1(row["name"])
@@ -103,7 +103,7 @@ class PhotographSet:
         return Taken(name, run / row["path"], exposure_s, profile=profile, projector=projector)
 
     def _of_format_1(self, name: str) -> tuple[str, str | None]:
-        """Name and projector from an index of journal format 1, where both were one text."""
+        """Name and projector from an index of journal format 1, which has both in one text."""
         if self.projector is not None:
             return name.removeprefix(f"{self.projector}-"), self.projector
         if self.kind == StepKind.DRIFT_PHOTOGRAPHS:
@@ -125,7 +125,7 @@ def codes_of(projector: str) -> PhotographSet:
 
 
 def white_again_of(projector: str) -> PhotographSet:
-    """White of one projector, photographed once more by a quick recalibration."""
+    """White of one projector, photographed again by a quick recalibration."""
     return PhotographSet("white", projector)
 
 
@@ -146,18 +146,18 @@ def white_name(number: int) -> str:
 
 def white_bracket(taken: Sequence[Taken]) -> list[Taken]:
     """The bracket of white among the photographs of a projector's light."""
-    found = {one.name: one for one in taken}
+    found = {photograph.name: photograph for photograph in taken}
     names = (white_name(number) for number in range(len(found)))
     return [found[name] for name in names if name in found]
 
 
 def captures_folder(run: Path, shot: ShotId) -> Path:
-    """Where the photograph lies: those of one kind and projector lie together, so that no two have the same name."""
+    """The photograph's folder: one for each kind and projector, so that all names differ."""
     return run / CAPTURES / stem(shot.kind, shot.projector)
 
 
 def captured(run: Path, of: PhotographSet) -> int:
-    """How many photographs of a set's kind and projector lie in the run, listed or not."""
+    """Number of photographs of a set's kind and projector in the run, listed or not."""
     folder = captures_folder(run, of.shot(""))
     if not folder.is_dir():
         return 0
@@ -170,7 +170,7 @@ def capture_name(shot: ShotId) -> str:
 
 
 def write_exposure(photograph: Path, exposure_s: float) -> None:
-    """Note, beside a photograph, the exposure that the camera confirmed, in seconds."""
+    """Write the note with the exposure that the camera confirmed, in seconds."""
     write_json(_note(photograph), {"exposure_s": exposure_s})
 
 
@@ -184,13 +184,13 @@ def _note(photograph: Path) -> Path:
 
 
 NOTE_SUFFIX: Final = ".json"
-"""Of the notes beside photographs."""
+"""Suffix of the photographs' notes."""
 
 
 class Developed(Mapping[str, FloatImage]):
-    """Photographs by pattern name, in full scales per second, read each time they are asked for.
+    """Photographs by pattern name, in full scales per second, read at each access.
 
-    ``ready`` holds images that are there already (HDR black and white) and go before the photographs.
+    ``ready`` holds images in memory (HDR black and white), which take precedence over the photographs.
     """
 
     def __init__(self, taken: Mapping[str, Taken], ready: Mapping[str, FloatImage]) -> None:

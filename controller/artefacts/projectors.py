@@ -1,4 +1,4 @@
-"""What a run measured of each projector: its light, its metapixels, its dots."""
+"""A run's measurements of each projector: light, metapixels, dots."""
 
 from __future__ import annotations
 
@@ -85,11 +85,11 @@ class Pixels:
 
     @property
     def known_mosaic(self) -> npt.NDArray[np.int64] | None:
-        """The camera's mosaic, None where it is not known or there is none."""
+        """The camera's mosaic, None if it is unknown or there is none."""
         return self.mosaic if self.mosaic is not None and self.mosaic.size else None
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Those that there are, by name."""
+        """The existing ones, by name."""
         return {name: array for name in _names(Pixels) if (array := getattr(self, name)) is not None}
 
     @staticmethod
@@ -150,12 +150,12 @@ class DotNotes:
 
 
 def write_radiometry_figures(run: Path, projector: str, figures: Mapping[str, Any]) -> Path:
-    """``radiometry-PROJECTOR.json``: how well the response was measured (docs/reference/report.md)."""
+    """``radiometry-PROJECTOR.json``: quality of the measured response (docs/reference/report.md)."""
     return write_json(json_path(run, StepKind.RADIOMETRY, projector), figures)
 
 
 def read_radiometry_figures(run: Path, projector: str) -> Any:
-    """What ``write_radiometry_figures`` wrote; {} where there is none."""
+    """The content of ``write_radiometry_figures``; {} if it is missing."""
     return _read_figures(json_path(run, StepKind.RADIOMETRY, projector))
 
 
@@ -175,13 +175,13 @@ class PixelFigures:
 
     @classmethod
     def read(cls, run: Path, projector: str) -> Self | None:
-        """None where there are none."""
+        """None if there are none."""
         row = _read_figures(json_path(run, StepKind.PIXELS, projector))
         return cls(int(row["fitted"]), int(row["pixels"]), int(row["camera_pixels"])) if row else None
 
 
 def write_dot_figures(run: Path, projector: str, figures: Mapping[str, Any]) -> Path:
-    """``metapixels-PROJECTOR.json``: how the dots were fitted; for people."""
+    """``metapixels-PROJECTOR.json``: figures of the fit to the dots; for people."""
     return write_json(json_path(run, StepKind.METAPIXELS, projector), figures)
 
 
@@ -190,7 +190,7 @@ def _read_figures(path: Path) -> Any:
 
 
 def _names(kind: type[Light | Pixels | DotMetapixels]) -> list[str]:
-    return [one.name for one in fields(kind)]
+    return [field.name for field in fields(kind)]
 
 
 def _save(path: Path, value: Light | Pixels | DotMetapixels) -> Path:

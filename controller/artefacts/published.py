@@ -1,4 +1,4 @@
-"""What a run published and what was photographed of it: bundle, thumbnails, photographs, playback, report."""
+"""Files of published appearances: bundle, thumbnails, photographs, playback."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BUNDLE_FIGURES: Final = "bundle"
 
 @dataclass(frozen=True, slots=True)
 class BundleFigures:
-    """``bundle.json``: the bundle's size in bytes, how many times smaller than raw frames it is, where it lies."""
+    """``bundle.json``: the bundle's size in bytes, its compression factor, its path."""
 
     bytes: int
     ratio: float
@@ -38,12 +38,12 @@ class BundleFigures:
 
 
 def write_playback(run: Path, figures: Mapping[str, Any]) -> Path:
-    """``playback.json``: how evenly the appearances were swapped (docs/reference/report.md)."""
+    """``playback.json``: regularity of the swaps (docs/reference/report.md)."""
     return write_json(json_path(run, StepKind.PLAYBACK), figures)
 
 
 def read_playback(run: Path) -> Any:
-    """What ``write_playback`` wrote."""
+    """The content of ``write_playback``."""
     return read_json(json_path(run, StepKind.PLAYBACK))
 
 
@@ -55,7 +55,7 @@ def write_photograph(run: Path, kind: StepKind, name: str, picture: FloatImage) 
 
 
 def has_photograph(run: Path, kind: StepKind, name: str) -> bool:
-    """Whether the run holds that photograph."""
+    """Whether the run has that photograph."""
     return npz_path(run, kind, name).exists()
 
 
@@ -66,13 +66,13 @@ def read_photograph_of(run: Path, kind: StepKind, name: str) -> FloatImage:
 
 
 def read_thumbnail(run: Path, name: str) -> bytes | None:
-    """The PNG file of an appearance as it was solved last; None where there is none yet."""
+    """The PNG file of an appearance's latest solve; None if there is none yet."""
     path = _thumbnail(run, name)
     return path.read_bytes() if path.exists() else None
 
 
 def write_thumbnail(run: Path, name: str, png: bytes) -> None:
-    """Keep it until the appearance is solved anew, and remove the older ones."""
+    """Keep it until the appearance is solved again, and remove the older ones."""
     for older in run.glob(f"thumbnail-{name}-{'[0-9a-f]' * 16}.png"):
         older.unlink()
     write_atomically(_thumbnail(run, name), png)
@@ -83,5 +83,5 @@ def _thumbnail(run: Path, name: str) -> Path:
 
 
 def exported_path(run: Path, kind: str) -> Path:
-    """Where the object lies for other programs: a file by its format, or Blender's folder."""
+    """Path of the exported object: a file by its format, or Blender's folder."""
     return run / ("blender" if kind == "blender" else f"object.{kind}")

@@ -1,6 +1,6 @@
-"""What was solved on a calibration, in a run's folder: the base image, rendered targets, appearances.
+"""Files of solves in a run's folder: the base image, rendered targets, appearances.
 
-The solver is loaded only where its values are read: the kiosk asks for files while it plays.
+The solver is imported only to read its values, because the kiosk looks for files while it plays.
 """
 
 from __future__ import annotations
@@ -58,24 +58,24 @@ def has_base(run: Path) -> bool:
 
 
 def read_base_figures(run: Path) -> Any:
-    """How the base image was solved: objective, KKT residual, iterations, seconds, converged."""
+    """Figures of the base image's solve: objective, KKT residual, iterations, seconds, converged."""
     return read_json(json_path(run, StepKind.BASE))
 
 
 def render_folder(run: Path, name: str) -> Path:
-    """Where Blender's files for an appearance's target lie."""
+    """The folder of Blender's files for an appearance's target."""
     return run / f"render-{name}"
 
 
 def write_target(run: Path, name: str, target: Target) -> Path:
-    """``target-NAME.npz``: a rendered target's picture, reflectance-like, and where it says something."""
+    """``target-NAME.npz``: a rendered target's picture, like reflectance, and the mask of its valid pixels."""
     path = npz_path(run, StepKind.TARGET, name)
     save_arrays(path, {"image": target.image, "mask": target.mask})
     return path
 
 
 def read_target(run: Path, name: str) -> Target:
-    """What ``write_target`` wrote."""
+    """The content of ``write_target``."""
     from controller.solve.targets.values import Target
 
     arrays = load_arrays(npz_path(run, StepKind.TARGET, name))
@@ -84,12 +84,12 @@ def read_target(run: Path, name: str) -> Target:
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """``appearance-NAME.npz`` and ``.json``: an appearance's frames, its target, and where that is reachable.
+    """``appearance-NAME.npz`` and ``.json``: an appearance's frames, its target, and the mask where it is reachable.
 
     ``frames``: 8-bit device frames by projector name, (rows, columns, 3)
     ``linear``: the same before dithering, linear light in [0, 1]
     ``target`` (camera rows, columns, 3): radiance in full scales per second; ``reachable`` (camera rows, columns)
-    ``figures``: how it was solved (docs/reference/report.md); ``exposure`` is the target's white's radiance
+    ``figures``: of the solve (docs/reference/report.md); ``exposure`` is the radiance of the target's white
     """
 
     frames: dict[str, ByteImage]
@@ -116,7 +116,7 @@ def is_solved(run: Path, name: str) -> bool:
 
 
 def solved_figures_path(run: Path, name: str) -> Path:
-    """The file whose bytes say on which solving of an appearance something depends."""
+    """The file whose bytes identify a solve of an appearance."""
     return json_path(run, StepKind.APPEARANCE, name)
 
 
@@ -136,7 +136,7 @@ def read_solved(run: Path, name: str, projectors: Sequence[str]) -> Solved:
         )
     arrays = load_arrays(npz_path(run, StepKind.APPEARANCE, name))
     figures: Mapping[str, object] = read_json(json_path(run, StepKind.APPEARANCE, name))
-    # Runs from before journal format 2 have the frames by the projectors' bare names.
+    # Runs from before journal format 2 have the frames by the projectors' names only.
     prefix = "device-" if all(f"device-{projector}" in arrays for projector in projectors) else ""
     return Solved(
         frames={projector: arrays[f"{prefix}{projector}"] for projector in projectors},

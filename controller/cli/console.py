@@ -1,4 +1,4 @@
-"""What a person sees on the terminal, and what a machine reads with ``--json``."""
+"""Output on the terminal, and JSON lines with ``--json``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from controller.core.text import duration, printable
 from controller.run.progress import Level, Phase, Progress, Reporter
 
 PLAIN_EVERY: Final = 0.25
-"""Share of a step after which plain output says another line."""
+"""Share of a step after which plain output prints another line."""
 
 
 @contextlib.contextmanager
@@ -83,7 +83,7 @@ class PlainReporter:
         self._print(text if level is Level.INFO else f"{level.value}: {text}")
 
     def _print(self, text: str) -> None:
-        # Work that lights lamps does not end because nobody can read how far it is.
+        # Work that lights lamps does not stop only because its progress can't be printed.
         with self._lock, contextlib.suppress(OSError):
             print(printable(text), file=self._stream, flush=True)
 
@@ -148,9 +148,9 @@ def show_error(code: str, what: str, remedy: str, *, as_json: bool) -> None:
 
 
 def prepare_streams() -> None:
-    """Make the standard streams usable: a closed one leads nowhere, and no character that it can't show stops us.
+    """Make the standard streams safe: a closed one discards output, and unprintable characters raise no error.
 
-    A closed stream's number would otherwise be that of the next opened file, into which children would then write.
+    Otherwise the next opened file would get the closed stream's number, and child processes would write into it.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
@@ -161,7 +161,7 @@ def prepare_streams() -> None:
             os.set_inheritable(number, True)
             setattr(sys, name, open(number, "w" if number else "r", closefd=False, encoding="utf-8"))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper) and isinstance(sys.stdout.buffer, io.RawIOBase):
-        # PYTHONUNBUFFERED: what could not be written would be forgotten, and ``output_lost`` could not find it
+        # PYTHONUNBUFFERED: a write error would be lost, and ``output_lost`` could not find it
         sys.stdout = open(1, "w", 1, closefd=False, encoding=sys.stdout.encoding)  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -169,22 +169,24 @@ def prepare_streams() -> None:
 
 
 def output_lost() -> bool:
-    """Whether standard output can't be written to; says so on standard error, and writes no more to it."""
+    """Whether writing to standard output fails. If so, report it on standard error and stop writing."""
     try:
         sys.stdout.flush()
     except OSError as error:
         if not isinstance(error, BrokenPipeError):
             what = f"The output could not be written: {error.strerror}."
             with contextlib.suppress(OSError):
-                show_error("output-lost", what, "Check where the output goes, and start again.", as_json=False)
-        # Else the interpreter tries again at its end, and fails with a message of its own.
+                show_error(
+                    "output-lost", what, "Check the output's destination and start the command again.", as_json=False
+                )
+        # Otherwise Python tries again at exit and fails with its own message.
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
         return True
     return False
 
 
 def show_result(result: Mapping[str, Any] | str | None, *, as_json: bool) -> None:
-    """What a command returned: ``{"result": ...}`` for machines; for people the text, or ``key: value`` lines."""
+    """Print a command's result: ``{"result": ...}`` as JSON, else the text or ``key: value`` lines."""
     if as_json:
         JsonReporter(sys.stdout).line(result=result)
     elif isinstance(result, str):

@@ -23,12 +23,16 @@ if TYPE_CHECKING:
 
 _TYPES: Final[Mapping[str, Any]] = {"integer": int, "number": float, "boolean": bool, "file": Path, "target": Path}
 _COMPLETE: Final = {"appearance": appearance_names, "projector": projector_names, "": None}
-NoWait = Annotated[bool, typer.Option("--no-wait", help="Do not follow it to its end.")]
+NoWait = Annotated[bool, typer.Option("--no-wait", help="Do not wait for the end of the job.")]
 
 
 def commands(group: str = "", operations: Sequence[Operation] = OPERATIONS) -> tuple[Callable[..., None], ...]:
-    """The commands of one group of the command line, "" for those of one word."""
-    words = ((one, one.words.rpartition(" ")) for one in operations if not one.within and one.holder != "targets")
+    """The commands of one group, "" for those of one word."""
+    words = (
+        (operation, operation.words.rpartition(" "))
+        for operation in operations
+        if not operation.within and operation.holder != "targets"
+    )
     return tuple(command(one, name) for one, (first, _, name) in words if first == group)
 
 
@@ -52,13 +56,13 @@ def command(operation: Operation, name: str) -> Callable[..., None]:
         parameters.append(_parameter("no_wait", NoWait, False))
     parameters.append(_parameter("as_json", Json, False))
     vars(run)["__signature__"] = inspect.Signature(parameters)
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     run.__name__, run.__doc__ = name.replace("-", "_"), _help(operation)
     return run
 
 
 def job(stage: Path, op: str, arguments: Mapping[str, Any], *, as_json: bool) -> None:
-    """Begin a job of the running kiosk, and follow it to its end."""
+    """Start a job of the running kiosk and wait for its end."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.kiosk.jobs.follow_job import ask_and_follow
@@ -73,13 +77,13 @@ def _parameter(name: str, annotation: Any, default: Any = inspect.Parameter.empt
 
 
 def _typed(field: Field) -> tuple[Any, ...]:
-    """The annotation that typer reads, and the default where the value may be left out."""
+    """The annotation that typer reads, and the default of an optional value."""
     about = ("" if field.choices else field.about[:1].upper()) + field.about[0 if field.choices else 1 :] + "."
     if field.flag is not None:
         return Annotated[bool, typer.Option(field.flag.option, help=field.flag.about)], False
     kind, complete = _TYPES.get(field.kind, str), _COMPLETE[field.names]
     if field.kind == "target":
-        about = "What the object should look like to the camera."
+        about = "The object's requested look, seen from the camera (PNG)."
     if field.argument or (field.required and not field.usual):
         made = typer.Argument(help=about, autocompletion=complete, metavar=field.metavar or None)
         return (Annotated[kind, made],) if field.required else (Annotated[kind | None, made], None)
@@ -94,7 +98,7 @@ def _value(field: Field, given: Any) -> Any:
     if field.flag is not None:
         return field.flag.value if given else field.flag.otherwise
     if field.kind == "target" and not given.is_file():
-        raise UsageError("target-missing", what=f"There is no file {given}.", remedy="Give a PNG file.")
+        raise UsageError("target-missing", what=f"The file {given} does not exist.", remedy="Give a PNG file.")
     return str(given.absolute()) if isinstance(given, Path) else given
 
 
@@ -107,11 +111,11 @@ def _secret(field: Field) -> str:
 def _help(operation: Operation) -> str:
     sentences = [f"{operation.about}.", *([operation.more] if operation.more else [])]
     if any(field.secret for field in operation.fields):
-        sentences.append("The password is asked for, or read from standard input.")
+        sentences.append("You are asked for the password; a script gives it on standard input.")
     if operation.effect is Effect.WORKS:
-        sentences.append("The command waits for its end.")
+        sentences.append("The command waits until it is done.")
     if operation.answer in (Answer.FILE, Answer.PICTURE):
-        sentences.append("Prints the file's name.")
+        sentences.append("Prints the name of the file.")
     if not operation.offline:
-        sentences.append("Needs a running kiosk.")
+        sentences.append("The kiosk must be running.")
     return " ".join(sentences)

@@ -1,4 +1,4 @@
-"""``velatura`` where the command line's own packages are missing: what is installed, and what to add."""
+"""``velatura`` without the packages of the command line: shows what is installed and what to add."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def _help() -> str:
     return (
         "Usage: velatura COMMAND ...\n\n"
         "Gives a physical object a new appearance with light from several superimposed projectors.\n\n"
-        "This installation has only the player: python -m controller.play --help\n"
-        "The commands come with these extras:\n\n"
+        "Only the player is installed: python -m controller.play --help\n"
+        "These extras add the commands:\n\n"
         f"{rows}\n"
-        f"Type {install_command('controller')}, or several: {install_command('controller,panel,bench')}.\n"
+        f"Run {install_command('controller')}, or several: {install_command('controller,panel,bench')}.\n"
     )

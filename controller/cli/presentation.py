@@ -1,4 +1,4 @@
-"""What a command shows of an operation's answer: a sentence, a file's name, or what a formatter here makes of it."""
+"""How a command shows an operation's result: as a sentence, a file name, or the text of a formatter."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def of(operation: Operation, answer: Any, arguments: Mapping[str, Any], *, as_js
     if (formatter := FORMATTERS.get(operation.name)) is not None:
         return formatter(answer, arguments, as_json)
     if operation.effect is Effect.WORKS:
-        said = "It has begun; `velatura status` tells how far it is."
+        said = "Started. `velatura status` shows the progress."
         return {"done": operation.socket_name} if as_json else said
     if operation.answer is Answer.NOTHING:
         return {"done": operation.socket_name} if as_json else printable(operation.sentence(dict(arguments)))
@@ -47,7 +47,7 @@ def _lamps(rows: Any, _: Mapping[str, Any], as_json: bool) -> Mapping[str, Any] 
 
 
 def _identified(_: Any, arguments: Mapping[str, Any], as_json: bool) -> Mapping[str, Any] | str:
-    return {"done": "identify"} if as_json else "The names are shown." if arguments["on"] else "The names are gone."
+    return {"done": "identify"} if as_json else "The names are shown." if arguments["on"] else "The names are hidden."
 
 
 def _restored(_: Any, arguments: Mapping[str, Any], as_json: bool) -> Mapping[str, Any] | str:
@@ -59,8 +59,11 @@ def _diagnosed(path: Any, _: Mapping[str, Any], as_json: bool) -> Mapping[str, A
     from hal.runtime.caches import kept, summary
 
     outside = kept()
-    rows = [{"path": str(one.path), "what": one.what, "bytes": one.size_bytes, "in_use": one.in_use} for one in outside]
-    text = "\n".join([f"Written: {path}", *(f"Kept outside the stage: {line}" for line in summary(outside))])
+    rows = [
+        {"path": str(folder.path), "what": folder.what, "bytes": folder.size_bytes, "in_use": folder.in_use}
+        for folder in outside
+    ]
+    text = "\n".join([f"Written: {path}", *(f"Stored outside the stage: {line}" for line in summary(outside))])
     return {"file": path, "outside_the_stage": rows} if as_json else text
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: their common parameters, and how work is called and its result shown."""
+"""Shared by all commands: common parameters, running the work, showing the result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
 StageFolder = Annotated[Path, typer.Argument(metavar="STAGE", help="The stage's folder, which holds stage.toml.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object a line, for machines.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON lines for programs.")]
 
 
 def projector_names(incomplete: str) -> list[str]:
@@ -45,7 +45,7 @@ def _completed(incomplete: str, tables: str) -> list[str]:
 
 
 Work = Callable[["Reporter", "threading.Event"], Mapping[str, Any] | str | None]
-"""What a command does, told where to report and what is set when it is to stop; it imports what it needs."""
+"""The work of a command, with a reporter and the event that requests a stop; it imports what it needs."""
 
 
 def work(do: Work, *, as_json: bool) -> None:

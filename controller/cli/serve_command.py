@@ -1,4 +1,4 @@
-"""What ``velatura serve`` runs: the service, its socket and the panel, until it is told to end."""
+"""Runs ``velatura serve``: the service, its socket and the panel, until it is asked to stop."""
 
 from __future__ import annotations
 
@@ -42,7 +42,11 @@ def parse_address(text: str) -> tuple[str, int]:
     """``HOST:PORT`` or ``PORT``. Raises UsageError("address-wrong")."""
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not 0 < int(port) < 65536:
-        raise UsageError("address-wrong", what=f"{text[:64]!r} is no address.", remedy="Write HOST:PORT.")
+        raise UsageError(
+            "address-wrong",
+            what=f"{text[:64]!r} is not a valid address.",
+            remedy="Write HOST:PORT, for example 127.0.0.1:8377.",
+        )
     return host.strip("[]") or "127.0.0.1", int(port)
 
 
@@ -55,9 +59,9 @@ def serve(
     reporter: Reporter,
     cancel: threading.Event,
 ) -> Mapping[str, Any]:
-    """Run the stage until ``cancel``; the settings are read again when somebody saves them.
+    """Run the stage until ``cancel``; changed settings are read again.
 
-    ``setup``: go on without a valid stage.toml, for the panel's first page.
+    ``setup``: start without a valid stage.toml, for set-up in the panel.
     Raises what ``serving`` raises at the first start, unless ``setup``.
     """
     stage = stage.resolve()
@@ -77,7 +81,7 @@ def serve(
                         stack.enter_context(ControlServer(path, socket_table(kiosk.holders())))
                     if first:
                         _open_panel(stack, kiosk, panel, reporter)
-                        reporter.say(f"{stage.name} is served.")
+                        reporter.say(f"The kiosk {stage.name} is running.")
                         first = False
                     _wait(kiosk, cancel)
                 kiosk.detach()
@@ -105,7 +109,7 @@ def _check_panel(where: PanelAddress) -> None:
             require_regular(file)
         except OSError as error:
             raise UsageError("file-unreadable", what=f"{file} can't be read: {error.strerror}.",
-                             remedy="Check the path, or leave the option out.") from error  # fmt: skip
+                             remedy="Check the path, or omit the option.") from error  # fmt: skip
     check_port(where.host, where.port)
 
 
@@ -121,7 +125,7 @@ def _open_panel(stack: contextlib.ExitStack, kiosk: StageKiosk, panel: PanelAddr
 
 @contextlib.contextmanager
 def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterator[None]:
-    """The panel in a thread of its own. The player is another process, so that no page delays a picture."""
+    """The panel in its own thread. The player is another process, so that no page delays a picture."""
     from controller.kiosk.store.accounts import FIRST_ACCOUNT
     from controller.panel.app import make_panel
     from controller.panel.context import PanelOptions

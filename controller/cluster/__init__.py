@@ -1,1 +1,1 @@
-"""Work on many machines with Dask distributed (docs/how-to/cluster.md). Entry: `connect`, `appearances`."""
+"""Solves on many machines with Dask distributed (docs/how-to/cluster.md). Entry: `connect`, `appearances`."""

@@ -1,4 +1,4 @@
-"""Appearances of one stage, spread over a cluster: the stage goes to a worker once, then only targets and frames."""
+"""Solves the appearances of one stage on a cluster. A worker gets the stage once, then only targets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from controller.solve.targets.values import Target
 
 
 class SpreadAppearances:
-    """Begins appearances anywhere, and gives their answers by name."""
+    """Starts appearances elsewhere, and gives their results by name."""
 
     def __init__(self, cluster: Cluster, stage: StageData) -> None:
         key = f"velatura-stage-{stage.digest()}"
@@ -20,16 +20,16 @@ class SpreadAppearances:
         self._begun: dict[str, Task[AppearanceResult]] = {}
 
     def begin(self, name: str, asked: Target, options: SolveOptions) -> None:
-        """Begin an appearance, unless one of that name has been."""
+        """Start an appearance, unless it was started already."""
         if name not in self._begun:
             self._begun[name] = self._cluster.submit(make_there, self._stage, self._key, asked, options)
 
     def answer(self, name: str, check: Callable[[], None]) -> AppearanceResult:
-        """The answer of one that was begun; errors as ``solve.request.solve_appearance`` and ``Task.result``."""
+        """The result of a started one; errors as ``solve.request.solve_appearance`` and ``Task.result``."""
         return self._begun.pop(name).result(check)
 
     def cancel(self) -> None:
-        """Let go of all that was begun and not fetched."""
+        """Cancel all that were started and not fetched."""
         for task in self._begun.values():
             task.cancel()
         self._begun.clear()

@@ -1,8 +1,8 @@
-"""The connection to a Dask scheduler: tasks in, results out, whatever becomes of the workers meanwhile.
+"""The connection to a Dask scheduler: tasks in, results out, even if workers fail meanwhile.
 
-Dask moves our data with its own protocol, which unpickles what a peer sends: a scheduler and its workers can run any
-code here, and the other way round. So they stand on a network of their own, or speak TLS with certificates on both
-sides (address ``tls://``; the files as Dask's own configuration names them, ``distributed.comm.tls``).
+Dask's protocol unpickles the data of its peers: a scheduler and its workers can run any code here, and the other way
+round. So they need their own network, or TLS with certificates on both sides (address ``tls://``; the files as in
+Dask's configuration, ``distributed.comm.tls``).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ WORKERS_S: Final = 60.0
 """How long to wait while the scheduler has no worker at all."""
 POLL_S: Final = 0.02
 ASK_S: Final = 1.0
-"""How often the scheduler is asked whether it has workers, while a task is waited for."""
+"""Interval of asking the scheduler for its workers during a task."""
 TRIES: Final = 4
-"""A task is begun anew when what it needs was lost with its worker; this often."""
+"""Maximum starts of a task whose worker was lost."""
 
 
 class Cluster:
-    """Workers behind a scheduler. Calls may come from one thread."""
+    """Workers of a scheduler. For calls from one thread."""
 
     def __init__(self, client: Any, address: str) -> None:
         self._client = client
@@ -38,16 +38,16 @@ class Cluster:
 
     @property
     def workers(self) -> int:
-        """How many the scheduler has now."""
+        """Number of workers now."""
         info: dict[str, Any] = self._client.scheduler_info(n_workers=-1)
         return len(info["workers"])
 
     def submit(self, function: Callable[..., Outcome[Value]], *arguments: Any) -> Task[Value]:
-        """Begin ``function(*arguments)`` on some worker; of arguments that are ``Shared``, it gets the values."""
+        """Start ``function(*arguments)`` on a worker; ``Shared`` arguments arrive there as their values."""
         return Task(self, lambda: self._begin(function, arguments))
 
     def share(self, key: str, value: Any) -> Shared:
-        """Data that many tasks need. ``key`` tells contents apart; each worker gets them once, when it needs them."""
+        """Data for many tasks. ``key`` identifies the content; each worker gets it once, at its first use."""
         return Shared(key, value)
 
     def _begin(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -55,12 +55,12 @@ class Cluster:
         return self._client.submit(function, *given, pure=False, retries=0)
 
     def _placed(self, shared: Shared) -> Any:
-        """The data's place in the cluster; sent again if the worker that had it is gone."""
+        """The data in the cluster; sent again if its worker is gone."""
         future = self._shared.get(shared.key)
         if future is None or future.status != "finished":
             self.wait_for_workers(lambda: None)
-            # Never twice under one name: a worker that is still asking a lost one for it would drop what it is sent,
-            # while the scheduler believes that it has it, and what needs it would wait there for good.
+            # Never twice under one name: a worker that still asks a lost worker for the data would drop the new copy,
+            # the scheduler would believe that the worker has it, and its tasks would wait for ever.
             name = f"{shared.key}-{secrets.token_hex(8)}"
             (future,) = self._client.scatter({name: shared.value}, hash=False).values()
             self._shared[shared.key] = future
@@ -78,12 +78,12 @@ class Cluster:
                 raise WorkError(
                     "no-workers",
                     what=f"The scheduler at {self._address} has had no worker for {WORKERS_S:g} seconds.",
-                    remedy="Start workers there (docs/how-to/cluster.md), or solve without --scheduler.",
+                    remedy="Start workers (docs/how-to/cluster.md), or solve without --scheduler.",
                 )
             time.sleep(POLL_S)
 
     def check_code(self) -> None:
-        """Raise UsageError("workers-differ") unless every worker has the code that is here."""
+        """Raise UsageError("workers-differ") unless every worker has the same code as this process."""
         ours = code_digest()
         self.wait_for_workers(lambda: None)
         theirs = self._client.run(code_digest, on_error="return")
@@ -97,7 +97,7 @@ class Cluster:
 
 
 class Shared:
-    """Data under the name of its contents; see ``Cluster.share``."""
+    """Data named by its content; see ``Cluster.share``."""
 
     def __init__(self, key: str, value: Any) -> None:
         self.key = key
@@ -105,7 +105,7 @@ class Shared:
 
 
 class Task(Generic[Value]):
-    """Work that was begun elsewhere."""
+    """Work that was started elsewhere."""
 
     def __init__(self, cluster: Cluster, begin: Callable[[], Any]) -> None:
         self._cluster = cluster
@@ -113,7 +113,7 @@ class Task(Generic[Value]):
         self._future = begin()
 
     def result(self, check: Callable[[], None] = lambda: None) -> Value:
-        """Wait and return the value. ``check`` is called often; where it raises, the task is let go.
+        """Wait and return the value. ``check`` is called often; if it raises, the task is cancelled.
 
         Raises what the work raised; WorkError "workers-lost" or "no-workers".
         """
@@ -139,17 +139,17 @@ class Task(Generic[Value]):
             self._future = self._begin()
         raise WorkError(
             "workers-lost",
-            what=f"{TRIES} workers went away, one after the other, over the same piece of work.",
-            remedy="Check their memory; docs/how-to/cluster.md says what a worker needs. Then start again.",
+            what=f"{TRIES} workers failed on the same task, one after the other.",
+            remedy="Check their memory (see docs/how-to/cluster.md). Then start again.",
         )
 
     def cancel(self) -> None:
-        """Let go of the work, whether it has begun or not."""
+        """Cancel the work, started or not."""
         self._future.cancel()
 
 
 def _lost() -> tuple[type[BaseException], ...]:
-    """What Dask raises when a worker, or what only it had, is gone."""
+    """Dask's errors for a lost worker or its lost data."""
     from concurrent.futures import CancelledError
 
     from distributed import KilledWorker
@@ -173,7 +173,7 @@ def connected(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Cluster
         raise UsageError(
             "scheduler-address",
             what=f"{address!r} is not a scheduler's address.",
-            remedy="Give it as tcp://host:8786 or tls://host:8786.",
+            remedy="Write it as tcp://host:8786 or tls://host:8786.",
         )
     try:
         client: Any = Client(address, timeout=timeout_s, set_as_default=False, name="velatura")  # type: ignore[no-untyped-call]
@@ -181,7 +181,7 @@ def connected(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Cluster
         raise WorkError(
             "scheduler-unreachable",
             what=f"No scheduler answers at {address} ({str(error).splitlines()[0] if str(error) else 'no answer'}).",
-            remedy="Start it with `dask scheduler`, correct the address, or look at Dask's TLS settings.",
+            remedy="Start it with `dask scheduler`, correct the address, or check Dask's TLS settings.",
         ) from error
     try:
         cluster = Cluster(client, address)

@@ -1,7 +1,7 @@
-"""What workers do: plain functions of plain values, sent by name.
+"""The workers' tasks: plain functions of plain values, sent by name.
 
-A worker is a process with this release installed. One task of ours runs at a time in it, because the compiled kernels
-use all of its cores by themselves. Errors come back as values: what a worker raises would not survive the way.
+A worker is a process with this release installed. It runs one task at a time, because the compiled kernels use all of
+its cores. Errors are returned as values, because Dask can't transfer our exceptions.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from controller.transport import LightTransport
 
 Value = TypeVar("Value")
 _RUNNING: Final = threading.Lock()
-_CODE: Final = ("core/arrays.py", "core/jit.py", "solve", "transport")
+_CODE: Final = ("controller/core/arrays.py", "hal/runtime/jit.py", "controller/solve", "controller/transport")
 
 
 @dataclass(frozen=True, slots=True)
 class StageData:
-    """What every appearance of a stage needs; a worker gets it once.
+    """Data for all appearances of a stage; a worker gets it once.
 
     ``image``: the base image C_b, ``solution`` its frames; ``black``: K
     """
@@ -43,7 +43,7 @@ class StageData:
     black: FloatImage
 
     def digest(self) -> str:
-        """A hash of the contents: equal stages are sent once, however often they are asked for."""
+        """A hash of the contents, so that equal stages are sent only once."""
         hashed = xxhash.xxh3_128()
         for name, array in sorted(self.transport.arrays().items()):
             _update(hashed, name, array)
@@ -60,13 +60,13 @@ def _update(hashed: xxhash.xxh3_128, name: str, array: np.ndarray[tuple[int, ...
 
 @dataclass(frozen=True, slots=True)
 class Outcome(Generic[Value]):
-    """What a task came to: a value, or the code and the sentences of the error that stopped it."""
+    """The result of a task: a value, or the code and the sentences of its error."""
 
     value: Value | None
     error: tuple[type[VelaturaError], str, str, str] | None
 
     def unwrapped(self) -> Value:
-        """The value. Raises the error here that was raised there."""
+        """The value. Raises the error of the worker."""
         if self.error is not None:
             kind, code, what, remedy = self.error
             raise kind(code, what=what, remedy=remedy)
@@ -86,11 +86,11 @@ _kept: dict[str, tuple[Base, DriveLevels]] = {}
 
 
 def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions) -> Outcome[AppearanceResult]:
-    """An appearance, as ``solve.request.solve_appearance`` makes it; ``key`` names the stage's contents."""
+    """An appearance from ``solve.request.solve_appearance``; ``key`` identifies the stage's contents."""
 
     def work() -> AppearanceResult:
         if key not in _kept:
-            _kept.clear()  # a stage fills a worker's memory: not two of them
+            _kept.clear()  # keep one stage only: it fills a worker's memory
             base = prepare_base(stage.transport, stage.image, stage.black, stage.solution)
             _kept[key] = base, DriveLevels(stage.transport)
         base, drive = _kept[key]
@@ -100,13 +100,13 @@ def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions)
 
 
 def code_digest() -> str:
-    """A hash of the code that this process runs with and results depend on; machines must not differ in it."""
+    """A hash of this process's code that affects results; it must be the same on all machines."""
     return _CODE_DIGEST
 
 
 def _digest_of_code() -> str:
     hashed = hashlib.sha256(np.__version__.encode())
-    folder = Path(__file__).resolve().parent.parent
+    folder = Path(__file__).resolve().parents[2]
     for name in _CODE:
         path = folder / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
@@ -114,5 +114,5 @@ def _digest_of_code() -> str:
     return hashed.hexdigest()
 
 
-# as of now: the files may be replaced while we run
+# read at import: the files may be replaced later
 _CODE_DIGEST: Final = _digest_of_code()

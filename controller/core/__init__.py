@@ -1,3 +1,3 @@
-"""What everything rests on: errors with codes, files written atomically, arrays, compiled kernels, text,
+"""Base of all controller packages: errors with codes, atomic files, arrays, text,
 plotting. Start with `errors.VelaturaError` and `storage.write_atomically`.
 """

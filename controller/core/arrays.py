@@ -1,4 +1,4 @@
-"""Array types, and the container in which arrays lie on disk.
+"""Array types, and the container for arrays on disk.
 
 The container is NumPy's published ``.npz`` format (a zip of ``.npy`` members), never with pickled objects.
 """
@@ -31,14 +31,14 @@ def save_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read what ``save_arrays`` wrote. Raises UsageError("array-file-unreadable") for anything else."""
+    """Read a file of ``save_arrays``. Raises UsageError("array-file-unreadable") for any other file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            # By the members' own names: without their ending, "a" and "a.npy" would both name the first.
+            # Use the members' full names: without the suffix, "a" and "a.npy" would both mean the first.
             return {name: archive[f"{name}.npy"] for name in archive.files}
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise UsageError(
             "array-file-unreadable",
             what=f"{path} is not a readable array file ({error}).",
-            remedy="Remove it and let the step that makes it run again.",
+            remedy="Delete it and run the command that made it again.",
         ) from error

@@ -1,4 +1,4 @@
-"""The one error tree of the controller; device errors (``hal.errors``) join it at the command line."""
+"""The controller's errors; the command line also handles device errors (``hal.errors``)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import ClassVar
 
 
 class VelaturaError(Exception):
-    """Something went wrong that a person can act on.
+    """An error that a person can act on.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class VelaturaError(Exception):
 
 
 class UsageError(VelaturaError):
-    """Wrong arguments, a wrong stage.toml, a file that is not what it should be."""
+    """Wrong arguments, a wrong stage.toml, a wrong file."""
 
     exit_code = 2
 
@@ -41,4 +41,4 @@ class CalibrationError(WorkError):
 
 
 class BundleError(WorkError):
-    """A bundle is damaged, not ours, or does not fit this stage."""
+    """A bundle is damaged, not trusted, or does not fit this stage."""

@@ -32,14 +32,14 @@ def file_error(error: OSError) -> WorkError | None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return WorkError(
             "no-space",
-            what=f"There was no space left to write {error.filename or 'a file'}.",
-            remedy="Free some space and start again.",
+            what=f"The disk has no space for {error.filename or 'a file'}.",
+            remedy="Free space and start again.",
         )
     if error.errno == errno.EROFS:
         return WorkError(
             "cannot-write",
-            what=f"{error.filename or 'A file'} is on a disk that can't be written to.",
-            remedy="Give another folder, or mount the disk for writing.",
+            what=f"{error.filename or 'A file'} is on a read-only disk.",
+            remedy="Give another folder, or make the disk writable.",
         )
     if error.filename is not None and error.errno in _REFUSED:
         return WorkError(

@@ -1,6 +1,6 @@
-"""Figures of matplotlib and what they come to as pictures; without any window.
+"""Figures of matplotlib and their pictures, without a window.
 
-matplotlib is imported by the first figure, not with this module: what draws nothing must not wait for it.
+matplotlib is imported with the first figure, so that other code does not wait for it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from controller.core.arrays import ByteImage
 
 
 def figure_of(size_in: tuple[float, float], *, dpi: int, constrained: bool = False) -> Any:
-    """An empty figure (width, height) in inches; ``constrained``: what is drawn in it is kept apart."""
-    # Agg by hand: pyplot would look for a window system, and keeps every figure for ever.
+    """An empty figure (width, height) in inches; ``constrained``: its parts do not overlap."""
+    # Agg directly: pyplot would look for a window system, and keeps every figure in memory.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

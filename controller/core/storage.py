@@ -18,13 +18,13 @@ from controller.core.errors import UsageError, WorkError
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644) -> None:
     """Replace ``path`` by ``data`` so that a reader, or a machine after a power cut, finds the old or the new bytes.
 
-    Raises WorkError("no-space") when the disk is full; ``path`` is then as it was.
+    Raises WorkError("no-space") when the disk is full; ``path`` is then unchanged.
     """
     stream_atomically(path, lambda file: file.write(data), mode=mode)
 
 
 def stream_atomically(path: Path, write: Callable[[BinaryIO], object], *, mode: int = 0o644) -> None:
-    """As ``write_atomically``, for content that ``write`` produces into an open binary file."""
+    """As ``write_atomically``, for content that ``write`` writes to an open binary file."""
     temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def stream_atomically(path: Path, write: Callable[[BinaryIO], object], *, mode: 
 
 
 def clear_unfinished_writes(folder: Path) -> None:
-    """Remove the temporary files that a killed process left below ``folder``; nobody may be writing there."""
+    """Remove the temporary files of a killed process below ``folder``; no process may be writing there."""
     for temporary in folder.rglob(".*.part"):
         temporary.unlink(missing_ok=True)
 
@@ -66,13 +66,13 @@ def _explained(error: OSError, path: Path) -> WorkError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return WorkError(
             "no-space",
-            what=f"There was no space left to write {path.name}.",
-            remedy=f"Free some on the disk that holds {path.parent} and start again; nothing is left half-written.",
+            what=f"The disk has no space for {path.name}.",
+            remedy=f"Free space on the disk of {path.parent} and start again.",
         )
     return WorkError(
         "cannot-write",
         what=f"{path} could not be written: {error.strerror}.",
-        remedy="Check the folder's permissions and that its disk is mounted for writing.",
+        remedy="Check the folder's permissions and that its disk is writable.",
     )
 
 
@@ -86,8 +86,8 @@ def sha256_of(path: Path) -> str:
 def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
     """Hold the lock file ``path`` for the duration, or raise UsageError("already-running").
 
-    The lock dies with the process, so a power cut leaves none behind. Raises WorkError("no-space" or "cannot-write")
-    where the file can not be made.
+    The lock ends with the process, so a power cut leaves none. Raises WorkError("no-space" or "cannot-write")
+    if the file can't be created.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,7 +119,7 @@ def runtime_folder(stage: Path) -> Path:
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise UsageError(
             "runtime-folder-unsafe",
-            what=f"{folder} belongs to someone else or is open to others.",
+            what=f"{folder} belongs to another user or is open to others.",
             remedy="Remove it, or set XDG_RUNTIME_DIR to a private folder, and start again.",
         )
     return folder

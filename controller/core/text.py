@@ -1,10 +1,10 @@
-"""Words for people: what a device or a file said, made harmless; durations."""
+"""Text for people: safe text of devices and files; durations."""
 
 from __future__ import annotations
 
 
 def printable(text: str) -> str:
-    """Text whose control characters cannot reach a terminal; line breaks and tabs become spaces."""
+    """Text without control characters; line breaks and tabs become spaces."""
     return "".join(
         character if character.isprintable() else " " if character.isspace() else "\ufffd" for character in text
     )

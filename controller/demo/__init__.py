@@ -1,1 +1,1 @@
-"""The whole job on an emulated stage, ending in a report. Entry: `job.demo`, `stage`."""
+"""A complete job on an emulated stage, with a report at the end. Entry: `job.demo`, `stage`."""

@@ -1,4 +1,4 @@
-"""`velatura demo`: the steps of the whole job, on the demo's stage."""
+"""`velatura demo`: the steps of a complete job on the demo's stage."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def demo(
     reporter: Reporter,
     cancel: threading.Event,
 ) -> Mapping[str, Any]:
-    """Do the whole job in ``out``, going on with an unfinished demo; return where stage and report lie.
+    """Run the complete job in ``out``, or continue an unfinished demo; return the paths of stage and report.
 
     Raises what ``demo.stage.prepare``, the configuration, the devices and the steps raise; the lamps are safe by then.
     """
@@ -101,12 +101,12 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
 
 
 def _traditional_step(rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float) -> Step:
-    """What the targets look like when one projector makes them by division at each pixel, to compare with."""
+    """For comparison: the targets shown by one projector, with division at each pixel."""
     return Step(
         StepId(StepKind.TRADITIONAL),
         partial(_traditional, rig, calibrated, tuple(names), longest_s),
         after=tuple(StepId(StepKind.APPEARANCE, item=name) for name in names),
-        title="Photographing the traditional way for comparison",
+        title="Photographing the traditional method for comparison",
         weight=photographs_s(rig, names),
     )
 

@@ -1,4 +1,4 @@
-"""The demo's stage: written once, used again by a demo that goes on."""
+"""The demo's stage: written once, used again by a continued demo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MARK = "demo.json"
 BUILDING = ".stage.part"
 PHOTOGRAPH = "photograph.png"
 POWER_DOWN_S = 10.0
-"""Emulated lamps go off at once; a bench that died must not hold up the end of the demo."""
+"""Emulated lamps go off at once; a dead bench must not delay the end of the demo."""
 
 APPEARANCES: tuple[dict[str, Any], ...] = (
     {"name": "photograph", "kind": "photograph", "file": PHOTOGRAPH},
@@ -37,10 +37,10 @@ APPEARANCES: tuple[dict[str, Any], ...] = (
 
 
 def prepare(out: Path, *, size: str, object_file: Path | None, seed: int) -> Path:
-    """The stage folder ``out/stage`` for these wishes: made now, or found as an earlier demo left it.
+    """The stage folder ``out/stage`` for these options, created now or by an earlier demo.
 
-    Raises UsageError("demo-folder-taken") if ``out`` holds a stage of other wishes, and what the bench refuses (a mesh
-    without faces, an unknown size) before anything is written.
+    Raises UsageError("demo-folder-taken") if ``out`` holds a stage with other options, and what the bench refuses (a
+    mesh without faces, an unknown size) before anything is written.
     """
     stage = out / "stage"
     wishes = {"size": size, "seed": seed, "object": _object_digest(object_file)}
@@ -48,14 +48,14 @@ def prepare(out: Path, *, size: str, object_file: Path | None, seed: int) -> Pat
         if _read_mark(mark) != wishes:
             raise UsageError(
                 "demo-folder-taken",
-                what=f"{out} holds a demo of another size, object or seed.",
-                remedy="Choose another folder with --out, or remove this one.",
+                what=f"{out} contains a demo with another size, object or seed.",
+                remedy="Choose another folder with --out, or delete this one.",
             )
         return stage
     if stage.is_dir() and any(stage.iterdir()):
         raise UsageError(
             "demo-folder-taken",
-            what=f"{stage} is not empty and was not made by the demo.",
+            what=f"{stage} is not empty and is not from a demo.",
             remedy="Choose another folder with --out.",
         )
     _build(out, stage, wishes, object_file)
@@ -63,7 +63,7 @@ def prepare(out: Path, *, size: str, object_file: Path | None, seed: int) -> Pat
 
 
 def _build(out: Path, stage: Path, wishes: Mapping[str, Any], object_file: Path | None) -> None:
-    """Write the stage under another name and rename it: a demo that ends here leaves all of it or nothing."""
+    """Write the stage under another name and rename it, so that a stopped demo leaves all of it or nothing."""
     building, there = out / BUILDING, out.exists()
     shutil.rmtree(building, ignore_errors=True)
     try:
@@ -117,7 +117,7 @@ def _object_digest(object_file: Path | None) -> str:
     if not object_file.is_file():
         raise UsageError(
             "object-missing",
-            what=f"There is no file {object_file}.",
+            what=f"The file {object_file} does not exist.",
             remedy="Give OBJECT the path of a mesh, .obj or .ply.",
         )
     try:

@@ -1,3 +1,3 @@
-"""`velatura doctor`: what is connected, what is wrong with it, what to do (docs/how-to/doctor.md). Entry: `examine`,
+"""`velatura doctor`: finds devices, their faults and the remedies (docs/how-to/doctor.md). Entry: `examine`,
 `outputs`.
 """

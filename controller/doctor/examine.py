@@ -1,4 +1,4 @@
-"""Look at every bus, try the stage's own devices, and compare."""
+"""Search every bus, test the stage's own devices, and compare."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LONGEST_S: Final = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Tools:
-    """What finds and what drives; other than the installed ones only in tests. ``wanted`` changes where is looked."""
+    """Finders and drivers; only tests replace the installed ones. ``wanted`` changes where to search."""
 
     finders: tuple[Finder, ...] | None = None
     drivers: Drivers | None = None
@@ -39,7 +39,7 @@ class Tools:
 def examine(
     *, stage: Path | None, write_it: bool, reporter: Reporter, cancel: threading.Event, tools: Tools | None = None
 ) -> Examination:
-    """Everything that `velatura doctor` tells. ``write_it``: then put what was found into stage.toml.
+    """The result of `velatura doctor`. ``write_it``: also write the devices found to stage.toml.
 
     Raises UsageError("already-running") while another program works on the stage, and what writing raises.
     """
@@ -63,10 +63,14 @@ def examine(
 
 
 def _checked(folder: Path, tools: Tools) -> tuple[Checked | None, list[Finding]]:
-    """The stage, or what is wrong with its stage.toml; a folder without one is no stage yet."""
+    """The stage, or the error in its stage.toml; a folder without stage.toml is not a stage yet."""
     if not (folder / FILE).exists():
         if not folder.is_dir():
-            raise UsageError("stage-missing", what=f"There is no folder {folder}.", remedy="Make it, or give another.")
+            raise UsageError(
+                "stage-missing",
+                what=f"The folder {folder} does not exist.",
+                remedy="Create it, or give another folder.",
+            )
         return None, []
     try:
         checked = check_stage(folder, drivers=tools.drivers)
@@ -84,15 +88,15 @@ def _known(checked: Checked | None) -> tuple[Known, ...]:
 def _search(
     wanted: Wanted, finders: Sequence[Finder] | None, deadline: Deadline, reporter: Reporter
 ) -> tuple[list[Found], list[Finding]]:
-    """All buses side by side, because most of the time is spent waiting for answers."""
+    """Search all buses in parallel, because most of the time is spent waiting for answers."""
     broken: tuple[Problem, ...] = ()
     if finders is None:
         finders, broken = load_finders()
     problems = [Finding("", problem) for problem in broken]
     found: list[Found] = []
-    reporter.say(f"Looking at {', '.join(finder.bus for finder in finders)}.")
+    reporter.say(f"Searching {', '.join(finder.bus for finder in finders)}.")
     with ThreadPoolExecutor(max(1, len(finders)), thread_name_prefix="doctor") as pool:
-        for finder, search in [(one, pool.submit(search_bus, one, wanted, deadline)) for one in finders]:
+        for finder, search in [(finder, pool.submit(search_bus, finder, wanted, deadline)) for finder in finders]:
             try:
                 found += search.result()
             except Cancelled:
@@ -113,7 +117,7 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
         problems += [Finding(one.address, problem) for problem in one.problems]
         if not one.driver or one.kind == "display":
             continue
-        # Without a place in its table the stage takes the only device of this kind that there is.
+        # A table without an address or serial number stands for the only device of its kind.
         if not any((one.driver, place) in own for place in (*map(str, one.settings.values()), "")):
             new.append(one)
     if checked is not None:
@@ -127,23 +131,23 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
 
 def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
     told = []
-    for one in new:
-        if one.kind == "power_switch":
+    for device in new:
+        if device.kind == "power_switch":
             remedy = (
-                "Add it by hand, because only you know what each relay feeds: [[relays]] with driver, serial and "
+                "Add it by hand, with the projector of each relay: [[relays]] with driver, serial and "
                 "[[relays.mains]] (docs/how-to/relays-sensor-keys.md)."
             )
-        elif one.kind == "camera" and "camera" in kinds:
-            remedy = f"If it is the one to use, write address = {one.settings.get('address', '')!r} into [camera]."
+        elif device.kind == "camera" and "camera" in kinds:
+            remedy = f"If it is the one to use, write address = {device.settings.get('address', '')!r} into [camera]."
         else:
-            remedy = "Add it with `velatura doctor STAGE --write`, or unplug it if another machine's."
-        told.append(Finding(one.address, Problem("not-in-stage", f"{one.what} is not in stage.toml.", remedy)))
+            remedy = "Add it with `velatura doctor STAGE --write`, or unplug it if it is not part of this stage."
+        told.append(Finding(device.address, Problem("not-in-stage", f"{device.what} is not in stage.toml.", remedy)))
     return told
 
 
 def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Finding]:
-    """Outputs of stage.toml that the X server does not have; without an X server nobody can tell."""
-    there = {one.address for one in found if one.kind == "display"}
+    """Outputs of stage.toml that the X server does not have; empty without an X server."""
+    there = {device.address for device in found if device.kind == "display"}
     if not there:
         return []
     return [
@@ -152,7 +156,7 @@ def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Findin
             Problem(
                 "output-missing",
                 f"stage.toml has an output {name}, and the X server has {', '.join(sorted(there))}.",
-                "Plug the projector in and switch the output on (xrandr), or correct [[display.outputs]].",
+                "Connect the projector and enable the output (xrandr), or correct [[display.outputs]].",
             ),
         )
         for name in sorted(outputs - there)
@@ -160,11 +164,11 @@ def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Findin
 
 
 def _tried(checked: Checked, seen: Examination, deadline: Deadline, reporter: Reporter) -> Examination:
-    reporter.say("Trying the stage's own devices; no lamp is struck.")
+    reporter.say("Testing the stage's own devices; no lamp is switched on.")
     failed = {
-        one.address: one.problems[0]
-        for one in seen.found
-        if one.problems and not one.problems[0].code.endswith("may-be-taken")
+        device.address: device.problems[0]
+        for device in seen.found
+        if device.problems and not device.problems[0].code.endswith("may-be-taken")
     }
     tried, findings = [], list(seen.findings)
     for one, finding in Trying(checked, deadline).each(failed):

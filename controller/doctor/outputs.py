@@ -1,8 +1,8 @@
-"""Which projector shows which output: a number on each for people, and for the camera white and a shutter.
+"""Finds which projector shows which output: numbers for people, white light and shutters for the camera.
 
-White stands on one output at a time. If the photograph goes dark when the shutter of the projector closes that
-stage.toml names for it, the cables are right; else the shutters of the others tell whose light it is. The lamps are lit
-for this, under the lamp rules, and switched off afterwards.
+One output at a time shows white. If the photograph goes dark when the projector named in stage.toml closes its
+shutter, the cables are right; otherwise the other shutters show whose light it is. The lamps are switched on for this,
+under the lamp rules, and off afterwards.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from hal.values import Presented
 
 LONGEST_S: Final = 3600.0
 NUMBERS_S: Final = 10.0
-"""How long the numbers are shown to whoever stands there."""
+"""How long the numbers are shown."""
 ANSWER_S: Final = 10.0
 LEAST_LIGHT: Final = 1e-4
 """Less light than this share of full scale is noise."""
 DARKER: Final = 0.5
-"""A shutter is in the way of a light of which it takes more than this share."""
+"""A shutter that removes more than this share blocks the light."""
 
 
 @runtime_checkable
 class _Identifies(Protocol):
-    """A display that has a picture with the number of each output."""
+    """A display that can show the number of each output."""
 
     def identify(self, *, deadline: Deadline) -> Presented: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """Whose light an output is: a projector's name, or None where no shutter took it away."""
+    """The projector that shows an output, or None if no shutter removed the light."""
 
     output: str
     projector: str | None
@@ -62,7 +62,7 @@ class Shown:
 def examine_outputs(
     seen: Examination, *, stage: Path, reporter: Reporter, cancel: threading.Event, checked: Checked | None = None
 ) -> Examination:
-    """``seen`` with what the outputs showed. Strikes the lamps; raises what the session raises."""
+    """Add to ``seen`` which projector shows each output. Strikes the lamps; raises what the session raises."""
     checked = checked or check_stage(stage)
     deadline = in_seconds(LONGEST_S, cancel)
     safety = checked.stage.tables.safety
@@ -71,7 +71,7 @@ def examine_outputs(
         opened(checked, deadline=deadline) as rig,
         lit(rig, Machine(), power_down_s=safety.power_down_s, reporter=reporter),
     ):
-        reporter.say("Lighting the lamps.")
+        reporter.say("Switching the lamps on.")
         light(
             rig.guards,
             deadline=deadline.within(safety.power_up_s),
@@ -86,7 +86,7 @@ def examine_outputs(
 
 
 def show_numbers(rig: Rig, reporter: Reporter, deadline: Deadline, seconds: float = NUMBERS_S) -> None:
-    """Numbers on the outputs, where the display has them, and the list of whose they should be."""
+    """Show numbers on the outputs, if the display can, and list the projector that should show each."""
     if not isinstance(rig.display, _Identifies):
         return
     numbers = {info.name: n for n, info in enumerate(rig.display.outputs(deadline=deadline.within(ANSWER_S)), 1)}
@@ -97,38 +97,40 @@ def show_numbers(rig: Rig, reporter: Reporter, deadline: Deadline, seconds: floa
 
 
 def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Shown]:
-    """Light on one output after another, and whose shutter takes it away."""
+    """Light one output after the other, and find the shutter that removes the light."""
     look = _Camera(rig, folder, deadline)
     exposure_s = look.exposure_s()
-    with_shutter = [one for one in rig.projectors if one.guard.capabilities.shutter]
+    with_shutter = [projector for projector in rig.projectors if projector.guard.capabilities.shutter]
     shown = []
     for projector in rig.projectors:
         frames = rig.on_outputs({projector.name: np.full_like(projector.black(), 255)})
         bright = look.brightness(frames, exposure_s)
-        # The one that stage.toml names first: if all is well, one photograph an output is enough.
+        # First the one in stage.toml: if the cables are right, one photograph per output is enough.
         suspects = sorted(with_shutter, key=lambda one: one is not projector)
-        owner = next((one.name for one in suspects if look.goes_dark(one, frames, bright, exposure_s)), None)
+        owner = next(
+            (suspect.name for suspect in suspects if look.goes_dark(suspect, frames, bright, exposure_s)), None
+        )
         shown.append(Shown(projector.output, owner))
     return shown
 
 
 def judge(projectors: Sequence[RigProjector], shown: Sequence[Shown]) -> list[Finding]:
-    """What is wrong with the cables, by output."""
+    """Problems with the cables, by output."""
     findings = []
-    for projector, one in zip(projectors, shown, strict=True):
-        if one.projector is None:
-            what = f"Whose light output {one.output} is could not be seen: no shutter made the photograph darker."
-            remedy = "Check that the lamp burns and the camera sees its picture, or look at the numbers yourself."
-            findings.append(Finding(one.output, Problem("output-unseen", what, remedy)))
-        elif one.projector != projector.name:
-            what = f"Output {one.output} is shown by projector {one.projector}, not by {projector.name}."
-            remedy = f'Swap the cables, or write output = "{one.output}" for {one.projector} into stage.toml.'
-            findings.append(Finding(one.output, Problem("output-swapped", what, remedy)))
+    for projector, output in zip(projectors, shown, strict=True):
+        if output.projector is None:
+            what = f"The projector on output {output.output} could not be found: no shutter made the photograph darker."
+            remedy = "Check that the lamp is on and the camera sees the picture, or compare the numbers yourself."
+            findings.append(Finding(output.output, Problem("output-unseen", what, remedy)))
+        elif output.projector != projector.name:
+            what = f"Output {output.output} is shown by projector {output.projector}, not by {projector.name}."
+            remedy = f'Swap the cables, or write output = "{output.output}" for {output.projector} into stage.toml.'
+            findings.append(Finding(output.output, Problem("output-swapped", what, remedy)))
     return findings
 
 
 class _Camera:
-    """Photographs, of which only the light as a whole counts."""
+    """Photographs to measure total light."""
 
     def __init__(self, rig: Rig, folder: Path, deadline: Deadline) -> None:
         self._rig = rig
@@ -138,7 +140,7 @@ class _Camera:
         self._black: float | None = None
 
     def exposure_s(self) -> float:
-        """Short enough for white on all outputs: whichever of them is alone then is not clipped either."""
+        """Short enough for white on all outputs, so that no single output is clipped either."""
         frames = {p.output: np.full_like(p.black(), 255) for p in self._rig.projectors}
         for exposure_s in reversed(self._rig.acquirer.exposures_s()):
             if exposure_s <= 1.0 and self._values(frames, exposure_s)[1] < 0.01:
@@ -151,7 +153,7 @@ class _Camera:
     def goes_dark(
         self, projector: RigProjector, frames: Mapping[str, ByteImage], bright: float, exposure_s: float
     ) -> bool:
-        """Whether closing this projector's shutter takes the light away; it is opened again, whatever happens."""
+        """Whether closing this projector's shutter removes the light; the shutter is always opened again."""
         with self._closed(projector):
             dark = self.brightness(frames, exposure_s)
         if self._black is None:
@@ -169,7 +171,7 @@ class _Camera:
             guard.set_shutter(False, deadline=in_seconds(ANSWER_S))
 
     def _values(self, frames: Mapping[str, ByteImage], exposure_s: float) -> tuple[float, float]:
-        """Mean of a photograph, 0 to 1, and the share of it that is clipped."""
+        """Mean of a photograph, 0 to 1, and its clipped share."""
         self._taken += 1
         shot = Shot(f"look-{self._taken}", dict(frames), exposure_s)
         file, _ = self._rig.acquirer.take(shot, self._folder, deadline=self._deadline)

@@ -1,4 +1,4 @@
-"""The devices of stage.toml, opened and asked. No lamp is struck, no relay moved, no shutter released."""
+"""Opens the devices of stage.toml and reads their state. No lamp, relay or camera is operated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OPEN_S = 15.0
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A device of the stage: how a person calls it, and what opens it."""
+    """A device of the stage: its name for people, and how to open it."""
 
     name: str
     kind: str
@@ -31,17 +31,17 @@ class Device:
 
     @property
     def title(self) -> str:
-        """Its name in stage.toml, or "" where a stage has one such device at most, which needs none."""
+        """Its name in stage.toml, or "" for a kind of which a stage has at most one."""
         return self.name if self.kind in ("projector", "power_switch") else ""
 
     @property
     def place(self) -> str:
-        """Where it is, as its table says."""
+        """Its address in its table."""
         return str(self.settings.get("port") or self.settings.get("address") or self.settings.get("serial") or "")
 
 
 def devices_of(checked: Checked) -> Iterator[Device]:
-    """Relays first, because a projector without mains answers nothing. The display is not tried: it is our own."""
+    """Relays first, because a projector without mains does not answer. The display is not tested: it is our own."""
     tables = checked.stage.tables
     for relays, (driver, settings) in zip(tables.relays, checked.relays, strict=True):
         yield Device(relays.name, "power_switch", driver, settings)
@@ -55,7 +55,7 @@ def devices_of(checked: Checked) -> Iterator[Device]:
 
 
 class Trying:
-    """Tries one device after another, and remembers which relays are open."""
+    """Tests one device after the other, and remembers which relays are open."""
 
     def __init__(self, checked: Checked, deadline: Deadline) -> None:
         self._checked = checked
@@ -63,7 +63,7 @@ class Trying:
         self._dark: dict[str, str] = {}
 
     def each(self, failed: Mapping[str, Problem]) -> Iterator[tuple[Tried, Finding | None]]:
-        """Every device; one whose place has ``failed`` already is not tried again."""
+        """Test every device, except those whose address has ``failed`` already."""
         for device in devices_of(self._checked):
             problem = failed.get(device.place)
             answer = None
@@ -76,7 +76,7 @@ class Trying:
                 problem = Problem(
                     "mains-off",
                     f"Projector {device.name} does not answer, and its mains relay {self._dark[device.name]} is open.",
-                    "A run closes it by itself; to try the projector now, give it mains by hand (usbrelay, or a plug).",
+                    "A run closes it automatically. To test it now, switch the relay on by hand (usbrelay).",
                 )
             finding = None if problem is None else Finding(device.name, problem)
             yield Tried(device.name, device.kind, answer), finding
@@ -112,7 +112,7 @@ class Trying:
             raise faulty(name, status)
         hours = "" if status.lamp_hours is None else f", {status.lamp_hours} lamp hours"
         warned = f", {', '.join(status.faults)}" if status.faults else ""
-        by_hand = "" if can.power else ", to be switched by hand"
+        by_hand = "" if can.power else ", must be switched by hand"
         notes = projector.troubles() if isinstance(projector, WatchedProjector) else []
         return " ".join([f"{status.power.value}{hours}{warned}{by_hand}", *(f"({note})" for _, note in notes)])
 

@@ -1,4 +1,4 @@
-"""What the doctor tells."""
+"""The results of the doctor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hal.finding import Found, Problem
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A problem with the device at ``device``, or with the whole stage where that is ""."""
+    """A problem with the device at ``device``, or with the whole stage if that is ""."""
 
     device: str
     problem: Problem
@@ -28,7 +28,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """A device of stage.toml that was opened and asked: ``answer`` is what it said, None where it failed."""
+    """A tested device of stage.toml: ``answer`` describes its state, None if it failed."""
 
     name: str
     kind: str
@@ -37,7 +37,7 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """Everything that was seen. ``new``: devices that stage.toml does not have yet."""
+    """All results. ``new``: devices that are not in stage.toml yet."""
 
     found: tuple[Found, ...]
     tried: tuple[Tried, ...]
@@ -50,41 +50,41 @@ class Examination:
         return not self.findings
 
     def as_json(self) -> dict[str, Any]:
-        """For machines; every text of a device is made printable."""
+        """For programs; every text of a device is made printable."""
         return {
             "healthy": self.healthy,
             "found": [
                 {
-                    "bus": one.bus,
-                    "address": printable(one.address),
-                    "what": printable(one.what),
-                    "kind": one.kind,
-                    "driver": one.driver,
-                    "settings": dict(one.settings),
-                    "new": one in self.new,
+                    "bus": device.bus,
+                    "address": printable(device.address),
+                    "what": printable(device.what),
+                    "kind": device.kind,
+                    "driver": device.driver,
+                    "settings": dict(device.settings),
+                    "new": device in self.new,
                 }
-                for one in self.found
+                for device in self.found
             ],
-            "tried": [{"name": one.name, "kind": one.kind, "answer": one.answer} for one in self.tried],
+            "tried": [{"name": tried.name, "kind": tried.kind, "answer": tried.answer} for tried in self.tried],
             "problems": [finding.as_json() for finding in self.findings],
             "written": list(self.written),
         }
 
     def as_text(self) -> str:
-        """For people: what there is, what the stage's devices said, and what to mend, most important last."""
+        """For people: devices, their states, and what to correct, the most important last."""
         lines = [f"Found {len(self.found)} devices." if self.found else "Nothing was found."]
         lines += [
-            f"  {one.bus:<8} {one.address:<28} {one.what}{'  (not in stage.toml)' * (one in self.new)}"
-            for one in self.found
+            f"  {device.bus:<8} {device.address:<28} {device.what}{'  (not in stage.toml)' * (device in self.new)}"
+            for device in self.found
         ]
         if self.tried:
             lines += ["", "The stage's devices:"]
-            lines += [f"  {one.name:<16} {one.answer or 'failed, see below'}" for one in self.tried]
+            lines += [f"  {tried.name:<16} {tried.answer or 'failed, see below'}" for tried in self.tried]
         for number, finding in enumerate(self.findings, 1):
             where = f"{finding.device}: " if finding.device else ""
             lines += ["", f"{number}. {where}{finding.problem.what} [{finding.problem.code}]",
                       f"   {finding.problem.remedy}"]  # fmt: skip
         if self.written:
             lines += ["", *(f"Written into stage.toml: {text}." for text in self.written)]
-        lines += ["", "No problem was found." if self.healthy else f"{len(self.findings)} to mend."]
+        lines += ["", "No problems found." if self.healthy else f"Problems to correct: {len(self.findings)}."]
         return "\n".join(printable(line) for line in lines)

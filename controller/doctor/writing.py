@@ -1,4 +1,4 @@
-"""What was found, into stage.toml: new devices, and settings that the devices themselves contradict."""
+"""Writes new devices, and settings that the devices contradict, to stage.toml."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from controller.doctor.values import Examination
 from hal.finding import Found
 
 CORRECTIONS: Final = ("serial-wrong-baud", "serial-other-profile")
-"""Problems whose remedy is a setting that the finder has put into its table."""
+"""Problems that a setting in the finder's table corrects."""
 SINGLE: Final[Mapping[str, str]] = {"camera": "camera", "light_sensor": "light_sensor", "button_panel": "key_panel"}
-"""Kinds of which a stage has one, with the name of its table."""
+"""Kinds of which a stage has at most one, with the name of the table."""
 FIRST_ISO: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What would be written: changes of keys, further tables, and both in words."""
+    """Planned changes: keys, new tables, and both in words."""
 
     changes: list[KeyChange] = field(default_factory=list)
     tables: dict[str, Any] = field(default_factory=dict)
@@ -33,32 +33,32 @@ class Plan:
 
 
 def plan_for(stage: Stage, seen: Examination) -> Plan:
-    """What to write into a stage that has a stage.toml."""
+    """The changes for an existing stage.toml."""
     plan = Plan()
     _correct(stage, seen.found, plan)
     outputs = _outputs(stage.tables, seen.found)
     free = [name for name in outputs if name not in {projector.output for projector in stage.tables.projectors}]
     names = {projector.name for projector in stage.tables.projectors}
-    for one in seen.new:
-        if one.kind == "projector" and free:
+    for device in seen.new:
+        if device.kind == "projector" and free:
             name = next(f"projector-{n}" for n in range(1, 1000) if f"projector-{n}" not in names)
             names.add(name)
-            table = {"name": name, "output": free.pop(0), "driver": one.driver, **one.settings}
+            table = {"name": name, "output": free.pop(0), "driver": device.driver, **device.settings}
             plan.tables.setdefault("projectors", []).append(table)
-            plan.words.append(f"projector {name} at {one.address} on output {table['output']}")
-        elif one.kind in ("light_sensor", "button_panel") and not getattr(stage.tables, SINGLE[one.kind]):
-            table_name = SINGLE[one.kind]
+            plan.words.append(f"projector {name} at {device.address} on output {table['output']}")
+        elif device.kind in ("light_sensor", "button_panel") and not getattr(stage.tables, SINGLE[device.kind]):
+            table_name = SINGLE[device.kind]
             if table_name not in plan.tables:
-                plan.tables[table_name] = {"driver": one.driver, **one.settings}
-                plan.words.append(f"[{table_name}] {one.what}")
+                plan.tables[table_name] = {"driver": device.driver, **device.settings}
+                plan.words.append(f"[{table_name}] {device.what}")
     return plan
 
 
 def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str]]:
-    """The content of a first stage.toml, and what it says in words. Raises UsageError("doctor-not-enough")."""
-    outputs = [table for one in seen.found if one.kind == "display" for table in one.settings["outputs"]]
-    projectors = [one for one in seen.new if one.kind == "projector"]
-    cameras = [one for one in seen.new if one.kind == "camera"]
+    """The content of a first stage.toml, and a description. Raises UsageError("doctor-not-enough")."""
+    outputs = [table for device in seen.found if device.kind == "display" for table in device.settings["outputs"]]
+    projectors = [device for device in seen.new if device.kind == "projector"]
+    cameras = [device for device in seen.new if device.kind == "camera"]
     missing = [
         word
         for word, there in (
@@ -71,8 +71,8 @@ def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str
     if missing:
         raise UsageError(
             "doctor-not-enough",
-            what=f"A stage needs {', '.join(missing)} more than was found, so no stage.toml was written.",
-            remedy="Plug in and switch on what is missing, or write stage.toml by hand (docs/reference/stage-toml.md).",
+            what=f"No stage.toml was written, because the stage still needs {', '.join(missing)}.",
+            remedy="Connect the missing devices and switch them on, or see docs/reference/stage-toml.md.",
         )
     content: dict[str, Any] = {
         "stage": {"name": folder.resolve().name},
@@ -83,18 +83,18 @@ def new_stage(folder: Path, seen: Examination) -> tuple[dict[str, Any], list[str
         "camera": {"driver": cameras[0].driver, "iso": FIRST_ISO, **cameras[0].settings},
         "display": {"driver": "player", "outputs": outputs},
     }
-    for one in seen.new:
-        if one.kind in ("light_sensor", "button_panel"):
-            content.setdefault(SINGLE[one.kind], {"driver": one.driver, **one.settings})
+    for device in seen.new:
+        if device.kind in ("light_sensor", "button_panel"):
+            content.setdefault(SINGLE[device.kind], {"driver": device.driver, **device.settings})
     return content, [f"[{name}]" if not isinstance(table, list) else f"{len(table)} [[{name}]]"
                      for name, table in content.items()]  # fmt: skip
 
 
 def write(folder: Path, stage: Stage | None, seen: Examination) -> tuple[str, ...]:
-    """Write what was found into the stage's folder; what was written, in words.
+    """Write the devices found to stage.toml; returns a description of the changes.
 
-    Raises UsageError where the result would not be a stage ("doctor-not-enough", or as ``load_stage``); the file is
-    then as it was.
+    Raises UsageError if the result would not be a valid stage ("doctor-not-enough", or as ``load_stage``); the file
+    is then unchanged.
     """
     if stage is None:
         content, words = new_stage(folder, seen)
@@ -107,14 +107,14 @@ def write(folder: Path, stage: Stage | None, seen: Examination) -> tuple[str, ..
 
 
 def _correct(stage: Stage, found: Sequence[Found], plan: Plan) -> None:
-    for one in found:
-        if not any(problem.code in CORRECTIONS for problem in one.problems):
+    for device in found:
+        if not any(problem.code in CORRECTIONS for problem in device.problems):
             continue
         for position, projector in enumerate(stage.tables.projectors):
             written = projector.model_dump()
-            if projector.driver != one.driver or written.get("port") != one.settings.get("port"):
+            if projector.driver != device.driver or written.get("port") != device.settings.get("port"):
                 continue
-            wanted = {key: value for key, value in one.settings.items() if written.get(key) != value}
+            wanted = {key: value for key, value in device.settings.items() if written.get(key) != value}
             for key, value in wanted.items():
                 plan.changes.append(KeyChange(("projectors", position), key, value))
                 plan.words.append(f"{key} = {value!r} for projector {projector.name}")
@@ -122,4 +122,6 @@ def _correct(stage: Stage, found: Sequence[Found], plan: Plan) -> None:
 
 def _outputs(tables: StageTables, found: Sequence[Found]) -> list[str]:
     own = [output.name for output in tables.display.outputs]
-    return own or [table["name"] for one in found if one.kind == "display" for table in one.settings["outputs"]]
+    return own or [
+        table["name"] for device in found if device.kind == "display" for table in device.settings["outputs"]
+    ]

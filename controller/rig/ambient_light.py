@@ -1,4 +1,4 @@
-"""Darkness as a condition of calibration: the room's light is in every photograph, and it changes."""
+"""Checks that the room is dark for calibration, because room light is in every photograph and changes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ANSWER_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Darkness:
-    """A light sensor at the object, and the illuminance in lux above which nobody should calibrate."""
+    """A light sensor at the object, and the maximum illuminance in lux for a calibration."""
 
     sensor: LightSensor
     most_lux: float
@@ -29,33 +29,33 @@ class Darkness:
         if lux > self.most_lux:
             raise DeviceRefused(
                 "room-not-dark",
-                what=f"There are {lux:.2f} lux at the object, and calibration needs at most {self.most_lux:g}.",
-                remedy="Switch the lights off and close the blinds, or raise most_lux under [light_sensor].",
+                what=f"The light at the object is {lux:.2f} lux. Calibration needs at most {self.most_lux:g} lux.",
+                remedy="Switch off the lights and close the blinds, or increase most_lux under [light_sensor].",
             )
         return lux
 
     def warning(self, *, deadline: Deadline) -> str | None:
-        """What to tell the technician if it is no longer dark; None if it is."""
+        """A warning for the technician if it is no longer dark; None if it is."""
         try:
             self.require(deadline=deadline)
         except DeviceRefused as error:
             if error.code != "room-not-dark":
                 raise
-            return f"{error.what} What was just measured holds for this light only: calibrate again in the dark."
+            return f"{error.what} The last measurements are valid only in this light: calibrate again in the dark."
         return None
 
 
 class LightWatch:
-    """Tells the room's light from the projectors' own while something is played.
+    """Separates room light from the projectors' light while something is played.
 
-    The sensor stands at the object and sees both. What it saw least under one picture counts as that picture's own
-    light; what comes on top of it is the room's. A room that was bright ever since is therefore not noticed before the
-    picture changes; whoever calibrates is told by ``Darkness``.
+    The sensor at the object measures both. The minimum during one picture counts as that picture's own
+    light; anything above it is room light. Constant room light is therefore noticed only when the
+    picture changes; for calibrations, ``Darkness`` checks it.
 
     Parameters
     ----------
-    most_lux : more than this on top of the picture's own light is told
-    looks : so many in a row, so that nobody is told of a visitor's torch
+    most_lux : warn above this much room light
+    looks : so many readings in a row, so that a visitor's torch causes no warning
     """
 
     def __init__(self, most_lux: float, *, looks: int = 2) -> None:
@@ -65,23 +65,23 @@ class LightWatch:
         self._bright = False
 
     def saw(self, lux: float, scene: str | None) -> str | None:
-        """What to tell people for as long as it holds; ``scene`` names what is shown, None: nothing that lasts."""
+        """A warning while there is room light; ``scene`` names the picture shown, None: none that stays."""
         if scene is None:
             self._in_a_row, self._bright = 0, False
             return None
         own = min(lux, self._least.get(scene, lux))
         self._least = {**dict(list(self._least.items())[-99:]), scene: own}
         room = lux - own
-        # Half of it must be gone before all is well: light that flickers about the limit is told once.
+        # The warning ends only below half the limit, so that light around the limit causes one warning.
         self._in_a_row = self._in_a_row + 1 if room > self._most_lux else 0
         self._bright = self._in_a_row >= self._looks or (self._bright and room > self._most_lux / 2)
         if not self._bright:
             return None
-        return f"There is light in the room: {room:.1f} lux at the object that are not the projectors'."
+        return f"The room is not dark: {room:.1f} lux at the object do not come from the projectors."
 
 
 def dark_before(darkness: Darkness | None) -> list[Step]:
-    """The step that refuses a bright room, for before the lamps are struck: their light must not count."""
+    """The step that refuses a bright room; it runs before the lamps are struck, so that their light does not count."""
     if darkness is None:
         return []
 
@@ -90,11 +90,11 @@ def dark_before(darkness: Darkness | None) -> list[Step]:
         context.reporter.say(f"The room is dark: {lux:.2f} lux at the object.")
         return ()
 
-    return [Step(StepId("dark-before"), look, title="Looking whether the room is dark", weight=0.1, always=True)]
+    return [Step(StepId("dark-before"), look, title="Checking that the room is dark", weight=0.1, always=True)]
 
 
 def dark_after(darkness: Darkness | None, display: Display) -> list[Step]:
-    """The step that warns of light that came on meanwhile; the projectors show black for it."""
+    """The step that warns of light switched on meanwhile; the projectors show black for it."""
     if darkness is None:
         return []
 
@@ -104,4 +104,4 @@ def dark_after(darkness: Darkness | None, display: Display) -> list[Step]:
             context.reporter.say(warning, Level.WARNING)
         return ()
 
-    return [Step(StepId("dark-after"), look, title="Looking whether the room stayed dark", weight=0.1)]
+    return [Step(StepId("dark-after"), look, title="Checking that the room stayed dark", weight=0.1)]

@@ -1,4 +1,4 @@
-"""What the camera tells beside its pictures: mended faults go into the journal, low batteries to the technician."""
+"""Watches the camera's state: corrected faults go to the journal, warnings such as a low battery to the technician."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from hal.errors import DeviceError
 from hal.interfaces import Camera, WatchedCamera
 
 EVERY_S: Final = 60.0
-"""Between two questions for the camera's battery and card; each takes a few of its answers."""
+"""Time between two queries of the camera's battery and card."""
 _ASK_S: Final = 5.0
 _SAID: Final[Mapping[str, str]] = {
-    "battery-low": "The camera's battery is low; give it mains power.",
-    "card-nearly-full": "The camera's card is nearly full.",
-    "card-unusable": "The camera's card can not be written; check its lock, or put another in.",
-    "autofocus-on": "The camera's lens is on autofocus; set it to manual, or photographs may be out of focus or fail.",
-    "mode-dial": "The camera's mode dial is not on M; exposures may not be what was asked for.",
-    "target-changed": "The camera sent a picture elsewhere than it was told to, and was told again.",
+    "battery-low": "The camera's battery is low: connect its power supply.",
+    "card-nearly-full": "The camera's card is nearly full: replace or empty it.",
+    "card-unusable": "The camera can't write to its card: check the card's lock, or replace the card.",
+    "autofocus-on": "The camera's lens is on autofocus: set it to manual focus, or photographs may be blurred or fail.",
+    "mode-dial": "The camera's mode dial is not on M: turn it to M, or exposures may be wrong.",
+    "target-changed": "The camera stored a picture at the wrong place. The setting was sent again.",
 }
 
 
 class CameraWatch:
-    """Asks ``camera`` what went wrong and how long it can go on, where its driver can tell; never fails for it."""
+    """Asks ``camera`` for corrected faults and its state, if its driver supports it; never raises for it."""
 
     def __init__(self, camera: Camera, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._camera = camera if isinstance(camera, WatchedCamera) else None
@@ -34,7 +34,7 @@ class CameraWatch:
         self._next_s = clock()
 
     def look(self, context: Context) -> None:
-        """After a photograph: journal what was mended; once a minute, ask for the camera's state."""
+        """After a photograph: journal corrected faults; once a minute, ask for the camera's state."""
         if self._camera is None:
             return
         for code, sentence in self._camera.troubles():
@@ -47,7 +47,7 @@ class CameraWatch:
         except Cancelled:
             raise
         except DeviceError as error:
-            # The next photograph will tell whether the camera is gone; its state alone is not worth a failed run.
+            # The next photograph will show whether the camera is gone; a failed query alone must not fail the run.
             context.journal.record(error.code, error.what, Level.WARNING)
             return
         known = {event.code for event in context.journal.events()} if status.warnings else set()

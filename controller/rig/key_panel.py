@@ -1,4 +1,4 @@
-"""The technician's keys: play, stop, recalibrate, each with a picture that says what the stage is doing."""
+"""The technician's keys: play, stop, recalibrate, and one that shows the stage's state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hal.interfaces import ButtonPanel
 
 ANSWER_S: Final = 5.0
 RETRY_S: Final = 2.0
-"""Between two looks for a panel that was unplugged."""
+"""Time between two attempts to find an unplugged panel."""
 
 _BACKGROUND: Final = (24, 24, 24)
 _POSSIBLE: Final = (240, 240, 240)
@@ -30,13 +30,13 @@ _LIGHTS: Final[Mapping[State, tuple[int, int, int]]] = {
     State.DEGRADED: (240, 170, 30),
     State.FAULT: (230, 50, 40),
 }
-"""The colour of the status key; every other state is work in progress."""
+"""Colours of the status key; every other state is work in progress."""
 _WORKING: Final = (60, 130, 240)
 
 
 @dataclass(frozen=True, slots=True)
 class KeyCommand:
-    """A key: what is written on it, the event that it asks for, and what to call. ``event`` None: the status key."""
+    """A key: its text, the event that it requests, and the function to call. ``event`` None: the status key."""
 
     text: str
     event: Event | None
@@ -46,7 +46,7 @@ class KeyCommand:
 def technicians_keys(
     play: Callable[[], None], stop: Callable[[], None], recalibrate: Callable[[], None]
 ) -> tuple[KeyCommand, ...]:
-    """The usual keys, first the one that shows the state and does nothing."""
+    """The usual keys; the first only shows the state."""
     return (
         KeyCommand("", None, lambda: None),
         KeyCommand("PLAY", Event.PLAY, play),
@@ -56,11 +56,11 @@ def technicians_keys(
 
 
 class KeyService:
-    """Shows the stage's state on a panel's keys, and calls commands for pressed ones, until it is stopped.
+    """Shows the stage's state on a panel's keys, and calls commands for pressed keys, until it is stopped.
 
-    ``state`` is asked whenever the panel is looked at. A command is called on the service's thread, must return soon
-    and not raise; one that the state does not allow is not called. ``trouble`` hears of a panel that fails (None: works
-    again); the service looks for it again for ever.
+    ``state`` is called at each update. A command is called on the service's thread, must return soon
+    and not raise; one that the state does not allow is not called. ``trouble`` is called when the panel fails (None:
+    it works again); the service tries to reconnect without end.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class KeyService:
                     self._trouble(None)
             except Cancelled:
                 return
-            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: told, and it goes on
+            except Exception as error:  # noqa: BLE001 - the last boundary of this thread: reported, and it continues
                 if not failed:
                     failed = True
                     self._trouble(error if isinstance(error, DeviceError) else _unknown(error))
@@ -127,12 +127,12 @@ class KeyService:
 
 
 def _unknown(error: Exception) -> DeviceError:
-    what = f"The key panel met an error that Velatura does not know ({type(error).__name__}: {error})."
-    return DeviceError("crash", what=what, remedy="Export the diagnostics.")
+    what = f"An unexpected error occurred at the key panel ({type(error).__name__}: {error})."
+    return DeviceError("crash", what=what, remedy="Export the diagnostics and send them to the maintainers.")
 
 
 def key_picture(command: KeyCommand, state: State, size_px: tuple[int, int]) -> ByteImage:
-    """The picture of a key in a state: (rows, columns, 3) uint8. A key that can do nothing now is dim."""
+    """The picture of a key in a state: (rows, columns, 3) uint8. A key without a function now is dim."""
     width, height = size_px
     picture = np.empty((height, width, 3), np.uint8)
     if command.event is None:
@@ -146,7 +146,7 @@ def key_picture(command: KeyCommand, state: State, size_px: tuple[int, int]) -> 
 
 
 def _write(picture: ByteImage, text: str, colour: tuple[int, int, int]) -> None:
-    """Write ``text`` as large as fits into the middle."""
+    """Write ``text`` in the centre, as large as fits."""
     font = cv2.FONT_HERSHEY_SIMPLEX
     height, width = picture.shape[:2]
     (wide, tall), _ = cv2.getTextSize(text, font, 1.0, 2)

@@ -1,7 +1,7 @@
-"""The lamp rules, between every caller and the projectors. No other code holds a bare projector.
+"""The lamp rules, between every caller and the projectors. No other code uses a projector without them.
 
 - A lamp is never struck while it cools, nor before its minimum off time is over.
-- After a power cut, a kill, or a look at a lamp that went off by itself, it counts as hot from the moment of the look.
+- After a power cut or a kill, or when a lamp is found to be off by itself, it counts as hot from that moment.
 - Strikes are counted before they happen, hours while they pass; both survive restarts.
 - A mains relay opens only after cooling; photometric work begins only when the lamp is stable.
 """
@@ -23,24 +23,24 @@ from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, 
 
 SAVE_HOURS_EVERY_S = 60.0
 ANSWER_S = 10.0
-"""Wait at least so long for one answer, whatever the driver says."""
+"""Wait at least so long for one answer, even if the driver gives less."""
 
 
 @dataclass(frozen=True, slots=True)
 class LampUse:
-    """What a lamp has been through under our hands: strikes, and hours lit."""
+    """A lamp's use by this program: strikes, and hours lit."""
 
     strikes: int
     hours: float
 
 
 class LampGuard:
-    """A ``Projector`` that keeps the lamp rules; wraps the driver's.
+    """Wraps a driver's ``Projector`` and keeps the lamp rules.
 
     Parameters
     ----------
-    name : the projector's name in stage.toml; its record in the ledger
-    at_least : rules of the stage that may be stricter than the device's own, never laxer
+    name : the projector's name in stage.toml and in the ledger
+    at_least : rules of the stage; each may be stricter than the device's own, never less strict
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class LampGuard:
         return self._projector.identity(deadline=deadline)
 
     def close(self) -> None:
-        """Release the line. The lamp stays as it is."""
+        """Close the connection. The lamp stays as it is."""
         with self._lock:
             self._count()
             if self._unsaved_s > 0:
@@ -84,9 +84,9 @@ class LampGuard:
         self._projector.set_shutter(closed, deadline=deadline)
 
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
-        """As the device answers now; what is seen enters the lamp's record.
+        """The device's answer now; it is also written to the lamp's record.
 
-        One that only a person can switch counts as on after ``switched_by_hand``, unless it tells otherwise.
+        A projector that only a person can switch counts as on after ``switched_by_hand``, unless it reports otherwise.
         """
         with self._lock:
             status = self._projector.status(deadline=deadline)
@@ -98,11 +98,11 @@ class LampGuard:
             return status
 
     def troubles(self) -> list[tuple[str, str]]:
-        """As ``hal.interfaces.WatchedProjector``; empty where the driver tells none."""
+        """As ``hal.interfaces.WatchedProjector``; empty if the driver reports none."""
         return self._projector.troubles() if isinstance(self._projector, WatchedProjector) else []
 
     def switch_on(self, *, deadline: Deadline) -> None:
-        """Strike the lamp if the rules allow; harmless when it is lit.
+        """Strike the lamp if the rules allow; no effect if it is lit.
 
         Raises DeviceRefused with code "lamp-cooling", "lamp-resting", "lamp-state-unknown" or "projector-fault" before
         anything is sent, and WorkError if the strike can't be recorded (then nothing is sent either).
@@ -117,14 +117,14 @@ class LampGuard:
             try:
                 self._projector.switch_on(deadline=deadline)
             except DeviceRefused:
-                # Only a refusal proves that the lamp was not struck; after silence it counts as struck.
+                # Only a refusal proves that the lamp was not struck; without an answer it counts as struck.
                 self._write(replace(before, lit_s=self._record.lit_s))
                 raise
 
     def switch_off(self, *, deadline: Deadline) -> None:
-        """Ask for standby. Whatever a look at the lamp or the ledger raises, the command goes out.
+        """Switch to standby. The command is sent even if checking the lamp or the ledger fails.
 
-        What the look raised is not lost: ``power_down`` looks again afterwards, and so does the kiosk.
+        That error is not lost: ``power_down`` and the kiosk check again afterwards.
         """
         with self._lock:
             power = Power.UNKNOWN
@@ -143,11 +143,11 @@ class LampGuard:
 
     @property
     def by_hand(self) -> bool:
-        """Whether nobody knows the codes to switch this projector."""
+        """Whether the codes to switch this projector are unknown."""
         return not self._can.power
 
     def switched_by_hand(self, on: bool, *, in_s: float = 0.0) -> None:
-        """A technician was told to switch it, and is believed to have done so in ``in_s`` seconds."""
+        """A technician was asked to switch it, which is assumed to be done in ``in_s`` seconds."""
         with self._lock:
             if on and not self._record.lit:
                 strikes = self._record.strikes + 1
@@ -160,21 +160,21 @@ class LampGuard:
 
     @property
     def answer_s(self) -> float:
-        """How long to wait for one answer: as the driver says, and never less than ``ANSWER_S``."""
+        """How long to wait for one answer: the driver's value, at least ``ANSWER_S``."""
         return max(ANSWER_S, self._can.answer_s)
 
     @property
     def switch_s(self) -> float:
-        """How long to wait until a switch is confirmed; some projectors answer nothing while they start."""
+        """How long to wait until a switch is confirmed; some projectors do not answer while they start."""
         return max(ANSWER_S, self._can.switch_s)
 
     @property
     def may_be_lit(self) -> bool:
-        """Whether the lamp was struck, or seen on, and has not been seen off since."""
+        """Whether the lamp was struck or seen on, and not seen off since."""
         return self._record.lit
 
     def rest_left_s(self) -> float:
-        """Seconds until the rules allow a strike, as far as time decides; 0 for a lamp that is lit or never seen."""
+        """Seconds until the rules allow a strike by time; 0 for a lamp that is lit or was never seen."""
         with self._lock:
             if self._record.lit or self._record.since_s is None:
                 return 0.0
@@ -194,22 +194,22 @@ class LampGuard:
             return
         raise DeviceRefused(
             "lamp-not-stable",
-            what=f"The lamp of projector {self.name} is {power.value} and its light is not yet steady.",
-            remedy=f"Measure after it has been on for {self._rules.stable_s:.0f} s.",
+            what=f"The lamp of projector {self.name} is {power.value}. Its light is not stable yet.",
+            remedy=f"Wait until it has been on for {self._rules.stable_s:.0f} s.",
         )
 
     def may_open_mains(self, *, deadline: Deadline) -> bool:
-        """Whether the projector is in standby, and has been cooling for long enough, so that its mains may be cut."""
+        """Whether the projector is in standby and has cooled long enough to cut its mains."""
         if self.status(deadline=deadline).power is not Power.OFF:
             return False
         with self._lock:
-            # A lamp without a record may have been switched off a moment before this program started.
+            # A lamp without a record may have been switched off just before this program started.
             off_since_s = self._born_s if self._record.since_s is None else self._record.since_s
             return not self._record.lit and self._now() - off_since_s >= self._rules.cool_down_s
 
     @contextlib.contextmanager
     def unstruck(self) -> Iterator[None]:
-        """While it lasts no other thread strikes the lamp, and ``may_be_lit`` stays what it is."""
+        """Inside, no other thread strikes the lamp, and ``may_be_lit`` does not change."""
         with self._lock:
             yield
 
@@ -222,7 +222,7 @@ class LampGuard:
 
     @property
     def _can(self) -> ProjectorCapabilities:
-        """What the projector's driver can do; as it said last, if it fails to say it now: lamps go off by it."""
+        """The driver's capabilities; the last known ones if the query fails, because switching off needs them."""
         with contextlib.suppress(Exception):
             self._known = self._projector.capabilities
         return self._known
@@ -239,13 +239,13 @@ class LampGuard:
         if status.power is not Power.OFF:
             raise DeviceRefused(
                 "lamp-state-unknown",
-                what=f"Projector {self.name} does not tell whether its lamp is hot.",
-                remedy="Switch it on by its own remote control, or check its profile in stage.toml.",
+                what=f"Projector {self.name} does not report whether its lamp is hot.",
+                remedy="Switch it on with its own remote control, or check its profile in stage.toml.",
             )
         if (rest_s := self.rest_left_s()) > 0:
             raise DeviceRefused(
                 "lamp-resting",
-                what=f"The lamp of projector {self.name} was on a moment ago and must rest.",
+                what=f"The lamp of projector {self.name} was on recently. It must stay off for a minimum time.",
                 remedy=f"Wait {rest_s:.0f} s and start again.",
             )
 
@@ -258,19 +258,19 @@ class LampGuard:
             return LampRecord()
         if record.boot == self._boot() and record.since_s is not None:
             return record
-        # Another boot's clock says nothing: whatever the lamp did, it counts as hot from now.
+        # The clock of another boot can't be compared: the lamp counts as hot from now.
         return replace(record, since_s=self._now(), boot=self._boot())
 
     def _seen(self, power: Power) -> None:
         self._count()
         lit = self._record.lit
         if power in (Power.ON, Power.WARMING) and not lit:
-            # Somebody else switched it on: it has been lit for at least no time at all.
+            # It was switched on elsewhere: its time on is unknown, so count from now.
             self._write_quietly(replace(self._record, lit=True, since_s=self._now(), boot=self._boot()))
         elif power in (Power.OFF, Power.COOLING) and lit:
             self._went_off()
         elif power is Power.COOLING and self._cooled_by_now():
-            # Somebody else had it on between two looks, or it takes longer to cool than its rules say.
+            # It was switched on elsewhere between two checks, or cools longer than its rules state.
             self._went_off()
 
     def _cooled_by_now(self) -> bool:
@@ -295,9 +295,9 @@ class LampGuard:
         self._record, self._unsaved_s = record, 0.0
 
     def _write_quietly(self, record: LampRecord) -> None:
-        """For what has happened already: remembered in any case, on disk if the disk lets us (the next write retries).
+        """Record what has happened: always in memory, and on disk if possible (the next write retries).
 
-        What the disk then holds is older, so after a restart the lamp counts as hot: the safe side.
+        If the record on disk is older, the lamp counts as hot after a restart, which is safe.
         """
         self._record = record
         with contextlib.suppress(VelaturaError):
@@ -311,7 +311,7 @@ class LampGuard:
 
 
 def stricter(rules: LampRules, at_least: LampRules | None) -> LampRules:
-    """The longer of each time."""
+    """The longer of both times, for each time."""
     if at_least is None:
         return rules
     return LampRules(

@@ -1,4 +1,4 @@
-"""What is known of each lamp, kept so that a restart or a power cut never makes a hot lamp look cold."""
+"""Stored state of each lamp, so that after a restart or power cut a hot lamp never counts as cold."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from hal.deadline import Deadline
 
 
 class Clock(Protocol):
-    """Seconds since the machine's boot, and waiting."""
+    """Seconds since boot, and waiting."""
 
     def now_s(self) -> float:
-        """Never runs backwards; comparable between processes of one boot."""
+        """Monotonic; comparable between processes of one boot."""
 
     def boot(self) -> str:
-        """Names this boot; times of another boot mean nothing."""
+        """Identifies this boot; times of another boot can't be compared."""
 
     def sleep(self, seconds: float, deadline: Deadline) -> None:
         """As ``Deadline.sleep``."""
 
 
 class SystemClock:
-    """CLOCK_MONOTONIC, which on Linux counts from boot for every process alike."""
+    """CLOCK_MONOTONIC, which on Linux counts from boot for all processes."""
 
     def now_s(self) -> float:
         return time.monotonic()
@@ -46,8 +46,8 @@ class SystemClock:
 class LampRecord:
     """One lamp.
 
-    ``lit``: was struck, and has not been seen off since; ``since_s``: the clock at the strike (lit) or at the off (not
-    lit), None for "never seen"; ``boot``: the boot that ``since_s`` belongs to; ``strikes`` and ``lit_s``: for life.
+    ``lit``: struck and not seen off since; ``since_s``: the clock at the strike (lit) or at the off (not
+    lit), None for "never seen"; ``boot``: the boot of ``since_s``; ``strikes`` and ``lit_s``: totals.
     """
 
     lit: bool = False
@@ -64,7 +64,7 @@ class LampLedger(Protocol):
         """The record of a lamp; None if it was never written."""
 
     def write(self, name: str, record: LampRecord) -> None:
-        """Durable on return. Raises WorkError("no-space") and the like; the caller's lamp is then as it was."""
+        """Durable on return. Raises WorkError("no-space") and the like; the stored record is then unchanged."""
 
 
 _UNKNOWN: Final = ""
@@ -73,7 +73,7 @@ _UNKNOWN: Final = ""
 class LampFile:
     """A ledger in one JSON file of the stage folder. A damaged file makes every lamp of the stage count as hot.
 
-    Those that were not written since then count as hot after a restart too: an entry without a name says so.
+    Lamps that were not written since then count as hot after a restart, too: an entry without a name marks this.
     """
 
     NAME: Final = "lamps.json"

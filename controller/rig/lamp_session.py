@@ -1,4 +1,4 @@
-"""Light for the time of a run: lamps on and steady before it, off after it whatever happens, and then their mains."""
+"""Lamps for a run: on and stable before it, off after it in every case, and then their mains."""
 
 from __future__ import annotations
 
@@ -18,51 +18,51 @@ from hal.errors import DeviceError
 
 @contextlib.contextmanager
 def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) -> Iterator[None]:
-    """Whatever happens inside, the lamps are off or cooling afterwards.
+    """Afterwards the lamps are off or cooling in every case.
 
-    A projector that can't be switched off is told to the technician. For that, DeviceError("lamp-still-lit") is raised,
-    unless the work itself failed: then its own error is.
+    If a projector can't be switched off, warn the technician and raise DeviceError("lamp-still-lit"),
+    unless the work itself failed: then raise its error.
     """
     try:
         yield
     finally:
         _tell(reporter, "Switching the projectors off.")
-        # Before the machine is told: a listener that fails (a full disk under the journal) must not keep lamps lit.
+        # Before the state changes: a failing listener (a full disk under the journal) must not keep lamps lit.
         failures = power_down(rig.guards, within_s=power_down_s)
         for failure in failures:
             _tell(reporter, f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
         for name in (guard.name for guard in rig.guards if guard.by_hand):
-            _tell(reporter, f"Switch projector {name} off by its own remote control now.", Level.WARNING)
+            _tell(reporter, f"Switch projector {name} off with its own remote control now.", Level.WARNING)
         if machine.allows(Event.STOP):
             machine.handle(Event.STOP, "the lamps are switched off")
         _cut_mains(rig, reporter)
         if not failures and machine.allows(Event.COOLED):
-            machine.handle(Event.COOLED, "every lamp is off or cooling by itself")
+            machine.handle(Event.COOLED, "every lamp is off or cooling")
     if failures:
         names = ", ".join(failure.projector for failure in failures)
         raise DeviceError(
             "lamp-still-lit",
             what=f"The work is done, but {names} could not be switched off.",
-            remedy="Switch off by the remote control, and leave the mains on until the fans stand still.",
+            remedy="Switch them off with the remote control. Leave the mains on until the fans stop.",
         )
 
 
 def _cut_mains(rig: Rig, reporter: Reporter) -> None:
     if not rig.circuits:
         return
-    _tell(reporter, "Waiting until the lamps have cooled, to cut their mains.")
+    _tell(reporter, "Waiting until the lamps have cooled, to switch their mains off.")
     for stuck in open_circuits(rig.circuits, rig.guards):
         _tell(reporter, f"The mains of relay {stuck.circuit} stay on: {stuck.error}", Level.WARNING)
 
 
 def _tell(reporter: Reporter, text: str, level: Level = Level.INFO) -> None:
-    # A terminal that was closed, or a reader that went away, must not keep lamps lit.
+    # A closed terminal or reader must not keep lamps lit.
     with contextlib.suppress(OSError, ValueError):
         reporter.say(text, level)
 
 
 def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
-    """Strike the lamps and wait for steady light. Never skipped: hardware is probed, not restored."""
+    """Strike the lamps and wait for stable light. Never skipped: hardware is checked, not restored."""
 
     def strike(context: Context) -> Sequence[Path]:
         light(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance,
@@ -87,6 +87,6 @@ def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
     return [
         Step(StepId("strike"), strike, title="Switching the projectors on", weight=light_s, enter=Event.START,
              leave=Event.LAMPS_LIT, always=True),
-        Step(StepId("steady"), settle, title="Waiting for steady light", weight=steady_s,
+        Step(StepId("steady"), settle, title="Waiting for stable light", weight=steady_s,
              leave=Event.LAMPS_STABLE, always=True),
     ]  # fmt: skip

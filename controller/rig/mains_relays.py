@@ -1,4 +1,4 @@
-"""Mains relays: closed before the projectors are spoken to, opened only when every lamp behind them has cooled."""
+"""Mains relays: closed before the projectors are used, opened only when every lamp behind them has cooled."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from hal.errors import DeviceRefused
 from hal.interfaces import PowerSwitch
 
 MARGIN_S = 60.0
-"""Beyond the longest cooling that its lamps' rules name, a projector gets this long to say that it is in standby."""
+"""Beyond the longest cooling time of its lamps' rules, a projector gets this long to report standby."""
 
 
 @dataclass(frozen=True, slots=True)
 class Circuit:
-    """One relay, and the projectors (by name) whose mains go through it. ``boot_s``: until they can be spoken to."""
+    """One relay, and the names of the projectors that it feeds. ``boot_s``: time until they accept commands."""
 
     name: str
     channel: int
@@ -28,28 +28,28 @@ class Circuit:
     _switch: PowerSwitch = field(repr=False)
 
     def on(self, *, deadline: Deadline) -> bool:
-        """Whether its relay is closed now, as the board says."""
+        """Whether its relay is closed now, according to the board."""
         return self._switch.state(self.channel, deadline=deadline)
 
     def close(self, *, deadline: Deadline) -> bool:
-        """Give mains; whether there were none before."""
+        """Switch the mains on; returns whether they were off before."""
         if self.on(deadline=deadline):
             return False
         self._switch.switch(self.channel, True, deadline=deadline)
         return True
 
     def open(self, guards: Mapping[str, LampGuard], *, deadline: Deadline) -> None:
-        """Cut the mains; harmless where they are cut.
+        """Switch the mains off; no effect if they are off.
 
         Raises DeviceRefused("mains-lamp-hot") unless every lamp behind it is known to be cold.
         """
         if not self._switch.state(self.channel, deadline=deadline):
-            return  # nobody behind it could answer
+            return  # no projector behind it could answer
         self._refuse([name for name in self.feeds if not guards[name].may_open_mains(deadline=deadline)])
         with contextlib.ExitStack() as held:
             for name in self.feeds:
                 held.enter_context(guards[name].unstruck())
-            # By another thread, since it was looked at.
+            # Another thread did it after the check.
             self._refuse([name for name in self.feeds if guards[name].may_be_lit])
             self._switch.switch(self.channel, False, deadline=deadline)
 
@@ -58,7 +58,7 @@ class Circuit:
             raise DeviceRefused(
                 "mains-lamp-hot",
                 what=f"Relay {self.name} stays closed: the lamp of {', '.join(hot)} is lit or has not cooled.",
-                remedy="Switch the projector off and wait until its fans stand still.",
+                remedy="Switch the projector off and wait until its fans stop.",
             )
 
 
@@ -71,7 +71,7 @@ class MainsFailure:
 
 
 def close_circuits(circuits: Sequence[Circuit], *, deadline: Deadline, clock: Clock | None = None) -> None:
-    """Close every relay, and wait until the projectors that had no mains can be spoken to.
+    """Close every relay, and wait until the projectors that had no mains accept commands.
 
     Raises what the relays' drivers raise, and Cancelled.
     """
@@ -86,7 +86,7 @@ def open_circuits(
 ) -> tuple[MainsFailure, ...]:  # fmt: skip
     """Open every relay as soon as each lamp behind it has cooled; call after ``power_down``.
 
-    Has its own time, ``within_s``, or as long as the lamps' rules say and a minute more. A relay whose lamps are not
+    Its time limit is ``within_s``, or the time of the lamps' rules plus a minute. A relay whose lamps are not
     known to be cold by then stays closed and is returned as a failure. Raises nothing.
     """
     clock = clock or SystemClock()

@@ -1,4 +1,4 @@
-"""All projectors on, all projectors off: the two procedures that need every lamp guard at once."""
+"""Switches all projectors on or off: the two procedures that need every lamp guard at once."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power
 
 POLL_S = 1.0
-"""Between two looks at a projector; some lock up when they are asked more often while they boot."""
+"""Time between two queries of a projector; some hang when they are asked more often during boot."""
 BY_HAND_S = 60.0
-"""How long a technician may take to reach a projector that only a person can switch."""
+"""Time for a technician to reach a projector that only a person can switch."""
 
 Advance = Callable[[float, str], None]
 """Fraction of the whole (0..1) and what is waited for."""
@@ -44,8 +44,8 @@ def light(
 ) -> None:  # fmt: skip
     """Strike every lamp and wait until each projector says that it is on.
 
-    Lamps that must rest are waited for. Every projector is looked at before any lamp is struck, and all are struck
-    before any is waited for. The technician is told to switch those that only a person can switch, and has
+    Waits for lamps in their minimum off time. Every projector is checked before any lamp is struck, and all are struck
+    before waiting for any. The technician is asked to switch those that only a person can switch, and has
     ``BY_HAND_S`` for it.
 
     Raises
@@ -53,7 +53,7 @@ def light(
     DeviceRefused("projector-fault")  a projector reports a fault, at any time
     DeviceTimeout("lamps-not-lit")  the deadline passed
     Cancelled  the lamps are then as they were: call ``power_down``
-    and what a driver raises on the first look, so that a silent projector is named at once
+    and what a driver raises at the first check, so that a silent projector is named at once
     """
     clock = clock or SystemClock()
     for guard in guards:
@@ -65,8 +65,8 @@ def light(
         advance(1 - len(waiting) / len(guards), f"waiting for the light of {names}")
         deadline.check(
             "lamps-not-lit",
-            what=f"The lamp of {names} was not on when the time was over.",
-            remedy="Look at the projector: is it powered, is its cover closed? Then start again.",
+            what=f"The lamp of {names} did not come on in time.",
+            remedy="Check that the projector has power and its cover is closed. Then start again.",
         )
         clock.sleep(POLL_S, deadline)
 
@@ -83,8 +83,8 @@ def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance,
             if not _is_on(guard, deadline) and not guard.may_be_lit:
                 raise DeviceRefused(
                     "lamp-went-off",
-                    what=f"The lamp of projector {guard.name} went off while it warmed up.",
-                    remedy="Let it cool for some minutes and start again; if it comes back, replace the lamp.",
+                    what=f"The lamp of projector {guard.name} went off while it was warming up.",
+                    remedy="Let it cool for some minutes and start again. If it goes off again, replace the lamp.",
                 )
         left_s = max((guard.stable_left_s() for guard in guards), default=0.0)
         if left_s <= 0:
@@ -92,8 +92,8 @@ def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance,
         advance(max(0.0, 1 - left_s / wait_s), f"the lamps become steady, {left_s:.0f} s")
         deadline.check(
             "lamps-not-stable",
-            what="The lamps were not yet steady when the time was over.",
-            remedy="Give them a longer power_up_s under [safety] in stage.toml.",
+            what="The lamps did not become stable in time.",
+            remedy="Increase power_up_s under [safety] in stage.toml.",
         )
         clock.sleep(min(POLL_S, max(left_s, 0.01)), deadline)
 
@@ -101,10 +101,10 @@ def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance,
 def power_down(
     guards: Sequence[LampGuard], *, within_s: float = 60.0, clock: Clock | None = None
 ) -> tuple[PowerFailure, ...]:
-    """Switch every projector off, all at once, each tried until it is seen cooling or off, or ``within_s`` is over.
+    """Switch all projectors off at once, each until it is seen cooling or off, or ``within_s`` has passed.
 
-    Is not stopped by a cancelled or overdue run: it has its own time. A failing projector never keeps the others lit.
-    Those that only a person can switch are left to the technician, whom the caller must tell.
+    A cancelled or overdue run does not stop it: it has its own time. A failing projector never keeps the others lit.
+    Those that only a person can switch are left to the technician; the caller must ask for it.
     Returns the failures, empty when every lamp is off or cooling; raises nothing.
     """
     if not guards:
@@ -131,7 +131,7 @@ def cool_all(
     """``power_down``, then wait until every lamp that went off is cool enough for its mains to be cut.
 
     Raises DeviceTimeout("lamps-not-cool") when the deadline passes and Cancelled when stopped; by then every projector
-    has been told to switch off.
+    has received the off command.
     """
     clock = clock or SystemClock()
     failures = power_down(guards, clock=clock)
@@ -143,8 +143,8 @@ def cool_all(
         advance(1 - len(hot) / len(cooling), f"cooling {', '.join(hot)}")
         deadline.check(
             "lamps-not-cool",
-            what=f"The lamp of {', '.join(hot)} was still cooling when the time was over.",
-            remedy="Leave the mains on until its fans stand still.",
+            what=f"The lamp of {', '.join(hot)} was still cooling at the deadline.",
+            remedy="Leave the mains on until its fans stop.",
         )
         clock.sleep(POLL_S, deadline)
     return failures
@@ -170,26 +170,26 @@ def _strike(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock
 
 
 def _by_hand(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock, tell: Tell) -> None:
-    """Also told of one that should be on: since a run that was killed somebody may have switched it off."""
+    """Also for one that should be on: it may have been switched off since a killed run."""
     while (left_s := guard.rest_left_s()) > 0:
         _rest(guard, left_s, deadline, advance, clock)
-    within = "" if guard.may_be_lit else f" It is taken to burn in {BY_HAND_S:.0f} s."
-    tell(f"Switch projector {guard.name} on by its own remote control, if it is not: nobody else can.{within}")
+    within = "" if guard.may_be_lit else f" It is expected to be on in {BY_HAND_S:.0f} s."
+    tell(f"Switch projector {guard.name} on with its remote control, if it is off. Velatura can't switch it.{within}")
     guard.switched_by_hand(True, in_s=BY_HAND_S)
 
 
 def _rest(guard: LampGuard, left_s: float, deadline: Deadline, advance: Advance, clock: Clock) -> None:
-    advance(0.0, f"the lamp of {guard.name} rests for {left_s:.0f} s")
+    advance(0.0, f"the lamp of {guard.name} must stay off for {left_s:.0f} s")
     deadline.check(
         "lamp-resting",
-        what=f"The lamp of projector {guard.name} still rested when the time was over.",
+        what=f"The lamp of projector {guard.name} was still in its minimum off time at the deadline.",
         remedy="Start again in some minutes.",
     )
     clock.sleep(POLL_S, deadline)
 
 
 def _is_on(guard: LampGuard, deadline: Deadline) -> bool:
-    """Whether the lamp is on. A projector that boots may be silent or talk nonsense: that is not yet a failure."""
+    """Whether the lamp is on. A booting projector may be silent or answer nonsense: that is not a failure yet."""
     try:
         status = guard.status(deadline=deadline.within(guard.answer_s))
     except (DeviceTimeout, DeviceBusy, ProtocolError):
@@ -200,9 +200,9 @@ def _is_on(guard: LampGuard, deadline: Deadline) -> bool:
 
 
 def _switch_off(guard: LampGuard, deadline: Deadline, clock: Clock) -> None:
-    """Ask until the lamp is seen off or cooling; a projector that warms up may refuse for a while.
+    """Send the off command until the lamp is off or cooling; a warming projector may refuse for a while.
 
-    One that was never seen lit is asked once: a silent projector must not hold up the end of a run that it spoilt.
+    One that was never seen lit is asked once: a silent projector must not delay the end of a failed run.
     """
     last: Exception | None = None
     while True:
@@ -212,12 +212,12 @@ def _switch_off(guard: LampGuard, deadline: Deadline, clock: Clock) -> None:
                 return
         except Cancelled:
             raise
-        except Exception as error:  # noqa: BLE001 - whatever it is, the lamp must go off; told when time is over
+        except Exception as error:  # noqa: BLE001 - in every case the lamp must go off; reported at the time limit
             last = error
         if deadline.passed or (last is not None and not guard.may_be_lit):
             raise last or DeviceTimeout(
                 "lamp-not-off",
-                what=f"Projector {guard.name} was told to switch off and is still on.",
-                remedy="Switch it off by its own remote control, and do not cut its mains before its fans stand still.",
+                what=f"Projector {guard.name} is still on after the off command.",
+                remedy="Switch it off with its own remote control. Leave its mains on until its fans stop.",
             )
         clock.sleep(POLL_S, deadline)

@@ -1,4 +1,4 @@
-"""The opened stage as the steps of a run see it."""
+"""The opened stage for the steps of a run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hal.values import Power
 
 @dataclass(frozen=True, slots=True)
 class RigProjector:
-    """A projector with its picture: ``size_px`` (width, height) of the output it hangs on."""
+    """A projector and its picture: ``size_px`` (width, height) of its output."""
 
     name: str
     output: str
@@ -36,7 +36,7 @@ class RigProjector:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Everything that is switched, shown or photographed. Made by ``controller.stage.open`` alone."""
+    """All devices of a run. Created only by ``controller.stage.open``."""
 
     stage: Path
     projectors: tuple[RigProjector, ...]
@@ -51,7 +51,7 @@ class Rig:
         return tuple(projector.guard for projector in self.projectors)
 
     def check_light(self, *, deadline: Deadline) -> None:
-        """Look at every projector: a photograph counts only if each lamp is on and steady.
+        """Check every projector: a photograph is valid only if each lamp is on and stable.
 
         Raises DeviceRefused("projector-fault" or "lamp-went-off"), and what the drivers raise.
         """
@@ -63,9 +63,9 @@ class Rig:
                 raise DeviceRefused(
                     "lamp-went-off",
                     what=f"The lamp of projector {guard.name} went off during the work.",
-                    remedy="See whether somebody switched it off, or it overheated; then start again.",
+                    remedy="Check whether it was switched off or overheated. Then start again.",
                 )
 
     def on_outputs(self, frames: Mapping[str, ByteImage]) -> dict[str, ByteImage]:
-        """Frames by output from frames by projector; every projector that is not named shows black."""
+        """Frames by output from frames by projector; projectors without a frame show black."""
         return {projector.output: frames.get(projector.name, projector.black()) for projector in self.projectors}

@@ -1,1 +1,1 @@
-"""A run of steps that can be stopped and resumed: `runner.Runner`, its journal, its states and its progress."""
+"""Runs of steps that can be stopped and resumed: `runner.Runner`, its journal, states and progress."""

@@ -1,7 +1,7 @@
-"""The journal of a run: what was done, with which inputs, and what came out, in SQLite.
+"""The journal of a run in SQLite: finished steps, their inputs and their results.
 
-The rule that makes it trustworthy after a power cut: the artefact first, atomically and fsynced, then its row. A row
-without its artefact, or with other bytes than it says, counts as not done.
+It stays correct after a power cut, because an artefact is written first, atomically and with fsync, then its row. A row
+whose artefact is missing or changed counts as not done.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from controller.run.state_machine import Change
 from controller.run.step_id import ShotId, StepId
 
 Inputs = Mapping[str, str]
-"""Name of an input -> hash of it (or the value itself, where it is short)."""
+"""Name of an input -> its hash (or the value itself, if it is short)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Artefact:
-    """A file that a step or a shot left. ``sha256`` is the hex digest of its bytes."""
+    """A file written by a step or a shot. ``sha256`` is the hex digest of its bytes."""
 
     path: Path
     size: int
@@ -47,7 +47,7 @@ class StepResult:
 
 @dataclass(frozen=True, slots=True)
 class JournalEvent:
-    """One line of the log. ``at_s`` is wall-clock time (Unix seconds) and may jump with the machine's clock."""
+    """One line of the log. ``at_s`` is wall-clock time (Unix seconds) and may jump with the computer's clock."""
 
     at_s: float
     level: str
@@ -58,14 +58,14 @@ class JournalEvent:
 class Journal:
     """The journal beside a run's artefacts; safe to use from several threads, written by one process at a time.
 
-    Paths are kept relative to the journal's folder, so a stage may be moved. Timestamps are wall-clock Unix seconds and
-    serve people only: nothing is decided by them.
+    Paths are relative to the journal's folder, so a stage may be moved. Timestamps are wall-clock Unix seconds, only
+    for people: no decision depends on them.
     """
 
     FILE: Final = "journal.sqlite"
 
     def __init__(self, folder: Path) -> None:
-        """Open, or begin, the journal of the run in ``folder``.
+        """Open or create the journal of the run in ``folder``.
 
         Raises JournalError with code "journal-damaged", "journal-locked", "journal-version" or "journal-not-ours", and
         WorkError("no-space").
@@ -83,7 +83,7 @@ class Journal:
         self.close()
 
     def close(self) -> None:
-        """Close the file. Harmless when called twice."""
+        """Close the file. May be called twice."""
         with self._lock:
             self._database.close()
 
@@ -98,19 +98,19 @@ class Journal:
         except BaseException as error:
             try:
                 self._end(getattr(error, "code", None) or type(error).__name__)
-            except WorkError as second:  # must not hide what went wrong first
-                error.add_note(f"It could not be journalled: {second}")
+            except WorkError as second:  # must not hide the first error
+                error.add_note(f"The error could not be written to the journal: {second}")
             raise
         self._end("done")
 
     def outcomes(self) -> list[tuple[str, str | None]]:
-        """Name and outcome of every start, oldest first; outcome None for one that was killed or still goes on."""
+        """Name and outcome of every start, oldest first; outcome None for one that was killed or is running."""
         return [(row[0], row[1]) for row in self._read("SELECT name, outcome FROM runs ORDER BY id")]
 
     # -- steps
 
     def step(self, step: StepId, inputs: Inputs, run: Callable[[], Sequence[Path]]) -> StepResult:
-        """Do a step once: skip it if it was done from the same inputs and its artefacts still match, else run it.
+        """Do a step once: skip it if it was done with the same inputs and its artefacts still match, else run it.
 
         ``run`` writes the artefacts and returns their paths; it may be called again after a kill at any moment.
         """
@@ -122,12 +122,12 @@ class Journal:
         return StepResult(self.complete(step, inputs, paths, began_at_s=began_at_s), repeated=True)
 
     def done(self, step: StepId, inputs: Inputs) -> tuple[Artefact, ...] | None:
-        """The artefacts of a step that was done from these inputs and whose files still match; else None."""
+        """The artefacts of a step that was done with these inputs and whose files still match; else None."""
         rows = self._read(_STEP, *_step(step))
         return self.latest(step) if rows and rows[0][1] == _canonical(inputs) else None
 
     def latest(self, step: StepId) -> tuple[Artefact, ...] | None:
-        """The artefacts of a step, whatever it was done from; None if it was not done or its files do not match."""
+        """The artefacts of a step with any inputs; None if it was not done or its files do not match."""
         rows = self._read(_STEP, *_step(step))
         if not rows:
             return None
@@ -158,7 +158,7 @@ class Journal:
         rows = self._read("SELECT kind, projector, item, ended_at_s - began_at_s FROM steps ORDER BY id")
         return {StepId(kind, projector, item): max(0.0, float(seconds)) for kind, projector, item, seconds in rows}
 
-    # -- shots: a photograph is paid for in minutes, so each is journalled by itself
+    # -- shots: photographs take minutes, so each has its own journal entry
 
     def shot(self, shot: ShotId, settings: Inputs) -> Artefact | None:
         """The photograph if it was taken with these settings and its file still matches; else None."""
@@ -180,13 +180,13 @@ class Journal:
         return artefact
 
     def shot_count(self) -> int:
-        """How many photographs the journal knows."""
+        """Number of photographs in the journal."""
         return int(self._read("SELECT COUNT(*) FROM shots")[0][0])
 
     # -- events
 
     def record(self, code: str, text: str, level: Level = Level.INFO) -> None:
-        """Write one event: a device error, a retry, a decision. ``text`` may hold what a device said."""
+        """Write one event: a device error, a retry, a decision. ``text`` may contain a device's text."""
         self._write(
             "INSERT INTO events (run, at_s, level, code, text) VALUES (?, ?, ?, ?, ?)",
             *(self._run, _now(), level.value, code, text),
@@ -265,8 +265,8 @@ def _durable(path: Path) -> Artefact:
     except OSError as error:
         raise JournalError(
             "artefact-missing",
-            what=f"A step said that it wrote {path.name}, but the file can't be read ({error.strerror}).",
-            remedy="Check the disk and start again; the step will run again.",
+            what=f"The file {path.name}, written by a step, can't be read ({error.strerror}).",
+            remedy="Check the disk and start again. The step is repeated.",
         ) from error
 
 

@@ -1,7 +1,7 @@
-"""Journals of format 1, whose steps and photographs had a name where now they have an identity, brought to format 2.
+"""Converts journals of format 1, with names of steps and photographs, to format 2, with identities.
 
 A step of a projector was called KIND-PROJECTOR, one of an appearance or experiment KIND-NAME. The kinds of format 1 are
-listed here and never change; none of them begins as another one does, so every name has one meaning.
+listed here and never change. No kind is the beginning of another one, so every name has one meaning.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _OF_PROJECTORS: Final = (
 )  # fmt: skip
 _OF_ITEMS: Final = ("appearance", "target", "compare", "pictures", "study")
 OLD_SHOT: Final = "format-1"
-"""The kind of photographs from format 1: counted, and taken again where a run that goes on needs them."""
+"""The kind of photographs from format 1: they are counted, and taken again if a continued run needs them."""
 
 _CHANGES: Final = (
     "ALTER TABLE steps RENAME TO steps_1",
@@ -28,7 +28,7 @@ _CHANGES: Final = (
 
 
 def from_format_1(database: sqlite3.Connection, tables: list[str]) -> None:
-    """Move what a journal of format 1 holds into ``tables`` (statements); inside the caller's transaction."""
+    """Move the content of a journal of format 1 into ``tables`` (statements), inside the caller's transaction."""
     for statement in (*_CHANGES, *tables):
         database.execute(statement)
     rows = database.execute("SELECT id, name, run, inputs, began_at_s, ended_at_s FROM steps_1").fetchall()
@@ -52,7 +52,7 @@ def from_format_1(database: sqlite3.Connection, tables: list[str]) -> None:
 
 
 def step_id_of(name: str) -> StepId:
-    """The identity of the step that had this name in format 1."""
+    """The identity of the step with this name in format 1."""
     for kind in _OF_PROJECTORS:
         if (rest := name.removeprefix(f"{kind}-")) != name:
             return StepId(kind, projector=rest)
@@ -63,7 +63,7 @@ def step_id_of(name: str) -> StepId:
 
 
 def _inputs(canonical: str, ids: dict[str, StepId]) -> str:
-    """The inputs with the names of format 2 for the artefacts of earlier steps, NAME/NUMBER before."""
+    """The inputs with format 2 names for the artefacts of earlier steps, which were NAME/NUMBER."""
     found = {}
     for key, value in json.loads(canonical).items():
         step, _, number = key.rpartition("/")

@@ -1,4 +1,4 @@
-"""The journal's SQLite file: its tables, how it is opened, and what can be wrong with it."""
+"""The journal's SQLite file: its tables, opening it, and its errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from controller.core.storage import sync_folder
 from controller.run.journal_migration import from_format_1
 
 VERSION: Final = 2
-"""Format 1 had names where format 2 has identities; it is migrated when it is opened (``journal_migration``)."""
+"""Format 1 is converted when it is opened (``journal_migration``)."""
 APPLICATION: Final = 0x56454C41
 """SQLite's ``application_id``: "VELA"."""
 BUSY_S: Final = 2.0
@@ -49,11 +49,11 @@ CREATE UNIQUE INDEX shot_identity ON shots (kind, ifnull(projector, ''), name);
 
 
 class JournalError(WorkError):
-    """The journal can't be trusted or used."""
+    """The journal is damaged or can't be used."""
 
 
 def opened(path: Path) -> sqlite3.Connection:
-    """A connection to the journal at ``path``, which is made if it is not there."""
+    """A connection to the journal at ``path``, which is created if it is missing."""
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         database = sqlite3.connect(path, timeout=BUSY_S, check_same_thread=False)
@@ -67,7 +67,7 @@ def opened(path: Path) -> sqlite3.Connection:
 
 def _prepare(database: sqlite3.Connection, path: Path) -> None:
     database.execute("PRAGMA foreign_keys = ON")
-    # Taken before the version is read: two processes that begin the same journal must not both make its tables.
+    # Lock before reading the version: two processes that open a new journal must not both create its tables.
     database.execute("BEGIN IMMEDIATE")
     application = database.execute("PRAGMA application_id").fetchone()[0]
     version = database.execute("PRAGMA user_version").fetchone()[0]
@@ -102,8 +102,8 @@ def _check(database: sqlite3.Connection, path: Path, application: int, version: 
     if version not in (1, VERSION):
         raise JournalError(
             "journal-version",
-            what=f"{path} was written by another version of Velatura (format {version}, this one reads {VERSION}).",
-            remedy="Use the version that began this run, or begin a new run.",
+            what=f"{path} has format {version}, from another version of Velatura; this version reads {VERSION}.",
+            remedy="Use the version that started this run, or start a new run.",
         )
     if (verdict := database.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
         raise _damaged(path, str(verdict))
@@ -111,7 +111,7 @@ def _check(database: sqlite3.Connection, path: Path, application: int, version: 
 
 @contextlib.contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn what SQLite raises into errors with a code and a remedy."""
+    """Convert SQLite's errors to errors with a code and a remedy."""
     try:
         yield
     except sqlite3.Error as error:
@@ -131,8 +131,8 @@ def _typed(path: Path, error: sqlite3.Error) -> WorkError:
     if primary == sqlite3.SQLITE_FULL:
         return WorkError(
             "no-space",
-            what=f"There was no space left to write {path.name}.",
-            remedy=f"Free some space on the disk that holds {path.parent} and start again; finished steps are kept.",
+            what=f"The disk has no space for {path.name}.",
+            remedy=f"Free space on the disk of {path.parent} and start again. Finished steps are kept.",
         )
     if primary in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
         return _damaged(path, str(error))
@@ -143,7 +143,7 @@ def _unusable(path: Path, detail: str) -> JournalError:
     return JournalError(
         "journal-unusable",
         what=f"{path} could not be used ({detail}).",
-        remedy="Check the folder's permissions and that its disk is mounted for writing, then start again.",
+        remedy="Check the folder's permissions and that its disk is writable, then start again.",
     )
 
 
@@ -151,5 +151,5 @@ def _damaged(path: Path, detail: str) -> JournalError:
     return JournalError(
         "journal-damaged",
         what=f"The journal {path} is damaged ({detail}).",
-        remedy="Move it out of the run's folder and start again; the steps will be done again.",
+        remedy="Move it out of the run's folder and start again. All steps are repeated.",
     )

@@ -1,4 +1,4 @@
-"""Progress of a run: what a reporter is told, and how the time left is estimated. Nothing here draws anything."""
+"""Progress of a run: the values for a reporter, and the estimate of the time left. Draws nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Protocol
 
 
 class Phase(enum.Enum):
-    """Where a step stands."""
+    """State of a step."""
 
     RUNNING = "running"
     DONE = "done"
@@ -18,7 +18,7 @@ class Phase(enum.Enum):
 
 
 class Level(enum.Enum):
-    """How much a message matters."""
+    """Level of a message."""
 
     INFO = "info"
     WARNING = "warning"
@@ -27,11 +27,11 @@ class Level(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a run has come.
+    """Progress of a run.
 
-    ``step`` the step's title; ``index`` its place, from 0, among ``count``; ``fraction`` of the whole run by weight and
-    ``step_fraction`` of this step, both 0..1; ``elapsed_s`` since the run began; ``left_s`` None until it can be told;
-    ``note`` what is being done inside the step, or empty
+    ``step`` the step's title; ``index`` its number, from 0, of ``count``; ``fraction`` of the whole run by weight and
+    ``step_fraction`` of this step, both 0..1; ``elapsed_s`` since the start; ``left_s`` None until it can be estimated;
+    ``note`` the present work inside the step, or empty
     """
 
     step: str
@@ -46,12 +46,12 @@ class Progress:
 
 
 class Reporter(Protocol):
-    """Whoever shows progress to a person or a machine. May be called from any thread."""
+    """Shows progress to a person or a program. May be called from any thread."""
 
     def progress(self, now: Progress) -> None: ...
 
     def say(self, text: str, level: Level = Level.INFO) -> None:
-        """One sentence. ``text`` may hold what a device said: the reporter escapes it."""
+        """Show one sentence. ``text`` may contain a device's text: the reporter escapes it."""
 
 
 class Silent:
@@ -65,12 +65,12 @@ class Silent:
 
 
 class Tracker:
-    """Turns steps done into ``Progress``; the rate is measured on the steps that really ran.
+    """Computes ``Progress`` from finished steps; the rate is measured on steps that really ran.
 
     Parameters
     ----------
     weights : expected relative cost of each step, > 0 (seconds on the reference machine make the best weights)
-    clock : seconds on a clock that never runs backwards
+    clock : seconds on a monotonic clock
     """
 
     def __init__(
@@ -90,12 +90,12 @@ class Tracker:
         self._index, self._step_began_s, self._step_fraction = 0, self._began_s, 0.0
 
     def begin(self, index: int) -> None:
-        """Step ``index`` starts to run."""
+        """Step ``index`` starts."""
         self._index, self._step_began_s, self._step_fraction = index, self._clock(), 0.0
         self._tell(Phase.RUNNING)
 
     def advance(self, step_fraction: float, note: str = "") -> None:
-        """The present step has come this far (0..1); a fraction below the last one is held at the last."""
+        """Progress of the present step (0..1); it never decreases."""
         self._step_fraction = min(1.0, max(step_fraction, self._step_fraction))
         self._tell(Phase.RUNNING, note)
 
@@ -106,7 +106,7 @@ class Tracker:
         self._close(Phase.DONE)
 
     def skip(self, index: int) -> None:
-        """Step ``index`` was done by an earlier run; it costs nothing and says nothing about the rate."""
+        """Step ``index`` was done by an earlier run; it does not count for the rate."""
         self._index = index
         self._close(Phase.SKIPPED)
 

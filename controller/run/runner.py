@@ -1,4 +1,4 @@
-"""Runs steps in order: each once, until a deadline, stoppable at any moment, and going on where the journal ends."""
+"""Runs steps in order: each once, with a deadline, stoppable at any time, resumed from the journal."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from hal.errors import DeviceError
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a step's ``run`` gets.
+    """Argument of a step's ``run``.
 
-    ``folder`` where artefacts go; ``results`` the artefacts of earlier steps. ``advance`` is also where a stop takes
-    hold, so a long step calls it often.
+    ``folder`` for artefacts; ``results`` the artefacts of earlier steps. ``advance`` also raises on a stop
+    request, so a long step calls it often.
     """
 
     folder: Path
@@ -47,7 +47,7 @@ class Context:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One piece of work with artefacts at its end.
+    """One piece of work that ends with artefacts.
 
     Parameters
     ----------
@@ -56,10 +56,10 @@ class Step:
     inputs : name -> hash of everything outside the run that the result depends on: settings, files, code version
     after : earlier steps whose artefacts it reads; their hashes become inputs too
     weight : expected cost relative to the other steps; seconds on the reference machine
-    title : what the technician reads; the identity if empty
-    enter, leave : machine events when the work begins and when it is done; neither happens for a skipped step
-    always : run it even if an earlier run did. For steps that bring hardware into a state, which is never restored
-        from the journal but probed anew
+    title : the text for the technician; the identity if empty
+    enter, leave : machine events at the start and end of the work; none for a skipped step
+    always : run it even if an earlier run did it. For steps that set the state of hardware, which can't be
+        restored from the journal
     """
 
     id: StepId
@@ -74,7 +74,7 @@ class Step:
 
     @property
     def heading(self) -> str:
-        """What the technician reads of it."""
+        """Its title for the technician."""
         return self.title or str(self.id)
 
 
@@ -83,8 +83,8 @@ class Runner:
 
     Parameters
     ----------
-    machine : told of ``Step.enter`` and ``Step.leave``; of CANCEL when the run is stopped; of FAIL, with the reason,
-        when a device fails (work that fails for other reasons is a CANCEL with the reason: the lamps are well)
+    machine : gets ``Step.enter`` and ``Step.leave``; CANCEL when the run is stopped; FAIL, with the reason,
+        when a device fails (other failures of the work are a CANCEL with the reason: the lamps are fine)
     """
 
     def __init__(
@@ -104,9 +104,9 @@ class Runner:
         self._clock = clock
 
     def run(self, name: str, *, deadline: Deadline) -> dict[StepId, tuple[Artefact, ...]]:
-        """Run, or go on with, the steps; return the artefacts of each.
+        """Run or continue the steps; return the artefacts of each.
 
-        Raises whatever a step raises, after journalling it; Cancelled when ``deadline.cancel`` is set, and
+        Raises what a step raises, after journalling it; Cancelled when ``deadline.cancel`` is set, and
         WorkError("run-too-slow") when the deadline passes, in both cases between two steps or at a step's ``advance``.
         """
         titles = [step.heading for step in self._steps]
@@ -157,7 +157,7 @@ class Runner:
             self._machine.handle(event, reason)
 
     def _failed(self, error: BaseException) -> None:
-        """Journal the failure and tell the machine; what fails here must not hide ``error``."""
+        """Journal the failure and report it to the machine; errors here must not hide ``error``."""
         stopped = isinstance(error, Cancelled)
         broken = isinstance(error, DeviceError) and not stopped
         code = error.code if isinstance(error, VelaturaError | DeviceError) else type(error).__name__
@@ -168,18 +168,18 @@ class Runner:
             if self._machine is not None and self._machine.allows(event):
                 self._machine.handle(event, text)
         except VelaturaError as second:
-            error.add_note(f"It could not be journalled either: {second}")
+            error.add_note(f"The error could not be written to the journal: {second}")
 
 
 def check(deadline: Deadline) -> None:
-    """Raise Cancelled if the run is to stop, WorkError("run-too-slow") if its time is over."""
+    """Raise Cancelled if a stop is requested, WorkError("run-too-slow") after the deadline."""
     if deadline.cancel is not None and deadline.cancel.is_set():
         raise Cancelled
     if deadline.passed:
         raise WorkError(
             "run-too-slow",
-            what="The run did not end within the time it was given.",
-            remedy="Start it again: it goes on from the last finished step.",
+            what="The run took longer than its time limit.",
+            remedy="Start it again to continue after the last finished step.",
         )
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and friends ask for a stop; they never tear the work apart."""
+"""Ctrl-C and other stop signals request a clean stop of the work."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextlib.contextmanager
 def cancelled_by_signals() -> Iterator[threading.Event]:
-    """An event that the first SIGINT, SIGTERM or SIGHUP sets; more of them change nothing.
+    """An event that the first SIGINT, SIGTERM or SIGHUP sets; further ones have no effect.
 
-    Put it into the run's ``Deadline`` and keep the context open around the cooling of the lamps, so that an impatient
-    second Ctrl-C can't skip it. On leaving, the former handlers come back. Outside the main thread, where Python
-    handles no signals, the event is a plain one.
+    Put it into the run's ``Deadline`` and keep the context open while the lamps are cooled, so that a second
+    Ctrl-C can't skip that. On leaving, the previous handlers are restored. Outside the main thread, where Python
+    handles no signals, it is an ordinary event.
     """
     cancel = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield cancel
         return
-    # A handler that set the event itself could meet the main thread inside Event.wait, holding the event's lock, and
-    # hang. The interpreter writes a byte for each signal instead, and a thread turns the byte into the event.
+    # A handler that sets the event itself could hang, if it interrupts the main thread inside Event.wait, with the
+    # event's lock held. So the interpreter writes a byte for each signal, and a thread sets the event.
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     watcher = threading.Thread(target=_watch, args=(ours, cancel), name="signals", daemon=True)
@@ -34,7 +34,7 @@ def cancelled_by_signals() -> Iterator[threading.Event]:
     handlers = {number: signal.getsignal(number) for number in STOPPING}
     try:
         for number, handler in handlers.items():
-            if handler is not signal.SIG_IGN:  # nohup, or a shell's background job: it stays ignored
+            if handler is not signal.SIG_IGN:  # nohup or a shell's background job ignores it: keep that
                 signal.signal(number, _noticed)
         yield cancel
     finally:
@@ -47,7 +47,7 @@ def cancelled_by_signals() -> Iterator[threading.Event]:
 
 
 def _noticed(number: int, frame: FrameType | None) -> None:
-    """Takes the place of the handler that would raise KeyboardInterrupt; the byte on the socket does the work."""
+    """Replaces the handler that raises KeyboardInterrupt; the byte on the socket does the work."""
 
 
 def _watch(ours: socket.socket, cancel: threading.Event) -> None:

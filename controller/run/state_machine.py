@@ -1,4 +1,4 @@
-"""The stage's state machine: an enum of states and a pure table. Work runs outside transitions."""
+"""The stage's state machine: an enum of states and a table of transitions. Work runs outside transitions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from controller.core.errors import WorkError
 
 
 class State(enum.Enum):
-    """What the stage is doing."""
+    """State of the stage."""
 
     OFF = "off"
     POWERING = "powering"
@@ -28,7 +28,7 @@ class State(enum.Enum):
 
 
 class Event(enum.Enum):
-    """What happened to the stage, or was asked of it."""
+    """An event or a request."""
 
     START = "start"
     LAMPS_LIT = "lamps lit"
@@ -62,17 +62,17 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     (State.PUBLISHING, Event.PUBLISHED): State.READY,
     (State.PLAYING, Event.PAUSE): State.READY,
     (State.PLAYING, Event.RECALIBRATE): State.CALIBRATING,
-    # Work that is stopped on request leaves the lamps as they are; what was done is in the journal.
+    # Work that is stopped on request leaves the lamps as they are; finished steps are in the journal.
     (State.CALIBRATING, Event.CANCEL): State.READY,
     (State.SOLVING, Event.CANCEL): State.READY,
     (State.PUBLISHING, Event.CANCEL): State.READY,
-    # A stage that lost something goes on with the rest, and says so.
+    # A stage with a failed device continues with the rest and reports it.
     (State.READY, Event.DEGRADE): State.DEGRADED,
     (State.CALIBRATING, Event.DEGRADE): State.DEGRADED,
     (State.PLAYING, Event.DEGRADE): State.DEGRADED,
     (State.DEGRADED, Event.RECOVERED): State.READY,
     (State.DEGRADED, Event.RECALIBRATE): State.CALIBRATING,
-    # Stopping is allowed wherever a lamp may be lit, and always goes through cooling.
+    # Stopping is allowed in every state with a lit lamp, and always leads to cooling.
     (State.POWERING, Event.STOP): State.COOLING,
     (State.WARMING, Event.STOP): State.COOLING,
     (State.READY, Event.STOP): State.COOLING,
@@ -92,13 +92,13 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     (State.PLAYING, Event.FAIL): State.FAULT,
     (State.DEGRADED, Event.FAIL): State.FAULT,
     (State.COOLING, Event.FAIL): State.FAULT,
-    # After mending, lamps are probed again: one that is still lit is not struck, one that is hot is waited for.
+    # After a repair, lamps are checked again: a lit one is not struck, a hot one cools first.
     (State.FAULT, Event.START): State.POWERING,
 }
 
 
 class TransitionError(WorkError):
-    """The event makes no sense in the present state."""
+    """The event is not allowed in the present state."""
 
 
 def next_state(state: State, event: Event) -> State:
@@ -110,7 +110,7 @@ def next_state(state: State, event: Event) -> State:
         raise TransitionError(
             "state-not-allowed",
             what=f"'{event.value}' is not possible while the stage is {state.value}.",
-            remedy=f"Possible now: {allowed}.",
+            remedy=f"Allowed now: {allowed}.",
         ) from None
 
 
@@ -128,7 +128,7 @@ def mermaid() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One transition that took place. ``reason`` is a sentence for the technician, or empty."""
+    """A transition. ``reason`` is a sentence for the technician, or empty."""
 
     before: State
     event: Event
@@ -140,11 +140,11 @@ Listener = Callable[[Change], None]
 
 
 class Machine:
-    """The present state with the reason beside it. Safe to use from several threads.
+    """The present state and its reason. Safe to use from several threads.
 
-    Listeners are told after the state has changed, one change at a time and in order; the first is usually
-    ``Journal.record_change``. When a listener fails the others are still told, then its error is raised: the state has
-    changed all the same.
+    Listeners are called after the state has changed, one change at a time and in order; the first is usually
+    ``Journal.record_change``. If a listener fails, the others are still called, then its error is raised; the state
+    stays changed.
     """
 
     def __init__(self, *listeners: Listener, state: State = State.OFF) -> None:
@@ -163,7 +163,7 @@ class Machine:
         return self._reason
 
     def listen(self, listener: Listener) -> None:
-        """Tell ``listener`` of every change from now on."""
+        """Call ``listener`` at every change from now on."""
         with self._lock:
             self._listeners.append(listener)
 
@@ -179,7 +179,7 @@ class Machine:
             for listener in tuple(self._listeners):
                 try:
                     listener(change)
-                except Exception as error:  # noqa: BLE001 - raised below, when every listener has been told
+                except Exception as error:  # noqa: BLE001 - raised below, after all listeners were called
                     failure = failure or error
             if failure is not None:
                 raise failure

@@ -1,4 +1,4 @@
-"""What identifies a step of a run, and a photograph of a step: values that are compared, never texts to parse."""
+"""Identities of steps and photographs: values to compare, not texts to parse."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class StepId:
-    """Which step of a run it is; no two steps of a run have the same.
+    """Identity of a step, unique in its run.
 
     Parameters
     ----------
-    kind : what the step does, for example "radiometry" (``artefacts.kinds.StepKind``)
-    projector : the name of the projector that it concerns alone; None if it concerns all, or none
-    item : the name of what else it concerns alone: an appearance, or an experiment
+    kind : the work of the step, for example "radiometry" (``artefacts.kinds.StepKind``)
+    projector : the name of its projector; None if it concerns all, or none
+    item : the name of its appearance or experiment
     """
 
     kind: str
@@ -22,19 +22,19 @@ class StepId:
     item: str | None = None
 
     def __str__(self) -> str:
-        """For people: in reports, and in the place of a title."""
+        """For people: in reports, and if there is no title."""
         return "-".join(part for part in (self.kind, self.projector, self.item) if part is not None)
 
 
 @dataclass(frozen=True, slots=True)
 class ShotId:
-    """Which photograph of a run it is.
+    """Identity of a photograph in its run.
 
     Parameters
     ----------
-    kind : the kind of the photographs that it belongs to, usually that of the step which takes it
-    name : its own name among those, for example that of its pattern
-    projector : the name of the projector that shines alone; None for several, or none
+    kind : the kind of its set of photographs, usually that of the step that takes it
+    name : its name in the set, for example that of its pattern
+    projector : the name of the only lit projector; None for several, or none
     """
 
     kind: str
@@ -47,5 +47,5 @@ class ShotId:
 
 
 def input_name(step: StepId, number: int) -> str:
-    """Under which the hash of a step's artefact stands among the inputs of a later step."""
+    """Name of the hash of a step's artefact among the inputs of a later step."""
     return json.dumps([step.kind, step.projector, step.item, number], ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""What the command line asks for around bundles: build, check, install, go back, export; and keys for signing."""
+"""Operations on bundles: build, check, install, roll back, export; and signing keys."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def build(
     cancel: threading.Event,
     live: bool = False,
 ) -> Mapping[str, Any]:
-    """Write appearances that are solved on the last calibration as a signed bundle; nothing is installed.
+    """Write appearances solved with the latest calibration to a signed bundle, without installing it.
 
-    ``names`` empty: those of stage.toml that are solved, in its order. The revision is one above the installed
-    bundles', unless one of them is the same, to the byte. ``live``: with what the live mode needs.
+    ``names`` empty: the solved ones of stage.toml, in its order. The revision is one above that of the installed
+    bundles, unless one of them is identical. ``live``: include the live-mode data.
     Raises UsageError("not-calibrated", "nothing-solved" or "no-signing-key"), and as ``publish_solved``.
     """
     checked = check_stage(stage)
@@ -75,8 +75,8 @@ def _solved(stage: Stage, run: Path) -> tuple[str, ...]:
     if not solved:
         raise UsageError(
             "nothing-solved",
-            what="No appearance of stage.toml is solved on the last calibration.",
-            remedy="Run `velatura appearance` on the stage first; it builds and installs a bundle, too.",
+            what="No appearance of stage.toml is solved with the latest calibration.",
+            remedy="Run `velatura appearance` on the stage first. It also builds and installs a bundle.",
         )
     return solved
 
@@ -87,16 +87,16 @@ def _check(cancel: threading.Event) -> None:
 
 
 def verify(file: Path, *, stage: Path | None, trusted: Sequence[Path]) -> Mapping[str, Any]:
-    """Check every byte of a bundle, and its signature: as the stage's player does, or against these public key files.
+    """Check every byte of a bundle and its signature, with the stage's trusted keys or these public key files.
 
-    With neither, the signature must fit the content, and "trusted" in what is returned is "not checked".
+    With neither, the signature must fit the content, and "trusted" in the result is "not checked".
     Raises BundleError as ``Bundle.open`` and ``Bundle.verify`` do; UsageError("trust-twice").
     """
     if stage is not None and trusted:
         raise UsageError(
             "trust-twice",
-            what="Both a stage and keys were given to check the signature against.",
-            remedy="Give --stage or --trusted, not both.",
+            what="Both --stage and --trusted were given.",
+            remedy="Give only one of them.",
         )
     trust = ANY_SIGNER
     accept: Callable[[Index], None] = _anything
@@ -119,11 +119,11 @@ def verify(file: Path, *, stage: Path | None, trusted: Sequence[Path]) -> Mappin
 
 
 def _anything(index: Index) -> None:
-    """Where no stage is given, every sound bundle fits."""
+    """Without a stage, every intact bundle fits."""
 
 
 def _fits(stage: Stage) -> Callable[[Index], None]:
-    """Refuses a bundle of another stage, or for other outputs, which the player would refuse in the night."""
+    """Refuse a bundle for another stage or other outputs now; otherwise the player would refuse it later."""
     name = stage.tables.stage.name
     ours = {(output.name, output.width_px, output.height_px) for output in stage.tables.display.outputs}
 
@@ -132,7 +132,7 @@ def _fits(stage: Stage) -> Callable[[Index], None]:
             raise BundleError(
                 "bundle-other-stage",
                 what=f"The bundle was made for the stage {index.stage!r}; this one is {name!r}.",
-                remedy="Install it where it belongs, or build one here with 'velatura bundle build'.",
+                remedy="Install it on that stage, or build one for this stage with 'velatura bundle build'.",
             )
         check_outputs(index, ours)
 
@@ -149,7 +149,7 @@ def check_outputs(index: Index, ours: set[tuple[str, int, int]]) -> None:
         raise BundleError(
             "bundle-outputs-differ",
             what=f"The bundle was made for the outputs {_listed(theirs)}; this stage has {_listed(ours)}.",
-            remedy="Calibrate and build again with these outputs, or set the outputs as they were.",
+            remedy="Calibrate and build again with these outputs, or restore the previous outputs.",
         )
 
 
@@ -158,7 +158,7 @@ def _listed(outputs: set[tuple[str, int, int]]) -> str:
 
 
 def install(file: Path, *, stage: Path) -> Mapping[str, Any]:
-    """Install a bundle on a stage, if the stage trusts it and it was made for the stage.
+    """Install a bundle on the stage that it was made for, if the stage trusts it.
 
     Raises BundleError as ``bundle.install.install``, and ("bundle-other-stage" or "bundle-outputs-differ").
     """
@@ -176,7 +176,7 @@ def install(file: Path, *, stage: Path) -> Mapping[str, Any]:
 
 
 def rollback(stage: Path) -> Mapping[str, Any]:
-    """Go back to the bundle before, if the stage still trusts that one. Raises BundleError."""
+    """Go back to the previous bundle, if the stage still trusts it. Raises BundleError."""
     loaded = load_stage(stage)
     folder = loaded.folder / BUNDLES
     before, trust = slots.previous(folder), stage_trust(loaded)
@@ -192,13 +192,13 @@ def _identity(file: Path, trust: Trust) -> dict[str, Any]:
         return {
             "revision": bundle.index.revision,
             "signed_by": "nobody" if bundle.signed_by is None else bundle.signed_by.hex(),
-            "appearances": ", ".join(one.name for one in bundle.index.appearances),
+            "appearances": ", ".join(appearance.name for appearance in bundle.index.appearances),
             **_warning(bundle.signed_by, trust),
         }
 
 
 def _warning(signed_by: bytes | None, trust: Trust) -> dict[str, str]:
-    """``{"warning": ...}`` for a bundle that anyone may have made, else nothing."""
+    """``{"warning": ...}`` for an unsigned bundle, else nothing."""
     found = unsigned_warning(signed_by, trust)
     return {} if found is None else {"warning": f"{found.what} {found.remedy}"}
 
@@ -208,24 +208,26 @@ def export(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event
 
     def advance(done: float) -> None:
         _check(cancel)
-        reporter.say(f"{100 * done:.0f} % of the pictures are written.")
+        reporter.say(f"{100 * done:.0f} % of the pictures written.")
 
     with Bundle.open_trusted(file, ANY_SIGNER) as bundle:
         return {"folder": str(out), "pictures": export_pictures(bundle, out, advance)}
 
 
 def make_key(stage: Path, name: str) -> dict[str, Any]:
-    """Make STAGE/keys/NAME.key and NAME.key.pub; "trusted_keys" is then what stage.toml should say, and "where" how.
+    """Make STAGE/keys/NAME.key and NAME.key.pub. "trusted_keys" is the value for stage.toml, "where" its place.
 
     Raises UsageError("stage-missing", "key-exists" or "key-name"), and as ``load_stage`` where there is a stage.toml.
     """
     if not stage.is_dir():
         raise UsageError(
-            "stage-missing", what=f"There is no folder {stage}.", remedy="Give the stage's folder, or make it first."
+            "stage-missing",
+            what=f"The folder {stage} does not exist.",
+            remedy="Give the stage's folder, or create it first.",
         )
     if not valid_name(name):
         raise UsageError(
-            "key-name", what=f"{name!r} can not be the name of a key.", remedy="Give a plain word; it names two files."
+            "key-name", what=f"{name!r} is not a valid name for a key.", remedy="Use only letters, digits, - and _."
         )
     tables = load_stage(stage).tables if (stage / FILE).exists() else None
     trusted = [] if tables is None else list(tables.bundle.trusted_keys)

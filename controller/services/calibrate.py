@@ -1,4 +1,4 @@
-"""What the command line and the kiosk ask for, each a run on a stage: calibrate, make appearances, play."""
+"""Calibrate a stage and solve appearances, each as a run; for the command line and the kiosk."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from controller.steps.capture.lens_check import lens_check
 from hal.deadline import in_seconds
 
 KEY_FILE = "keys/stage.key"
-"""The stage's signing key, where there is one."""
+"""The stage's signing key, if it exists."""
 
 
 def calibrate(
@@ -63,9 +63,9 @@ def calibrate(
     dot_spacing: str | None = None,
     accept_grade: bool = False,
 ) -> Mapping[str, Any]:
-    """Calibrate the stage, going on with an unfinished calibration; returns where the results lie.
+    """Calibrate the stage, or continue an unfinished calibration; returns where the results are.
 
-    ``mode`` and ``dot_spacing``, and what is raised for wrong ones: see ``artefacts.modes.dot_options``.
+    ``mode``, ``dot_spacing`` and their errors: see ``artefacts.modes.dot_options``.
     """
     options = dot_options(mode, dot_spacing)
     checked = check_stage(session.stage)
@@ -87,7 +87,7 @@ def calibrate(
 def calibrating(
     rig: Rig, run: Path, *, checked: Checked, options: DotOptions | None = None, calibrated: Calibrated | None = None
 ) -> Sequence[Step]:
-    """The calibration's steps, its grading the last, between their state markers.
+    """The calibration's steps between their state markers; grading is the last.
 
     ``calibrated``: what reads the calibration of ``run``, where the caller needs it too.
     """
@@ -116,14 +116,14 @@ def make_appearances(
     scheduler: str | None = None,
     quick: bool = False,
 ) -> Mapping[str, Any]:
-    """Solve appearances of stage.toml on the last calibration, and install them as the stage's bundle.
+    """Solve appearances of stage.toml with the latest calibration, and install them as the stage's bundle.
 
-    ``scenes``: Blender scenes to render besides ``names``, or alone if no names are given.
-    ``accept_grade``: publish whatever the calibration's grade. ``base``: the base image, instead of stage.toml's.
-    ``scheduler``: of a Dask cluster, on whose workers the appearances are solved. ``quick``: by base times scale
-    alone, whatever stage.toml says; without it the next run solves them as stage.toml says.
+    ``scenes``: Blender scenes to render besides ``names``, or only these if no names are given.
+    ``accept_grade``: publish with any calibration grade. ``base``: base image that replaces stage.toml's.
+    ``scheduler``: a Dask cluster that solves the appearances. ``quick``: a preview by base times scale only;
+    the next run without it solves them as stage.toml says.
 
-    No device is touched: the projectors may be off, or playing.
+    Uses no device: the projectors may be off, or playing.
     Raises what ``usable_calibration``, ``wishes_of``, ``answering_on`` and the steps raise.
     """
     chosen = None if base is None else base_choice(base)
@@ -138,7 +138,7 @@ def make_appearances(
         kept = base_choice(table.base)
         options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or kept, table.adapt)
         if quick:
-            # a high-pass base would be solved anew for each
+            # a high-pass base would be solved again for each
             options = replace(options, mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
         outputs = output_sizes(checked)
         scale = costs.scale(size for _, size in outputs.values())
@@ -160,7 +160,7 @@ def make_appearances(
 
 
 def signing_key(checked: Checked) -> Path | None:
-    """The stage's own key. Without one, bundles stay unsigned, which stage.toml must allow in so many words.
+    """The stage's own key; None for unsigned bundles, if stage.toml allows them.
 
     Raises UsageError("no-signing-key", or "signing-key-refused" for one whose bundles the stage would not play).
     """
@@ -173,15 +173,18 @@ def signing_key(checked: Checked) -> Path | None:
     raise UsageError(
         "no-signing-key",
         what=f"The stage has no signing key in {KEY_FILE}.",
-        remedy="Make one with `velatura keys STAGE`, which also tells which line to add to stage.toml.",
+        remedy="Make one with `velatura keys STAGE`. It also shows the line to add to stage.toml.",
     )
 
 
 def _check_own_key(path: Path, trust: Trust) -> None:
-    # Before the work: otherwise the player alone would tell, once everything is solved.
+    # Before the work: otherwise the player refuses the bundle when everything is solved.
     public = bytes(load_signing_key(path).verify_key)
     if public in trust.revoked:
-        problem, remedy = "is revoked", f"Move {path} away, make a new key with `velatura keys STAGE`, and trust that."
+        problem, remedy = (
+            "is revoked",
+            f"Move {path} away, make a new key with `velatura keys STAGE`, and add it to trusted_keys.",
+        )
     elif public not in trust.keys and (trust.keys or not trust.allow_unsigned):
         problem, remedy = "is not trusted", f'Add "{public.hex()}" to trusted_keys under [bundle] in stage.toml.'
     else:
@@ -190,9 +193,9 @@ def _check_own_key(path: Path, trust: Trust) -> None:
 
 
 def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bool = False) -> Path:
-    """The newest calibration, if it passes the gate.
+    """The newest calibration, if its grade is good enough.
 
-    An older one is never taken in its stead: the stage may have changed since. ``accept_grade`` lets it pass, loudly.
+    An older one is never used instead: the stage may have changed. ``accept_grade`` accepts any grade with a warning.
     Raises UsageError("not-calibrated") and CalibrationError("calibration-below-grade").
     """
     run, worst = finished_calibration(checked.stage.folder), worst_grade(checked)
@@ -204,7 +207,7 @@ def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bo
 
 
 def tell_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:
-    """After a calibration: say it when it is worse than the last one, or not good enough to publish."""
+    """After a calibration: warn if it is worse than the previous one, or not good enough to publish."""
     worst = worst_grade(checked)
     compare_with_last(run, last, reporter)
     if accept_grade:

@@ -1,4 +1,4 @@
-"""What ``velatura camera`` does: the board, and the lens from photographs of it."""
+"""``velatura camera``: the printed board, and the lens calibration from photographs of it."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def board(*, out: Path) -> dict[str, Any]:
 
 
 def calibrate(*, photographs: Sequence[Path], out: Path, reporter: Reporter, cancel: threading.Event) -> dict[str, Any]:
-    """The lens from photographs of the board, written to ``out``. Raises as ``calibrate_views`` and ``read_grey``."""
+    """Compute the lens from board photographs; write it to ``out``; raises as ``calibrate_views``, ``read_grey``."""
     views, size = [], None
     for path in photographs:
         if cancel.is_set():
-            raise WorkError("cancelled", what="The camera's calibration was stopped.", remedy="Start it again.")
+            raise WorkError("cancelled", what="The camera calibration was stopped.", remedy="Start it again.")
         grey = read_grey(path)
         if size is not None and size != grey.shape:
             raise UsageError(
                 "camera-photographs-differ",
-                what=f"{path.name} is {grey.shape[1]} x {grey.shape[0]} pixels, those before {size[1]} x {size[0]}.",
-                remedy="Take all of them with the same camera in the same orientation and format.",
+                what=f"{path.name} has {grey.shape[1]} x {grey.shape[0]} pixels, the others {size[1]} x {size[0]}.",
+                remedy="Take all photographs with the same camera, orientation and format.",
             )
         size = grey.shape
         view = find_corners(grey)
         if view is None:
-            reporter.say(f"{path.name} does not show the board well enough and is left out.", Level.WARNING)
+            reporter.say(f"{path.name} does not show the board well enough. It is not used.", Level.WARNING)
         else:
             reporter.say(f"{path.name}: {len(view.board)} corners")
             views.append(view)
@@ -54,24 +54,24 @@ def calibrate(*, photographs: Sequence[Path], out: Path, reporter: Reporter, can
         raise CalibrationError(
             "camera-board-not-found",
             what=f"The board was found in none of {len(photographs)} photographs.",
-            remedy="Print the board of `velatura camera board`, let it fill half of the picture, light it evenly.",
+            remedy="Print the board from `velatura camera board`, fill half of the picture with it, light it evenly.",
         )
     return _kept(calibrate_views(views, (size[1], size[0])), out)
 
 
 def from_exif(*, photograph: Path, out: Path) -> dict[str, Any]:
-    """The lens as a photograph's EXIF tells it, written to ``out``. Raises as ``intrinsics_from_exif``."""
+    """Read the lens from a photograph's EXIF data and write it to ``out``. Raises as ``intrinsics_from_exif``."""
     return _kept(intrinsics_from_exif(photograph), out)
 
 
 def read_grey(path: Path) -> ByteImage:
-    """A photograph, (rows, columns) uint8, as the eye sees it. Raises WorkError("photograph-unreadable")."""
+    """A photograph with display gamma, (rows, columns) uint8. Raises WorkError("photograph-unreadable")."""
     if path.suffix.lower() in PICTURES:
         try:
             data = np.frombuffer(read_picture_bytes(path), np.uint8)
         except OSError as error:
             raise _unreadable(path, error.strerror) from error
-        # the sensor's orientation, not the EXIF's: the stage's pictures are not turned either
+        # the sensor's orientation, not EXIF's: the stage's pictures are not rotated either
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         try:
             grey = cv2.imdecode(data, flags) if data.size else None
@@ -89,7 +89,7 @@ def _unreadable(path: Path, why: str | None) -> WorkError:
     return WorkError(
         "photograph-unreadable",
         what=f"The photograph {path} can't be read: {why}.",
-        remedy="Give JPEG, PNG, TIFF or RAW files as they came from the camera.",
+        remedy="Give unedited JPEG, PNG, TIFF or RAW files from the camera.",
     )
 
 

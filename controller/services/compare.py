@@ -1,4 +1,4 @@
-"""What the command line and the kiosk ask for: photographs of what is installed, compared with its targets."""
+"""Photograph the installed appearances and compare them with their targets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from controller.steps.appearance.compare import compare_steps
 
 @dataclass(frozen=True, slots=True)
 class Installed:
-    """The appearances of the installed bundle that can be compared, and the run that holds their targets."""
+    """The appearances of the installed bundle that can be compared, and the run with their targets."""
 
     bundle: str
     run: Path
@@ -37,9 +37,9 @@ class Installed:
 def photograph(
     *, session: StageSession, names: Sequence[str], reporter: Reporter, cancel: threading.Event
 ) -> Mapping[str, Any]:
-    """Light the projectors, show each appearance of the installed bundle (or ``names``), photograph and compare it.
+    """Switch the projectors on, show each appearance of the installed bundle (or ``names``), photograph and compare it.
 
-    Goes on with an unfinished run of the same day. Raises as ``installed``, and what the devices raise.
+    Continues an unfinished run of the same day. Raises as ``installed``, and what the devices raise.
     """
     checked = check_stage(session.stage)
     found = installed(checked, names, reporter)
@@ -49,25 +49,26 @@ def photograph(
         longest_s = checked.stage.tables.capture.longest_exposure_s
         taken = compare_steps(rig, calibrated, found.names, bundle=found.bundle, longest_exposure_s=longest_s)
         drawn = picture_steps(calibrated, found.names)
-        # Each with its pictures at once: whoever stops the run sees what was photographed until then.
+        # Each with its pictures at once, so that a stopped run has a report of its photographs.
         both = [step for pair in zip(taken, drawn, strict=True) for step in pair]
         return [*both, *dark_after(rig.darkness, rig.display)]
 
     run = session.run(checked, steps, name=COMPARE, reporter=reporter, cancel=cancel, dark=True)
     html = comparison_report(run, checked)
     rows = [
-        {"name": one.name, "delta_e00_median": one.delta_e00_median, "delta_e00_p95": one.delta_e00_p95,
-         "rmse": one.rmse, "sharpness_lambda": one.sharpness_lambda}
-        for one in compared_in(run) if one.name in found.names
+        {"name": comparison.name, "delta_e00_median": comparison.delta_e00_median,
+         "delta_e00_p95": comparison.delta_e00_p95, "rmse": comparison.rmse,
+         "sharpness_lambda": comparison.sharpness_lambda}
+        for comparison in compared_in(run) if comparison.name in found.names
     ]  # fmt: skip
     return {"run": str(run), "report": str(html), "appearances": rows}
 
 
 def installed(checked: Checked, names: Sequence[str], reporter: Reporter) -> Installed:
-    """What is to be photographed: ``names`` in their order, or all that have a target here.
+    """The appearances to photograph: ``names`` in their order, or all that have a target here.
 
     Raises UsageError("nothing-installed", "appearance-unknown", "targets-missing"), and BundleError for a bundle that
-    the stage would not play.
+    the stage does not trust.
     """
     folder = checked.stage.folder
     file = current(folder / "bundles")
@@ -76,21 +77,21 @@ def installed(checked: Checked, names: Sequence[str], reporter: Reporter) -> Ins
                          remedy="Run `velatura appearance` on it first.")  # fmt: skip
     with Bundle.open_trusted(file, stage_trust(checked.stage)) as bundle:
         index = bundle.index
-    held = [one.name for one in index.appearances]
+    held = [appearance.name for appearance in index.appearances]
     for name in names:
         if name not in held:
             raise UsageError("appearance-unknown", what=f"The installed bundle has no appearance {name[:64]!r}.",
-                             remedy=f"It has {', '.join(held) or 'none'}.")  # fmt: skip
+                             remedy=f"Available: {', '.join(held) or 'none'}.")  # fmt: skip
     wanted = tuple(dict.fromkeys(names)) or tuple(held)
-    # A bundle may come from elsewhere, so what it names is looked for among the runs that are here.
-    run = next((one for one in finished_calibrations(folder) if one.name == index.calibration), None)
+    # A bundle may come from another computer, so look for its appearances in the runs of this stage.
+    run = next((finished for finished in finished_calibrations(folder) if finished.name == index.calibration), None)
     known = () if run is None else tuple(name for name in wanted if is_solved(run, name))
     missing = [name for name in wanted if name not in known]
     if run is None or not known or (names and missing):
-        raise UsageError("targets-missing", what=f"This stage holds no target of {', '.join(missing) or 'anything'}.",
-                         remedy="Run `velatura appearance` on it: that solves and installs them anew.")  # fmt: skip
+        raise UsageError("targets-missing", what=f"This stage has no target for {', '.join(missing) or 'any'}.",
+                         remedy="Run `velatura appearance` on it to solve and install them again.")  # fmt: skip
     if missing:
-        reporter.say(f"Nothing is known of the target of {', '.join(missing)}: left out.", Level.WARNING)
+        reporter.say(f"Not photographed, because the target is missing: {', '.join(missing)}.", Level.WARNING)
     return Installed(file.stem, run, known)
 
 

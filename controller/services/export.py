@@ -1,4 +1,4 @@
-"""What ``velatura export`` does: the reconstructed object and stage for other programs."""
+"""``velatura export``: the reconstructed object and stage for other programs."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ MESH, SCRIPT = "object.glb", "scene.py"
 def export(*, run: Path, kind: str, out: Path | None, step: int | None) -> dict[str, Any]:
     """Write the geometry of a finished calibration run as ``kind``; ``out`` a file, for "blender" a folder.
 
-    ``step``: every n-th camera pixel becomes a vertex; None: as many as keep it under ``MOST_VERTICES``.
+    ``step``: every n-th camera pixel becomes a vertex; None: at most ``MOST_VERTICES`` vertices.
 
     Raises UsageError("export-format-unknown", "not-calibrated"), and as the writers.
     """
     if kind not in FORMATS:
         raise UsageError(
             "export-format-unknown",
-            what=f"There is no export format {kind!r}.",
+            what=f"The export format {kind!r} is unknown.",
             remedy=f"Choose one of {', '.join(FORMATS)}.",
         )
     if not has_geometry(run):
         raise UsageError(
             "not-calibrated",
-            what=f"{run} holds no reconstructed geometry.",
+            what=f"{run} has no reconstructed geometry.",
             remedy="Give the folder of a finished calibration: STAGE/runs/...",
         )
     geometry = read_geometry(run)
@@ -66,7 +66,7 @@ def _write(
 
 
 def _picture(run: Path, names: tuple[str, ...]) -> ByteImage | None:
-    """The object in all projectors' white light, sRGB (rows, columns, 3); None where the run has no white images."""
+    """The object in all projectors' white light, sRGB (rows, columns, 3); None if the run has no white images."""
     if not all(Light.path(run, name).is_file() for name in names):
         return None
     white = np.sum([np.nan_to_num(Light.read(run, name).white) for name in names], axis=0)

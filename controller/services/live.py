@@ -1,4 +1,4 @@
-"""``velatura live``: a folder, a video or a running render shown on a calibrated stage as it comes."""
+"""``velatura live``: shows a folder, a video or a running render live on a calibrated stage."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ from hal.values import LiveStatus
 
 FRAMES_FILE: Final = "live.frame"
 TARGETS_FILE: Final = "live-targets.frame"
-"""In the stage's runtime folder: what the player shows live."""
+"""Frame file in the stage's runtime folder that the player shows live."""
 NO_SHADERS: Final = {"live-no-shaders", "display-unfit", "bundle-not-live", "bundle-none"}
-"""What a player refuses targets with where it would take finished frames."""
+"""Error codes of a player that refuses targets but accepts finished frames."""
 LAST_S: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """What is worked out before the lamps are lit. ``shaded``: the installed bundle has the maps for shaders."""
+    """Prepared before the lamps are lit. ``shaded``: the installed bundle has the maps for shaders."""
 
     maps: LiveMaps
     brightness: float
@@ -67,7 +67,7 @@ def live(
     reporter: Reporter,
     cancel: threading.Event,
 ) -> Mapping[str, Any]:
-    """Light the projectors and show ``source`` until it ends, ``seconds`` have passed or it is stopped.
+    """Switch the projectors on and show ``source`` until it ends, ``seconds`` have passed or it is stopped.
 
     Raises UsageError "live-source-unreadable" or "live-file-unfit", WorkError "base-not-solved", what
     ``usable_calibration`` raises, and what devices raise.
@@ -103,13 +103,13 @@ def _calibrated(checked: Checked, reporter: Reporter) -> Calibrated:
 
 
 def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> Ready:
-    """The maps, and the brightest white that the stated share of the object can show."""
+    """The maps, and the brightest white that the given share of the object can show."""
     maps = live_maps(calibrated, {table.name: table.output for table in checked.stage.tables.projectors})
     black = calibrated.calibration.black
     white: FloatImage = np.ones_like(black)
     share = checked.stage.tables.solve.exposure_share
     brightness = choose_exposure(calibrated.transport, white, black, share=share, drive=calibrated.drive)
-    reporter.say(f"A target's white is a radiance of {brightness:.7g}.")
+    reporter.say(f"White of a target has the radiance {brightness:.7g}.")
     return Ready(maps, brightness, _in_bundle(checked, calibrated.folder.name))
 
 
@@ -151,16 +151,18 @@ def _show(
             context.deadline.sleep(LAST_S)
             tell(figures)
     finally:
-        # The lamps shine on for a while: black. A player that is gone is black as soon as it is back.
+        # The lamps stay lit for a while: show black. A player that ended shows black when it restarts.
         with contextlib.suppress(DeviceError):
             display.stop(deadline=in_seconds(20))
     if figures.bad:
-        context.reporter.say(f"{figures.bad} pictures could not be shown; the last: {figures.trouble}", Level.WARNING)
+        context.reporter.say(
+            f"{figures.bad} pictures could not be shown. The last error: {figures.trouble}", Level.WARNING
+        )
     return figures.told() | _told(figures, status)
 
 
 def _told(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any]:
-    """What the player made of it; pictures that it did not get to show were replaced by newer ones."""
+    """The player's figures. Pictures that it did not show were replaced by newer ones."""
     if status is None:
         return {"shown": 0, "by": None, "shown_after_p50_ms": None, "shown_after_p99_ms": None}
     p50_ms, p99_ms = (None if s is None else 1e3 * s for s in (status.delay_p50_s, status.delay_p99_s))
@@ -171,7 +173,7 @@ def _told(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """How pictures become light: targets to the player's shaders, or finished frames."""
+    """How pictures are shown: as targets for the player's shaders, or as finished frames."""
 
     maker: Maker
     write: Callable[[Frames], object]
@@ -179,7 +181,7 @@ class Way:
 
 @contextlib.contextmanager
 def way_to_light(rig: Rig, context: Context, ready: Ready) -> Iterator[Way]:
-    """Ask the player for live pictures, in the way that it can, and let it go at the end; the picture stays.
+    """Start live mode in the player in a way that it supports, and end it on leaving; the picture stays.
 
     Raises what devices raise.
     """
@@ -211,7 +213,7 @@ def _takes_targets(rig: Rig, path: Path, white: float, deadline: Deadline) -> bo
 
 @contextlib.contextmanager
 def _fresh(path: Path, outputs: Sequence[OutputSize]) -> Iterator[FrameFile]:
-    """A frame file without an old picture in it, removed again on leaving."""
+    """A frame file without an old picture, removed on leaving."""
     path.unlink(missing_ok=True)
     file = FrameFile(path, outputs)
     try:
@@ -245,10 +247,10 @@ def feed(
     reporter: Reporter,
     cancel: threading.Event,
 ) -> Mapping[str, Any]:
-    """Write what ``source`` shows to the frame file ``into``, for a player that is asked elsewhere to show it live.
+    """Write the pictures of ``source`` to the frame file ``into``, for another player to show live.
 
-    Finished frames, or with ``targets`` those of the bundle's live section. No device is touched. Ends with the source,
-    after ``seconds``, or when it is stopped; the file stays, with its last picture.
+    Writes finished frames, or with ``targets`` targets for the bundle's live section. Uses no device. Ends with the
+    source, after ``seconds``, or when it is stopped; the file stays, with its last picture.
     """
     checked = check_stage(stage)
     calibrated = _calibrated(checked, reporter)

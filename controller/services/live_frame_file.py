@@ -1,4 +1,4 @@
-"""A running render that writes targets to a shared frame file (docs/reference/player-protocol.md), as a live source."""
+"""A live source: a shared frame file to which a render writes targets (docs/reference/player-protocol.md)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def holds_frames(path: Path) -> bool:
 
 
 class FileSource:
-    """What another process writes there: always the newest; see ``controller.live.sources.LiveSource``."""
+    """The newest picture that another process wrote there; see ``controller.live.sources.LiveSource``."""
 
     def __init__(self, path: Path, size: OutputSize) -> None:
         """Raises UsageError("live-file-unfit"), naming both sizes."""
@@ -31,7 +31,7 @@ class FileSource:
         self._told_gone = False
 
     def next(self, at_s: float) -> LivePicture | None:
-        """See ``LiveSource``. UsageError("live-source-gone"), once, where its writer ended: it may come back."""
+        """See ``LiveSource``. Raises UsageError("live-source-gone") once when the writer ended; it may come back."""
         if self._file.newest(self._set) is not None:
             self._heard_s, self._told_gone = time.monotonic(), False
             self._number += 1
@@ -43,14 +43,14 @@ class FileSource:
                 self._told_gone = True
                 raise UsageError(
                     "live-source-gone",
-                    what=f"Nobody writes to {self._path} any more; the last picture stays.",
-                    remedy="Start its writer again; it is then gone on with.",
+                    what=f"The source of {self._path} has ended. The last picture stays.",
+                    remedy="Restart the source; playback resumes.",
                 )
         return None
 
     @property
     def ended(self) -> bool:
-        """A writer may always come back."""
+        """False: a writer may come back at any time."""
         return False
 
     def close(self) -> None:

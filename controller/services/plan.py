@@ -1,4 +1,4 @@
-"""What ``velatura plan`` does: from plan.toml to places for the projectors, a page and a file with the figures."""
+"""``velatura plan``: from plan.toml to places for the projectors, a page and a file with the figures."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ HTML, MACHINE = "plan.html", "plan.json"
 SEED: Final = 1
 VIEW_ROWS: Final = 420
 WEIGHTS: Final = (1.0, 8.0, 3.0, 2.0)
-STEPS: Final = ("Reading the object", "Trying every place", "Choosing together", "Drawing the page")
+STEPS: Final = ("Reading the object", "Evaluating every place", "Choosing the set of places", "Drawing the page")
 
 
 def write_example(path: Path) -> Mapping[str, Any]:
-    """Write a plan.toml to begin with. Raises UsageError("plan-exists"), WorkError("no-space", "cannot-write")."""
+    """Write an example plan.toml. Raises UsageError("plan-exists"), WorkError("no-space", "cannot-write")."""
     if path.exists():
         raise UsageError(
             "plan-exists",
-            what=f"There is a {path} already.",
+            what=f"{path} exists already.",
             remedy="Give another name, or remove the file first.",
         )
     write_atomically(path, EXAMPLE.encode())
@@ -86,16 +86,18 @@ def _page(
     figures: Mapping[str, Any],
 ) -> Page:
     goal = tables.aims()
-    placements = [one.placement for one in best.candidates]
-    room = ReportPicture("The room", layout(placements, surface, audience), "metres from the middle of the object")
-    galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Who stands where", "", (room,))]
+    placements = [candidate.placement for candidate in best.candidates]
+    room = ReportPicture("The room", layout(placements, surface, audience), "metres from the centre of the object")
+    galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Projector places", "", (room,))]
     for number, eye in enumerate(audience):
         name = "from the audience" if len(audience) == 1 else f"from the audience's place {number + 1}"
-        galleries.append((f"What the object gets, seen {name}", "", _maps(target_object, eye, placements, goal)))
+        galleries.append(
+            (f"Light and detail on the object, seen {name}", "", _maps(target_object, eye, placements, goal))
+        )
     return Page(
         title=f"Plan for {Path(tables.object.mesh).stem}",
-        summary=f"{len(placements)} projectors in {len(tables.spots())} places; {best.tried} sets were judged. "
-        "Predicted from data sheets: vignetting, the age of lamps and the paint are not in it.",
+        summary=f"{len(placements)} projectors in {len(tables.spots())} places; {best.tried} sets were compared. "
+        "Predicted from data sheets: vignetting, lamp age and paint are not included.",
         goals=tuple(_goals(figures, goal)),
         rows=(),
         galleries=tuple(galleries),
@@ -105,21 +107,21 @@ def _page(
 
 def _goals(figures: Mapping[str, Any], goal: PlanGoal) -> list[Goal]:
     def share(name: str, key: str, asked: str) -> Goal:
-        return Goal(name, f"{100 * figures[key]:.0f} % of what is seen", asked)
+        return Goal(name, f"{100 * figures[key]:.0f} % of the visible surface", asked)
 
     detail = figures["detail_mm_median"]
     return [
-        Goal("Quality", f"{figures['quality']:.2f}", "1: all that is wanted, everywhere"),
+        Goal("Quality", f"{figures['quality']:.2f}", "1: every goal is reached everywhere"),
         share("Light", "share_bright_enough", f"{goal.lux:g} lx; the median is {figures['lux_median']:.0f} lx"),
         share("Detail", "share_fine_enough",
               f"{goal.detail_mm:g} mm; the median is {'-' if detail is None else format(detail, '.2f')} mm"),
         share("Overlap", "share_overlapped", f"{goal.overlap} projectors at each point"),
-        share("Reached at all", "share_reached", "by one projector"),
+        share("Covered", "share_reached", "by at least one projector"),
     ]  # fmt: skip
 
 
 def _stands(figures: Mapping[str, Any]) -> dict[str, str]:
-    """For each projector where it stands, how it is turned and set, and what it does alone."""
+    """For each projector its place, direction and settings, and its figures on its own."""
     stands = {}
     for number, one in enumerate(figures["projectors"], start=1):
         x, y, z = one["position_m"]
@@ -128,7 +130,7 @@ def _stands(figures: Mapping[str, Any]) -> dict[str, str]:
             f"{one['place']} (x {x:.2f}, y {y:.2f}, z {z:.2f} m); turn {one['pan_degrees']:+.1f}°, "
             f"tilt {one['tilt_up_degrees']:+.1f}°, throw {one['throw_ratio']:.2f}, focus at {one['focus_m']:.2f} m. "
             f"Reaches {100 * one['share_reached']:.0f} %, {one['lux_median']:.0f} lx, {detail}; "
-            f"{100 * (one['grazing_loss_mean'] or 0):.0f} % lost by grazing."
+            f"{100 * (one['grazing_loss_mean'] or 0):.0f} % lost by oblique incidence."
         )
     return stands
 
@@ -138,18 +140,18 @@ def _maps(
 ) -> tuple[ReportPicture, ...]:
     view = seen_from(target_object, eye, rows=VIEW_ROWS)
     lit = [lit_by(placement, view.surface, target_object) for placement in placements]
-    useful = np.stack([one.useful(goal.steepest_degrees) for one in lit])
+    useful = np.stack([values.useful(goal.steepest_degrees) for values in lit])
     found = together(lit, useful)
     reached = found.count > 0
     finest = np.where(reached, found.detail_mm, np.nan)
-    sharp = np.where(reached, np.where(useful, [one.blur_px for one in lit], np.inf).min(axis=0), np.nan)
-    steep = np.degrees(np.arccos(np.clip(np.where(useful, [one.cosine for one in lit], 0.0).max(axis=0), 0, 1)))
+    sharp = np.where(reached, np.where(useful, [values.blur_px for values in lit], np.inf).min(axis=0), np.nan)
+    steep = np.degrees(np.arccos(np.clip(np.where(useful, [values.cosine for values in lit], 0.0).max(axis=0), 0, 1)))
     maps = (
         ("Light", "lux", found.lux, 0.0, max(1.5 * goal.lux, float(np.quantile(found.lux, 0.95)))),
         ("Finest detail", "mm", finest, 0.0, 2 * goal.detail_mm),
-        ("Projectors that reach", "number", found.count.astype(np.float64), 0.0, float(len(placements))),
-        ("Steepness of the best light", "degrees from the normal", np.where(reached, steep, np.nan), 0.0, 90.0),
-        ("Blur of the sharpest", "projector pixels", sharp, 0.0, 2.0),
+        ("Number of projectors", "number", found.count.astype(np.float64), 0.0, float(len(placements))),
+        ("Incidence of the best light", "degrees from the normal", np.where(reached, steep, np.nan), 0.0, 90.0),
+        ("Blur of the sharpest projector", "projector pixels", sharp, 0.0, 2.0),
     )
     return tuple(
         ReportPicture(name, value_map(view.map_of(values), name, unit, lowest=low, highest=high), unit)

@@ -1,4 +1,4 @@
-"""What the command line and the kiosk ask for: playing the installed bundle's appearances on a stage."""
+"""Play the installed bundle's appearances on a stage; for the command line and the kiosk."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from controller.steps.appearance.publishing import bundle_display
 from hal.deadline import in_seconds
 
 SHOWN_S: Final = 10.0
-"""How long one of several appearances stays, unless told otherwise."""
+"""Default time for each of several appearances."""
 _KEYS: Final = {"appearance", "seconds", "fade_s"}
 
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """Appearances in turn: (name, seconds, fade_s) each; ``repeat`` rounds, 0: for ever.
+    """Appearances one after the other: (name, seconds, fade_s) each; ``repeat`` rounds, 0: without end.
 
     ``for_s``: black after so many seconds; None: after the rounds.
     """
@@ -47,7 +47,7 @@ class Programme:
 
     @property
     def whole_s(self) -> float:
-        """How long it goes on, at most as long as a run may."""
+        """Its duration, at most the longest that a run may take."""
         rounds_s = self.repeat * sum(seconds for _, seconds, _ in self.items) or LONGEST_RUN_S
         return min(rounds_s if self.for_s is None else self.for_s, LONGEST_RUN_S)
 
@@ -63,13 +63,13 @@ def play(
     reporter: Reporter,
     cancel: threading.Event,
 ) -> Mapping[str, Any]:
-    """Light the projectors and show appearances of the installed bundle.
+    """Switch the projectors on and show appearances of the installed bundle.
 
-    Nothing named: the playlist that the bundle suggests. One name: for ``seconds``, or until stopped. Several, or
-    ``sequence`` (a file, see ``read_programme``): each for ``seconds``, coming in over ``fade_s`` of them, ``repeat``
-    rounds, or for ever if 0. Raises UsageError("nothing-installed", "nothing-to-play", "played-twice",
+    No name: the playlist in the bundle. One name: for ``seconds``, or until stopped. Several, or
+    ``sequence`` (a file, see ``read_programme``): each for ``seconds``, of which ``fade_s`` fade it in, ``repeat``
+    rounds, without end if 0. Raises UsageError("nothing-installed", "nothing-to-play", "played-twice",
     "sequence-file-wrong", "fade-too-long" or "appearance-unknown"), and BundleError for a bundle that
-    the stage does not trust or that was made for other outputs: all of them before a lamp is struck.
+    the stage does not trust or that was made for other outputs; always before a lamp is struck.
     """
     checked = check_stage(session.stage)
     installed = current(checked.stage.folder / "bundles")
@@ -97,7 +97,7 @@ def play(
 
 
 def _checked_index(bundle: Path, checked: Checked, programme: Programme) -> Index:
-    """The index of a bundle that the stage trusts, that fits its outputs and has what is to be played."""
+    """The index of a bundle that the stage trusts, that fits its outputs and has the given appearances."""
     with Bundle.open_trusted(bundle, stage_trust(checked.stage)) as opened:
         index = opened.index
     held = [appearance.name for appearance in index.appearances]
@@ -106,7 +106,7 @@ def _checked_index(bundle: Path, checked: Checked, programme: Programme) -> Inde
             raise UsageError(
                 "appearance-unknown",
                 what=f"The installed bundle has no appearance '{name[:64]}'.",
-                remedy=f"It has {', '.join(held) or 'none'}.",
+                remedy=f"Available: {', '.join(held) or 'none'}.",
             )
     outputs = checked.stage.tables.display.outputs
     check_outputs(index, {(output.name, output.width_px, output.height_px) for output in outputs})
@@ -119,75 +119,75 @@ def _programme(
     if names and sequence is not None:
         raise UsageError(
             "played-twice",
-            what="Appearances and a sequence were given.",
-            remedy="Name the appearances to show, or give --sequence FILE.",
+            what="Both appearances and a sequence were given.",
+            remedy="Give names of appearances, or --sequence FILE.",
         )
     if sequence is not None:
         return read_programme(sequence)
     if len(names) == 1:
-        # The last picture of a sequence stays, so how long its item lasts does not matter.
+        # The last picture of a sequence stays, so its duration does not matter.
         return Programme(((names[0], max(fade_s, 1.0), fade_s),), 1, LONGEST_RUN_S if seconds is None else seconds)
     each_s = SHOWN_S if seconds is None else seconds
     if fade_s > each_s:
         raise UsageError(
             "fade-too-long",
-            what=f"A fade of {fade_s:g} s does not fit into the {each_s:g} s that an appearance is shown.",
+            what=f"The fade of {fade_s:g} s is longer than the {each_s:g} s for each appearance.",
             remedy="Give a shorter --fade or longer --seconds.",
         )
     return Programme(tuple((name, each_s, fade_s) for name in names), repeat)
 
 
 def suggested_programme(bundle: Path, trust: Trust, repeat: int, seconds: float | None) -> Programme:
-    """The playlist that a bundle suggests. ``seconds``: each for so long instead, its fade at most that.
+    """The playlist in a bundle. ``seconds``: replaces each item's time; a fade is at most as long.
 
-    Raises UsageError("nothing-to-play") for one that suggests none, and BundleError as ``Bundle.open``.
+    Raises UsageError("nothing-to-play") for a bundle without playlist, and BundleError as ``Bundle.open``.
     """
     with Bundle.open_trusted(bundle, trust) as opened:
         hints = opened.index.schedule
     if not hints:
         raise UsageError(
             "nothing-to-play",
-            what="Neither appearances nor a sequence were given, and the installed bundle suggests no playlist.",
-            remedy="Name the appearances to show, or give --sequence FILE.",
+            what="No appearances and no sequence were given, and the installed bundle has no playlist.",
+            remedy="Give names of appearances, or --sequence FILE.",
         )
     lasting = [(hint.appearance, seconds or hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints]
     return Programme(tuple((name, shown_s, min(fade_s, shown_s)) for name, shown_s, fade_s in lasting), repeat)
 
 
 def read_programme(path: Path) -> Programme:
-    """Read a sequence from a TOML file: ``repeat`` (0: for ever), and a table [[item]] for each appearance.
+    """Read a sequence from a TOML file: ``repeat`` (0: without end), and a table [[item]] for each appearance.
 
-    An item has ``appearance``, ``seconds`` and, if it is to fade in, ``fade_s``, at most its seconds. Raises
+    An item has ``appearance``, ``seconds`` and optionally ``fade_s``, at most its seconds. Raises
     UsageError("sequence-file-wrong").
     """
     try:
         tables = tomllib.loads(read_text(path))
     except OSError as error:
-        raise _wrong(path, f"it can not be read ({error.strerror})") from error
+        raise _wrong(path, f"it can't be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
         raise _wrong(path, f"it is not TOML ({error})") from error
     items, repeat = tables.get("item"), tables.get("repeat", 0)
     if tables.keys() - {"item", "repeat"} or not isinstance(items, list) or not items:
-        raise _wrong(path, "it has something else than repeat and tables [[item]], or none of these")
+        raise _wrong(path, "it needs [[item]] tables, and may have only repeat besides")
     if type(repeat) is not int or repeat < 0:
-        raise _wrong(path, "repeat is not a whole number from 0")
+        raise _wrong(path, "repeat must be a whole number from 0")
     return Programme(tuple(_item(path, number, table) for number, table in enumerate(items, start=1)), repeat)
 
 
 def _item(path: Path, number: int, table: Any) -> tuple[str, float, float]:
     if not isinstance(table, dict) or table.keys() - _KEYS or not isinstance(table.get("appearance"), str):
-        raise _wrong(path, f"item {number} has not just appearance, seconds and fade_s")
+        raise _wrong(path, f"item {number} needs appearance, and may have only seconds and fade_s besides")
     seconds, fade_s = table.get("seconds", SHOWN_S), table.get("fade_s", 0.0)
     if any(type(value) not in (int, float) for value in (seconds, fade_s)) or not 0 <= fade_s <= seconds or not seconds:
-        raise _wrong(path, f"in item {number} seconds is not a number above 0, or fade_s not one from 0 to seconds")
+        raise _wrong(path, f"in item {number}, seconds must be above 0, and fade_s from 0 to seconds")
     return table["appearance"], float(seconds), float(fade_s)
 
 
 def _wrong(path: Path, detail: str) -> UsageError:
     return UsageError(
         "sequence-file-wrong",
-        what=f"The sequence {path} can not be used: {detail}.",
-        remedy='Write repeat = 0, and for each appearance [[item]], appearance = "...", seconds = 10, fade_s = 1.',
+        what=f"The sequence {path} can't be used: {detail}.",
+        remedy='Write repeat = 0, then for each appearance: [[item]], appearance = "...", seconds = 10, fade_s = 1.',
     )
 
 
@@ -204,7 +204,7 @@ def _playing(rig: Rig, programme: Programme, index: Index) -> Sequence[Step]:
 def _show(rig: Rig, programme: Programme, context: Context) -> Sequence[Path]:
     display = bundle_display(rig)
     display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
-    # A fade answers when it is over.
+    # A fade answers at its end.
     patience_s = 20 + programme.items[0][2]
     display.play_sequence(programme.items, repeat=programme.repeat, deadline=context.deadline.within(patience_s))
     whole_s = programme.whole_s

@@ -1,4 +1,4 @@
-"""What keeps a calibration true: the drift check, and the recalibration that repeats only what has changed."""
+"""Keeps a calibration up to date: the drift check, and recalibration of only what has changed."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from controller.steps.calibrate.quick import quick_steps
 from controller.steps.calibrate.single_projector import one_projector_steps
 
 CHECKS = (StepKind.DRIFT_PHOTOGRAPHS, StepKind.VERIFICATION_PHOTOGRAPHS)
-"""The photographs of the check before and of the grade."""
+"""The photographs of the previous check and of the grade."""
 
 
 def check_drift(
     *, session: StageSession, details: bool, reporter: Reporter, cancel: threading.Event
 ) -> Mapping[str, Any]:
-    """Photograph the stage N + 2 times and tell what has changed since its calibration; ``details``: every figure.
+    """Photograph the stage N + 2 times and find what has changed since its calibration; ``details``: all figures.
 
     Raises UsageError("not-calibrated"), and what the devices raise.
     """
@@ -66,10 +66,9 @@ def recalibrate(
     accept_grade: bool = False,
     projector: str | None = None,
 ) -> Mapping[str, Any]:
-    """Bring the last calibration up to date, repeating only what has changed; goes on with an unfinished one.
+    """Bring the last calibration up to date, repeating only what has changed; continues an unfinished run.
 
-    ``projector``: all of that one is measured anew, whatever has changed, and nothing of the others but one photograph
-    each for the grade.
+    ``projector``: measure only this one again, completely. The others get one photograph each, for the grade.
     Raises UsageError("not-calibrated", "projector-unknown"), CalibrationError("projector-dark"),
     CalibrationError("calibration-below-grade") for a result that may not replace the last calibration, and what the
     devices raise.
@@ -113,12 +112,12 @@ def recalibrate(
 def check_name(checked: Checked, projector: str | None) -> None:
     """Raises UsageError("projector-unknown"), before a lamp is struck."""
     if projector is not None and projector not in checked.names:
-        raise UsageError("projector-unknown", what=f"There is no projector {projector[:64]!r}.",
-                         remedy=f"It is one of {', '.join(checked.names)}.")  # fmt: skip
+        raise UsageError("projector-unknown", what=f"The stage has no projector {projector[:64]!r}.",
+                         remedy=f"Choose one of {', '.join(checked.names)}.")  # fmt: skip
 
 
 def _take_over_step(worst: float, reporter: Reporter, *, accept_grade: bool) -> Step:
-    """Only a result that passes the gate counts as a finished calibration, and takes the last one's place."""
+    """Only a result with a sufficient grade counts as finished and replaces the last calibration."""
 
     def run(context: Context) -> Sequence[Path]:
         if accept_grade:
@@ -127,7 +126,7 @@ def _take_over_step(worst: float, reporter: Reporter, *, accept_grade: bool) -> 
             context.journal.complete(CALIBRATED, {}, (), began_at_s=time.time())
         return ()
 
-    return Step(StepId("take-over"), run, title="Comparing the grade with what is asked", weight=0.01, always=True)
+    return Step(StepId("take-over"), run, title="Comparing the grade with the limit", weight=0.01, always=True)
 
 
 def _longest_s(checked: Checked) -> float:

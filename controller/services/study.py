@@ -1,4 +1,4 @@
-"""`velatura study`: experiments on emulated stages, each stage set up and calibrated once and kept for re-use."""
+"""`velatura study`: experiments on emulated stages. Each stage is set up and calibrated once and kept."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from hal.errors import DeviceError
 SIZES = ("small", "medium", "paper")
 MARK = "study.json"
 RESULTS = "study"
-"""Folder of a run that holds the experiments' results."""
+"""Folder in a run with the experiments' results."""
 POWER_DOWN_S = 10.0
 
 
@@ -52,7 +52,7 @@ def study(
     reporter: Reporter,
     cancel: threading.Event,
 ) -> Mapping[str, Any]:
-    """Do the experiments, going on with what ``out`` holds; write their pages; return where the index lies.
+    """Run the experiments, continuing what is in ``out``; write their pages; return the path of the index.
 
     Raises UsageError("experiment-unknown", "size-unknown", "study-folder-taken"), and what the devices, the calibration
     and the experiments raise; the lamps are safe by then.
@@ -60,22 +60,23 @@ def study(
     wanted = chosen(names)
     if size not in SIZES:
         raise UsageError(
-            "size-unknown", what=f"There is no size {size!r}.", remedy=f"Choose one of {', '.join(SIZES)}."
+            "size-unknown", what=f"The size {size!r} is unknown.", remedy=f"Choose one of {', '.join(SIZES)}."
         )
     out = out.resolve()
     pages = (out / "pages" if pages is None else pages).resolve()
-    index = publish([_without_stage(one, out, size, seed, reporter) for one in wanted if one.scene is None], pages,
+    free = [experiment for experiment in wanted if experiment.scene is None]
+    index = publish([_without_stage(experiment, out, size, seed, reporter) for experiment in free], pages,
                     EXPERIMENTS)  # fmt: skip
-    for scene in dict.fromkeys(one.scene for one in wanted if one.scene is not None):
-        here = [one for one in wanted if one.scene == scene]
-        reporter.say(f"On {SCENES[scene].title}: {', '.join(one.name for one in here)}.")
-        # After each stage, so that one that fails does not cost the pages of those before.
+    for scene in dict.fromkeys(experiment.scene for experiment in wanted if experiment.scene is not None):
+        here = [experiment for experiment in wanted if experiment.scene == scene]
+        reporter.say(f"On {SCENES[scene].title}: {', '.join(experiment.name for experiment in here)}.")
+        # After each stage, so that a failing one does not cost the pages of the previous ones.
         index = publish(_on_scene(SCENES[scene], here, out, size, seed, reporter, cancel), pages, EXPERIMENTS)
     return {"index": str(index)}
 
 
 def _without_stage(one: Experiment, out: Path, size: str, seed: int, reporter: Reporter) -> Path:
-    """An experiment that needs no stage gets none: its function is called with None."""
+    """For an experiment without a stage: its function is called with None."""
     reporter.say(f"{one.title}.")
     began_s = time.perf_counter()
     result = one.run(None)  # type: ignore[arg-type]
@@ -96,39 +97,39 @@ def _on_scene(
 ) -> list[Path]:
     stage = prepare_scene(out / "scenes" / scene.name, scene, size=size, seed=seed)
     checked = check_stage(stage)
-    bench_of(stage).disturb(stage, ())  # what a stopped experiment may have left
+    bench_of(stage).disturb(stage, ())  # a stopped experiment may have left files
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
     steps = partial(
         _steps, experiments=experiments, checked=checked, scene=scene, size=size, seed=seed, disturb=bench.disturb
     )
     session = OwnSession(stage, around=bench, again=True)
     run = session.run(checked, steps, name="study", reporter=reporter, cancel=cancel)
-    return [run / RESULTS / f"{one.name}.json" for one in experiments]
+    return [run / RESULTS / f"{experiment.name}.json" for experiment in experiments]
 
 
 def _steps(
     rig: Rig, run: Path, *, experiments: Sequence[Experiment], checked: Checked, scene: Scene, size: str, seed: int,
     disturb: Callable[[Sequence[Mapping[str, Any]]], None],
 ) -> Sequence[Step]:  # fmt: skip
-    """Calibrate, photograph dots where they are wanted, and do each experiment; what is done already is passed over."""
+    """Calibrate, photograph dots where needed, and run each experiment; skip what is done already."""
     longest_s = checked.stage.tables.capture.longest_exposure_s
     calibrated = Calibrated(run, checked.names)
     steps = list(calibrating(rig, run, checked=checked, calibrated=calibrated))
     after = [StepId(StepKind.GEOMETRY), *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS)]
-    if any(one.dots for one in experiments):
+    if any(experiment.dots for experiment in experiments):
         steps += dot_steps(rig, longest_exposure_s=longest_s)
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     told = {"scene": scene.title, "size": size, "seed": seed}
-    for one in experiments:
-        dots = of_projectors(checked.names, StepKind.STUDY_DOTS) if one.dots else ()
+    for experiment in experiments:
+        dots = of_projectors(checked.names, StepKind.STUDY_DOTS) if experiment.dots else ()
         steps.append(
             Step(
-                StepId("study", item=one.name),
-                partial(_experiment, rig, checked, calibrated, one, told, longest_s, disturb),
-                inputs={"size": size, "seed": str(seed), "code": one.code_sha256()},
+                StepId("study", item=experiment.name),
+                partial(_experiment, rig, checked, calibrated, experiment, told, longest_s, disturb),
+                inputs={"size": size, "seed": str(seed), "code": experiment.code_sha256()},
                 after=(*after, *dots),
-                title=one.title,
-                weight=one.cost_s * scale,
+                title=experiment.title,
+                weight=experiment.cost_s * scale,
             )
         )
     return steps
@@ -156,7 +157,7 @@ def _experiment(
         disturb(())
     facts = {
         **told,
-        # What an earlier run photographed counts, too; what an experiment photographs by itself is not in ``used``.
+        # Photographs of an earlier run count, too; those of an experiment itself are not in ``used``.
         "photographs": max(len(light.used), context.journal.shot_count() - before),
         "seconds": round(time.perf_counter() - began_s),
     }
@@ -166,9 +167,9 @@ def _experiment(
 
 
 def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
-    """The stage folder ``out/stage`` of a scene: set up now, or found as an earlier study left it.
+    """The stage folder ``out/stage`` of a scene, created now or by an earlier study.
 
-    Raises UsageError("study-folder-taken") where it is of another size or seed, and WorkError where the bench refuses.
+    Raises UsageError("study-folder-taken") for another size or seed, and WorkError if the bench refuses.
     """
     stage, wishes = out / "stage", {"scene": scene.name, "size": size, "seed": seed}
     if stage.exists():
@@ -179,8 +180,8 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
         if known != wishes:
             raise UsageError(
                 "study-folder-taken",
-                what=f"{stage} holds something else than the stage of this study.",
-                remedy="Choose another folder with --out, or the size and seed that it was made with.",
+                what=f"{stage} does not contain the stage of this study.",
+                remedy="Choose another folder with --out, or use the size and seed of that folder.",
             )
         return stage
     building = out / ".stage.part"

@@ -1,4 +1,4 @@
-"""Targets bent gently into what a stage can make, where light is lacking, instead of cut off (after Law et al. 2011).
+"""Adapts targets to the available light instead of clipping them (after Law et al. 2011).
 
 What the eye compares is a place with its surroundings. So where a target needs more light than there is, its
 surroundings are dimmed with it, by one gain that varies slowly: differences within a neighbourhood stay, the
@@ -31,7 +31,7 @@ REACH: Final = 1 / 8
 WINDOW_MIN_PX: Final = 3
 STRENGTHS: Final = (0.5, 1.0)
 GIVEN_UP: Final = (0.02, 0.05)
-"""Shares of the object's pixels, those that need most, for which nothing else is dimmed."""
+"""Shares of the object's pixels with the highest need of light that do not cause dimming."""
 TOE: Final = 0.5
 """Of the black image: targets bend away from it within about this part of it."""
 SCALES: Final = (1 / 400, 1 / 200, 1 / 100, 1 / 50)
@@ -40,7 +40,7 @@ FINEST_PX: Final = 2.0
 FAINTEST_CONTRAST: Final = 0.01
 """Weber's fraction: a neighbourhood that varies less than this has no contrast to lose."""
 STRAY: Final = 0.005
-"""Light scattered in the eye and the room, relative to a perfect white; below it nothing is told apart."""
+"""Light scattered in the eye and the room, relative to a perfect white; differences below it are invisible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def adapt(
     given_up: float = 0.0,
     drive: DriveLevels | None = None,
 ) -> Adapted:
-    """Bend ``wanted`` into reach.
+    """Adapt ``wanted`` to the available light.
 
     Parameters
     ----------
@@ -115,8 +115,8 @@ def _check_strength(strength: float, given_up: float) -> None:
     if not (0 <= strength <= 1 and 0 <= given_up < 1):
         raise UsageError(
             "adapt-strength",
-            what=f"A contrast adaptation of strength {strength} was asked for, with {given_up} of the pixels given up.",
-            remedy="Ask for a strength from 0 to 1, and give up a share from 0 to below 1.",
+            what=f"A contrast adaptation can't have strength {strength} and give up a share {given_up} of the pixels.",
+            remedy="Give a strength from 0 to 1, and a share of given-up pixels from 0 to below 1.",
         )
 
 
@@ -146,7 +146,7 @@ def _above_black(wanted: FloatImage, black: FloatImage, strength: float) -> Floa
 def _gain(needed: FloatImage, mask: Mask, strength: float) -> FloatImage:
     """(rows, columns): one gain a neighbourhood, such that gain x needed stays below 1."""
     radius = max(round(max(mask.shape) * REACH / 2), WINDOW_MIN_PX)
-    # the blur's window lies within the maximum's, so the envelope is nowhere below what is needed
+    # the blur's window is inside the maximum's, so the envelope is never below the needed value
     largest = cv2.dilate(np.where(mask, needed, 0), np.ones((2 * radius + 1, 1), np.uint8))
     largest = cv2.dilate(largest, np.ones((1, 2 * radius + 1), np.uint8))
     size = 2 * (radius // 2) + 1
@@ -174,7 +174,7 @@ def contrast_kept(achieved: FloatImage, target: FloatImage, mask: Mask, *, white
     present = mask.astype(np.float32)
     for sigma in sorted({max(scale * max(mask.shape), FINEST_PX) for scale in SCALES}):
         size = 2 * round(2 * sigma) + 1
-        # the weight of neighbours on the object: what lies beside it must not count as contrast
+        # the weight of neighbours on the object: the background must not count as contrast
         weight = np.maximum(cv2.blur(present, (size, size)), np.float32(1e-6))
 
         def mean(image: FloatImage, size: int = size, weight: FloatImage = weight) -> FloatImage:

@@ -26,7 +26,7 @@ BaseChoice = Literal["minimum", "white", "high-pass"]
 Mode = Literal["auto", "scale", "full"]
 
 FAINTEST_BASE: Final = 1e-2
-"""Base light below this fraction of its mean divides nothing: the pixel is left out of its metapixels' means."""
+"""Below this fraction of the mean base light, a pixel is not used in its metapixels' means."""
 HEADROOM: Final = 0.5
 """A white base uses this part of the reachable light, so that scales above 1 are possible."""
 FINE_DETAIL: Final = 0.02
@@ -34,7 +34,7 @@ FINE_DETAIL: Final = 0.02
 
 
 WELL_BELOW: Final = 0.5
-"""Of the frequency limit: a high-pass base keeps what is above, so that the scale has nothing near the limit."""
+"""Fraction of the frequency limit above which a high-pass base keeps detail, so that the scale has none near it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +195,7 @@ def make_appearance(
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Appearance:
-    """Frames for a target radiance: by base and scale, by a full solve, or by what the target needs.
+    """Frames for a target radiance: by base and scale, by a full solve, or depending on the target.
 
     A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 25).
     """

@@ -15,7 +15,7 @@ from controller.transport import LightTransport
 
 @dataclass(frozen=True, slots=True)
 class Feasibility:
-    """How a target radiance lies in what the projectors can make.
+    """Which part of a target radiance the projectors can make.
 
     ``too_bright``, ``too_dark`` (rows, columns, 3) float32, >= 0: by how much the channels of the projectors would have
     to be driven above white, or below black; 1 is all of a channel's light
@@ -37,7 +37,7 @@ def feasibility(
     margin: float = 2e-3,
     drive: DriveLevels | None = None,
 ) -> Feasibility:
-    """Compare ``target`` (rows, columns, 3), linear radiance, with what the projectors can make.
+    """Compare ``target`` (rows, columns, 3), linear radiance, with the light that the projectors can make.
 
     ``margin``: so much drive beyond [0, 1] is forgiven; ``drive`` of this transport, where already known.
     """
@@ -62,7 +62,7 @@ def choose_exposure(
     """The largest exposure at which ``share`` of the object's pixels can be made as bright as exposure x target.
 
     ``target`` (rows, columns, 3): reflectance-like, 0 to 1. No channel of a pixel may need more than all its light;
-    pixels too dark or too saturated for the stage do not bear on the exposure: another one would not help them.
+    pixels too dark or too saturated for the stage do not affect the exposure: another one would not help them.
 
     Raises UsageError("share-out-of-range"), WorkError("no-light") when there is no light or the target is black.
     """
@@ -70,8 +70,8 @@ def choose_exposure(
     if not 0 < share <= 1:
         raise UsageError(
             "share-out-of-range",
-            what=f"A share of {share} reachable pixels was asked for.",
-            remedy="Ask for a share above 0 and up to 1, for example 0.95.",
+            what=f"A share of {share} reachable pixels is not possible.",
+            remedy="Give a share above 0 and up to 1, for example 0.95.",
         )
     drive = DriveLevels(transport) if drive is None else drive
     mask = drive.mask
@@ -88,8 +88,8 @@ def choose_exposure(
     if not 0 < exposure < np.inf:
         raise WorkError(
             "no-light",
-            what="No exposure fits this target: it is black, or the projectors bring no light to the object.",
-            remedy="Check the target, and that the calibration saw the projectors' light on the object.",
+            what="No exposure fits this target: it is black, or no projector lights the object.",
+            remedy="Check the target. Check that the projectors lit the object during the calibration.",
         )
     return exposure
 

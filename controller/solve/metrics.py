@@ -71,7 +71,7 @@ def compare(achieved: FloatImage, target: FloatImage, camera_to_xyz: Float64, wh
     Raises UsageError("nothing-to-compare") when the mask is empty or the images are not finite or of different sizes.
     """
     if achieved.shape != target.shape or target.shape[:2] != mask.shape or not mask.any() or not white > 0:
-        raise _incomparable("they differ in size, or no pixel is to be compared")
+        raise _incomparable("they differ in size, or the mask is empty")
     if not (np.isfinite(achieved[mask]).all() and np.isfinite(target[mask]).all()):
         raise _incomparable("some pixels are not finite")
     difference = colour_difference(achieved, target, camera_to_xyz, white, mask)

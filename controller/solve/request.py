@@ -1,6 +1,6 @@
 """One appearance from its picture to its frames: exposure, feasibility, adaptation and the solve, arrays in and out.
 
-What is asked and what is answered are plain values, so that the same function makes appearances here and on another
+Request and result are plain values, so that the same function makes appearances here and on another
 machine, and gives the same.
 """
 
@@ -30,7 +30,7 @@ from controller.solve.targets.values import Target
 from controller.transport import LightTransport
 
 ADVICE_FULL_SOLVE = (
-    'The target has finer detail than one projector can scale; mode "full" or base "high-pass" would keep it.'
+    'The target has finer detail than one projector can scale. To keep it, use mode "full" or base "high-pass".'
 )
 
 
@@ -54,7 +54,7 @@ class SolveOptions:
         return asked if self.adapt == 0 else {**asked, "adapt": repr(self.adapt)}
 
     def base_inputs(self) -> dict[str, str]:
-        """What the base image depends on: neither on how appearances are made of it, nor how bright."""
+        """The inputs of the base image; the mode and brightness of appearances are not among them."""
         shared = "white" if self.base == "high-pass" else self.base
         return {"smoothness": repr(self.smoothness), "base": shared}
 
@@ -65,7 +65,7 @@ class AppearanceResult:
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
     ``target`` (rows, columns, 3) float32: radiance aimed at
-    ``reachable`` (rows, columns) bool: where the picture says something that is in reach
+    ``reachable`` (rows, columns) bool: valid pixels of the picture that are reachable
     ``figures``: mode, exposure, seconds, reachable_share, fine_detail, advice, iterations, kkt; with adaptation also
         the share and the contrast kept before and after it
     """

@@ -1,6 +1,6 @@
-"""Compensation as it was done before: one projector, a division at each pixel (Nayar 2003, Grossberg 2004).
+"""Traditional compensation: one projector, a division at each pixel (Nayar 2003, Grossberg 2004).
 
-It is what superimposed projectors are compared with (paper 6); it knows no neighbours, other projectors or bounds.
+Superimposed projectors are compared with it (paper 6). It ignores neighbours, other projectors and bounds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
     if not 0 <= n < len(calibration.projectors):
         raise UsageError(
             "projector-unknown",
-            what=f"There is no projector number {n + 1}.",
+            what=f"Projector number {n + 1} does not exist.",
             remedy=f"Choose one from 1 to {len(calibration.projectors)}.",
         )
     if target.shape != calibration.black.shape:
@@ -47,7 +47,7 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
     wanted = np.maximum(target - calibration.black, 0)
     light = _sampled(wanted, centre)
     white = _sampled(projector.white, centre)
-    # Where the projector brings no light nothing can be divided; as bright as possible is as near as it gets.
+    # Without light of the projector a division is impossible: use full brightness.
     ratio = np.divide(
         light, white, out=(light > 0).astype(np.float64), where=white > 1e-6 * projector.white.max(initial=0)
     )

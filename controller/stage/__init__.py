@@ -1,3 +1,3 @@
-"""A stage on disk: it is checked (`check.check_stage`), its devices are opened (`open.opened`), and a run is
-made on it by who has its lock and devices (`session.StageSession`).
+"""A stage on disk: checking it (`check.check_stage`), opening its devices (`open.opened`), and runs with its
+lock and devices (`session.StageSession`).
 """

@@ -1,4 +1,4 @@
-"""The bench as a process of its own, for as long as the demo lasts."""
+"""The bench as its own process during the demo."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ TOLD = 400
 class BenchProcess:
     """``velatura emulate STAGE`` in the background. A context manager: starts on entering, ends on leaving.
 
-    It is a process group of its own, so that Ctrl-C reaches the demo alone: the emulated lamps must still be there to
-    be cooled. When the demo is killed, it ends by itself, because its standard input closes.
+    It has its own process group, so that Ctrl-C reaches only the demo: the emulated lamps must still be there to
+    cool. When the demo is killed, the bench ends because its standard input closes.
     """
 
     def __init__(
@@ -42,13 +42,13 @@ class BenchProcess:
         self._disturbed = False
 
     def __enter__(self) -> Self:
-        """Return once its devices are there. Raises what it tells, WorkError("bench-not-started") and Cancelled."""
-        self._tell("Starting the bench: an emulated stage in a process of its own.")
+        """Return once its devices are ready. Raises the bench's error, WorkError("bench-not-started") and Cancelled."""
+        self._tell("Starting the bench (the emulated stage).")
         for left in reversed(range(STARTS)):
             try:
                 self._start()
             except DeviceError as error:
-                # The bench of a demo that was killed a moment ago may be on its way out still.
+                # The bench of a demo that was just killed may still be ending.
                 if error.code != "port-in-use" or not left:
                     raise
             else:
@@ -57,7 +57,7 @@ class BenchProcess:
 
     def _start(self) -> None:
         command = [sys.executable, "-m", "controller", "emulate", str(self._stage), "--json", "--until-input-ends"]
-        # A file, because nobody reads a pipe while the demo works, and a full one would stop the bench.
+        # A file, not a pipe: nothing reads a pipe while the demo works, and a full one would block the bench.
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by end()
         self._process = subprocess.Popen(  # noqa: S603 - our own program
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
@@ -76,7 +76,7 @@ class BenchProcess:
             watcher.join()
 
     def _end_when_cancelled(self) -> None:
-        """While rays are cast the bench may say nothing for a long time; a stop must not wait for its next line."""
+        """While rays are cast the bench may print nothing for a long time; a stop must not wait for its next line."""
         while not self._ready.wait(0.1):
             if self._cancel.is_set():
                 self._process.terminate()
@@ -87,7 +87,7 @@ class BenchProcess:
         for line in self._process.stdout:
             record: dict[str, Any] = json.loads(line) if line.strip() else {}
             if "progress" in record:
-                self._tell(f"Casting rays through the stage: {record['progress']:.0%}")
+                self._tell(f"Casting rays: {record['progress']:.0%}")
             elif "device" in record:
                 self.addresses[record["device"]] = record["address"]
             elif "error" in record:
@@ -102,12 +102,12 @@ class BenchProcess:
         last_words = self._errors.read().decode(errors="replace").split()
         raise WorkError(
             "bench-not-started",
-            what=f"The bench ended before its devices were there: {' '.join(last_words)[-TOLD:]}",
-            remedy="Start `velatura emulate` on the stage by hand to see more.",
+            what=f"The bench ended before its devices were ready: {' '.join(last_words)[-TOLD:]}",
+            remedy="Run `velatura emulate` on the stage to see more.",
         )
 
     def disturb(self, changes: Sequence[Mapping[str, Any]]) -> None:
-        """Change the stage as the bench explains it, () mends all; on return it counts.
+        """Change the stage as the bench explains it; () undoes all changes. The change holds on return.
 
         Raises DeviceError for a change that the bench does not know, WorkError("bench-gone").
         """
@@ -119,10 +119,10 @@ class BenchProcess:
         for line in self._process.stdout:
             if line.strip() and "bumps" in json.loads(line):
                 return
-        raise WorkError("bench-gone", what="The bench ended while the stage was changed.", remedy="Start again.")
+        raise WorkError("bench-gone", what="The bench ended during a change of the stage.", remedy="Start again.")
 
     def end(self) -> None:
-        """Ask the bench to end, and make it end."""
+        """Ask the bench to end; kill it if it does not."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -137,7 +137,7 @@ class BenchProcess:
 
 
 def bench_of(stage: Path, settings: Mapping[str, Any] | None = None) -> Bench:
-    """The bench that this installation has, for ``stage``; settings as its driver explains them.
+    """The installed bench for ``stage``; settings as its driver explains them.
 
     Raises UsageError("extra-missing") or PluginError("driver-unknown") where there is none.
     """
@@ -151,7 +151,7 @@ def bench_of(stage: Path, settings: Mapping[str, Any] | None = None) -> Bench:
 
 
 def terminated_when_input_ends() -> None:
-    """From now on SIGTERM comes when standard input closes: so a child learns that its parent was killed."""
+    """Send SIGTERM when standard input closes: so a child notices that its parent was killed."""
 
     def watch() -> None:
         while sys.stdin.buffer.read(4096):

@@ -1,6 +1,6 @@
-"""What a stage's folder holds that is finished: its calibrations, and who may sign its bundles.
+"""A stage's finished calibrations, and the keys that may sign its bundles.
 
-Light on purpose: the kiosk asks for this before its first picture, when nothing that calibrates is loaded yet.
+It imports little: the kiosk uses it before its first picture, before the calibration code is loaded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from controller.stage.check import Checked
 
 
 def stage_trust(stage: Stage) -> Trust:
-    """Which bundles stage.toml lets play."""
+    """Which bundles stage.toml allows."""
     table = stage.tables.bundle
     keys, revoked = (tuple(map(bytes.fromhex, keys)) for keys in (table.trusted_keys, table.revoked_keys))
     return Trust(keys, table.allow_unsigned, revoked)
@@ -26,7 +26,7 @@ def stage_trust(stage: Stage) -> Trust:
 def finished_calibrations(stage: Path) -> list[Path]:
     """The run folders whose calibration is complete, the newest first.
 
-    One whose journal is damaged counts as not complete, as for whoever resumes it; it takes no other one with it.
+    A run with a damaged journal counts as not complete.
     Raises JournalError for a journal that can't be used now.
     """
     found = []
@@ -56,7 +56,7 @@ def finished_calibration(stage: Path) -> Path:
 
 
 def worst_grade(checked: Checked) -> float:
-    """The largest error, in per cent, with which the stage publishes."""
+    """The largest error, in per cent, at which the stage publishes."""
     return checked.stage.tables.calibration.worst_grade
 
 

@@ -1,4 +1,4 @@
-"""stage.toml with every key checked, the drivers' own among them, before anything is opened or switched on."""
+"""Checks every key of stage.toml, including the drivers' keys, before a device is opened."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from hal.registry import Driver, Drivers, OpenContext, check_device, load_driver
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A stage whose every table has been checked; nothing is opened or switched on yet.
+    """A completely checked stage; no device is opened yet.
 
-    ``faults``: drivers that failed to check their settings. Opening the device shows whether it works nevertheless.
+    ``faults``: drivers that failed to check their settings. Their devices may still open.
     """
 
     stage: Stage
@@ -37,7 +37,7 @@ class Checked:
 
     @property
     def prior(self) -> CameraPrior:
-        """What stage.toml knows of the camera, and what was measured on the stage.
+        """The camera's values from stage.toml and from measurements on the stage.
 
         Raises UsageError as ``read_intrinsics``, and "stage-key-missing" without any focal length.
         """
@@ -49,7 +49,7 @@ class Checked:
                 distance_m=table.distance_m, distance_rel_sigma=table.distance_rel_sigma, distances=distances
             )
         if table.focal_length_px is None:
-            allowed = "a number above 0, unless intrinsics names a file of `velatura camera calibrate`"
+            allowed = "a number above 0, or intrinsics with a file from `velatura camera calibrate`"
             raise table.place.missing("focal_length_px", allowed, written=[])
         return CameraPrior(
             focal_length_px=table.focal_length_px,
@@ -66,7 +66,7 @@ class Checked:
 
 
 def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
-    """Read stage.toml and check every key, the drivers' own among them, before anything is opened.
+    """Read stage.toml and check every key, including the drivers' keys; opens no device.
 
     Raises UsageError (see ``controller.config.load_stage``) and PluginError("driver-unknown").
     """
@@ -114,7 +114,7 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
 
 
 def mistake_in(table: OpenConfigTable, settings: Mapping[str, Any], error: DeviceError) -> UsageError:
-    """What a driver finds wrong in its settings, as the mistake in stage.toml that it is, told with its line."""
+    """Turn a driver's error about its settings into an error with the line in stage.toml."""
     place = table.place
     named = (key for key, value in settings.items() if f"'{key}'" in error.what or f"'{value}'" in error.what)
     line = place.line(next(named, None))

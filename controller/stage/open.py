@@ -1,4 +1,4 @@
-"""From a checked stage to opened devices, a player and a rig; nothing else builds them."""
+"""From a checked stage to opened devices, a player and a rig. The only place that builds them."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ OPEN_S = 20.0
 
 @contextlib.contextmanager
 def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iterator[Rig]:
-    """Open every device of the stage and start the player; close them, and end the player, on leaving.
+    """Open every device of the stage and start the player; on leaving, close the devices and end the player.
 
-    ``plays``: the player starts with the installed bundle, and a start that shows no picture of it counts as failed.
+    ``plays``: the player starts with the installed bundle; the start fails if it shows no picture of it.
 
-    Mains relays are closed first. They and the lamps are left as they are: switching them off is ``lit``'s.
+    Mains relays are closed first. This function switches no relay or lamp off: ``lit`` does that.
     """
     stage = checked.stage
     context = OpenContext(stage=stage.folder, runtime=runtime_folder(stage.folder))
@@ -57,7 +57,7 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
         driver, settings = checked.camera
         camera = cast("Camera", open_device(stage.tables.camera, driver, settings, context, deadline))
         _closed_by(stack, camera)
-        # A stage that names the player's socket has a player already, for instance systemd's.
+        # If the stage names the player's socket, a player runs already, for instance under systemd.
         if checked.stage.tables.display.driver == "player" and "socket" not in checked.display[1]:
             stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
@@ -68,7 +68,7 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
 
 @contextlib.contextmanager
 def technicians_panel(checked: Checked, *, deadline: Deadline) -> Iterator[ButtonPanel | None]:
-    """The panel of [key_panel] for a ``rig.key_panel.KeyService``, closed on leaving; None where the stage has none."""
+    """The panel of [key_panel] for a ``rig.key_panel.KeyService``, closed on leaving; None if the stage has none."""
     table = checked.stage.tables.key_panel
     if table is None or checked.key_panel is None:
         yield None
@@ -109,7 +109,7 @@ def open_device(
 ) -> object:
     """Open a device as ``hal.registry.open_device``.
 
-    What the driver finds wrong in its settings is a mistake in stage.toml, told with its line.
+    An error that the driver finds in its settings is raised with the line in stage.toml.
     """
     try:
         name = str(getattr(table, "name", ""))
@@ -119,7 +119,7 @@ def open_device(
 
 
 def _closed_by(stack: contextlib.ExitStack, device: Device) -> None:
-    """Close ``device`` on leaving. What its driver raises then never hides the error for which the stage is left."""
+    """Close ``device`` on leaving. A driver's error here never hides the error that ended the work."""
 
     def leave(kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         try:
@@ -136,18 +136,18 @@ def _player(stage: Stage, context: OpenContext, *, plays: bool) -> PlayerProcess
     """The player of this stage; a context manager that ends it."""
     assert context.runtime is not None
     settings = player_settings(stage, context.runtime, plays=plays)
-    # A run that was killed leaves its player, which plays on by design; it still has our socket.
+    # A killed run leaves its player running by design; it still has our socket.
     return replace_player(context.runtime, settings)
 
 
 def player_settings(stage: Stage, runtime: Path, *, plays: bool) -> PlayerSettings:
-    """What the stage's player is started with; ``plays``: with the installed bundle, if there is one."""
+    """Arguments of the stage's player; ``plays``: with the installed bundle, if there is one."""
     table = stage.tables.display
     frames = None if table.frames is None else stage.path(table.frames)
     if frames is not None:
         frames.parent.mkdir(parents=True, exist_ok=True)
-    # Given as the link, so that a bundle that never shows a picture is given up. Not to a
-    # calibration, which must go on whatever is installed.
+    # As the link, so that the player drops a bundle that never shows a picture. Not for a
+    # calibration, which must work with any installed bundle.
     bundle = stage.folder / "bundles" / CURRENT
     return PlayerSettings(
         outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
@@ -161,7 +161,7 @@ def player_settings(stage: Stage, runtime: Path, *, plays: bool) -> PlayerSettin
 
 
 def _key_files(keys: Sequence[str], folder: Path, name: str) -> list[Path]:
-    """Public key files for the player, which reads no stage.toml."""
+    """Public key files for the player, which does not read stage.toml."""
     paths = [folder / f"{name}-{number}.pub" for number in range(len(keys))]
     for path, key in zip(paths, keys, strict=True):
         write_public_key(path, bytes.fromhex(key))

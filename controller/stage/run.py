@@ -1,4 +1,4 @@
-"""What every run on a stage shares: the stage's lock, its folder among the runs, marker steps."""
+"""Shared by every run on a stage: the stage's lock, the run's folder, marker steps."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from controller.run.step_id import StepId
 
 LONGEST_RUN_S = 12 * 3600.0
 LOCK = "run/lock"
-"""Held by whoever works on the stage."""
+"""Held by the program that works on the stage."""
 
 
 def marker(kind: str, title: str, *, enter: Event | None = None, leave: Event | None = None) -> Step:
-    """A step that only moves the state machine; never skipped, so that a resumed run is in the right state too."""
+    """A step that only changes the state; never skipped, so that a resumed run is in the right state, too."""
     return Step(StepId(kind), lambda _: (), title=title, weight=0.01, enter=enter, leave=leave, always=True)
 
 
 def stage_lock(folder: Path) -> contextlib.AbstractContextManager[None]:
-    """The lock of whoever works on the stage. Raises UsageError("already-running")."""
+    """Hold the stage's lock. Raises UsageError("already-running")."""
     return exclusive(folder / LOCK, what_is_running="Velatura")
 
 
 def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:
-    """The newest run folder of ``name`` whose work was begun and not finished, or a new one, not yet made.
+    """The newest run folder of ``name`` with unfinished work, or the path for a new one.
 
-    ``finished``: the newest one, finished or not. For the holder of the stage's lock.
+    ``finished``: the newest one, finished or not. Only for the holder of the stage's lock.
     """
     runs = stage / "runs"
     for folder in sorted(runs.glob(f"*-{name}"), reverse=True):

@@ -1,4 +1,4 @@
-"""Who has a stage's lock and devices while something is done with the stage, given to every service that needs them."""
+"""Gives services a stage's lock and devices while they work on the stage."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StageSession(ABC):
 
     @abstractmethod
     def locked(self) -> contextlib.AbstractContextManager[None]:
-        """For work that touches no device: inside, no one else works on the stage.
+        """For work without devices: inside, no other program works on the stage.
 
         Raises UsageError("already-running").
         """
@@ -54,19 +54,18 @@ class StageSession(ABC):
     ) -> Path:
         """Run the steps of a new or unfinished run of this name with the lamps on; the run's folder.
 
-        ``checked``: the session's stage; ``dark``: not in a bright room, where the stage has a light sensor;
-        ``plays``: as in ``stage.open.opened``; ``before``: steps that come before the lamps are struck, where they are
-        not lit already.
+        ``checked``: the session's stage; ``dark``: refuse a bright room, if the stage has a light sensor;
+        ``plays``: as in ``stage.open.opened``; ``before``: steps before the lamps are struck, if they are not lit yet.
         Raises what the steps raise; UsageError("already-running") if another program works on the stage.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class OwnSession(StageSession):
-    """Takes the stage's lock, opens its devices and strikes its lamps for each run, and leaves the lamps safe.
+    """For each run: takes the stage's lock, opens its devices, strikes its lamps, and leaves the lamps safe.
 
     ``around`` is entered before the devices are opened and left when they are closed
-    ``again``: a finished run of the name is continued, too; what it has done already is not repeated
+    ``again``: continue a finished run of the name, too; its finished steps are not repeated
     """
 
     stage: Path
@@ -112,7 +111,7 @@ class OwnSession(StageSession):
 
 @dataclass(frozen=True, slots=True)
 class BorrowedSession(StageSession):
-    """Uses what the kiosk holds: its lock, and the lit ``rig`` that it lends; None for work that touches no device.
+    """Uses the kiosk's lock and its lit ``rig``; ``rig`` is None for work without devices.
 
     The lamps stay lit, and the state machine is the kiosk's.
     """
@@ -138,7 +137,7 @@ class BorrowedSession(StageSession):
     ) -> Path:
         """See ``StageSession``. Raises ValueError without a rig."""
         if self.rig is None:
-            raise ValueError("this session was given no devices to work with")
+            raise ValueError("this session has no devices")
         with kernels_compiled(reporter) as compiled, Journal(unfinished_run(self.rig.stage, name)) as journal:
             clear_unfinished_writes(journal.folder)
             first = dark_before(self.rig.darkness) if dark else []

@@ -1,3 +1,1 @@
-"""The steps of runs, by what they produce: photographs, calibrations, appearances. `costs` says how long each
-takes.
-"""
+"""The steps of runs, by their products: photographs, calibrations, appearances. `costs` estimates their times."""

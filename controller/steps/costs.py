@@ -1,7 +1,7 @@
-"""What steps cost in seconds on the reference machine (2 cores, emulated stage), to tell the time left by.
+"""Cost of steps in seconds on the reference machine (2 cores, emulated stage), to estimate the time left.
 
-Measured at the sizes small and medium; between them, what works on every pixel grows with the pixels, and a photograph
-has a part that does not.
+Measured at the sizes small and medium. Work on every pixel grows with the number of pixels; a photograph also has a
+constant part.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def scale(sizes_px: Iterable[tuple[int, int]]) -> float:
 
 
 def shot_s(of_scale: float) -> float:
-    """A photograph, shown, settled, exposed and transferred."""
+    """A photograph: show, settle, expose, transfer."""
     return 0.18 + 0.05 * of_scale
 
 
@@ -36,5 +36,5 @@ def geometry_s(of_scale: float) -> float:
 
 
 def dots_s(of_scale: float, photographs: int) -> float:
-    """Metapixels from that many photographs of dots: the fits, and the development of each photograph."""
+    """Metapixels from so many photographs of dots: the fits, and the development of each photograph."""
     return of_scale * (0.8 + 0.06 * photographs)

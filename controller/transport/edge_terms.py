@@ -1,4 +1,4 @@
-"""A light transport that tells at depth edges what was measured there, whatever its model of a projector pixel.
+"""A light transport with the measured light at depth edges, for any model of a projector pixel.
 
 T p gains W_n (.) E_n (M_n p_n) for each projector. E_n is sparse: measured share less the model's, of the few projector
 pixels that fall on two surfaces, at the camera pixels that see them. Its rows sum to 0, so T_n 1 stays the white image.
@@ -26,7 +26,7 @@ NOISES: Final = 2.0
 MOST: Final = 1.0
 LEAST_SHARE: Final = 0.03
 LEAST_CHANGE: Final = 0.04
-"""Of its light; a camera pixel none of whose shares changes by more is left to the model."""
+"""Share of its light; a camera pixel with smaller changes keeps the model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class EdgedTransport(LightTransport):
     def submatrix(
         self, box: CameraBox, pixels: npt.NDArray[np.int64], channels: tuple[int, ...]
     ) -> sp.csr_matrix[np.float64]:
-        """The model's part of T, and what the measured terms add to it, as ``LightTransport.submatrix``."""
+        """The model's part of T plus the measured terms, as ``LightTransport.submatrix``."""
         model = self.model.submatrix(box, pixels, channels)
         return sp.csr_matrix(model + self._term_rows(box, pixels, channels))
 
@@ -151,7 +151,7 @@ def terms_from(
 
 
 def with_terms(model: LightTransport, terms: tuple[EdgeTerm, ...]) -> EdgedTransport:
-    """``model`` with what was measured at depth edges; one term a projector."""
+    """``model`` with the measurement at depth edges; one term for each projector."""
     return EdgedTransport(model.mixing, model.lit, model.per_weight, model.sizes, model, terms)
 
 
@@ -165,7 +165,7 @@ def edge_term(model: LightTransport, n: int, measured: EdgeShares, white: FloatI
     camera, projector, share = (part[lit] for part in (measured.camera, measured.projector, measured.share))
     difference = share - _modelled(model, n, measured.pattern, camera, projector, white)
     difference, noise = _shrunk(np.clip(difference, -MOST, MOST))
-    # What is neither different nor much of the light only costs time in every product.
+    # Small differences of small shares only cost time in every product.
     _, row = np.unique(camera, return_inverse=True)
     largest = np.zeros(int(row.max(initial=-1)) + 1, np.float32)
     np.maximum.at(largest, row, np.abs(difference))
@@ -203,7 +203,7 @@ def _modelled(
 
 
 def _shrunk(difference: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], float]:
-    """Without what is no more than noise, and the size of that, which the many small differences tell."""
+    """Without differences of the size of the noise, which is estimated from the many small differences."""
     if not difference.size:
         return difference, 0.0
     noise = 1.4826 * float(np.median(np.abs(difference)))

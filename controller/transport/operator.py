@@ -37,8 +37,8 @@ class LightTransport(LinearOperator[np.float32], ABC):
     """T without its black image K, for all projectors of a stage and three channels at once.
 
     It is a SciPy linear operator from planes (3, pixels of all projectors) to planes (3, camera rows, columns), both
-    flat: ``lsqr(T, b)``, ``lsq_linear(T, b, (0, 1))`` and ``svds(T)`` take it as it is. ``forward`` and ``adjoint`` do
-    the same with pictures. SciPy's transposed operator is ``T.H``.
+    flat: ``lsqr(T, b)``, ``lsq_linear(T, b, (0, 1))`` and ``svds(T)`` accept it directly. ``forward`` and ``adjoint``
+    do the same with pictures. SciPy's transposed operator is ``T.H``.
 
     ``shape``: (3 camera pixels, 3 projector pixels); ``dtype``: float32
     ``mixing`` (projectors, 3, 3) float32: camera channel by projector channel

@@ -1,4 +1,4 @@
-"""Between images (rows, columns, 3), as everyone else has them, and planes (3, ...), as the products want them."""
+"""Converts between images (rows, columns, 3) and the planes (3, ...) of the products."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ _scratch: list[FloatImage] = []
 
 @contextmanager
 def borrow(shape: tuple[int, ...]) -> Iterator[FloatImage]:
-    """A float32 array with any content. Whoever calls at the same time gets another one; one is kept afterwards."""
-    # pop and append of a list are one step each, whoever else does the same
+    """A float32 array with any content. A simultaneous caller gets another one; one is kept afterwards."""
+    # pop and append of a list are atomic
     try:
         array = _scratch.pop()
     except IndexError:

@@ -1,1 +1,1 @@
-"""Protocols as pure functions from bytes to values and back; nothing here opens, waits or keeps time."""
+"""Protocols as pure functions from bytes to values and back; no I/O and no clock."""

@@ -1,4 +1,4 @@
-"""What every driver must do, as tests: ours and a third party's run the same ones, with one line each.
+"""Tests for every driver, ours and third-party ones. Each needs only a few lines:
 
     from hal.conformance import CameraConformance
 
@@ -7,8 +7,8 @@
         def camera(self): return MyCamera.open("emulated")
 
 The fixture (``projector``, ``camera``, ``display``, ``power_switch``, ``light_sensor`` or ``button_panel``) gives an
-opened device and closes it afterwards. The device may be in any healthy state when a test gets it. Class attributes say
-how patient a test is; give a slow device more. This is the only part of ``hal`` that needs pytest.
+opened device and closes it afterwards. The device may be in any healthy state at the start of a test. Class attributes
+are the tests' time limits; increase them for a slow device. Only this part of ``hal`` needs pytest.
 """
 
 from hal.conformance.button_panel import ButtonPanelConformance

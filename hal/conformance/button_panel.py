@@ -1,4 +1,4 @@
-"""What every driver of a panel with keys must do."""
+"""Tests for drivers of key panels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hal.interfaces import ButtonPanel
 
 
 class ButtonPanelConformance(DeviceConformance):
-    """Run on every key panel driver; supply a fixture ``button_panel``. Nobody presses a key meanwhile."""
+    """Run on every key panel driver; supply a fixture ``button_panel``. Do not press a key during the test."""
 
     def test_says_who_it_is(self, button_panel: ButtonPanel) -> None:
         assert isinstance(button_panel, ButtonPanel)

@@ -1,4 +1,4 @@
-"""What every camera driver must do."""
+"""Tests for camera drivers."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class CameraConformance(DeviceConformance):
         self.configure_short(camera)
         files = camera.capture(tmp_path / "shot.of-the-day", deadline=self.soon())
         self.check_files(files, tmp_path / "shot.of-the-day")
-        assert sorted(file.path for file in files) == sorted(tmp_path.iterdir()), "nothing else may lie beside them"
+        assert sorted(file.path for file in files) == sorted(tmp_path.iterdir()), "no other files may be in the folder"
         assert all(file.path.stat().st_ino in synced for file in files), "every file is fsynced"
 
     def test_the_kind_of_file_follows_the_setting(self, camera: Camera, tmp_path: Path) -> None:

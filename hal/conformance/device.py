@@ -1,4 +1,4 @@
-"""What holds for every kind of device."""
+"""Tests for every kind of device."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from hal.interfaces import Device
 
 
 class DeviceConformance:
-    """What holds for every kind of device; the subclasses below add their kind."""
+    """Tests for every kind of device; subclasses add those of their kind."""
 
     patience_s: ClassVar[float] = 30.0
     """Deadline of an ordinary call."""
     prompt_s: ClassVar[float] = 6.0
-    """A call whose deadline has passed, or that was cancelled, must have ended after this."""
+    """A call must end within this time after its deadline or cancellation."""
 
     def soon(self) -> Deadline:
         return in_seconds(self.patience_s)
 
     def check_identity(self, device: Device) -> None:
         who = device.identity(deadline=self.soon())
-        assert who.model.strip(), "the device must say which model it is"
+        assert who.model.strip(), "the device must report its model"
 
     def check_closes_twice(self, device: Device) -> None:
         for _ in range(2):

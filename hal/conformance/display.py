@@ -1,4 +1,4 @@
-"""What every display driver must do."""
+"""Tests for display drivers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every driver of a light sensor must do."""
+"""Tests for drivers of light sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every driver of mains relays must do."""
+"""Tests for drivers of mains relays."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PowerSwitchConformance(DeviceConformance):
         for channel in channels:
             power_switch.switch(channel, True, deadline=self.soon())
             states = [power_switch.state(other, deadline=self.soon()) for other in channels]
-            assert states == [other == channel for other in channels], "just this one passes current"
+            assert states == [other == channel for other in channels], "only this one is closed"
             power_switch.switch(channel, False, deadline=self.soon())
             assert not power_switch.state(channel, deadline=self.soon())
 

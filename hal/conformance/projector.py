@@ -1,4 +1,4 @@
-"""What every projector driver must do."""
+"""Tests for projector drivers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ProjectorConformance(DeviceConformance):
     """Run on every projector driver; supply a fixture ``projector``. It switches the lamp on and off."""
 
     poll_s: ClassVar[float] = 0.5
-    """Pause between two questions while the lamp warms or cools."""
+    """Pause between two queries while the lamp warms or cools."""
 
     def test_says_who_it_is(self, projector: Projector) -> None:
         assert isinstance(projector, Projector)
@@ -42,13 +42,13 @@ class ProjectorConformance(DeviceConformance):
         assert projector.status(deadline=self.soon()).power is Power.ON, "switching on twice is harmless"
         projector.switch_off(deadline=self.soon())
         after = projector.status(deadline=self.soon()).power
-        assert after in (Power.COOLING, Power.OFF), "the status must be fresh, not remembered"
+        assert after in (Power.COOLING, Power.OFF), "the status must be new, not stored"
         self.bring(projector, Power.OFF)
         projector.switch_off(deadline=self.soon())
         assert projector.status(deadline=self.soon()).power is Power.OFF, "switching off twice is harmless"
 
     def check_power_is_refused(self, projector: Projector) -> None:
-        """A driver that cannot switch says so, and claims to know no more than it does."""
+        """A driver that can't switch reports this, and reports no power state that it can't know."""
         for switch in (projector.switch_on, projector.switch_off):
             with pytest.raises(DeviceRefused) as caught:
                 switch(deadline=self.soon())
@@ -57,7 +57,7 @@ class ProjectorConformance(DeviceConformance):
 
     def test_on_while_the_lamp_cools_is_refused_or_kept_safe(self, projector: Projector) -> None:
         if not projector.capabilities.power:
-            return  # it refuses always, as tested above
+            return  # it always refuses, as tested above
         self.bring(projector, Power.ON)
         projector.switch_off(deadline=self.soon())
         if projector.status(deadline=self.soon()).power is not Power.COOLING:
@@ -97,13 +97,13 @@ class ProjectorConformance(DeviceConformance):
         self.check_closes_twice(projector)
 
     def lit(self, projector: Projector) -> ProjectorStatus:
-        """The status with the lamp on, where the driver can switch it; else as it is."""
+        """The status with the lamp on, if the driver can switch it; else unchanged."""
         if projector.capabilities.power:
             return self.bring(projector, Power.ON)
         return projector.status(deadline=self.soon())
 
     def bring(self, projector: Projector, wanted: Power) -> ProjectorStatus:
-        """Bring the lamp to ON or OFF by the driver's own calls, from whatever state it is in."""
+        """Bring the lamp to ON or OFF by the driver's own calls, from any state."""
         rules = projector.capabilities.lamp_rules
         deadline = in_seconds(self.patience_s + 2 * (rules.warm_up_s + rules.cool_down_s + rules.minimum_off_s))
         while True:
@@ -122,5 +122,5 @@ class ProjectorConformance(DeviceConformance):
         try:
             projector.switch_on(deadline=self.soon())
         except DeviceRefused:
-            # Standby is told before the minimum off time is over on some models; the loop asks again.
+            # Some models report standby before the minimum off time is over; the loop asks again.
             time.sleep(self.poll_s)

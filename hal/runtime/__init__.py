@@ -1,4 +1,4 @@
-"""How the program runs on this computer: processors, compiled kernels, caches, safe reading of files.
+"""Support for this computer: processors, compiled kernels, caches, safe reading of files.
 
 Start with `compute.prepare_threads`, `kernels.Compilation`, `caches.kept` and `files.read_text`.
 """

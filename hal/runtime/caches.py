@@ -1,7 +1,7 @@
-"""What Velatura keeps outside a stage's folder and its own installation: compiled kernels, sockets, crash reports.
+"""Velatura's files outside stages and its installation: compiled kernels, sockets, crash reports.
 
-``python -m hal.runtime.caches`` lists it, ``python -m hal.runtime.caches remove`` removes what no running
-program uses. Imports nothing beyond the standard library, so that it also works without an environment.
+``python -m hal.runtime.caches`` lists them, ``python -m hal.runtime.caches remove`` removes those that no running
+program uses. Imports only the standard library, so that it also works without an environment.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from typing import Final
 RUNTIME: Final = "velatura-{uid}-*"
 """Folders of sockets (``controller.core.storage.runtime_folder``)."""
 TEMPORARY: Final = "velatura-tmp-"
-"""How temporary folders begin."""
+"""Prefix of temporary folders."""
 SHORTEST: Final = Path("/tmp")  # noqa: S108 - mkdtemp makes the private folder in it
-"""Where a folder's path is short, because that of a unix socket must be."""
+"""A folder with a short path, because a unix socket's path must be short."""
 LOCK: Final = "lock"
-"""In such a folder: held by its process."""
+"""Lock file in such a folder, held by its process."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """A folder outside the stage: what lies in it, its bytes, and whether a running program uses it."""
+    """A folder outside the stage: its content, its bytes, and whether a running program uses it."""
 
     path: Path
     what: str
@@ -39,7 +39,7 @@ class Kept:
 
 
 def cache_folder() -> Path:
-    """Where compiled kernels are kept: ``VELATURA_CACHE``, else ``velatura`` in the user's cache folder.
+    """Folder of compiled kernels: ``VELATURA_CACHE``, else ``velatura`` in the user's cache folder.
 
     Raises RuntimeError for a user without a home folder.
     """
@@ -51,7 +51,7 @@ def cache_folder() -> Path:
 
 
 def state_folder() -> Path:
-    """Where crash reports go. Raises RuntimeError for a user without a home folder."""
+    """Folder of crash reports. Raises RuntimeError for a user without a home folder."""
     named = os.environ.get("XDG_STATE_HOME")
     return (Path(named) if named else Path.home() / ".local" / "state") / "velatura"
 
@@ -62,14 +62,14 @@ def temporary_folder() -> Path:
 
 
 def runtime_base() -> Path:
-    """Where folders of sockets are made."""
+    """Parent of the folders of sockets."""
     return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
 
 
 def prepare_libraries() -> None:
-    """Let matplotlib, before it is imported, keep its settings and font list in our folder, not in the user's.
+    """Set, before matplotlib is imported, our folder for its settings and font list, instead of the user's.
 
-    Where that can't be written it makes a temporary one for itself, and need not say so.
+    If our folder can't be written, matplotlib uses a temporary one, and its warning is not needed.
     """
     with contextlib.suppress(RuntimeError):
         os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))
@@ -78,9 +78,9 @@ def prepare_libraries() -> None:
 
 @contextlib.contextmanager
 def temporary(base: Path | None = None) -> Iterator[Path]:
-    """A private folder that is removed on leaving; of a killed process, ``remove`` finds it. Raises ``OSError``.
+    """A private folder that is removed on leaving; ``remove`` finds that of a killed process. Raises ``OSError``.
 
-    ``base``: where, ``SHORTEST`` for one that is to hold sockets; None: the system's folder for temporary files.
+    ``base``: its parent, ``SHORTEST`` for sockets; None: the system's folder for temporary files.
     """
     folder = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=base))
     try:
@@ -92,7 +92,7 @@ def temporary(base: Path | None = None) -> Iterator[Path]:
 
 
 def kept() -> list[Kept]:
-    """Everything that is there now."""
+    """All existing folders."""
     found = []
     for path, what in _places():
         with contextlib.suppress(OSError):
@@ -102,10 +102,10 @@ def kept() -> list[Kept]:
 
 
 def remove() -> list[Kept]:
-    """Remove what no running program uses; returns what was removed."""
-    removed = [one for one in kept() if not one.in_use]
-    for one in removed:
-        shutil.rmtree(one.path, ignore_errors=True)
+    """Remove the folders that no running program uses; returns the removed ones."""
+    removed = [folder for folder in kept() if not folder.in_use]
+    for folder in removed:
+        shutil.rmtree(folder.path, ignore_errors=True)
     return removed
 
 
@@ -120,7 +120,7 @@ def _places() -> Iterator[tuple[Path, str]]:
 
 
 def _in_use(folder: Path) -> bool:
-    """Whether a program listens at a socket in it, or holds its lock."""
+    """Whether a program listens at a socket in the folder, or holds its lock."""
     lock = folder / LOCK
     if lock.is_file():
         with lock.open("rb") as file:
@@ -145,13 +145,13 @@ def _size(folder: Path) -> int:
 
 
 def summary(found: Sequence[Kept]) -> list[str]:
-    """One sentence for each kind of folder, with its place where there is only one."""
+    """One sentence for each kind of folder, with its path if there is only one."""
     lines = []
-    for what in dict.fromkeys(one.what for one in found):
-        same = [one for one in found if one.what == what]
+    for what in dict.fromkeys(folder.what for folder in found):
+        same = [folder for folder in found if folder.what == what]
         where = str(same[0].path) if len(same) == 1 else f"{len(same)} folders like {same[0].path}"
-        used = sum(one.in_use for one in same)
-        lines.append(f"{where}: {what}, {sum(one.size_bytes for one in same) / 1e6:.1f} MB, {used} in use.")
+        used = sum(folder.in_use for folder in same)
+        lines.append(f"{where}: {what}, {sum(folder.size_bytes for folder in same) / 1e6:.1f} MB, {used} in use.")
     return lines
 
 

@@ -1,7 +1,7 @@
-"""How compiled numeric code runs on this machine: which CPUs it may use, how its threads wait, where it is kept.
+"""Compiled numeric code on this machine: its CPUs, how its threads wait, and its folder.
 
 Shared by the controller and the emulated bench, whose kernels are compiled by numba. Importing this module loads
-nothing beyond the standard library and changes nothing.
+only the standard library and changes nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hal.runtime.caches import cache_folder, temporary
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("controller", "plugins", "hal", "benchmarks", "tests")
-"""Whose kernels are kept in the cache."""
+"""Packages with kernels."""
 LOCATORS: Final = "hal.runtime.compute.KernelFolder,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
 _IMPORT: Final = re.compile(
     rf"^[ \t]*from[ \t]+((?:{'|'.join(PACKAGES)})[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)", re.MULTILINE
@@ -28,7 +28,7 @@ _IMPORT: Final = re.compile(
 
 
 def usable_cpus(groups: Path = Path("/sys/fs/cgroup"), membership: Path = Path("/proc/self/cgroup")) -> int:
-    """CPUs that this process may keep busy, at least 1: its affinity, and the quotas of its control groups.
+    """Number of CPUs that this process may use, at least 1: by its affinity and the quotas of its control groups.
 
     Args:
         groups: Where control groups are mounted, version 1 or 2.
@@ -44,19 +44,19 @@ def affinity() -> int:
 
 
 def prepare_threads() -> None:
-    """Set, in the environment, what numba and its OpenMP library read before the first kernel runs.
+    """Set the environment variables for numba and its OpenMP library, before the first kernel runs.
 
-    OpenMP's threads spin while they wait. Beside other busy programs each then spins for a thread that has no CPU, and
-    a solve takes up to 40 times as long (docs/decisions/0035). A variable that the user has set is kept.
+    OpenMP's threads spin while they wait. With other busy programs, each spins for a thread that has no CPU, and
+    a solve takes up to 40 times as long (docs/decisions/0035). A variable set by the user is kept.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    if usable_cpus() < affinity():  # numba knows the affinity, and no control groups
+    if usable_cpus() < affinity():  # numba uses the affinity, but no control groups
         os.environ.setdefault("NUMBA_NUM_THREADS", str(usable_cpus()))
     os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)
 
 
 def kernel_folder() -> Path:
-    """Where compiled kernels are kept: in ``hal.runtime.caches.cache_folder``."""
+    """The folder of compiled kernels, in ``hal.runtime.caches.cache_folder``."""
     return cache_folder() / "kernels"
 
 
@@ -77,7 +77,7 @@ def _make_private(folder: Path) -> None:
 
 
 class KernelFolder:
-    """Tells numba where a kernel's machine code is kept: a folder named after the contents of its sources.
+    """Gives numba the folder of a kernel's machine code, named after the contents of its sources.
 
     The sources are the kernel's file and every file of this project that it imports, because numba compiles called
     kernels and constants into their caller. Copies of one version share a folder, so a checkout, an installed package
@@ -91,9 +91,9 @@ class KernelFolder:
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> KernelFolder | None:
-        """For ``function`` in ``file``; None where the file is not this project's.
+        """For ``function`` in ``file``; None if the file is not part of this project.
 
-        Where no folder of the user's can be written, the kernels of this process are kept until it ends.
+        If the user has no writable folder, this process's kernels are kept until it ends.
         """
         source = Path(file).resolve()
         if not source.is_relative_to(ROOT) or source.relative_to(ROOT).parts[0] not in PACKAGES:
@@ -117,11 +117,11 @@ class KernelFolder:
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        """What the sources were when the kernel was compiled."""
+        """Identifies the sources of the compiled kernel."""
         return digest_of(self._source)
 
     def get_disambiguator(self) -> str:
-        """Tells kernels of one name in one file apart: the line."""
+        """Distinguishes kernels of one name in one file: the line."""
         return str(self._line)
 
 
@@ -149,7 +149,7 @@ def digest_of(source: Path) -> str:
 
 @cache
 def _imported(source: Path) -> frozenset[Path]:
-    """Files of this project that ``source`` imports itself, at its top or inside its functions."""
+    """Files of this project that ``source`` imports directly, at its top or inside its functions."""
     named = set()
     for module, names in _IMPORT.findall(source.read_text(encoding="utf-8")):
         named |= {module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))}

@@ -1,7 +1,7 @@
-"""Reading files that somebody else wrote: only regular ones, only up to a size, pictures up to a number of pixels.
+"""Safe reading of foreign files: only regular ones, up to a size, pictures up to a number of pixels.
 
-A pipe in the place of a file would block its reader for ever, and a picture of a few kilobytes can stand for gigabytes
-of pixels. Every error is an ``OSError``, whose ``strerror`` goes on after "it can't be read:".
+A pipe instead of a file would block its reader, and a picture of a few kilobytes can have gigabytes of
+pixels. Every error is an ``OSError``, whose ``strerror`` continues the text "it can't be read:".
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 MOST_PIXELS: Final = 128_000_000
-"""Of a picture that is read: more than any camera on the market has, and still light of 1.5 GB."""
+"""Largest picture: more pixels than any camera has, and 1.5 GB as linear light."""
 LARGEST_TEXT: Final = 1 << 20
 """Bytes of a text file that a person writes."""
 LARGEST_PICTURE: Final = 2 << 30
@@ -31,7 +31,7 @@ _NO_SIZE: Final = {0xC4, 0xC8, 0xCC}
 
 
 class UnfitFile(OSError):
-    """A file that is not read although it is there: not a regular one, too large, or a picture of too many pixels."""
+    """A file that is not read: not a regular one, too large, or a picture of too many pixels."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(errno.EINVAL, reason, str(path))
@@ -39,7 +39,7 @@ class UnfitFile(OSError):
 
 
 def require_regular(path: Path, largest: int | None = None) -> None:
-    """For readers that open ``path`` themselves. Raises ``OSError``; ``UnfitFile`` where it is not a regular file."""
+    """For readers that open ``path`` themselves. Raises ``OSError``; ``UnfitFile`` if it is not a regular file."""
     _check_name(path)
     _check(path, path.stat(), largest)
 
@@ -47,7 +47,7 @@ def require_regular(path: Path, largest: int | None = None) -> None:
 def read_bytes(path: Path, largest: int = LARGEST_PICTURE) -> bytes:
     """The bytes of a regular file. Raises ``OSError``; ``UnfitFile`` for another kind or above ``largest``."""
     _check_name(path)
-    # Without O_NONBLOCK the opening of a pipe already waits for its writer.
+    # Without O_NONBLOCK, opening a pipe waits for its writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:
         _check(path, os.fstat(handle), largest)
@@ -55,26 +55,26 @@ def read_bytes(path: Path, largest: int = LARGEST_PICTURE) -> bytes:
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
-    """The text of a UTF-8 file, less its byte order mark; raises as ``read_bytes``, and UnicodeDecodeError."""
+    """The text of a UTF-8 file without its byte order mark; raises as ``read_bytes``, and UnicodeDecodeError."""
     return read_bytes(path, largest).decode("utf-8-sig")
 
 
 def read_picture_bytes(path: Path, most_pixels: int = MOST_PIXELS) -> bytes:
-    """The bytes of a picture file that may be decoded; raises as ``read_bytes``, and where it has too many pixels."""
+    """The bytes of a picture file that may be decoded; raises as ``read_bytes``, and for too many pixels."""
     data = read_bytes(path)
     check_pixels(path, picture_size(data), most_pixels)
     return data
 
 
 def check_pixels(path: Path, size: tuple[int, int] | None, most_pixels: int = MOST_PIXELS) -> None:
-    """Raises ``UnfitFile`` for a picture whose size (width, height) has more pixels; None: the size is not known."""
+    """Raises ``UnfitFile`` for a picture whose size (width, height) has more pixels; None: the size is unknown."""
     if size is not None and size[0] * size[1] > most_pixels:
         limit = f"more than {most_pixels / 1e6:.0f} million pixels"
         raise UnfitFile(path, f"it is {size[0]} x {size[1]} pixels large, {limit}")
 
 
 def picture_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) as the header of a PNG, JPEG, TIFF, BMP or NetPBM picture says it, or None for anything else."""
+    """(width, height) from the header of a PNG, JPEG, TIFF, BMP or NetPBM picture, or None for other files."""
     if data.startswith(_PNG) and len(data) >= 24:
         return struct.unpack(">II", data[16:24])
     if data.startswith(b"\xff\xd8"):
@@ -121,8 +121,8 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _check_name(path: Path) -> None:
-    if "\0" in str(path):  # Python's ValueError would be taken for a mistake in the file
-        raise UnfitFile(path, "its name holds a character that no file can have")
+    if "\0" in str(path):  # Python's ValueError would look like a mistake in the file
+        raise UnfitFile(path, "its name has a character that is not allowed in file names")
 
 
 def _check(path: Path, status: os.stat_result, largest: int | None) -> None:

@@ -42,7 +42,7 @@ class Module:
 
 def are_compiled() -> bool:
     """Whether all kernels of the tables were compiled on this machine by this version; takes milliseconds."""
-    return _stamp().exists()
+    return not _missing() and _stamp().exists()
 
 
 class Compilation:
@@ -60,7 +60,9 @@ class Compilation:
         self._lock = threading.Lock()
         self._closed = False
         self._processes = [_begin() for _ in range(processes or usable_cpus())]
-        self._threads = [threading.Thread(target=self._feed, args=(one,), daemon=True) for one in self._processes]
+        self._threads = [
+            threading.Thread(target=self._feed, args=(process,), daemon=True) for process in self._processes
+        ]
         for thread in self._threads:
             thread.start()
 
@@ -104,7 +106,7 @@ class Compilation:
             thread.join(max(0.0, ends_s - time.monotonic()))
         if self.share < 1:
             return False
-        if not self._closed and not self._failed:
+        if not self._closed and not self._failed and not _missing():
             _stamp().parent.mkdir(parents=True, exist_ok=True)
             _stamp().touch()
         return True
@@ -155,10 +157,15 @@ def _modules() -> Iterator[Module]:
 def _stamp() -> Path:
     """Exists when all is compiled: named after the tables and the sources of every module in them."""
     content = hashlib.sha256(f"{sys.version_info[:2]}".encode())
-    for module in sorted(_modules(), key=lambda one: one.name):
+    for module in sorted(_modules(), key=lambda module: module.name):
         content.update(repr(module).encode())
         content.update(digest_of(_source(module.name)).encode())
     return kernel_folder() / f"all-{content.hexdigest()[:16]}"
+
+
+def _missing() -> Sequence[str]:
+    """Modules of the tables whose source does not exist any more."""
+    return [module.name for module in _modules() if not _source(module.name).is_file()]
 
 
 def _source(module: str) -> Path:
@@ -257,6 +264,15 @@ def _compile_named() -> int:
 
 
 def _compile_all() -> int:
+    missing = _missing()
+    for name in missing:
+        print(  # noqa: T201
+            f"velatura: The module {name} in the kernel tables does not exist. "
+            "Run `python -m hal.runtime.kernels record`.",
+            file=sys.stderr,
+        )
+    if missing:
+        return 1
     if are_compiled():
         return 0
     print(f"Compiling kernels, once. This takes about {max(SECONDS // usable_cpus(), 20)} s ...", flush=True)  # noqa: T201

@@ -1,4 +1,4 @@
-"""The way to the player: its socket and its inbox, as docs/reference/player-protocol.md describes them."""
+"""The connection to the player: its socket and its inbox (docs/reference/player-protocol.md)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _SLICE_S: Final = 0.1
 _MAX_ANSWER_BYTES: Final = 1024 * 1024
 _HEAD: Final = struct.Struct("<8sIIQdQ24x")
 _ENTRY: Final = struct.Struct("<40sIIQQ")
-_RESTARTED: Final = "Start it again with 'velatura play' or through its systemd unit; then ask again."
+_RESTARTED: Final = "Start it again with 'velatura play' or through its systemd unit. Then repeat the command."
 
 
 class Inbox:
-    """The mapped file in which frames go to the player."""
+    """The mapped file for frames to the player."""
 
     def __init__(self, path: Path, outputs: Sequence[OutputInfo]) -> None:
         try:
@@ -36,18 +36,18 @@ class Inbox:
         except (OSError, ValueError) as error:
             raise DeviceGone(
                 "player-not-running",
-                what=f"The player's inbox {path} can not be opened.",
+                what=f"The player's inbox {path} can't be opened.",
                 remedy=_RESTARTED,
             ) from error
         magic, version, count, _, _, size = _HEAD.unpack_from(self._map)
         if (magic, version, count, size) != (b"VELFRAME", _PROTOCOL, len(outputs), len(self._map)):
-            raise broken("its inbox has another layout than its answer to hello")
+            raise broken("the layout of its inbox differs from its answer to hello")
         self._sequence = np.frombuffer(self._map, "<u8", 1, 16)
         self._pixels = {}
         for number, output in enumerate(outputs):
             name, width, height, offset, _ = _ENTRY.unpack_from(self._map, _HEAD.size + number * _ENTRY.size)
             if (name.rstrip(b"\0").decode(), width, height) != (output.name, output.width_px, output.height_px):
-                raise broken("its inbox has other outputs than its answer to hello")
+                raise broken("the outputs of its inbox differ from its answer to hello")
             pixels = np.frombuffer(self._map, np.uint8, width * height * 3, offset)
             self._pixels[output.name] = pixels.reshape(height, width, 3)
 
@@ -68,10 +68,10 @@ class Inbox:
 
 
 class PlayerLink:
-    """A connection to a player, made when it is needed and again after the player was restarted.
+    """A connection to a player, opened when needed, and again after a restart of the player.
 
     ``expected``: the outputs that the player must have, or None for any. ``outputs`` and ``inbox`` are those of the
-    player that is connected.
+    connected player.
     """
 
     def __init__(self, path: Path, expected: tuple[OutputInfo, ...] | None) -> None:
@@ -84,7 +84,7 @@ class PlayerLink:
         self._closed = False
 
     def close(self) -> None:
-        """Hang up for good."""
+        """Close the connection permanently."""
         self._closed = True
         self.hang_up()
 
@@ -116,7 +116,7 @@ class PlayerLink:
             raise DeviceGone(
                 "player-not-running",
                 what=f"No player answers at {self._path}.",
-                remedy="Start it with 'velatura play' or through its systemd unit; then ask again.",
+                remedy="Start it with 'velatura play' or through its systemd unit. Then repeat the command.",
             ) from error
         except BaseException:
             channel.close()
@@ -138,21 +138,21 @@ class PlayerLink:
         if spoken != _PROTOCOL:
             raise DeviceRefused(
                 "player-protocol",
-                what=f"The player speaks protocol {spoken}; this driver speaks {_PROTOCOL}.",
+                what=f"The player has protocol {spoken}, but this driver has {_PROTOCOL}.",
                 remedy="Install player and controller of the same release, and restart the player.",
             )
         if self._expected is not None and self._expected != outputs:
             raise DeviceRefused(
                 "player-outputs-differ",
-                what=f"The player has the outputs {_listed(outputs)}; stage.toml says {_listed(self._expected)}.",
+                what=f"The player has the outputs {_listed(outputs)}, but stage.toml has {_listed(self._expected)}.",
                 remedy="Restart the player for this stage, or correct [[display.outputs]].",
             )
         self.outputs, self.inbox = outputs, Inbox(inbox, outputs)
 
     def ask(self, request: Mapping[str, Any], deadline: Deadline) -> dict[str, Any]:
-        """Send a request and return its answer; answers to earlier requests, given up since, are passed over.
+        """Send a request and return its answer; skip answers to earlier, abandoned requests.
 
-        Raises as ``connect``; DeviceRefused with the player's own code and sentences where it refuses.
+        Raises as ``connect``; DeviceRefused with the player's own code and sentences if it refuses.
         """
         self.connect(deadline)
         self._ticket += 1
@@ -165,13 +165,13 @@ class PlayerLink:
             self.hang_up()
             if isinstance(error, DeviceError):
                 raise
-            raise DeviceGone("player-gone", what="The player ended meanwhile.", remedy=_RESTARTED) from error
+            raise DeviceGone("player-gone", what="The player ended during the command.", remedy=_RESTARTED) from error
         if answer.get("ok") is True:
             return answer
         told = answer.get("error")
         if not isinstance(told, dict) or not all(isinstance(told.get(k), str) for k in ("code", "what", "remedy")):
             self.hang_up()
-            raise broken("an error of it does not say what and why")
+            raise broken("one of its errors lacks code, what or remedy")
         raise DeviceRefused(told["code"], what=told["what"], remedy=told["remedy"])
 
     def _send(self, line: bytes, deadline: Deadline) -> None:
@@ -182,7 +182,7 @@ class PlayerLink:
         try:
             self._channel.sendall(line)
         except TimeoutError as error:
-            self.hang_up()  # half a line may be under way
+            self.hang_up()  # half a line may have been sent
             raise silent from error
 
     def _answer(self, deadline: Deadline) -> dict[str, Any]:
@@ -211,7 +211,7 @@ class PlayerLink:
 
 
 def _call(channel: socket.socket, path: Path, deadline: Deadline) -> None:
-    """Connect; where too many others wait for the player, wait with them."""
+    """Connect; if too many others wait for the player, wait, too."""
     channel.setblocking(False)
     while True:
         silent = _silent()
@@ -228,7 +228,7 @@ def _silent() -> DeviceTimeout:
     return DeviceTimeout(
         "player-silent",
         what="The player did not answer in time.",
-        remedy="If it goes on, restart the player; it may hang.",
+        remedy="If this happens again, restart the player.",
     )
 
 
@@ -236,7 +236,7 @@ def broken(detail: str) -> ProtocolError:
     """The error for bytes that the player's protocol does not allow."""
     return ProtocolError(
         "player-protocol-broken",
-        what=f"The player does not keep to its protocol: {detail}.",
+        what=f"The player broke its protocol: {detail}.",
         remedy="Install player and controller of the same release, and restart the player.",
     )
 

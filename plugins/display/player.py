@@ -17,9 +17,9 @@ from plugins.display.link import PlayerLink, broken
 
 
 class PlayerDisplay:
-    """A running player as a display. Connects again by itself after the player was restarted.
+    """A running player as a display. Reconnects after the player was restarted.
 
-    It is a ``hal.interfaces.BundleDisplay``, and has ``status`` beyond that. Not for several threads at once.
+    It is a ``hal.interfaces.BundleDisplay`` and also has ``status``. Not for several threads at once.
     """
 
     def __init__(self, path: Path, expected: tuple[OutputInfo, ...] | None) -> None:
@@ -35,12 +35,12 @@ class PlayerDisplay:
         )
 
     def outputs(self, *, deadline: Deadline) -> tuple[OutputInfo, ...]:
-        """The outputs in stage order, as the player that runs now has them."""
+        """The outputs of the running player, in stage order."""
         self._link.connect(deadline)
         return self._link.outputs
 
     def show(self, frames: Mapping[str, npt.NDArray[np.uint8]], *, deadline: Deadline) -> Presented:
-        """Show one frame an output; see ``hal.interfaces.Display.show``."""
+        """Show one frame per output; see ``hal.interfaces.Display.show``."""
         self._link.connect(deadline)
         assert self._link.inbox is not None
         self._check(frames)
@@ -51,7 +51,7 @@ class PlayerDisplay:
         return _presented(self._link.ask({"op": "play", "appearance": appearance}, deadline))
 
     def close(self) -> None:
-        """Let go of the player; it goes on showing what it shows."""
+        """Disconnect from the player; its picture stays."""
         self._link.close()
 
     # --- hal.interfaces.BundleDisplay -------------------------------------------------------------------------------
@@ -64,7 +64,7 @@ class PlayerDisplay:
         repeat: int = 0,
         rate_hz: float | None = None,
     ) -> Presented:
-        """Show appearances in turn; see ``hal.interfaces.BundleDisplay.play_sequence``.
+        """Show appearances one after the other; see ``hal.interfaces.BundleDisplay.play_sequence``.
 
         ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds; None: at the player's own rate.
         """
@@ -76,7 +76,7 @@ class PlayerDisplay:
         return _presented(self._link.ask({"op": "stop"}, deadline))
 
     def live(self, file: Path, *, deadline: Deadline, white: float | None = None) -> None:
-        """Show what is written to a shared frame file as it comes; see ``hal.interfaces.BundleDisplay.live``."""
+        """Show pictures live from a shared frame file; see ``hal.interfaces.BundleDisplay.live``."""
         self._link.ask({"op": "live", "file": str(file.resolve()), "white": white}, deadline)
 
     def identify(self, *, deadline: Deadline) -> Presented:
@@ -84,11 +84,11 @@ class PlayerDisplay:
         return _presented(self._link.ask({"op": "identify"}, deadline))
 
     def status(self, *, deadline: Deadline) -> dict[str, Any]:
-        """What the player shows and how evenly: the keys of "status" in docs/reference/player-protocol.md."""
+        """The player's status: the keys of "status" in docs/reference/player-protocol.md."""
         return self._link.ask({"op": "status"}, deadline)
 
     def playing(self, *, deadline: Deadline) -> PlaybackStatus:
-        """What is shown now, and how evenly; see ``hal.interfaces.BundleDisplay.playing``."""
+        """The picture shown now, and timing; see ``hal.interfaces.BundleDisplay.playing``."""
         answer = self.status(deadline=deadline)
         try:
             return PlaybackStatus(
@@ -104,10 +104,10 @@ class PlayerDisplay:
                 live=_live(answer.get("live")),
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise broken("its status lacks something") from error
+            raise broken("its status is incomplete") from error
 
     def load_bundle(self, path: Path, *, deadline: Deadline) -> str:
-        """Let the player use another bundle from now on; returns the bundle's identity (hex)."""
+        """Let the player use another bundle; returns the bundle's identity (hex)."""
         return str(self._link.ask({"op": "load-bundle", "path": str(path.resolve())}, deadline)["bundle"])
 
     def _check(self, frames: Mapping[str, npt.NDArray[np.uint8]]) -> None:
@@ -124,14 +124,14 @@ class PlayerDisplay:
                     "display-frame-unfit",
                     what=f"A frame of shape {frame.shape}, {frame.dtype} does not fit output {name}, "
                     f"which takes {shapes[name]}, uint8.",
-                    remedy="Make frames of the size that stage.toml gives for this output.",
+                    remedy="Use frames of the size in stage.toml for this output.",
                 )
 
 
 def _presented(answer: Mapping[str, Any]) -> Presented:
     sequence, at_s = answer.get("sequence"), answer.get("presented_at")
     if not isinstance(sequence, int) or not isinstance(at_s, float):
-        raise broken("an answer of it does not say when it presented")
+        raise broken("an answer of it has no presentation time")
     return Presented(sequence, at_s)
 
 
@@ -150,7 +150,7 @@ def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline)
     if path is None:
         raise PluginError(
             "player-socket-unknown",
-            what="Neither stage.toml nor the command says where the player's socket is.",
+            what="The player's socket is not given in stage.toml or the command.",
             remedy='Set socket = "..." in [display].',
         )
     try:

@@ -1,1 +1,1 @@
-"""What looks for devices, one module per bus (`hal.finding`). Entry: `FINDER` in each module."""
+"""Finders of devices, one module per bus (`hal.finding`). Entry: `FINDER` in each module."""

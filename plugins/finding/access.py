@@ -1,4 +1,4 @@
-"""Who may open a device file, and who has it open: from its mode and from /proc."""
+"""Finds who may open a device file, and which programs have it open, from its mode and from /proc."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _PROC: Final = Path("/proc")
 
 
 def rule_text(name: str, needle: str) -> str:
-    """The lines of the shipped udev rules ``name`` that speak of ``needle``, so that a person sees what they do."""
+    """The lines of the shipped udev rules ``name`` with ``needle``, to show them to a person."""
     rules = (resources.files("firmware_configs") / "udev" / name).read_text(encoding="utf-8")
     return "\n".join(line for line in rules.splitlines() if needle in line and not line.startswith("#"))
 
 
 def forbidden(node: Path, device: str, rules: str, needle: str) -> Problem | None:
-    """The problem of a device file that this user may not read and write; None if it may."""
+    """The problem of a device file that this user may not read and write; None if there is none."""
     if os.access(node, os.R_OK | os.W_OK):
         return None
     try:

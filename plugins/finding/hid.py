@@ -21,11 +21,11 @@ RULES: Final = "70-velatura-hid.rules"
 ELGATO: Final = 0x0FD9
 LISTING_S: Final = 5.0
 ASKING_S: Final = 2.0
-"""For one device: a silent one must not take the time of the others."""
+"""Time limit for one device, so that a silent one does not use up the time of the others."""
 
 
 class _Hidapi(WorkerLink[Any]):
-    """hidapi on a thread of its own, because its calls can hang; ``name`` is what is asked, for sentences."""
+    """hidapi on its own thread, because its calls can hang; ``name`` is the device, for messages."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, broken=(OSError, ValueError))
@@ -36,11 +36,11 @@ class _Hidapi(WorkerLink[Any]):
         return importlib.import_module(BACKENDS["hidraw"])
 
     def let_go(self, opened: Any) -> None:
-        """There is nothing to close."""
+        """Nothing to close."""
 
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
-    """Every HID device that could be one of ours. Raises DeviceError where hidapi is missing or hangs."""
+    """Every HID device that could be supported. Raises DeviceError if hidapi is missing or hangs."""
     with contextlib.closing(_Hidapi("list of HID devices")) as listing:
         entries = listing.call(lambda hidapi: list(hidapi.enumerate()), deadline=deadline.within(LISTING_S))
     by_path = {entry["path"]: entry for entry in entries}
@@ -70,7 +70,9 @@ def _found(entry: Mapping[str, Any], deadline: Deadline) -> Found | None:
             problem = Problem.of(error)
         except DeviceError as error:
             problem = Problem(
-                "hid-not-opened", f"The {what} at {node} can't be asked: {error.what}", "Plug it out and in again."
+                "hid-not-opened",
+                f"The {what} at {node} does not answer: {error.what}",
+                "Unplug it and plug it in again.",
             )
     settings = {"serial": serial} if serial else {}
     problems = () if problem is None else (problem,)
@@ -80,7 +82,7 @@ def _found(entry: Mapping[str, Any], deadline: Deadline) -> Found | None:
 
 
 def _relay_serial(name: str, path: bytes, channels: int, deadline: Deadline) -> str:
-    """A board tells its serial number only when it is asked; USB's descriptor has none."""
+    """A board's serial number must be requested; its USB descriptor has none."""
 
     def ask(hidapi: Any) -> str:
         handle: HidHandle = hidapi.device()
@@ -102,7 +104,7 @@ def _held(node: Path, what: str) -> Problem | None:
     if not who:
         return None
     return Problem(
-        "hid-taken", f"The {what} at {node} is open in {', '.join(who)}.", "End that program, or see that it is ours."
+        "hid-taken", f"The {what} at {node} is open in {', '.join(who)}.", "End that program, unless it is Velatura."
     )
 
 

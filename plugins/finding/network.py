@@ -20,7 +20,7 @@ ANSWER_S: Final = 8.0
 
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
-    """Projectors that answer the search (class 2), and those that stage.toml names (any class)."""
+    """Projectors that answer the search (class 2), and those in stage.toml (any class)."""
     known = {str(settings.get("address", "")): settings for settings in wanted.of("projector", "pjlink")}
     found = [_tried(address, settings, wanted, deadline) for address, settings in known.items()]
     hosts = {host for address in known if (host := _host(address))}
@@ -31,7 +31,10 @@ def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
         return [*found, Found("network", "PJLink search", "search for projectors", problems=(problem,))]
     for host, mac in answers:
         if host in hosts:
-            found = [dataclasses.replace(one, identity=mac) if _host(one.address) == host else one for one in found]
+            found = [
+                dataclasses.replace(device, identity=mac) if _host(device.address) == host else device
+                for device in found
+            ]
         else:
             found.append(dataclasses.replace(_tried(host, {"address": host}, wanted, deadline), identity=mac))
     return found
@@ -42,7 +45,7 @@ def _searched(wanted: Wanted, deadline: Deadline) -> list[tuple[str, str]]:
         return []
     with PjLinkListener(*wanted.listen) as listener:
         answers = listener.search(deadline=deadline, to=wanted.search, patience_s=wanted.search_s)
-        return [(one.host, one.mac) for one in answers]
+        return [(answer.host, answer.mac) for answer in answers]
 
 
 def _tried(address: str, settings: Mapping[str, Any], wanted: Wanted, deadline: Deadline) -> Found:

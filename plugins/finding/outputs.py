@@ -1,4 +1,4 @@
-"""Display outputs, as the X server tells them through xrandr."""
+"""Display outputs of the X server, from xrandr."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _OUTPUT: Final = re.compile(
 
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
-    """Outputs with something plugged into them; none where there is no X server, as with frames in memory."""
+    """Connected outputs; empty without an X server, for example with frames in memory."""
     program = shutil.which("xrandr")
     if not os.environ.get("DISPLAY") or program is None:
         return []
@@ -33,22 +33,22 @@ def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
     except subprocess.TimeoutExpired as error:
         raise DeviceTimeout(
             "display-no-answer",
-            what="The X server did not tell its outputs in time.",
-            remedy="Check that DISPLAY names the server that runs.",
+            what="The X server did not list its outputs in time.",
+            remedy="Check that the variable DISPLAY is set for the running X server.",
         ) from error
     return parse_outputs(done.stdout)
 
 
 def parse_outputs(text: str) -> list[Found]:
-    """The connected outputs in what ``xrandr --query`` prints."""
+    """The connected outputs in the text of ``xrandr --query``."""
     found = []
     for match in _OUTPUT.finditer(text):
         name, (width, height, left, top) = printable(match[1]), match.groups()[1:]
         if width is None:
             dark = Problem(
                 "output-off",
-                f"Something is plugged into output {name}, and it is switched off.",
-                f"Switch it on: xrandr --output {name} --auto, and place it beside the others.",
+                f"Output {name} is connected, but it is switched off.",
+                f"Switch it on with xrandr --output {name} --auto, and place it beside the others.",
             )
             found.append(Found("display", name, "output, off", identity=name, problems=(dark,)))
             continue

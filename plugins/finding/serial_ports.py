@@ -1,8 +1,8 @@
-"""Serial ports, and which projector answers there.
+"""Serial ports, and the projectors that answer there.
 
-A port is asked for the power state in the words of every shipped profile, one after another: questions only, never a
-command, each as seldom as the profile wants. What nobody answers at its usual rate is asked at others where stage.toml
-names the port, or where something came back that nobody understood. Ports are looked at side by side.
+Each port gets the power query of every shipped profile, one after the other: only queries, never commands, not more
+often than the profile allows. Without an answer at the usual rate, other rates are tried if stage.toml has the port,
+or if the answer was not understood. Ports are searched in parallel.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MOST_PORTS: Final = 64
 AT_ONCE: Final = 8
 SLOW: Final = 3
 LISTENED: Final = 3
-"""What says something unasked in so many waits in a row speaks by itself, and is no projector at a wrong rate."""
+"""A device that sends data unasked in so many waits is not a projector at a wrong rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Who answered: a profile at a baud rate (None: nobody), whether anything at all came, and came unasked."""
+    """The profile that answered and its baud rate (None: no answer), whether any data came, and came unasked."""
 
     profile: ProjectorProfile | None
     baud: int = 0
@@ -67,7 +67,7 @@ def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
 
 
 def _ports(wanted: Wanted) -> list[Port]:
-    """Each port once, though it has many names: first as stage.toml calls it, then by its stable name."""
+    """Each port once, although it has many names: first by its name in stage.toml, then by its stable name."""
     ports: dict[str, Port] = {}
     for settings in wanted.of("projector", "serial"):
         name = str(settings.get("port", ""))
@@ -76,10 +76,10 @@ def _ports(wanted: Wanted) -> list[Port]:
     with contextlib.suppress(OSError):
         for path in sorted(wanted.serial_ports.iterdir()):
             if not path.is_symlink() and not path.is_char_device():
-                continue  # such as the lock beside a link to a pseudo terminal
+                continue  # such as the lock of a link to a pseudo terminal
             ports.setdefault(str(path.resolve()), Port(str(path), path, "serial adapter"))
     for listed in list_ports.comports() if wanted.system_ports else ():
-        # Ports of a board that may not be there have no hardware number.
+        # Ports of a missing board have no hardware number.
         if listed.hwid != "n/a":
             path = Path(listed.device)
             ports.setdefault(str(path.resolve()), Port(listed.device, path, printable(listed.description or "port")))
@@ -108,7 +108,7 @@ def _asked(
     written = int(settings.get("baud", own.serial.baud if own is not None and own.serial is not None else 0))
     heard = _who(port, _order(own, written, profiles), answer_s, deadline)
     if heard.profile is None and heard.anything and not heard.unasked:
-        # Somebody is there: an adapter or a machine under load may only have been slow to say who.
+        # A device is there: an adapter or a computer under load may only have been slow.
         usual = ((baud, known, only_if) for baud, known, only_if in _order(own, written, profiles) if not only_if)
         heard = _who(port, usual, SLOW * answer_s, deadline)
         heard = replace(heard, anything=True)
@@ -125,7 +125,7 @@ def _asked(
         problems.append(
             Problem(
                 "serial-other-profile",
-                f'{port.name} is answered by a projector of "{profile.name}", and stage.toml says "{own.name}".',
+                f'The projector at {port.name} needs the profile "{profile.name}", but stage.toml has "{own.name}".',
                 f'Write profile = "{profile.name}" for {port.name} into stage.toml.',
             )
         )
@@ -133,7 +133,7 @@ def _asked(
         problems.append(
             Problem(
                 "serial-wrong-baud",
-                f"The projector at {port.name} answers at {baud} baud, and stage.toml says {written}.",
+                f"The projector at {port.name} answers at {baud} baud, but stage.toml has {written}.",
                 f"Write baud = {baud} for {port.name} into stage.toml, or set {written} in the projector's menu.",
             )
         )
@@ -143,30 +143,33 @@ def _asked(
 
 def _nobody(port: Port, own: ProjectorProfile | None, heard: Heard, written: int) -> Found:
     if own is None and not heard.anything:
-        return Found("serial", port.name, f"{port.what}, nobody answers", identity=port.name)
-    code, remedy = "serial-no-answer", "Check that the projector has mains, the cable (a null modem?), and the profile."
-    what = f"Nobody at {port.name} answers as any profile would, at any usual rate."
+        return Found("serial", port.name, f"{port.what}, no answer", identity=port.name)
+    code, remedy = (
+        "serial-no-answer",
+        "Check the projector's power, the cable (it may need a null modem cable), and the profile.",
+    )
+    what = f"Nothing at {port.name} answers to any profile at any usual baud rate."
     if heard.anything:
         code = "serial-garbage"
-        what = f"Something at {port.name} answers, and no profile understands it at any usual rate."
-        remedy = "Look up its commands and write a profile (docs/how-to/projector-profile.md), or it is no projector."
+        what = f"A device at {port.name} answers, but no profile fits at any usual baud rate."
+        remedy = "If it is a projector, write a profile for it (docs/how-to/projector-profile.md)."
     return Found("serial", port.name, port.what, identity=port.name, problems=(Problem(code, what, remedy),))
 
 
 def _order(
     own: ProjectorProfile | None, written: int, profiles: Sequence[ProjectorProfile]
 ) -> Iterator[tuple[int, Sequence[ProjectorProfile], bool]]:
-    """Rates with the profiles to try there; True: only if something came back, or stage.toml names a profile."""
+    """Rates with the profiles to try there; True: only if data came back, or stage.toml has a profile."""
     if own is not None:
         yield written, [own], False
     usual: dict[int, list[ProjectorProfile]] = {}
-    # Last those whose questions do not end in a carriage return: what hears them waits for the rest of a line.
-    for profile in sorted(profiles, key=lambda one: not _question(one)[1].endswith(END)):
+    # Last those whose queries do not end in a carriage return: other devices wait for the rest of such a line.
+    for profile in sorted(profiles, key=lambda profile: not _question(profile)[1].endswith(END)):
         if profile.serial is not None:
             usual.setdefault(profile.serial.baud, []).append(profile)
     yield from ((baud, known, False) for baud, known in usual.items())
     for baud in BAUDS:
-        others = [one for one in profiles if one.serial is not None and one.serial.baud != baud]
+        others = [profile for profile in profiles if profile.serial is not None and profile.serial.baud != baud]
         yield baud, others if own is None else [own], True
 
 
@@ -188,7 +191,7 @@ def _who(
                 listened = True
                 if _speaks_unasked(link, answer_s, deadline):
                     return Heard(None, anything=True, unasked=True)
-            # What was asked at another rate arrived as noise: it must not stand before the first question on one line.
+            # Queries at another rate arrived as noise: it must not be on the same line as the first query.
             link.write(END, deadline=deadline.within(WRITE_S))
             for profile in profiles:
                 answered, came = _answers(link, profile, answer_s, deadline)
@@ -201,7 +204,7 @@ def _who(
 
 
 def _speaks_unasked(link: SerialLink, answer_s: float, deadline: Deadline) -> bool:
-    """Whether something comes all the time, though nobody asks."""
+    """Whether data comes all the time, without a query."""
     link.drain()
     for _ in range(LISTENED):
         deadline.sleep(answer_s)
@@ -211,7 +214,7 @@ def _speaks_unasked(link: SerialLink, answer_s: float, deadline: Deadline) -> bo
 
 
 def _answers(link: SerialLink, profile: ProjectorProfile, answer_s: float, deadline: Deadline) -> tuple[bool, bool]:
-    """Ask one question in a profile's words: whether the answer is one, and whether anything came."""
+    """Send one query of a profile; whether its answer is valid, and whether any data came."""
     table = profile.serial
     assert table is not None
     query, said = _question(profile)
@@ -223,9 +226,11 @@ def _answers(link: SerialLink, profile: ProjectorProfile, answer_s: float, deadl
         try:
             line = _line(link, table, patience)
         except DeviceTimeout:
-            deadline.check("doctor-too-slow", what="The search took too long.", remedy="Unplug what is not needed.")
+            deadline.check(
+                "doctor-too-slow", what="The search took too long.", remedy="Unplug devices that are not needed."
+            )
             if not said.endswith(END):
-                link.write(END, deadline=deadline.within(WRITE_S))  # the next question begins a line of its own
+                link.write(END, deadline=deadline.within(WRITE_S))  # the next query starts on a new line
             return False, came or bool(link.drain())
         came = True
         with contextlib.suppress(ProtocolError):
@@ -235,7 +240,7 @@ def _answers(link: SerialLink, profile: ProjectorProfile, answer_s: float, deadl
 
 
 def _question(profile: ProjectorProfile) -> tuple[Query, bytes]:
-    """The question for the power state, or another where a family's is not known, and its bytes."""
+    """The query for the power state, or another one if a family has none, and its bytes."""
     table = profile.serial
     assert table is not None
     query = table.queries["power"] if "power" in table.queries else next(iter(table.queries.values()))
@@ -243,7 +248,7 @@ def _question(profile: ProjectorProfile) -> tuple[Query, bytes]:
 
 
 def _line(link: SerialLink, table: SerialTable, deadline: Deadline) -> bytes:
-    """The next line or frame, or what came instead of one."""
+    """The next line or frame, or other data."""
     try:
         if table.frame is None:
             return link.read_until(table.terminator, limit=table.longest_answer, deadline=deadline)

@@ -1,4 +1,4 @@
-"""Still cameras on USB, who may use them, and who holds them."""
+"""Still cameras on USB, their permissions, and the programs that use them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from plugins.ptp.usb.bus import UsbCamera, usb_cameras
 
 RULES: Final = "70-velatura-camera.rules"
 MONITORS: Final = ("gvfs-gphoto2-volume-monitor", "gvfsd-gphoto2", "gphoto2", "digikam", "darktable", "entangle")
-"""Programs that take a camera for themselves as soon as it is plugged in, or keep it while they run."""
+"""Programs that claim a camera when it is plugged in, or while they run."""
 
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
-    """Every still camera, with what stands between it and us. Nothing is sent to a camera."""
+    """Every still camera and its problems. Nothing is sent to a camera."""
     found = []
     for camera in usb_cameras():
-        deadline.check("doctor-too-slow", what="The search took too long.", remedy="Unplug what is not needed.")
+        deadline.check(
+            "doctor-too-slow", what="The search took too long.", remedy="Unplug devices that are not needed."
+        )
         found.append(_found(camera))
     return found
 
@@ -41,7 +43,7 @@ def _held(node: Path) -> Problem | None:
     if who:
         return Problem(
             "camera-taken",
-            what=f"The camera at {node} is held by {', '.join(who)}.",
+            what=f"The camera at {node} is in use by {', '.join(who)}.",
             remedy="End that program. The desktop's own: systemctl --user mask --now gvfs-gphoto2-volume-monitor, and "
             "gio mount -u its mount.",
         )
@@ -49,7 +51,7 @@ def _held(node: Path) -> Problem | None:
     if waiting:
         return Problem(
             "camera-may-be-taken",
-            what=f"{', '.join(waiting)} runs, and takes cameras when it likes.",
+            what=f"{', '.join(waiting)} is running, and may claim the camera at any time.",
             remedy="End it before a run: systemctl --user mask --now gvfs-gphoto2-volume-monitor keeps the desktop's "
             "own away for good.",
         )
@@ -57,7 +59,7 @@ def _held(node: Path) -> Problem | None:
 
 
 def _name(device: Any) -> str:
-    """Its product name with a space after it; "" where it may not be read."""
+    """Its product name with a space after it; "" if it can't be read."""
     try:
         return printable(f"{device.product or ''}"[:60]).strip() + " "
     except (ValueError, NotImplementedError, OSError):

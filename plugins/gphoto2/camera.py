@@ -1,7 +1,7 @@
 """The driver ``gphoto2``: the cameras that libgphoto2 knows, through the wheel of the same name (extra ``gphoto2``).
 
-For a camera that speaks PTP use the driver ``ptp``: it survives a lost connection in the middle of a picture. This one
-never takes a picture twice either, but tells the caller that it was lost.
+For a camera with PTP use the driver ``ptp``: it survives a lost connection during a picture. This driver also
+never takes a picture twice, but reports that it was lost.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MOST_FILES: Final = 8
 
 
 class _Lost(Exception):
-    """The library's handle is of no more use."""
+    """The library's handle is not usable any more."""
 
 
 class Gphoto2Camera(WorkerLink[Opened]):
@@ -74,8 +74,8 @@ class Gphoto2Camera(WorkerLink[Opened]):
         if not self._capabilities.live_view:
             raise DeviceRefused(
                 "camera-no-live-view",
-                what="The camera can't show what it sees over its cable.",
-                remedy="Look through its finder, or take a picture to aim with.",
+                what="The camera has no live view over its cable.",
+                remedy="Use its viewfinder, or take a test picture to aim.",
             )
         return self._do(device.frame, deadline)
 
@@ -114,7 +114,7 @@ class Gphoto2Camera(WorkerLink[Opened]):
             self.let_go(opened)
             failure = DeviceRefused(
                 "camera-other",
-                what=f"The camera that answers is number {serial or '(none)'}, not {self._serial}.",
+                what=f"The connected camera has the serial number {serial or '(none)'}, not {self._serial}.",
                 remedy="Connect the right camera, or change serial in stage.toml and recalibrate.",
             )
         raise failure
@@ -124,14 +124,14 @@ class Gphoto2Camera(WorkerLink[Opened]):
             opened.camera.exit()
 
     def _ports(self) -> list[str]:
-        """Where to look: the port that was named, then, once the serial number is known, everywhere."""
+        """Where to search: at the given port, then, once the serial number is known, everywhere."""
         named = [self._port] if self._port else []
         found = self._library.Camera.autodetect()
         others = [found.get_value(at) for at in range(found.count())]
         return named + [port for port in others if port != self._port] if self._serial or not named else named
 
     def _do(self, work: Callable[[Opened], Result], deadline: Deadline, *, repeatable: bool = True) -> Result:
-        """Do ``work`` on the worker; the library's errors become ours, and a lost handle is opened anew."""
+        """Do ``work`` on the worker; convert the library's errors, and open a lost handle again."""
 
         def guarded(opened: Opened) -> Result:
             if opened.lost:
@@ -188,11 +188,11 @@ def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Dea
 DRIVER: Final = Driver(
     kind="camera",
     name="gphoto2",
-    summary="Cameras that libgphoto2 knows and that do not speak PTP, or not well (needs the extra gphoto2).",
+    summary="Cameras of libgphoto2 without (good) PTP support (needs the extra gphoto2).",
     open=open_camera,
     settings={
-        "address": "libgphoto2's port, such as usb:001,004; left out: the first camera that is found",
-        "serial": "serial number that the camera must have; left out: whichever answers",
+        "address": "libgphoto2's port, such as usb:001,004 (default: the first camera found)",
+        "serial": "serial number that the camera must have (default: any)",
     },
     required=(),
 )

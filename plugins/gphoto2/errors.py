@@ -1,4 +1,4 @@
-"""What libgphoto2's errors mean to a caller."""
+"""Converts libgphoto2's errors."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ def translated(library: Any, error: Exception) -> DeviceError:
         return DeviceBusy(
             "camera-in-use",
             what=f"The camera is busy, or another program holds it ({said}).",
-            remedy="End photo programs and the desktop's file manager (gvfs-gphoto2-volume-monitor), then try again.",
+            remedy="Close photo programs and the desktop's file manager (gvfs-gphoto2-volume-monitor), then try again.",
         )
     if code == library.GP_ERROR_TIMEOUT:
         return DeviceTimeout(
             "camera-no-answer",
             what="The camera did not answer libgphoto2 in time.",
-            remedy="Check that it is awake; switch it off and on if it stays silent.",
+            remedy="Check that it is awake. If it does not answer, switch it off and on.",
         )
     if code in (library.GP_ERROR_MODEL_NOT_FOUND, library.GP_ERROR_UNKNOWN_PORT) or -60 <= code <= -50 or code == -7:
         return DeviceGone(
             "camera-disconnected",
             what=f"libgphoto2 has lost the camera ({said}).",
-            remedy="Check the cable, the battery, and that no automatic power-off is set.",
+            remedy="Check the cable and the battery, and switch automatic power-off off.",
         )
     return DeviceRefused(
         "camera-refused",
-        what=f"The camera refused what libgphoto2 asked of it ({said}).",
+        what=f"The camera refused a command of libgphoto2 ({said}).",
         remedy="Check the mode dial (M), the lens switch (manual focus) and the card, then try again.",
     )
 
@@ -40,5 +40,5 @@ def shot_lost(error: DeviceError) -> DeviceError:
     return DeviceGone(
         "camera-shot-lost",
         what=f"The connection to the camera was lost during a picture: {error.what}",
-        remedy="Check cable and battery, then take this picture again; it was not taken twice.",
+        remedy="Check cable and battery, then take this picture again. It was not taken twice.",
     )

@@ -1,4 +1,4 @@
-"""A camera that libgphoto2 has open: what it says and does, in our values. Only on the thread that opened it."""
+"""A camera opened by libgphoto2, with our values. Only for the thread that opened it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LITTLE_SPACE: Final = 1 << 30
 
 
 class Opened:
-    """A camera that the library has open, and what it can be set to. Only on the worker's thread."""
+    """A camera opened by the library, and its settings. Only for the worker's thread."""
 
     def __init__(self, library: Any, camera: Any) -> None:
         self.library = library
@@ -28,7 +28,7 @@ class Opened:
         self.names: dict[str, str] = {kind: name for kind, name in names.items() if name}
 
     def text(self, name: str) -> str:
-        """A widget's value; "" where there is none."""
+        """A widget's value; "" if there is none."""
         try:
             return printable(str(self.camera.get_single_config(name).get_value()))
         except self.library.GPhoto2Error:
@@ -41,12 +41,12 @@ class Opened:
         return [] if widget.get_readonly() else [widget.get_choice(at) for at in range(widget.count_choices())]
 
     def numbers(self, kind: str) -> dict[float, str]:
-        """The numbers that a setting takes, and their words."""
+        """The numbers of a setting, and their texts."""
         read = _READERS[kind]
         return {number: choice for choice in self.choices(kind) if (number := read(choice)) is not None}
 
     def set(self, kind: str, choice: str) -> str:
-        """Set a widget unless it is so, and read it back."""
+        """Set a widget unless it has the value already, and read it back."""
         name = self.names[kind]
         widget = self.camera.get_single_config(name)
         if widget.get_value() != choice:
@@ -74,7 +74,7 @@ def fetched(opened: Opened, found: Sequence[tuple[str, str]], destination: Path)
             path = destination.parent / f"{destination.name}{kind[1]}"
             file = temporary.enter_context(PendingFile(path, kind[0]))
             held = opened.camera.file_get(folder, name, opened.library.GP_FILE_TYPE_NORMAL)
-            data = held.get_data_and_size()  # a view, good for as long as ``held`` lives
+            data = held.get_data_and_size()  # a view, valid as long as ``held`` exists
             if not 0 < len(data) <= LARGEST_PICTURE:
                 raise broken(f"a picture of {len(data)} bytes")
             file.write(memoryview(data).cast("B"))

@@ -1,4 +1,4 @@
-"""What libgphoto2's widgets say about exposure, read as numbers: its choices are texts, and differ by camera."""
+"""Exposure values of libgphoto2's widgets as numbers; their choices are texts and differ by camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ColorHug ALS ambient light sensor: darkness is a condition of calibration."""
+"""The ColorHug ALS ambient light sensor, to check that the room is dark."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SETTLE_S: Final = 0.05
 
 
 class ColorHugLightSensor:
-    """``hal.interfaces.LightSensor``. Readings are asked for, never taken from a queue, so none is stale."""
+    """``hal.interfaces.LightSensor``. Readings are requested, not taken from a queue, so none is old."""
 
     def __init__(self, *, serial: str = "", backend: str = "hidraw", deadline: Deadline) -> None:
         self._link = HidLink(_KIND, serial=serial, backend=backend)
@@ -40,7 +40,7 @@ class ColorHugLightSensor:
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         def ask(sensor: OpenHid) -> DeviceIdentity:
-            # Asked for its settings so that an answer never comes from a sensor that has left.
+            # Read its settings, so that an answer never comes from an unplugged sensor.
             parse_settings(sensor.handle.get_feature_report(REPORT, SETTINGS_LENGTH))
             return DeviceIdentity(sensor.found.maker, sensor.found.product, sensor.serial)
 
@@ -77,7 +77,7 @@ def _not_ready(reading: LightReading) -> DeviceBusy:
     return DeviceBusy(
         "light-sensor-not-ready",
         what=f"The light sensor has no reading: {reading.state.name.lower().replace('_', ' ')}.",
-        remedy="Wait a few seconds; if it stays so, unplug it and plug it in again.",
+        remedy="Wait a few seconds. If it still has none, unplug it and plug it in again.",
     )
 
 
@@ -96,7 +96,7 @@ DRIVER: Final = Driver(
     summary="The ColorHug ALS ambient light sensor (273f:1008).",
     open=open_light_sensor,
     settings={
-        "serial": "its USB serial number; left out: the only sensor there is",
-        "backend": '"hidraw" (default) or "libusb": which way hidapi goes',
+        "serial": "its USB serial number (default: the only sensor)",
+        "backend": '"hidraw" (default) or "libusb": the backend of hidapi',
     },
 )

@@ -1,4 +1,4 @@
-"""A HID device through hidapi, which may hang, and which may lose its device: deadlines, and finding it again."""
+"""A HID device through hidapi, with deadlines for hanging calls, and finding a lost device again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LONGEST_NAME: Final = 126
 
 
 class HidHandle(Protocol):
-    """What is used of ``hid.device``. Every call raises OSError or ValueError where it fails."""
+    """The used part of ``hid.device``. Every call raises OSError or ValueError if it fails."""
 
     def open_path(self, path: bytes) -> None: ...
     def close(self) -> None: ...
@@ -28,7 +28,7 @@ class HidHandle(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HidFound:
-    """A device as hidapi lists it; the names come from the device and are made printable."""
+    """A device in hidapi's list; its names come from the device and are made printable."""
 
     path: bytes
     maker: str
@@ -38,9 +38,9 @@ class HidFound:
 
 @dataclass(frozen=True, slots=True)
 class HidKind:
-    """What to look for. ``name`` is for sentences, e.g. "relay board".
+    """The kind of device to find. ``name`` is for messages, e.g. "relay board".
 
-    ``suits`` sorts out other devices with the same numbers; ``serial_of`` says the serial number of an open one.
+    ``suits`` excludes other devices with the same numbers; ``serial_of`` gives the serial number of an open one.
     """
 
     name: str
@@ -62,7 +62,7 @@ class OpenHid:
 class HidLink(WorkerLink[OpenHid]):
     """A ``WorkerLink`` to one HID device.
 
-    ``serial``: it must have this serial number; "" takes the only one there is, and stays with it.
+    ``serial``: it must have this serial number; "" uses the only one, and keeps to it.
     """
 
     def __init__(self, kind: HidKind, *, serial: str = "", backend: str = "hidraw") -> None:
@@ -80,20 +80,20 @@ class HidLink(WorkerLink[OpenHid]):
         if len(matching) == 1:
             self._serial = matching[0].serial
             return matching[0]
-        for one in matching:
-            one.handle.close()
+        for device in matching:
+            device.handle.close()
         if matching:
             raise DeviceRefused(
                 "hid-several",
                 what=f"There are {len(matching)} devices that could be the {self._kind.name}"
-                f" ({', '.join(one.serial or 'no serial number' for one in matching)}).",
+                f" ({', '.join(device.serial or 'no serial number' for device in matching)}).",
                 remedy="Write the serial number of the right one into stage.toml, or unplug the others.",
             )
         which = f" with serial number {self._serial}" if self._serial else ""
         raise DeviceGone(
             "hid-unplugged",
             what=f"No {self._kind.name}{which} is plugged in ({self._kind.vendor:04x}:{self._kind.product:04x}).",
-            remedy="Check its cable and its hub; it is used again as soon as it is there.",
+            remedy="Check its cable and its hub. Velatura uses it again when it is plugged in.",
         )
 
     def _matching(self) -> list[OpenHid]:
@@ -107,12 +107,12 @@ class HidLink(WorkerLink[OpenHid]):
             except (OSError, ValueError) as error:
                 handle.close()
                 if not any(other.path == found.path for other in self._listed()):
-                    continue  # it has just left
+                    continue  # it was just unplugged
                 refused = self.not_opened(error)
                 if self._serial:
-                    continue  # the one that is wanted may be another, which works
-                for one in opened:
-                    self.let_go(one)
+                    continue  # another one may be the right device, and work
+                for device in opened:
+                    self.let_go(device)
                 raise refused from error
             except BaseException:
                 handle.close()
@@ -126,14 +126,14 @@ class HidLink(WorkerLink[OpenHid]):
         return opened
 
     def _listed(self) -> list[HidFound]:
-        """Each device once, though hidapi lists one for every usage."""
+        """Each device once, although hidapi lists one for every usage."""
         entries = self._module.enumerate(self._kind.vendor, self._kind.product)
         by_path = {entry["path"]: entry for entry in entries}
         found = [
             HidFound(path, *(_name(entry[key]) for key in ("manufacturer_string", "product_string", "serial_number")))
             for path, entry in by_path.items()
         ]
-        return [one for one in found if self._kind.suits(one)]
+        return [device for device in found if self._kind.suits(device)]
 
 
 def _name(text: object) -> str:

@@ -29,7 +29,7 @@ _KIND: Final = HidKind(
 class RelayBoard:
     """``hal.interfaces.PowerSwitch`` on a relay board.
 
-    A board that was unplugged comes back with every relay open; ``state`` always asks the board.
+    After a board was unplugged, all its relays are open; ``state`` always asks the board.
     """
 
     def __init__(self, *, serial: str = "", backend: str = "hidraw", deadline: Deadline) -> None:
@@ -60,7 +60,7 @@ class RelayBoard:
         return self._link.call(ask, deadline=deadline)
 
     def switch(self, channel: int, closed: bool, *, deadline: Deadline) -> None:
-        """Close or open a relay, and see that the board says so; harmless where it is so already.
+        """Close or open a relay, and check it at the board; no effect if it is so already.
 
         Raises DeviceRefused("relay-no-channel"), before anything is sent, or DeviceRefused("relay-stuck").
         """
@@ -72,7 +72,7 @@ class RelayBoard:
                 raise DeviceRefused(
                     "relay-stuck",
                     what=f"Relay {channel} of board {board.serial} did not {'close' if closed else 'open'}.",
-                    remedy="Cut its mains by hand if in doubt, and replace the board.",
+                    remedy="If in doubt, switch its mains off by hand. Replace the board.",
                 )
 
         self._link.call(do, deadline=deadline)
@@ -102,10 +102,10 @@ def open_relay_board(settings: Mapping[str, Any], context: OpenContext, deadline
 DRIVER: Final = Driver(
     kind="power_switch",
     name="usb-relay",
-    summary="USB relay boards that call themselves USBRelay1 to USBRelay8 (16c0:05df).",
+    summary="USB relay boards with the names USBRelay1 to USBRelay8 (16c0:05df).",
     open=open_relay_board,
     settings={
-        "serial": "the board's five-character serial number; left out: the only board there is",
-        "backend": '"hidraw" (default) or "libusb": which way hidapi goes',
+        "serial": "the board's five-character serial number (default: the only board)",
+        "backend": '"hidraw" (default) or "libusb": the backend of hidapi',
     },
 )

@@ -21,14 +21,14 @@ from plugins.worker_link import NotOpened, WorkerLink
 
 _SLICE_S: Final = 0.1
 _LOOK_S: Final = 5.0
-"""After so long a look whether the panel is still there has failed; on a busy machine it may well take a second."""
+"""Time limit of checking that the panel is still connected; on a busy machine it may take a second."""
 _MOST_WAITING: Final = 16
-"""Presses that are kept for a caller who does not ask; older ones are forgotten."""
+"""Number of presses that are kept until they are read; older ones are dropped."""
 _ENCODINGS: Final = {"JPEG": ".jpg", "BMP": ".bmp"}
 
 
 class StreamDeckPanel(WorkerLink[Any]):
-    """``hal.interfaces.ButtonPanel``. After it was unplugged its pictures are put back on it."""
+    """``hal.interfaces.ButtonPanel``. Its pictures are restored after it was unplugged."""
 
     def __init__(self, *, serial: str = "", deadline: Deadline) -> None:
         super().__init__("key panel", broken=(TransportError,))
@@ -40,7 +40,7 @@ class StreamDeckPanel(WorkerLink[Any]):
         except ProbeError as error:
             raise PluginError(
                 "hidapi-missing",
-                what="The library for HID devices that key panels need could not be loaded.",
+                what="The library for key panels could not be loaded.",
                 remedy="Install the system's package libhidapi-libusb0.",
             ) from error
         try:
@@ -74,7 +74,7 @@ class StreamDeckPanel(WorkerLink[Any]):
     def wait_pressed(self, *, deadline: Deadline) -> int | None:
         """See ``hal.interfaces.ButtonPanel.wait_pressed``. Raises DeviceGone while it is unplugged.
 
-        A panel that hangs is told of 5 s after the deadline at the latest.
+        For a hanging panel, it raises at most 5 s after the deadline.
         """
         while True:
             deadline.sleep(0.0)  # a cancelled wait ends
@@ -99,7 +99,7 @@ class StreamDeckPanel(WorkerLink[Any]):
             which = f" with serial number {self._serial}" if self._serial else ""
             raise DeviceGone(
                 "hid-unplugged",
-                what=f"No key panel{which} is plugged in, or it may not be opened.",
+                what=f"No key panel{which} is plugged in, or this user may not open it.",
                 remedy="Check its cable, and install firmware_configs/udev/70-velatura-hid.rules.",
             )
         deck, self._serial = matching[0]
@@ -107,7 +107,7 @@ class StreamDeckPanel(WorkerLink[Any]):
         try:
             for key, picture in tuple(self._pictures.items()):
                 deck.set_key_image(key, picture)
-        except TransportError:  # it has left again
+        except TransportError:  # it was unplugged again
             self.let_go(deck)
             raise
         return deck
@@ -123,7 +123,7 @@ class StreamDeckPanel(WorkerLink[Any]):
                 deck.close()
                 if any(other.id() == deck.id() for other in self._manager.enumerate()):
                     refused = self.not_opened(error)
-                continue  # it has just left, or the one that is wanted may be another
+                continue  # it was just unplugged, or another one is the right panel
             if deck.is_visual() and self._serial in ("", serial):
                 matching.append((deck, serial))
             else:
@@ -135,7 +135,7 @@ class StreamDeckPanel(WorkerLink[Any]):
         return matching
 
     def let_go(self, opened: Any) -> None:
-        # Dark keys: nobody listens to them any more. A panel that has gone needs none.
+        # Dark keys: presses have no effect any more. An unplugged panel needs none.
         with contextlib.suppress(TransportError):
             opened.reset()
         with contextlib.suppress(TransportError):
@@ -203,5 +203,5 @@ DRIVER: Final = Driver(
     name="stream-deck",
     summary="Elgato Stream Deck key panels with pictures on their keys.",
     open=open_key_panel,
-    settings={"serial": "its serial number; left out: the only key panel there is"},
+    settings={"serial": "its serial number (default: the only key panel)"},
 )

@@ -1,4 +1,4 @@
-"""Which optional questions a projector does not answer, or with what nobody understands: noted once, asked seldom."""
+"""Optional queries that a projector does not answer, or not understandably: reported once, repeated seldom."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from typing import Final
 
 SILENT_S: Final = 60.0
-"""An optional question that was not answered is not asked again for so long: each costs seconds."""
+"""Time before an unanswered optional query is repeated, because each costs seconds."""
 
 
 class OptionalAnswers:
-    """One projector's. ``name``: how the technician knows it; ``fields``: what each question is for, for notes."""
+    """For one projector. ``name``: its name for the technician; ``fields``: the purpose of each query, for notes."""
 
     def __init__(self, name: str, fields: Mapping[str, str]) -> None:
         self._name = name
@@ -22,17 +22,17 @@ class OptionalAnswers:
         self._untold: list[tuple[str, str]] = []
 
     def may_ask(self, question: str) -> bool:
-        """Whether an optional question is worth its time now."""
+        """Whether to send an optional query now."""
         return time.monotonic() >= self._silent_until_s.get(question, 0.0)
 
     def silent(self, question: str, *, usual: bool = False) -> None:
-        """An optional question was not answered; ``usual``: in this state many do not, which is not worth a note."""
+        """An optional query was not answered; ``usual``: that is normal in this state and gets no note."""
         self._silent_until_s[question] = time.monotonic() + SILENT_S
         if not usual:
-            self.odd(question, f"It does not answer the question {question}.")
+            self.odd(question, f"It does not answer the query {question}.")
 
     def odd(self, question: str, what: str) -> None:
-        """The answer to an optional question means nothing; ``what``: a sentence that shows it."""
+        """The answer to an optional query was not understood; ``what``: a sentence that shows it."""
         if question not in self._noted:
             told = f"The {self._fields.get(question, question)} of the projector at {self._name} stay unknown,"
             self._untold.append(("projector-answer-odd", f"{told} everything else works. {what}"))
@@ -43,7 +43,7 @@ class OptionalAnswers:
         self._unknown.discard(question)
 
     def knows(self, question: str) -> bool:
-        """Whether the last answer to an optional question, if it was asked, was understood."""
+        """Whether the last answer to an optional query was understood."""
         return question not in self._unknown
 
     def troubles(self) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Projectors on the network that speak PJLink, class 1 or 2."""
+"""Projectors on the network with PJLink, class 1 or 2."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from plugins.projectors.profile_files import load_profile
 
 
 class PjLinkProjector:
-    """A projector that speaks PJLink. Implements ``hal.interfaces.Projector``.
+    """A projector with PJLink. Implements ``hal.interfaces.Projector``.
 
-    Every call has a connection of its own: the projector closes idle ones after 30 s, and what was left unread on an
+    Every call has its own connection: the projector closes idle ones after 30 s, and unread data of an
     old one can never be taken for a new answer.
 
     Parameters
     ----------
     connect : opens a connection
-    profile : its patience and its lamp; the protocol tells neither
-    name : how the technician knows it, for messages
+    profile : its time limits and its lamp, which the protocol does not give
+    name : its name for the technician, for messages
     password : at most 32 characters, or None
     """
 
@@ -62,7 +62,7 @@ class PjLinkProjector:
             with contextlib.suppress(DeviceBusy):
                 talk.power(deadline)
             self._inputs = talk.optional("INST", pjlink.parse_inputs, deadline) or ()
-            # Asked once now, so that ``capabilities`` does not promise what it does not tell.
+            # Asked once now, so that ``capabilities`` is correct.
             talk.optional("LAMP", pjlink.parse_lamps, deadline)
             talk.optional("ERST", pjlink.parse_errors, deadline)
 
@@ -102,7 +102,7 @@ class PjLinkProjector:
         with self._turn(deadline) as talk:
             power = talk.power(deadline)
             if power is Power.COOLING:
-                raise self._refused("projector-cooling", "is still cooling its lamp, and was not switched on")
+                raise self._refused("projector-cooling", "is still cooling its lamp and was not switched on")
             if power is Power.OFF:
                 self._command(talk, "POWR", "1", "switch on", deadline, lambda: talk.power(deadline) is Power.OFF)
         if power is Power.OFF:
@@ -157,8 +157,8 @@ class PjLinkProjector:
     ) -> str | Failure | None:
         """Send a command, and return its answer; None if that was lost.
 
-        It is sent a second time in one case alone: the connection had been used before, was closed with no answer, and
-        the state is ``unchanged``. Then the projector had closed it after the answer before, and never read this.
+        It is sent a second time in one case only: the connection was used before, was closed without an answer, and
+        the state is ``unchanged``. Then the projector had closed it after the previous answer, and never read this.
         """
         try:
             return talk.tell(name, parameter, deadline)
@@ -178,7 +178,7 @@ class PjLinkProjector:
 
     def _accepted(self, told: str | Failure | None, doing: str) -> bool:
         if told is Failure.UNAVAILABLE:
-            raise self._refused("projector-not-now", f"will not {doing} in the state it is in")
+            raise self._refused("projector-not-now", f"refuses to {doing} in its present state")
         if isinstance(told, Failure):
             raise self._refused("projector-refused", f"cannot {doing}: it answered {told.value}")
         if told is not None:
@@ -186,14 +186,14 @@ class PjLinkProjector:
         return told is not None
 
     def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
-        """Wait until the power state shows what a command should have done, whether or not its answer arrived."""
+        """Wait until the power state shows the effect of a command, even if its answer was lost."""
         patience = deadline.within(self._timing.confirm_s)
         while not self._shows(wanted, patience):
             if patience.passed:
                 raise DeviceTimeout(
                     f"projector-not-{word}",
-                    what=f"The projector at {self._name} was told to switch {word}, and did not.",
-                    remedy="Look at its lamps and messages; if it shows nothing, switch it by its own button once.",
+                    what=f"The projector at {self._name} did not switch {word}.",
+                    remedy="Check its indicator lights. If it shows no fault, switch it once with its own button.",
                 )
             patience.sleep(self._timing.boot_interval_s)
 
@@ -202,7 +202,7 @@ class PjLinkProjector:
             with self._turn(deadline) as talk:
                 return talk.power(deadline) in wanted
         except (DeviceBusy, DeviceTimeout, DeviceGone):
-            # A projector that starts may answer nothing for a while.
+            # A starting projector may not answer for a while.
             if self._closed:
                 raise
             return False
@@ -211,12 +211,12 @@ class PjLinkProjector:
         return DeviceRefused(
             code,
             what=f"The projector at {self._name} {doing}.",
-            remedy="Wait until it has cooled and shows standby; if it reports a fault, mend that first.",
+            remedy="Wait until it has cooled and shows standby. If it reports a fault, correct that first.",
         )
 
     @contextlib.contextmanager
     def _turn(self, deadline: Deadline) -> Iterator[PjLinkConversation]:
-        """One caller at a time, none after ``close``; a conversation that ends with it."""
+        """One caller at a time, none after ``close``; with its own connection."""
         talk = PjLinkConversation(self._connect, self._name, self._password, self._timing, self._habits)
         talk.check(deadline)
         with turn(self._lock, deadline, partial(talk.check, deadline)), contextlib.closing(talk):
@@ -237,7 +237,7 @@ def _settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[str, i
         raise PluginError(
             "setting-wrong",
             what=f"The password has {len(password)} characters; PJLink allows 1 to {pjlink.LONGEST_PASSWORD}.",
-            remedy="Correct password in stage.toml, or leave it out.",
+            remedy="Correct password in stage.toml, or remove it.",
         )
     return host, port, password, load_profile(setting(settings, "profile", str, "pjlink"), context.stage)
 
@@ -268,10 +268,10 @@ def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, dea
 DRIVER = Driver(
     kind="projector",
     name="pjlink",
-    summary="Projectors on the network that speak PJLink, class 1 or 2.",
+    summary="Projectors on the network with PJLink, class 1 or 2.",
     open=open_pjlink_projector,
     settings={
-        "address": 'host:port, or host alone for port 4352, e.g. "192.168.0.20"',
+        "address": 'host:port, or only host for port 4352, e.g. "192.168.0.20"',
         "password": "the PJLink password, if the projector has one",
         "profile": "times of its lamp: pjlink (the default), or a .toml file of the stage",
     },

@@ -1,4 +1,4 @@
-"""Talking PJLink over one connection: greeting, password, questions and commands."""
+"""PJLink over one connection: greeting, password, queries and commands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PADDED_LINE: Final = 8 * pjlink.LONGEST_LINE
 
 
 class PjLinkConversation:
-    """One connection, made when first needed; made again when an answer is lost, because the next would be its."""
+    """One connection, opened when first needed, and again when an answer is lost, which could come later."""
 
     def __init__(
         self,
@@ -40,24 +40,24 @@ class PjLinkConversation:
         self._link: ByteLink | None = None
         self._prefix = b""
         self.reused = False
-        """Whether the last question or command went over a connection that had carried another before."""
+        """Whether the last query or command used a connection that was used before."""
 
     def power(self, deadline: Deadline) -> Power:
         told = self.ask("POWR", deadline)
         if isinstance(told, Failure):
             raise DeviceBusy(
                 "projector-busy",
-                what=f"The projector at {self._name} would not tell its power state: it answered {told.value}.",
-                remedy="Wait until it has finished starting or cooling, and ask again.",
+                what=f"The projector at {self._name} did not report its power state: it answered {told.value}.",
+                remedy="Wait until it has finished starting or cooling, then try again.",
             )
         power = pjlink.parse_power(told)
         self._habits.slow = power in (Power.WARMING, Power.COOLING)
         return power
 
     def optional(self, name: str, parse: Callable[[str], T], deadline: Deadline, pj_class: PjClass = 1) -> T | None:
-        """The answer to a question that no projector needs to answer; None if it is refused, silent or meaningless.
+        """The answer to an optional query; None if it is refused, missing or not understood.
 
-        Raises nothing but Cancelled and the refusal of the password: the power state alone is worth an error.
+        Raises only Cancelled and the refusal of the password: only the power state is worth an error.
         """
         if not self._habits.may_ask(name):
             return None
@@ -69,7 +69,7 @@ class PjLinkConversation:
                 self._habits.silent(name)
             return None
         except ProtocolError as error:
-            # What follows on this connection may be the rest of it.
+            # Further data on this connection may be the rest of it.
             self.close()
             self._habits.odd(name, error.what)
             return None
@@ -89,7 +89,7 @@ class PjLinkConversation:
         return self.optional(name, pjlink.parse_text, deadline, pj_class) or ""
 
     def ask(self, name: str, deadline: Deadline, pj_class: PjClass = 1) -> str | Failure:
-        """A question, asked once more over a new connection if its answer is lost."""
+        """A query, repeated over a new connection if its answer is lost."""
         try:
             return self._say(name, "?", deadline, self._answer_s, pj_class)
         except (DeviceTimeout, DeviceGone):
@@ -129,7 +129,7 @@ class PjLinkConversation:
         try:
             line = self._exchanged(message, deadline, patience_s, second_level=self._habits.second_level is True)
             if pjlink.is_refusal(line) and self._habits.second_level is None and self._password is not None:
-                # It refused the digest, and with it the message: nothing was carried out.
+                # It refused the digest, and with it the message: nothing was done.
                 line = self._by_second_level(message, deadline, patience_s)
         except DeviceTimeout as error:
             self.close()
@@ -181,7 +181,7 @@ class PjLinkConversation:
         return self._link
 
     def _proof(self, random: str, deadline: Deadline, second_level: bool) -> bytes:
-        """What goes before the first message, so that the projector accepts it."""
+        """Prefix of the first message, so that the projector accepts it."""
         password = self._password or ""
         if not second_level or self._link is None:
             return pjlink.digest(random, password)
@@ -193,7 +193,7 @@ class PjLinkConversation:
         return pjlink.second_level_digest(theirs, secrets.token_bytes(pjlink.SALT_BYTES), password)
 
     def _wrong_password(self) -> DeviceRefused:
-        had = "did not accept the password" if self._password is not None else "wants a password"
+        had = "did not accept the password" if self._password is not None else "requires a password"
         return DeviceRefused(
             "projector-password",
             what=f"The projector at {self._name} {had}.",
@@ -202,7 +202,7 @@ class PjLinkConversation:
 
 
 def _answer_line(link: ByteLink, deadline: Deadline) -> bytes:
-    """The next line that is an answer: users report projectors that tell of themselves first, and pad with NUL."""
+    """The next line that is an answer: some projectors send notices first, and pad with NUL."""
     while True:
         line = pjlink.bare(link.read_until(pjlink.TERMINATOR, limit=_PADDED_LINE, deadline=deadline))
         if line != pjlink.TERMINATOR and not is_notification(line):

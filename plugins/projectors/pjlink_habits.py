@@ -1,4 +1,4 @@
-"""What was learned of one PJLink projector since it was opened: how soon it may be asked, and in what it is odd."""
+"""Special behaviour of one PJLink projector, learned since it was opened, and how soon it may be asked."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _FIELDS: Final = {
 
 
 class Habits(OptionalAnswers):
-    """One projector's. ``name``: how the technician knows it, for notes.
+    """For one projector. ``name``: its name for the technician, for notes.
 
-    ``slow``: it starts, cools, or did not answer, so the next question has to wait: users report projectors that hang
+    ``slow``: it starts, cools, or did not answer, so the next query has to wait: users report projectors that hang
     when asked often while they start. ``closes``: it closes the connection after each answer. ``second_level``: it
     checks the password by SHA-256; None until MD5 was refused. ``mute``: the kind of AVMT that it accepts.
     """
@@ -40,7 +40,7 @@ class Habits(OptionalAnswers):
         self._asked_at_s = -1e9
 
     def wait(self, deadline: Deadline) -> None:
-        """Wait until the next question may be asked."""
+        """Wait until the next query may be sent."""
         interval_s = self._timing.boot_interval_s if self.slow else self._timing.interval_s
         while (wait_s := self._asked_at_s + interval_s - time.monotonic()) > 0 and not deadline.passed:
             deadline.sleep(wait_s)

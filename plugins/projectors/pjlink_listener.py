@@ -1,4 +1,4 @@
-"""Finding PJLink class 2 projectors on the network, and hearing what they tell unasked (UDP port 4352)."""
+"""Finds PJLink class 2 projectors on the network, and receives their notifications (UDP port 4352)."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from types import TracebackType
 from typing import Final
 
 from hal.codecs.projectors.pjlink import PORT
-from hal.codecs.projectors.pjlink_udp import LONGEST_DATAGRAM, SEARCH, Here, Told, parse_datagram
+from hal.codecs.projectors.pjlink_udp import LONGEST_DATAGRAM, SEARCH, Here, Notification, parse_datagram
 from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, ProtocolError
 
 PATIENCE_S: Final = 30.0
-"""How long the specification lets a controller collect answers to a search."""
+"""Time for answers to a search, from the specification."""
 BROADCAST: Final = "255.255.255.255"
 MOST_FOUND: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
 class FoundProjector:
-    """A projector that answered a search: its IP address, and its MAC address, which stays when the other changes."""
+    """A projector that answered a search: its IP address, and its MAC address, which never changes."""
 
     host: str
     mac: str
@@ -31,10 +31,10 @@ class FoundProjector:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What the projector at ``host`` told. UDP names no sender that can be trusted: ask the projector before acting."""
+    """A notification from ``host``. The sender of UDP can't be trusted: query the projector before acting."""
 
     host: str
-    told: Told
+    notification: Notification
 
 
 class PjLinkListener:
@@ -65,8 +65,8 @@ class PjLinkListener:
             kind = DeviceBusy if error.errno == errno.EADDRINUSE else DeviceRefused
             raise kind(
                 "pjlink-port-taken",
-                what=f"UDP port {port} can't be listened on: {error.strerror}.",
-                remedy=f"End the program that listens there (ss -lunp | grep {port} names it).",
+                what=f"Velatura can't listen on UDP port {port}: {error.strerror}.",
+                remedy=f"End the program that uses the port (ss -lunp | grep {port} shows it).",
             ) from error
 
     @property
@@ -84,9 +84,9 @@ class PjLinkListener:
     def search(
         self, *, deadline: Deadline, to: tuple[str, int] = (BROADCAST, PORT), patience_s: float = PATIENCE_S
     ) -> tuple[FoundProjector, ...]:
-        """Ask who is there and collect answers for ``patience_s``, or until the deadline: what came by then counts.
+        """Send a search and collect answers for ``patience_s``, or until the deadline.
 
-        Notifications that arrive meanwhile are kept for ``heard``. Raises DeviceGone where the network is down.
+        Notifications that arrive meanwhile are kept for ``heard``. Raises DeviceGone if the network is down.
         """
         try:
             self._socket.sendto(SEARCH, to)
@@ -101,19 +101,19 @@ class PjLinkListener:
         while not patience.passed and len(found) < MOST_FOUND:
             patience.sleep(0)
             for heard in self._received(patience):
-                if isinstance(heard.told, Here):
-                    found.setdefault(heard.told.mac, FoundProjector(heard.host, heard.told.mac))
+                if isinstance(heard.notification, Here):
+                    found.setdefault(heard.notification.mac, FoundProjector(heard.host, heard.notification.mac))
                 elif len(self._kept) < MOST_FOUND:
                     self._kept.append(heard)
         return tuple(found.values())
 
     def heard(self, *, deadline: Deadline) -> Heard:
-        """The next thing that a projector tells. DeviceTimeout when nothing came before the deadline."""
+        """The next notification of a projector. DeviceTimeout if none came before the deadline."""
         while not self._kept:
             deadline.check(
                 "pjlink-nothing-heard",
-                what="No projector told anything.",
-                remedy="If it should have, register this machine's address in its network menu.",
+                what="No PJLink notification was received.",
+                remedy="To receive notifications, register this computer's address in the projector's network menu.",
             )
             self._kept += self._received(deadline)
         return self._kept.pop(0)
@@ -123,7 +123,7 @@ class PjLinkListener:
             self._socket.close()
 
     def _received(self, deadline: Deadline) -> list[Heard]:
-        """What one datagram tells, after a short wait; nothing if none came."""
+        """The content of one datagram, after a short wait; nothing if none came."""
         try:
             readable, _, _ = select.select([self._socket], [], [], min(SLICE_S, deadline.left_s()))
             if not readable:
@@ -136,7 +136,7 @@ class PjLinkListener:
                 "pjlink-listener-closed", what="The listener was closed.", remedy="Open it again."
             ) from error
         try:
-            return [Heard(str(sender[0]), told) for told in parse_datagram(data)] if data != SEARCH else []
+            return [Heard(str(sender[0]), sent) for sent in parse_datagram(data)] if data != SEARCH else []
         except ProtocolError:
             self.ignored += 1
             return []

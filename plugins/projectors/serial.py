@@ -1,4 +1,4 @@
-"""Projectors on a serial line, driven by a table (``firmware_configs/projectors``)."""
+"""Projectors on a serial line, with a table of commands (``firmware_configs/projectors``)."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from plugins.projectors.serial_settings import checked_address, read_settings, s
 T = TypeVar("T")
 _FIELDS: Final = {"lamp_hours": "lamp hours"}
 UNNAMED_FAULT: Final = "error-standby"
-"""The word for a projector that answers that it failed, and not how."""
+"""The word for a projector that reports an unknown fault."""
 
 
 class SerialProjector:
-    """A projector that speaks one of the table-driven serial protocols. Implements ``hal.interfaces.Projector``.
+    """A projector with one of the table-driven serial protocols. Implements ``hal.interfaces.Projector``.
 
     Parameters
     ----------
     open_link : opens the serial port; called again whenever the link was lost
-    profile : the family's table; its ``serial`` part must be there
-    name : how the technician knows it, for messages
+    profile : the family's table; it needs a ``serial`` part
+    name : its name for the technician, for messages
     address : the projector's address on the line, or None for the profile's
     """
 
@@ -71,7 +71,7 @@ class SerialProjector:
         )
 
     def open(self, deadline: Deadline) -> None:
-        """Open the port; asks nothing, because a projector that boots must not be disturbed."""
+        """Open the port; sends nothing, because a booting projector must not be disturbed."""
         self._talk.open(deadline)
 
     def _opened(self, deadline: Deadline) -> ByteLink:
@@ -80,7 +80,7 @@ class SerialProjector:
         return link
 
     def _may_be_starting(self) -> bool:
-        """Whether it must be asked seldom: it starts or cools, or may do so for all that was seen since the opening."""
+        """Whether it must be asked seldom: it starts or cools, or may do so."""
         now_s = time.monotonic()
         if self._view.in_transition(now_s):
             return True
@@ -109,7 +109,7 @@ class SerialProjector:
         with self._turn(deadline):
             model = self._told("model", deadline, str)
             if model is None:
-                self._power(deadline)  # whoever answers is one of this family
+                self._power(deadline)  # a projector that answers belongs to this family
             known = f"{self._profile.family}, model code {model}" if model else self._profile.family
             return DeviceIdentity(self._profile.maker, known, firmware=self._told("firmware", deadline, str) or "")
 
@@ -127,9 +127,9 @@ class SerialProjector:
             if power in (Power.ON, Power.WARMING):
                 return
             if power is Power.COOLING:
-                raise self._refused("projector-cooling", "is still cooling its lamp, and was not switched on")
+                raise self._refused("projector-cooling", "is still cooling its lamp and was not switched on")
             if power is Power.UNKNOWN:
-                raise self._refused("projector-state-unknown", "is in a state of which only the number is known")
+                raise self._refused("projector-state-unknown", "is in an unknown state")
             reply = self._talk.command("power_on", deadline=deadline)
             if reply in (Reply.REFUSED, Reply.COOLING):
                 raise self._refused("projector-refused-on", "refused to switch on; its lamp may still be cooling")
@@ -152,7 +152,7 @@ class SerialProjector:
     def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
         with self._turn(deadline):
             if not self.capabilities.shutter:
-                raise self._refused("projector-no-shutter", "cannot block its light")
+                raise self._refused("projector-no-shutter", "has no shutter")
             reply = self._talk.command("shutter_close" if closed else "shutter_open", deadline=deadline)
             if reply is None:
                 raise self._talk.no_answer()
@@ -177,7 +177,7 @@ class SerialProjector:
         return self._view.answered(answer, time.monotonic())
 
     def _power_untold(self, deadline: Deadline) -> Power:
-        """The power state where no question for it is known: any other question shows who is there, and who cools."""
+        """The power state if the family has no query for it: any other query shows that it is there, or cools."""
         try:
             self._talk.ask(next(iter(self._table.queries)), deadline=deadline)
         except DeviceBusy as busy:
@@ -189,12 +189,12 @@ class SerialProjector:
             raise DeviceRefused(
                 "projector-power-unknown",
                 what=f"The projector at {self._name} can't be switched: {self._profile.name} has no codes for it.",
-                remedy="Switch it by its own button or remote control, or add its power codes to the profile.",
+                remedy="Switch it with its own button or remote control, or add its power codes to the profile.",
             )
 
     def _hours(self, power: Power, deadline: Deadline) -> int | None:
         if power in (Power.WARMING, Power.COOLING):
-            return None  # a projector that is busy with its lamp is asked for its power alone
+            return None  # a projector that is busy with its lamp is asked only for its power
         if "lamp_hours" not in self._table.queries:
             return None
         per_hour = self._table.queries["lamp_hours"].per_hour
@@ -202,10 +202,10 @@ class SerialProjector:
         return self._told("lamp_hours", deadline, lambda text: parse_hours(text, per_hour), lit=lit)
 
     def _told(self, question: str, deadline: Deadline, parse: Callable[[str], T], *, lit: bool = True) -> T | None:
-        """The answer to an optional question; None where it is refused, silent or meaningless.
+        """The answer to an optional query; None if it is refused, missing or not understood.
 
-        Only Cancelled and the loss of the port are raised. In standby (not ``lit``) some models leave questions
-        unanswered or answer in another shape, which is no oddity.
+        Raises only Cancelled and the loss of the port. In standby (not ``lit``) some models do not answer queries
+        or answer in another shape, which is normal.
         """
         if question not in self._table.queries or not self._optional.may_ask(question):
             return None
@@ -229,7 +229,7 @@ class SerialProjector:
         return self._optional.troubles()
 
     def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
-        """Wait until the power state shows what a command should have done, whether or not its reply arrived."""
+        """Wait until the power state shows the effect of a command, even if its reply was lost."""
         patience = deadline.within(self._profile.timing.confirm_s)
         while (power := self._seen(deadline)) not in wanted:
             if word == "on" and (self._view.failed or power is Power.FAULT):
@@ -238,8 +238,8 @@ class SerialProjector:
             if patience.passed:
                 raise DeviceTimeout(
                     f"projector-not-{word}",
-                    what=f"The projector at {self._name} was told to switch {word}, and did not.",
-                    remedy="Look at its lamps and messages; if it shows nothing, switch it by its own button once.",
+                    what=f"The projector at {self._name} did not switch {word}.",
+                    remedy="Check its indicator lights. If it shows no fault, switch it once with its own button.",
                 )
             patience.sleep(self._profile.timing.interval_s)
 
@@ -247,7 +247,7 @@ class SerialProjector:
         try:
             return self._power(deadline)
         except (DeviceBusy, DeviceTimeout):
-            # Some models answer nothing while they start; only the caller's own deadline ends the waiting early.
+            # Some models do not answer while they start; only the caller's deadline ends the waiting early.
             if deadline.passed:
                 raise
             return None
@@ -262,7 +262,7 @@ class SerialProjector:
         return DeviceRefused(
             code,
             what=f"The projector at {self._name} {doing}.",
-            remedy="Wait until it has cooled and shows standby; if it reports a fault, mend that first.",
+            remedy="Wait until it has cooled and shows standby. If it reports a fault, correct that first.",
         )
 
     @contextmanager
@@ -302,13 +302,13 @@ def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, dea
 DRIVER = Driver(
     kind="projector",
     name="serial",
-    summary="Projectors on a serial line, by a table of their family's commands.",
+    summary="Projectors on a serial line, with a table of commands.",
     open=open_serial_projector,
     settings={
         "profile": "the family's table: a shipped name such as optoma-later, or a .toml file of the stage",
         "port": "the serial port; a stable name such as /dev/serial/by-id/..., or a path relative to the stage",
-        "baud": "baud rate, if not the profile's",
-        "address": "the projector's number on the line, if not the profile's",
+        "baud": "baud rate (default: the profile's)",
+        "address": "the projector's number on the line (default: the profile's)",
     },
     required=("profile", "port"),
     check=check_serial_projector,

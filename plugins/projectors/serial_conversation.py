@@ -1,4 +1,4 @@
-"""Talking with a serial projector: one question at a time, and never an old answer for a new question."""
+"""Communication with a serial projector: one query at a time, and never an old answer for a new query."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
 
 REAPPEAR_S: Final = 4.0
-"""How long a port that was unplugged is waited for: USB adapters need a second or two to come back."""
+"""Time to wait for an unplugged port: USB adapters need a second or two to come back."""
 COOLS: Final = "projector-cools"
-"""Code of the DeviceBusy that a projector gives because its lamp cools."""
+"""Code of the DeviceBusy of a projector whose lamp cools."""
 
 
 class SerialConversation:
-    """Questions and commands over a link that may be unplugged and come back.
+    """Queries and commands over a link that may be unplugged and come back.
 
-    The protocol does not say which question an answer belongs to. So every line that was not asked for is taken off the
-    link before a question, and after a lost answer nothing else is asked until that answer can no longer come.
+    An answer does not contain its query. So every unread line is removed from the link before a query, and after a
+    lost answer no query is sent until that answer can no longer come.
 
-    ``notice`` is called for every unsolicited line; ``slow`` says whether the projector starts or cools, and must not
+    ``notice`` is called for every unsolicited line; ``slow`` is true if the projector starts or cools, and must not
     be asked often.
     """
 
@@ -65,7 +65,7 @@ class SerialConversation:
         self._garbage: ProtocolError | None = None
 
     def open(self, deadline: Deadline) -> None:
-        """Open the link now, so that a wrong port is known at once."""
+        """Open the link now, so that a wrong port is reported at once."""
         self._link = self._open_link(deadline)
 
     def close(self) -> None:
@@ -79,14 +79,14 @@ class SerialConversation:
             link.close()
 
     def ask(self, question: str, *, deadline: Deadline) -> str:
-        """The value of the answer to a question of the profile; asked once more if the answer is lost.
+        """The value of the answer to a query of the profile; repeated if the answer is lost.
 
         Raises
         ------
         DeviceTimeout  no answer to either
-        ProtocolError  what came was not an answer
-        DeviceBusy     the projector answered that it won't answer now (code ``COOLS``: because its lamp cools)
-        DeviceGone     the port went away and did not come back
+        ProtocolError  the data was not an answer
+        DeviceBusy     the projector refuses to answer now (code ``COOLS``: because its lamp cools)
+        DeviceGone     the port was unplugged and did not come back
         """
         query = self._table.queries[question]
         self._garbage = None
@@ -94,7 +94,7 @@ class SerialConversation:
         for attempt in (1, 2):
             try:
                 if settled:
-                    self._clear(self._connected(deadline))  # half an answer must not grow together with the next
+                    self._clear(self._connected(deadline))  # half an answer must not be joined with the next
                 else:
                     self._settle(deadline)
                     settled = True
@@ -113,7 +113,7 @@ class SerialConversation:
         raise self._garbage or self.no_answer()
 
     def command(self, command: str, *, deadline: Deadline) -> Reply | None:
-        """Send a command once; None if no reply came. Never sent again: the caller must look at what it did."""
+        """Send a command once; None if no reply came. Never sent again: the caller must check its effect."""
         try:
             self._settle(deadline)
         except DeviceGone:
@@ -144,7 +144,7 @@ class SerialConversation:
         )
 
     def _settle(self, deadline: Deadline) -> None:
-        """Wait until the projector may be asked again, and take off the link whatever nobody waits for any more."""
+        """Wait until the projector may be asked again, and remove old data from the link."""
         link = self._connected(deadline)
         interval_s = self._timing.boot_interval_s if self._slow() else self._timing.interval_s
         while (wait_s := self._sent_at_s + interval_s - time.monotonic()) > 0:
@@ -159,7 +159,7 @@ class SerialConversation:
         self._clear(link)
 
     def _clear(self, link: ByteLink) -> None:
-        """Take off the link whatever has arrived; what was told unasked is passed on."""
+        """Remove all data from the link; notices are passed on."""
         left = link.drain()
         for line in left.split(self._table.terminator) if self._table.terminator else ():
             self._swallow(line)
@@ -176,7 +176,7 @@ class SerialConversation:
         self._owed_until_s = self._sent_at_s + self._timing.late_s
 
     def _listen(self, query: Query | None, deadline: Deadline) -> Answer | Reply | None:
-        """The reply to what was just said, or None if none came in time; notices are passed on."""
+        """The reply to the last message, or None if none came in time; notices are passed on."""
         link = self._connected(deadline)
         while (line := self._line(link, deadline)) is not None:
             try:
@@ -187,7 +187,7 @@ class SerialConversation:
             if isinstance(meaning, Notice):
                 self._notice(meaning)
             elif meaning is Reply.NOTHING or (query is not None and meaning is Reply.ACCEPTED):
-                continue  # some models accept a question before they answer it
+                continue  # some models accept a query before they answer it
             else:
                 self._owed -= 1
                 return meaning
@@ -217,7 +217,7 @@ class SerialConversation:
         return head + link.read_exactly(rest, deadline=deadline)
 
     def _ended(self, link: ByteLink, deadline: Deadline) -> bytes:
-        """A line up to its terminator; one that stands in quotes ends nothing."""
+        """A line up to its terminator; a terminator in quotes does not end the line."""
         quote, longest = self._table.quirks.quote.encode("latin-1"), self._table.longest_answer
         line = link.read_until(self._table.terminator, limit=longest, deadline=deadline)
         while quote and line.count(quote) % 2 and len(line) < longest:
@@ -225,7 +225,7 @@ class SerialConversation:
         return line
 
     def _abnormal(self, link: ByteLink) -> bytes | None:
-        """What came without its terminator, if it is whole by the rule for abnormal states."""
+        """Data without a terminator, if it is complete by the rule for abnormal states."""
         end = self._table.quirks.abnormal_terminator
         left = link.drain() if end else b""
         return left if end and left.strip() and left.endswith(end) else None
@@ -254,7 +254,7 @@ class SerialConversation:
                     raise
                 patience.sleep(0.1)
         if self._closed:
-            link.close()  # ``close`` may have looked for it before it was there
+            link.close()  # ``close`` may have run before it existed
         self.check_open()
         return link
 
@@ -265,6 +265,6 @@ class SerialConversation:
     def _busy(self, question: str, *, cooling: bool) -> DeviceBusy:
         return DeviceBusy(
             COOLS if cooling else "projector-busy",
-            what=f"The projector at {self._name} would not tell its {question.replace('_', ' ')} now.",
-            remedy="Wait until it has finished starting or cooling, and ask again.",
+            what=f"The projector at {self._name} does not report its {question.replace('_', ' ')} now.",
+            remedy="Wait until it has finished starting or cooling, then try again.",
         )

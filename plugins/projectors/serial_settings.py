@@ -1,4 +1,4 @@
-"""What a profile and the settings in stage.toml mean for the serial driver."""
+"""Settings of the serial driver from a profile and stage.toml."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def serial_table(profile: ProjectorProfile) -> SerialTable:
 
 
 def told_powers(table: SerialTable) -> frozenset[Power]:
-    """The power states that this family names in its answers."""
+    """The power states in this family's answers."""
     values = table.queries["power"].values if "power" in table.queries else {}
     return frozenset(Power(word) for word in values.values())
 
 
 def checked_address(table: SerialTable, address: str | None) -> str:
-    """The address to use; it must look like the profile's own, e.g. two digits. PluginError("setting-wrong")."""
+    """The address to use, in the same form as the profile's, e.g. two digits. PluginError("setting-wrong")."""
     if address is None:
         return table.address
     alike = len(address) == len(table.address) and address.isascii() and address.isalnum()
@@ -40,7 +40,7 @@ def checked_address(table: SerialTable, address: str | None) -> str:
         raise PluginError(
             "setting-wrong",
             what=f"The address {address!r} is not like {table.address!r}.",
-            remedy="Set address in stage.toml to the projector's own number, or leave it out.",
+            remedy="Set address in stage.toml to the projector's number, or remove it.",
         )
     return address
 

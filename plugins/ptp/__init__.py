@@ -1,1 +1,1 @@
-"""Cameras that speak PTP. Entry: `camera.DRIVER`; `still` is the camera, `body` what a maker's body does."""
+"""Cameras with PTP. Entry: `camera.DRIVER`; `still` is the camera, `body` the behaviour of a maker's bodies."""

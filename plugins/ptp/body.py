@@ -1,4 +1,4 @@
-"""What the two families of camera bodies, generic and Canon EOS, have in common towards ``plugins.ptp.camera``."""
+"""The common interface of the two families of camera bodies, generic and Canon EOS, for ``plugins.ptp.camera``."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from plugins.ptp.link import MOST_IN_MEMORY, Diary, PtpLink, Reply, Sink, camera
 from plugins.ptp.shot import Picture, Shot, Timing
 
 LARGEST_PICTURE: Final = 1 << 30
-"""Bytes; what claims to be larger is no photograph, and would only fill the disk."""
+"""Maximum bytes of a photograph; a larger size is an error and would fill the disk."""
 _EVERY_STORE: Final = 0xFFFF_FFFF
 _LITTLE_SPACE: Final = 1 << 30
 _LOW_BATTERY: Final = 25
 
 
 class Channel:
-    """A link, what the camera at its end can do, and patience with it.
+    """A link, the capabilities of its camera, and time limits.
 
-    ``exposing_until_s``: when, on the monotonic clock, an exposure will be over that nobody waits for any more.
+    ``exposing_until_s``: the end, on the monotonic clock, of an abandoned exposure.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Channel:
         self._properties = properties
 
     def patience(self, deadline: Deadline) -> Deadline:
-        """Until when a busy camera is asked again: beyond any exposure that goes on without us."""
+        """Time limit for asking a busy camera again: after the end of any abandoned exposure."""
         return deadline.within(max(0.0, self.exposing_until_s - time.monotonic()) + self.timing.busy_s)
 
     def has(self, operation: int) -> bool:
@@ -64,7 +64,7 @@ class Channel:
         patience_s: float | None = None,
         meanwhile: Callable[[], object] | None = None,
     ) -> Reply:
-        """Do an operation until it is done; a busy camera is asked again, ever more slowly, for ``busy_s``.
+        """Do an operation until it succeeds; a busy camera is asked again, at growing intervals, for ``busy_s``.
 
         ``doing`` completes "The camera refused to ..."; ``meanwhile`` runs between two attempts. Raises DeviceBusy,
         DeviceRefused, and what the link raises.
@@ -96,7 +96,7 @@ class Channel:
         most: int | None = None,
         patience_s: float | None = None,
     ) -> Reply:
-        """Do an operation once and return whatever the camera answers."""
+        """Do an operation once and return the camera's answer."""
         until = deadline.within(self.timing.answer_s if patience_s is None else patience_s)
         began_s = time.monotonic()
         reply = self.link.transact(
@@ -131,8 +131,8 @@ class Channel:
             infos = [self.once(Operation.GET_STORAGE_INFO, store, deadline=deadline) for store in present[:8]]
             cards = [StorageInfo.parse(info.data) for info in infos if info.ok]
             if cards:
-                free_bytes, free_pictures = sum(one.free for one in cards), sum(one.free_images for one in cards)
-            if not any(one.writable for one in cards):
+                free_bytes, free_pictures = sum(card.free for card in cards), sum(card.free_images for card in cards)
+            if not any(card.writable for card in cards):
                 warnings.append("card-unusable")
             elif free_bytes is not None and free_bytes < _LITTLE_SPACE:
                 warnings.append("card-nearly-full")
@@ -141,7 +141,7 @@ class Channel:
         return CameraStatus(battery_percent, free_bytes, free_pictures, tuple(warnings))
 
     def picture(self, handle: int, deadline: Deadline) -> Picture | None:
-        """What lies under a handle, if it is a picture and ready; else None."""
+        """The object of a handle, if it is a finished picture; else None."""
         reply = self.once(Operation.GET_OBJECT_INFO, handle, deadline=deadline)
         if not reply.ok:
             return None
@@ -182,7 +182,7 @@ class Channel:
                 deadline=deadline,
             )
             if not start < file.size <= start + count:
-                raise broken(f"{file.size - start} bytes of a picture where {count} were asked for")
+                raise broken(f"{file.size - start} bytes of a picture instead of {count}")
         if file.size != picture.size:
             raise broken(f"{file.size} bytes of a picture of {picture.size}")
 
@@ -203,7 +203,7 @@ class Body(Protocol):
         """The exposure that is set now."""
 
     def release(self, shot: Shot, *, deadline: Deadline) -> None:
-        """Press the button once. ``shot.fired`` says afterwards, also after an error, whether it may have fired."""
+        """Press the button once. Afterwards, also after an error, ``shot.fired`` is true if it may have fired."""
 
     def collect(self, shot: Shot, *, deadline: Deadline) -> list[Picture]:
         """Wait for the pictures of ``shot``."""
@@ -212,10 +212,10 @@ class Body(Protocol):
         """Stream one picture into ``file``."""
 
     def done(self, picture: Picture, *, deadline: Deadline) -> None:
-        """The picture is safe on this computer; the camera may forget it."""
+        """The picture is safe on this computer; the camera may delete it."""
 
     def keep_alive(self, *, deadline: Deadline) -> None:
-        """Tell the camera that somebody is there."""
+        """Keep the camera awake."""
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
         """See ``hal.interfaces.WatchedCamera``."""
@@ -227,15 +227,15 @@ class Body(Protocol):
         """See ``hal.interfaces.LiveViewCamera``."""
 
     def leave(self, *, deadline: Deadline) -> None:
-        """Give control back."""
+        """Release the camera."""
 
 
 def still_waiting(deadline: Deadline) -> None:
-    """Raise DeviceTimeout where the caller's time is over before the picture came."""
+    """Raise DeviceTimeout if the deadline passed before the picture came."""
     deadline.check(
         "camera-no-picture",
-        what="The picture did not come from the camera in the time that was given.",
-        remedy="Give it more than twice the exposure, and look whether the camera shows an error.",
+        what="The camera did not send the picture in time.",
+        remedy="Allow more than twice the exposure time, and check whether the camera shows an error.",
     )
 
 
@@ -244,8 +244,8 @@ def nearest(allowed: Collection[float], wanted: float, *, setting: str) -> float
     if not allowed:
         raise DeviceRefused(
             "camera-setting-fixed",
-            what=f"The camera does not let its {setting} be set now.",
-            remedy="Turn its mode dial to M, take it out of bulb and automatic modes, then try again.",
+            what=f"The camera's {setting} can't be set now.",
+            remedy="Turn its mode dial to M, leave bulb and automatic modes, then try again.",
         )
     if math.isfinite(wanted) and wanted > 0:
         best = min(allowed, key=lambda value: abs(math.log2(value / wanted)))
@@ -261,15 +261,15 @@ def nearest(allowed: Collection[float], wanted: float, *, setting: str) -> float
 def no_live_view() -> DeviceRefused:
     return DeviceRefused(
         "camera-no-live-view",
-        what="The camera can't show what it sees over its cable.",
-        remedy="Look through its finder, or take a picture to aim with.",
+        what="The camera has no live view over its cable.",
+        remedy="Use its viewfinder, or take a test picture to aim.",
     )
 
 
 def no_such_file(raw: bool) -> DeviceRefused:
-    """The error for a kind of file that the body does not make."""
+    """The error for a kind of file that the body does not support."""
     return DeviceRefused(
         "camera-no-raw" if raw else "camera-no-jpeg",
-        what=f"The camera does not make {'RAW' if raw else 'JPEG'} files.",
+        what=f"The camera does not support {'RAW' if raw else 'JPEG'} files.",
         remedy=f"Set raw = {'false' if raw else 'true'} for this camera.",
     )

@@ -1,4 +1,4 @@
-"""Which way of releasing a camera is taken: by the operations that it lists, never by its model's name."""
+"""Chooses how to release a camera: by the operations that it lists, never by its model's name."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def choose_body(channel: Channel, info: DeviceInfo, *, to_card: bool, keep_on_ca
         return GenericBody(channel, info, keep_on_card=keep_on_card)
     raise DeviceRefused(
         "camera-no-remote-release",
-        what=f"The {info.model or 'camera'} cannot be released over its cable.",
+        what=f"The {info.model or 'camera'} can't be released over its cable.",
         remedy="Set its USB or network mode to PTP or remote control, or use another camera.",
     )
 
 
 def device_info(channel: Channel, deadline: Deadline) -> DeviceInfo:
-    """What the camera says that it is and can do."""
-    return DeviceInfo.parse(channel.ask(Operation.GET_DEVICE_INFO, doing="say what it is", deadline=deadline).data)
+    """The camera's identity and capabilities."""
+    return DeviceInfo.parse(channel.ask(Operation.GET_DEVICE_INFO, doing="identify itself", deadline=deadline).data)

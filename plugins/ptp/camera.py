@@ -1,4 +1,4 @@
-"""The driver ``ptp``: still cameras that speak PTP, over the network or USB, which do what their DeviceInfo lists."""
+"""The driver ``ptp``: still cameras with PTP over the network or USB, by the operations in their DeviceInfo."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
 
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
     """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
-    address, to_card, keep_on_card, both = _settings(settings)  # a wrong one leaves no file behind
+    address, to_card, keep_on_card, both = _settings(settings)  # a wrong address leaves no file
     transcript = None
     if context.transcripts is not None:
         context.transcripts.mkdir(parents=True, exist_ok=True)
@@ -51,7 +51,7 @@ def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Dea
 def _way(address: str, transcript: Transcript | None) -> Connect:
     """What opens a link to ``address``. Raises PluginError."""
     if address.startswith("usb:"):
-        # Only here: a stage with its camera on the network needs no libusb.
+        # Imported here, because a stage with its camera on the network needs no libusb.
         from plugins.ptp.usb.bus import UsbAddress, UsbFinder
 
         return UsbFinder(UsbAddress.parse(address), transcript=transcript).connect
@@ -69,7 +69,7 @@ def _named(address: str) -> str:
 def _choice(settings: Mapping[str, Any], key: str, *allowed: str) -> str:
     value = str(settings.get(key, allowed[0]))
     if value not in allowed:
-        raise _wrong_setting(key, value, " or ".join(f'"{one}"' for one in allowed))
+        raise _wrong_setting(key, value, " or ".join(f'"{choice}"' for choice in allowed))
     return value
 
 
@@ -91,14 +91,14 @@ def _wrong_setting(key: str, value: object, allowed: str) -> PluginError:
 DRIVER: Final = Driver(
     kind="camera",
     name="ptp",
-    summary="Still cameras that speak PTP over USB or the network (PTP/IP): standard ones and Canon EOS.",
+    summary="Still cameras with PTP over USB or the network (PTP/IP): standard ones and Canon EOS.",
     open=open_camera,
     settings={
         "address": "usb:SERIAL, usb:VENDOR:PRODUCT, usb:PORT, usb: for any, or ptpip:HOST:COMMANDPORT[:EVENTPORT]",
-        "serial": "serial number that the camera must have; left out: whichever answers",
-        "target": '"computer" (default) or "card": where a Canon EOS puts its pictures first',
-        "raw_and_jpeg": "true to get a JPEG beside each RAW file, where the camera can do that (default false)",
-        "keep_on_card": "true to leave pictures on the card after they were fetched (default false)",
+        "serial": "serial number that the camera must have (default: any)",
+        "target": '"computer" (default) or "card": where a Canon EOS stores its pictures first',
+        "raw_and_jpeg": "true to get a JPEG with each RAW file, if the camera can (default false)",
+        "keep_on_card": "true to keep pictures on the card after the transfer (default false)",
     },
     required=("address",),
     check=check_camera,

@@ -1,4 +1,4 @@
-"""Pictures on this computer's disk: hashed while they stream in, durable before anyone is told of them."""
+"""Pictures on this computer's disk: hashed during the transfer, durable before they are reported."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _RAW_SUFFIX_OF: Final = {Format.CANON_CR2: ".cr2", Format.CANON_CR3: ".cr3", For
 
 
 def kind_of(format_code: int, filename: str) -> tuple[FileKind, str] | None:
-    """Kind and suffix of a picture on the camera, or None for anything that is no picture (a folder, a film).
+    """Kind and suffix of a picture on the camera, or None for other objects (a folder, a film).
 
-    A name's ending tells more than the format: vendors share the codes of raw formats, or use none.
+    The end of the name is more specific than the format: vendors share the codes of raw formats, or use none.
     """
     suffix = PurePosixPath(filename).suffix.lower()
     if format_code == Format.FOLDER:
@@ -38,9 +38,9 @@ def kind_of(format_code: int, filename: str) -> tuple[FileKind, str] | None:
 
 
 class PendingFile:
-    """A picture on its way to ``path``, under a temporary name beside it until ``commit``.
+    """A picture being written to ``path``, under a temporary name until ``commit``.
 
-    As a context it leaves nothing behind unless it was committed.
+    As a context manager it leaves no file unless it was committed.
     """
 
     def __init__(self, path: Path, kind: FileKind) -> None:
@@ -98,12 +98,12 @@ def commit_all(pending: Iterable[PendingFile]) -> list[CapturedFile]:
     Raises ProtocolError for an empty file, and DeviceError where the disk fails.
     """
     files = list(pending)
-    for one in files:
-        if one.size == 0:
-            raise broken(f"an empty picture for {one.path.name}")
-        one.sync()
-    named = [one.commit() for one in files]
-    for folder in {one.path.parent for one in files}:
+    for file in files:
+        if file.size == 0:
+            raise broken(f"an empty picture for {file.path.name}")
+        file.sync()
+    named = [file.commit() for file in files]
+    for folder in {file.path.parent for file in files}:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(handle)
@@ -116,11 +116,11 @@ def _disk(error: OSError, path: Path) -> DeviceError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DeviceError(
             "no-space",
-            what=f"There was no space left to store the picture {path.name}.",
-            remedy=f"Free some space on the disk that holds {path.parent}; nothing was left half-written.",
+            what=f"The disk has no space for the picture {path.name}.",
+            remedy=f"Free space on the disk of {path.parent}.",
         )
     return DeviceError(
         "cannot-write",
         what=f"The picture {path.name} could not be written: {error.strerror}.",
-        remedy=f"Check the permissions of {path.parent} and that its disk is mounted for writing.",
+        remedy=f"Check the permissions of {path.parent} and that its disk is writable.",
     )

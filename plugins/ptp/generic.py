@@ -1,4 +1,4 @@
-"""Cameras that keep to the standard: InitiateCapture, its events, and the standard exposure properties (ISO 15740)."""
+"""Standard cameras: InitiateCapture, its events, and the standard exposure properties (ISO 15740)."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class GenericBody:
         give_up = self._channel.patience(deadline)
         pause_s = 0.01
         while True:
-            # Anew each time: while the camera was busy, an earlier picture may have been finished.
+            # At each attempt: while the camera was busy, an earlier picture may have been finished.
             shot.known = self._channel.handles(deadline)
             self._channel.link.events()
             wanted = (self._raw_format if self._raw else Format.JPEG) if self._format_selectable else 0
@@ -109,7 +109,7 @@ class GenericBody:
             pause_s = min(0.5, 2 * pause_s)
 
     def collect(self, shot: Shot, *, deadline: Deadline) -> list[Picture]:
-        """Follow the events; where they do not come in time, or were lost with a connection, list the card instead."""
+        """Wait for the events; if they are late, or were lost with a connection, list the card instead."""
         timing = self._channel.timing
         complete = False
         newest_s = 0.0
@@ -120,7 +120,7 @@ class GenericBody:
             if not shot.found and (complete or shot.age_s() >= listing_due_s):
                 self._look_at(shot, self._channel.handles(deadline), deadline)
                 if shot.found and not shot.recovering:
-                    self._channel.diary.add("camera-event-lost", "The camera did not tell of a picture that it has.")
+                    self._channel.diary.add("camera-event-lost", "The camera has a picture that it did not report.")
                 listing_due_s = shot.age_s() + _LISTING_EVERY_S
             if len(shot.found) > before:
                 newest_s = shot.age_s()
@@ -133,7 +133,7 @@ class GenericBody:
             self._channel.link.wait_event(_LISTING_EVERY_S, deadline=deadline)
 
     def _follow_events(self, shot: Shot, deadline: Deadline) -> bool:
-        """Take in what the camera has said since; True once it says that the capture is complete."""
+        """Read the camera's events; True once the capture is complete."""
         complete = False
         for event in self._channel.link.events():
             if event.code == EventCode.OBJECT_ADDED and event.parameters:
@@ -152,7 +152,7 @@ class GenericBody:
             self._channel.once(Operation.DELETE_OBJECT, picture.handle, 0, deadline=deadline)
 
     def keep_alive(self, *, deadline: Deadline) -> None:
-        """Any question keeps a standard camera awake."""
+        """Any query keeps a standard camera awake."""
         self._channel.once(Operation.GET_STORAGE_IDS, deadline=deadline)
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
@@ -165,7 +165,7 @@ class GenericBody:
         """There is none."""
 
     def leave(self, *, deadline: Deadline) -> None:
-        """A standard camera is not taken over, so there is nothing to give back."""
+        """A standard camera has no remote mode to end."""
 
     def _look_at(self, shot: Shot, handles: set[int] | frozenset[int], deadline: Deadline) -> None:
         for handle in sorted(handles - shot.known - shot.found.keys()):
@@ -174,7 +174,7 @@ class GenericBody:
                 shot.found[handle] = picture
 
     def _allowed(self, code: Property) -> list[float]:
-        """What the property can be set to, ascending; empty where it can't be set."""
+        """The property's possible values, ascending; empty if it can't be set."""
         description = self._settings.get(code)
         if description is None or not description.writable:
             return []
@@ -188,7 +188,7 @@ class GenericBody:
         return nearest(self._allowed(code), wanted, setting=setting)
 
     def _confirm(self, code: Property, value: float, deadline: Deadline) -> float:
-        """Set, unless it is so already, and read back: what counts is what the camera says afterwards."""
+        """Set, unless it has the value already, and read back: the value read counts."""
         description = self._settings[code]
         wanted = round(value / _STEPS[code])
         if self._read(description, deadline) != wanted:
@@ -217,7 +217,7 @@ class GenericBody:
         reply = self._channel.ask(Operation.GET_PROPERTY, description.code, doing=doing, deadline=deadline)
         value = parse_value(reply.data, description.data_type)
         if not isinstance(value, int):
-            raise broken(f"a setting 0x{description.code:04x} that is no number")
+            raise broken(f"a setting 0x{description.code:04x} that is not a number")
         return value
 
 

@@ -1,4 +1,4 @@
-"""What a PTP camera driver needs of the bus, whichever it is, and the sentences for what goes wrong on it."""
+"""The interface of a PTP bus, and its error messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused
 from hal.transcript import Transcript
 
 Sink = Callable[[memoryview], object]
-"""Takes the bytes of a data phase piece by piece; the memory is reused after it returns."""
+"""Receives the bytes of a data phase in pieces; the memory is reused after it returns."""
 
 MOST_IN_MEMORY: Final = 32 << 20
 """Bytes of a data phase that is not streamed: 8 million object handles would fit."""
@@ -24,7 +24,7 @@ _MOST_NOTES: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A finished transaction. ``data`` is empty where a sink took it."""
+    """A finished transaction. ``data`` is empty if a sink received it."""
 
     code: int
     parameters: tuple[int, ...]
@@ -41,14 +41,14 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class LinkEvent:
-    """An event that the camera sent by itself."""
+    """An event from the camera."""
 
     code: int
     parameters: tuple[int, ...]
 
 
 class Diary:
-    """What went wrong with a camera and was mended, for a journal; the oldest is forgotten where nobody asks."""
+    """Corrected faults of a camera, for a journal; the oldest are dropped if they are not read."""
 
     def __init__(self, transcript: Transcript | None = None) -> None:
         self._notes: deque[tuple[str, str]] = deque(maxlen=_MOST_NOTES)
@@ -70,7 +70,7 @@ class PtpLink(Protocol):
 
     @property
     def broken(self) -> bool:
-        """Whether the connection is of no more use."""
+        """Whether the connection is broken."""
 
     def transact(
         self,
@@ -96,7 +96,7 @@ class PtpLink(Protocol):
 
 
 def camera_off(where: str, why: str) -> DeviceGone:
-    """Nobody answers at the camera's address."""
+    """No answer at the camera's address."""
     return DeviceGone(
         "camera-off",
         what=f"No camera answers at {where}: {why}.",
@@ -109,7 +109,7 @@ def camera_lost(why: str) -> DeviceGone:
     return DeviceGone(
         "camera-disconnected",
         what=f"The connection to the camera ended: {why}.",
-        remedy="Check the cable or network, the battery, and that no automatic power-off is set.",
+        remedy="Check the cable or network and the battery, and switch automatic power-off off.",
     )
 
 
@@ -130,7 +130,7 @@ def refused(reply: Reply, doing: str) -> DeviceError:
     try:
         name = Answer(reply.code).name.lower().replace("_", " ")
     except ValueError:
-        name = "a reason of its own"
+        name = "unknown reason"
     return DeviceRefused(
         "camera-refused",
         what=f"The camera refused to {doing}: {name} (0x{reply.code:04x}).",
@@ -143,10 +143,10 @@ def card_full(code: int) -> DeviceRefused:
         return DeviceRefused(
             "card-full",
             what="The camera took no picture because its memory is full.",
-            remedy="Empty or replace the card, then go on; nothing was exposed.",
+            remedy="Empty or replace the card, then continue. Nothing was exposed.",
         )
     return DeviceRefused(
         "card-unusable",
         what="The camera took no picture because its card is missing or write-protected.",
-        remedy="Insert a card, or slide its lock back, then go on; nothing was exposed.",
+        remedy="Insert a card, or unlock it, then continue. Nothing was exposed.",
     )

@@ -1,4 +1,4 @@
-"""One press of a camera's button and what came of it, and how patient the driver is meanwhile."""
+"""One press of a camera's button with its results, and the driver's time limits."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from hal.errors import DeviceError, DeviceGone, DeviceTimeout
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How patient the driver is, in seconds.
+    """The driver's time limits, in seconds.
 
     ``answer_s``: for an ordinary answer; ``busy_s``: with a busy camera; ``margin_s``: for a picture, beyond twice its
-    exposure; ``grace_s``: for an event, before asking for what it would have told; ``come_back_s``: for a lost camera
+    exposure; ``grace_s``: for an event, before its information is requested; ``come_back_s``: for a lost camera
     to answer again, ``reconnect_s``: the same during a picture; ``keep_alive_s``: between two signs of life while it
-    works, ``idle_s``: while nobody asks for anything; ``slow_s``: an answer that took longer is noted.
+    works, ``idle_s``: without any call; ``slow_s``: an answer that took longer is noted.
     """
 
     answer_s: float = 15.0
@@ -42,7 +42,7 @@ class Picture:
 
 @dataclass(slots=True)
 class Shot:
-    """One press of the button. ``fired`` from just before the request until the camera says that it did nothing.
+    """One press of the button. ``fired`` from just before the request until the camera reports that it did nothing.
 
     ``known``: handles on the card before it; ``recovering``: the connection was lost since; ``held``: the shutter is
     open and waits to be closed by us (bulb).
@@ -65,7 +65,7 @@ class Shot:
         self.fired = False
 
     def resume(self) -> None:
-        """Look for the picture on a new connection."""
+        """Search for the picture on a new connection."""
         self.recovering = True
         self.waiting_since_s = time.monotonic()
         self.found.clear()
@@ -75,25 +75,25 @@ class Shot:
         return time.monotonic() - self.fired_at_s
 
     def overdue(self, timing: Timing) -> bool:
-        """Whether the picture should have been there by now: twice its exposure and a margin."""
+        """Whether the picture is overdue: after twice its exposure and a margin."""
         return time.monotonic() - self.waiting_since_s > 2 * self.exposure_s + timing.margin_s
 
     def missing(self) -> DeviceError:
-        """The error for a picture that was fired and never came, or was exposed for too long."""
+        """The error for a picture that was fired and did not come, or was exposed for too long."""
         if self.held:
             return DeviceGone(
                 "camera-bulb-cut",
-                what="The connection to the camera was lost during a long exposure, which so got a wrong length.",
+                what="The connection to the camera was lost during a long exposure, so its exposure time is wrong.",
                 remedy="Check cable, network and battery, then take this picture again.",
             )
         if self.recovering:
             return DeviceGone(
                 "camera-shot-lost",
-                what="The connection to the camera was lost during a picture, and the camera has no new one.",
-                remedy="Check cable, network and battery, then take this picture again; it was not taken twice.",
+                what="The connection to the camera was lost during a picture, and the camera has no new picture.",
+                remedy="Check cable, network and battery, then take this picture again. It was not taken twice.",
             )
         return DeviceTimeout(
             "camera-no-picture",
-            what="The camera was released but no picture came from it in time.",
+            what="The camera was released, but no picture came in time.",
             remedy="Check that its lens is on manual focus and its drive mode on single shot, then take it again.",
         )

@@ -1,4 +1,4 @@
-"""A still camera that speaks PTP over whatever link: what it is told survives its leaving and coming back."""
+"""A still camera with PTP over any link: its settings are restored after a lost connection."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class PtpCamera:
 
     ``connect`` opens a new link whenever one is needed: a lost connection is opened again, the settings are restored,
     and a picture in progress is looked for on the camera instead of being taken again. One caller at a time; the others
-    wait. While nobody calls, a thread of its own keeps the camera awake.
+    wait. Between calls, a thread keeps the camera awake.
 
     Parameters
     ----------
-    serial : the camera must say this serial number; "" takes the first that answers and stays with it
+    serial : the camera must have this serial number; "" uses the first that answers and keeps to it
     to_card : let a Canon EOS store on its card instead of sending straight to this computer
     keep_on_card : leave pictures on the card after they are safe here
-    both : a JPEG comes with each RAW file, where the camera can do that
-    transcript : closed with the camera; what passes over a link is recorded by whoever opens it
+    both : get a JPEG with each RAW file, if the camera can
+    transcript : closed with the camera; the opener of a link records its bytes
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class PtpCamera:
     def close(self) -> None:
         self._closed = True
         self._leaving.set()
-        # A call that another thread has left hanging must not keep this one from ending.
+        # A hanging call of another thread must not block this one.
         mine = self._lock.acquire(timeout=_CLOSE_S)
         try:
             self._close(farewell=mine)
@@ -140,7 +140,7 @@ class PtpCamera:
                 self._lock.release()
 
     def _close(self, *, farewell: bool) -> None:
-        """``farewell``: nobody else is on the link, whose answer could be taken for ours and ours for his."""
+        """``farewell``: no other call uses the link, so answers can't be mixed up."""
         deadline = in_seconds(_CLOSE_S)
         body, channel, self._body, self._channel = self._body, self._channel, None, None
         if channel is not None:
@@ -166,13 +166,13 @@ class PtpCamera:
                 pictures = body.collect(shot, deadline=deadline)
                 return self._fetch(body, pictures, destination, deadline)
             except (DeviceGone, DeviceTimeout, ProtocolError) as error:
-                # Only a broken link is worth another attempt; a camera that answers has said its last word.
+                # Try again only after a broken link; an answer of the camera is final.
                 if attempt == _ATTEMPTS or deadline.passed or not self._link_broken():
                     raise
                 self._diary.add(error.code, error.what)
 
     def _with_body(self, work: Callable[[Body], Result], deadline: Deadline) -> Result:
-        """Do ``work``; if that breaks the connection, once more on a new one. Only for what may be done twice."""
+        """Do ``work``; if that breaks the connection, again on a new one. Only for repeatable work."""
         with self._turn(deadline):
             body = self._ready(deadline, self._timing.come_back_s)
             try:
@@ -185,15 +185,15 @@ class PtpCamera:
 
     @contextlib.contextmanager
     def _turn(self, deadline: Deadline) -> Iterator[None]:
-        """One caller at a time; another's exposure may take longer than this one has."""
+        """One caller at a time; another caller's exposure may exceed this deadline."""
         with turn(self._lock, deadline, partial(_still_time, deadline)):
             yield
 
     def _stay_awake(self) -> None:
-        """A camera that nobody talks to switches itself off."""
+        """An idle camera switches itself off."""
         while not self._leaving.wait(self._timing.idle_s):
             if not self._lock.acquire(blocking=False):
-                continue  # somebody talks to it
+                continue  # it is in use
             try:
                 if self._body is not None and not self._link_broken():
                     self._body.keep_alive(deadline=in_seconds(_ALIVE_S))
@@ -209,12 +209,12 @@ class PtpCamera:
         if deadline.left_s() <= shot.exposure_s:
             raise DeviceTimeout(
                 "camera-deadline-too-short",
-                what=f"An exposure of {shot.exposure_s:g} s does not fit in the {deadline.left_s():.1f} s left for it.",
-                remedy="Give the picture more than twice its exposure; nothing was exposed.",
+                what=f"An exposure of {shot.exposure_s:g} s does not fit into the remaining {deadline.left_s():.1f} s.",
+                remedy="Allow more than twice the exposure time. Nothing was exposed.",
             )
 
     def _fetch(self, body: Body, pictures: list[Picture], destination: Path, deadline: Deadline) -> list[CapturedFile]:
-        """Download all files of one picture, name them together, and only then let the camera forget them."""
+        """Download all files of one picture, name them together, and only then let the camera delete them."""
         with ExitStack() as temporary:
             pending: list[PendingFile] = []
             for picture in pictures:
@@ -226,7 +226,7 @@ class PtpCamera:
                 body.download(picture, file, deadline=deadline)
                 pending.append(file)
             captured = commit_all(pending)
-        # The files are safe: whatever goes wrong now must not make the caller take this picture again.
+        # The files are safe: an error now must not make the caller take this picture again.
         with contextlib.suppress(DeviceError):
             for picture in pictures:
                 body.done(picture, deadline=in_seconds(max(1.0, min(5.0, deadline.left_s()))))
@@ -281,7 +281,7 @@ class PtpCamera:
             body.prepare(deadline=deadline)
             if self._settings is not None:
                 body.configure(self._settings, deadline=deadline)
-            # ``close`` does not wait for ever for whoever is here: nobody else would let go of what it did not find.
+            # ``close`` does not wait for this thread without limit, so a link opened after it must be closed here.
             self._check_open()
         except BaseException:
             link.close()
@@ -291,11 +291,11 @@ class PtpCamera:
         return body
 
     def _check_serial(self, info: DeviceInfo) -> None:
-        """Calibration belongs to one camera: another one at the same address must not go unnoticed."""
+        """A calibration is for one camera, so refuse another one at the same address."""
         if self._serial and info.serial != self._serial:
             raise DeviceRefused(
                 "camera-other",
-                what=f"The camera that answers is number {info.serial or '(none)'}, not {self._serial}.",
+                what=f"The connected camera has the serial number {info.serial or '(none)'}, not {self._serial}.",
                 remedy="Connect the right camera, or change serial in stage.toml and recalibrate.",
             )
         self._serial = self._serial or info.serial

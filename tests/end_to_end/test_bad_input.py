@@ -37,7 +37,7 @@ MISTAKES = {
     "unknown table": Mistake(
         "[camera]\ndriver", "[light]\n[camera]\ndriver", "stage-key-unknown", "no key 'light'", "[light]"
     ),
-    "not TOML": Mistake("iso = 100", "iso = ", "stage-syntax", "is not valid TOML", "iso"),
+    "not TOML": Mistake("iso = 100", "iso = ", "stage-syntax", "is not valid TOML: Invalid value.", "iso"),
     "unknown driver": Mistake(
         'driver = "ptp"',
         'driver = "pttp"',

@@ -160,7 +160,7 @@ def test_ctrl_c_while_it_solves_leaves_lamps_cooling_and_says_so_in_a_sentence(f
     assert stopped.error == {
         "code": "cancelled",
         "what": "The work was stopped on request.",
-        "remedy": "The same command goes on from here.",
+        "remedy": "Run the same command to continue from here.",
     }
     assert stopped.stderr == ""
     assert finished_demo.lamps_then == {"left": False, "right": False, "above": False}

@@ -117,7 +117,7 @@ def story(tmp_path_factory: pytest.TempPathFactory, bumpy_ball: Path) -> Story:
     toml.write_text(toml.read_text().replace("power_down_s = 10.0", "power_down_s = 3.0") + QUICK)
     story = Story(out / "stage")
     with Bench(story.stage) as bench, truth_away(story.stage):
-        story.stop("stopped while the lamps warm up", "Waiting for steady light")
+        story.stop("stopped while the lamps warm up", "Waiting for stable light")
         story.fill_the_disk("disk full", "Photographing the light of left", 0.3)
         story.kill("killed", "Photographing the light of right", 0.3)
         story.stop("stopped while photographing", "Photographing the light of above", 0.3)
@@ -165,7 +165,7 @@ def test_ctrl_c_ends_soon_with_a_sentence_and_every_lamp_off(story: Story, name:
     assert chapter.outcome is not None
     assert chapter.outcome.code == 130
     assert chapter.outcome.error["what"] == "The work was stopped on request."
-    assert chapter.outcome.error["remedy"] == "The same command goes on from here."
+    assert chapter.outcome.error["remedy"] == "Run the same command to continue from here."
     assert chapter.outcome.stderr == ""
     assert chapter.seconds < 15
     assert set(chapter.powers.values()) <= {Power.OFF, Power.COOLING}

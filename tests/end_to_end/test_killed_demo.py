@@ -20,11 +20,11 @@ def test_a_killed_demos_bench_ends_by_itself_and_the_same_command_goes_on(prepar
     out = Path(shutil.copytree(prepared_once, tmp_path / "out"))
     with_ports_of_its_own(out / "stage")
     with Command("demo", "--out", out) as demo:
-        demo.wait_for("Waiting for steady light")
+        demo.wait_for("Waiting for stable light")
         demo.kill()
     # At once: the bench and the player of the killed one may still be there.
     with Command("demo", "--out", out) as demo:
-        demo.wait_for("Waiting for steady light")
+        demo.wait_for("Waiting for stable light")
         assert lamps(out / "stage") == {"left": True, "right": True, "above": True}
         stopped = demo.interrupt()
     assert stopped.code == 130

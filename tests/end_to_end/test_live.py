@@ -77,7 +77,7 @@ def test_pictures_are_shown_as_they_come_until_ctrl_c_leaves_lamps_safe_and_blac
         (white,) = (
             float(record["message"]["text"].split()[-1].rstrip("."))
             for record in live.records
-            if record.get("message", {}).get("text", "").startswith("A target's white")
+            if record.get("message", {}).get("text", "").startswith("White of a target")
         )
         maps = maps_of(stage)
         assert eventually(shows(stage, maps, picture(1), white))

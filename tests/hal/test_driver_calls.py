@@ -132,16 +132,16 @@ def test_the_errors_of_the_interface_and_ctrl_c_come_through_as_they_are(call: s
 @pytest.mark.parametrize(
     ("call", "wrong", "word"),
     [
-        ("status", None, "nothing (None) where a ProjectorStatus"),
-        ("status", "on", "a str where a ProjectorStatus"),
-        ("status", ProjectorStatus("on"), "power: a str where a Power"),  # type: ignore[arg-type]
-        ("status", ProjectorStatus(Power.ON, "lamp"), "faults: a str where a tuple"),  # type: ignore[arg-type]
+        ("status", None, "nothing (None) instead of a ProjectorStatus"),
+        ("status", "on", "a str instead of a ProjectorStatus"),
+        ("status", ProjectorStatus("on"), "power: a str instead of a Power"),  # type: ignore[arg-type]
+        ("status", ProjectorStatus(Power.ON, "lamp"), "faults: a str instead of a tuple"),  # type: ignore[arg-type]
         ("status", ProjectorStatus(Power.ON, (), 3.5), "lamp_hours: a float"),  # type: ignore[arg-type]
-        ("identity", ("Acme", "A1"), "a tuple where a DeviceIdentity"),
-        ("identity", DeviceIdentity("Acme", b"A1"), "model: a bytes where a str"),  # type: ignore[arg-type]
+        ("identity", ("Acme", "A1"), "a tuple instead of a DeviceIdentity"),
+        ("identity", DeviceIdentity("Acme", b"A1"), "model: a bytes instead of a str"),  # type: ignore[arg-type]
         ("capabilities", replace(CAN, answer_s=math.nan), "answer_s: nan is not a finite number"),
         ("capabilities", replace(CAN, lamp_rules=None), "lamp_rules: nothing"),  # type: ignore[arg-type]
-        ("switch_off", "ok", "a str where a NoneType"),
+        ("switch_off", "ok", "a str instead of a NoneType"),
     ],
 )
 def test_a_wrong_object_is_named_where_it_comes_from(call: str, wrong: Any, word: str) -> None:
@@ -162,11 +162,11 @@ def test_what_is_right_comes_back_as_it_is() -> None:
 def test_what_is_no_device_is_refused_at_opening(made: Any) -> None:
     if made is Acme:
         made = Acme()
-        with pytest.raises(DriverFault, match="without configure, capture, which is no camera"):
+        with pytest.raises(DriverFault, match="without configure, capture, which is not a camera"):
             opened(made, "camera")
         assert made.called == ["close"], "its port is needed again"
     else:
-        with pytest.raises(DriverFault, match="which is no projector"):
+        with pytest.raises(DriverFault, match="which is not a projector"):
             opened(made)
 
 

@@ -30,8 +30,8 @@ def inconsistent(own: Correspondence, what: str) -> CalibrationError:
         return CalibrationError(
             "surface-broken-up",
             what=f"{what[:-1]}: {broken:.0%} of the object's camera pixels lie beside a gap or an edge, as in lace.",
-            remedy="Cover what is full of holes or hair-thin, or bring the camera nearer. If the surface is in one piece, the"
-            " pictures do not belong together: capture again.",
+            remedy="Cover what is full of holes or hair-thin, or bring the camera nearer."
+            " If the surface is in one piece, the pictures do not belong together: capture again.",
         )
     return CalibrationError(
         "correspondences-inconsistent",

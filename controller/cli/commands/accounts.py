@@ -1,4 +1,4 @@
-"""``velatura account``: who may log in at the panel, and the tokens of machines."""
+"""``velatura account``: people who may log in at the panel, and tokens for programs."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from controller.cli import console
 from controller.cli.derived import commands
 from controller.cli.running import Json, StageFolder
 
-SUMMARY = "Who may log in at the stage's panel, and the tokens of machines."
+SUMMARY = "People who may log in at the stage's panel, and tokens for programs."
 
 
 def list_(stage: StageFolder, as_json: Json = False) -> None:
-    """All accounts and tokens."""
+    """List all accounts and tokens."""
     accounts, tokens = _call(stage, "accounts"), _call(stage, "tokens")
-    lines = [f"{one['name']:<32} {one['role']}{', one-time password' if one['one_time'] else ''}" for one in accounts]
-    lines += [f"{one['name']:<32} {one['role']}, token" for one in tokens]
+    lines = [
+        f"{account['name']:<32} {account['role']}{', one-time password' if account['one_time'] else ''}"
+        for account in accounts
+    ]
+    lines += [f"{token['name']:<32} {token['role']}, token" for token in tokens]
     found = {"accounts": accounts, "tokens": tokens}
     console.show_result(found if as_json else "\n".join(lines) or "There are none yet.", as_json=as_json)
 

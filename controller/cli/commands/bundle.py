@@ -1,4 +1,4 @@
-"""``velatura bundle``: what a kiosk plays, as one signed file."""
+"""``velatura bundle``: signed files with everything that a kiosk plays."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from controller.cli.running import Json, StageFolder, work
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
-SUMMARY: Final = "Builds, signs, checks and installs bundles: what a kiosk plays, as one file."
+SUMMARY: Final = "Build, sign, check and install bundles. A bundle is one file with everything that a kiosk plays."
 
-BundleFile = Annotated[Path, typer.Argument(metavar="FILE", help="A bundle, .vel.")]
+BundleFile = Annotated[Path, typer.Argument(metavar="FILE", help="A bundle file (.vel).")]
 
 
 def _show(found: Mapping[str, Any], *, as_json: bool) -> None:
-    """The result; for people a warning in it goes to where errors go, so that no pipe swallows it."""
+    """The result. For people, a warning in it goes to standard error, so that a pipe does not hide it."""
     if not as_json and "warning" in found:
         typer.secho(f"WARNING: {found['warning']}", err=True, bold=True, fg="red")
         found = {key: value for key, value in found.items() if key != "warning"}
@@ -30,12 +30,12 @@ def _show(found: Mapping[str, Any], *, as_json: bool) -> None:
 
 def build(
     stage: StageFolder,
-    names: Annotated[list[str] | None, typer.Argument(help="Appearances; all solved ones if none is given.")] = None,
-    out: Annotated[Path | None, typer.Option(help="The file to write; else STAGE/bundle.vel.")] = None,
-    live: Annotated[bool, typer.Option("--live", help="With what live targets need; a good deal larger.")] = False,
+    names: Annotated[list[str] | None, typer.Argument(help="Appearances (default: all solved ones).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output file (default: STAGE/bundle.vel).")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Include live-mode data (larger).")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the appearances solved last as a bundle, signed with the stage's key, one revision above the installed."""
+    """Write the latest solved appearances to a bundle, signed with the stage's key, with the next revision number."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.bundle import build
@@ -46,7 +46,7 @@ def build(
 
 
 def inspect(file: BundleFile, as_json: Json = False) -> None:
-    """Show what a bundle holds, whoever signed it."""
+    """Show the content of a bundle. The signature is not checked."""
     from controller.bundle.describe import as_text, describe
     from controller.bundle.reader import Bundle
     from controller.bundle.signing import ANY_SIGNER
@@ -58,11 +58,11 @@ def inspect(file: BundleFile, as_json: Json = False) -> None:
 
 def verify(
     file: BundleFile,
-    stage: Annotated[Path | None, typer.Option(help="Check as this stage's player would.")] = None,
-    trusted: Annotated[list[Path] | None, typer.Option(help="A public key file; may be repeated.")] = None,
+    stage: Annotated[Path | None, typer.Option(help="Check with the keys that this stage trusts.")] = None,
+    trusted: Annotated[list[Path] | None, typer.Option(help="A trusted public key file; can be repeated.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Check every byte of a bundle and its signature; without --stage and --trusted, not whose signature it is."""
+    """Check every byte of a bundle and its signature. --stage or --trusted also checks who signed it."""
     from controller.services.bundle import verify as verified
 
     _show(verified(file, stage=stage, trusted=tuple(trusted or ())), as_json=as_json)
@@ -73,7 +73,7 @@ def diff(
     other: Annotated[Path, typer.Argument(metavar="B", help="Another.")],
     as_json: Json = False,
 ) -> None:
-    """Show in what two bundles differ: identity, outputs, appearances."""
+    """Show the differences between two bundles: identity, outputs, appearances."""
     from controller.bundle.describe import differences, differences_as_text
     from controller.bundle.reader import Bundle
     from controller.bundle.signing import ANY_SIGNER
@@ -85,10 +85,10 @@ def diff(
 
 def sign(
     file: BundleFile,
-    key: Annotated[Path, typer.Option(help="A secret key file, as `velatura keys` makes it.")],
+    key: Annotated[Path, typer.Option(help="A secret key file made by `velatura keys`.")],
     as_json: Json = False,
 ) -> None:
-    """Check every byte of a bundle, and put this key's signature in the place of its own, if it has one."""
+    """Check every byte of a bundle and sign it with this key. An existing signature is replaced."""
     from controller.bundle.signing import load_signing_key
     from controller.bundle.writer import sign_bundle
 
@@ -97,14 +97,14 @@ def sign(
 
 
 def install(file: BundleFile, stage: StageFolder, as_json: Json = False) -> None:
-    """Make a bundle the stage's own, if the stage trusts it; the one before is kept for rollback."""
+    """Install a bundle that the stage trusts. The previous bundle is kept for rollback."""
     from controller.services.bundle import install as installed
 
     _show(installed(file, stage=stage), as_json=as_json)
 
 
 def rollback(stage: StageFolder, as_json: Json = False) -> None:
-    """Go back to the bundle that was installed before."""
+    """Go back to the previously installed bundle."""
     from controller.services.bundle import rollback as rolled_back
 
     _show(rolled_back(stage), as_json=as_json)
@@ -112,10 +112,10 @@ def rollback(stage: StageFolder, as_json: Json = False) -> None:
 
 def export(
     file: BundleFile,
-    out: Annotated[Path, typer.Option(help="A folder that is empty or not yet there.")],
+    out: Annotated[Path, typer.Option(help="An empty or new folder.")],
     as_json: Json = False,
 ) -> None:
-    """Write every frame as a PNG picture, and index.json beside them; whoever signed the bundle."""
+    """Write every frame as a PNG picture, with an index.json. The signature is not checked."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.bundle import export

@@ -1,4 +1,4 @@
-"""``velatura camera``: the camera's lens, measured once with a printed board."""
+"""``velatura camera``: calibrate the camera's lens with a printed board."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from controller.cli.running import Json, work
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
-SUMMARY: Final = "Measures the camera's lens with a printed board, once for each lens and zoom."
+SUMMARY: Final = "Calibrate the camera's lens with a printed board, once for each lens and zoom setting."
 
-OutFile = Annotated[Path, typer.Option("--out", help="The file to write; stage.toml names it in [camera].")]
+OutFile = Annotated[Path, typer.Option("--out", help="Output file; name it in [camera] of stage.toml.")]
 
 
 def board(
-    out: Annotated[Path, typer.Option(help="The picture to print, a PNG.")] = Path("board.png"), as_json: Json = False
+    out: Annotated[Path, typer.Option(help="Output file (PNG) to print.")] = Path("board.png"), as_json: Json = False
 ) -> None:
-    """Write the ChArUco board to print, on A4 or larger, at any scale; glue it on something flat."""
+    """Write a ChArUco board to print on A4 or larger, at any scale. Glue the print on a flat plate."""
     from controller.services.camera import board as written
 
     console.show_result(written(out=out), as_json=as_json)
@@ -31,12 +31,12 @@ def board(
 
 def calibrate(
     photographs: Annotated[
-        list[Path], typer.Argument(metavar="PHOTOS...", help="Ten to fifteen photographs of the board, tilted.")
+        list[Path], typer.Argument(metavar="PHOTOS...", help="10 to 15 photographs of the board at different tilts.")
     ],
     out: OutFile = Path("camera-intrinsics.toml"),
     as_json: Json = False,
 ) -> None:
-    """Find focal length, principal point and distortion from photographs of the board, and how sure they are."""
+    """Compute focal length, principal point and distortion, with uncertainties, from photographs of the board."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.camera import calibrate
@@ -47,11 +47,11 @@ def calibrate(
 
 
 def exif(
-    photograph: Annotated[Path, typer.Argument(metavar="PHOTO", help="A photograph as it came from the camera.")],
+    photograph: Annotated[Path, typer.Argument(metavar="PHOTO", help="An unedited photograph from the camera.")],
     out: OutFile = Path("camera-intrinsics.toml"),
     as_json: Json = False,
 ) -> None:
-    """Take the focal length that a photograph tells of itself: rougher than the board, and quicker."""
+    """Read the focal length from a photograph's EXIF data. This is quicker than the board, but less accurate."""
     from controller.services.camera import from_exif
 
     console.show_result(from_exif(photograph=photograph, out=out), as_json=as_json)

@@ -16,16 +16,16 @@ DEVICE_FAILED = 3
 def doctor(
     stage: Annotated[
         Path | None,
-        typer.Argument(metavar="[STAGE]", help="The stage's folder; without it, only what is plugged in is told."),
+        typer.Argument(metavar="[STAGE]", help="The stage's folder (without it: only list connected devices)."),
     ] = None,
-    write: Annotated[bool, typer.Option("--write", help="Put what was found into STAGE/stage.toml.")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Write the devices found to STAGE/stage.toml.")] = False,
     outputs: Annotated[
         bool,
-        typer.Option("--outputs", help="Light the lamps and find out which projector shows which output."),
+        typer.Option("--outputs", help="Switch the lamps on and find which output each projector shows."),
     ] = False,
     as_json: Json = False,
 ) -> int:
-    """Find devices on every bus, try them without striking a lamp, and say what is wrong and how to mend it."""
+    """Find and test the connected devices without switching a lamp on. Report faults and how to correct them."""
     from controller.core.errors import UsageError
     from controller.doctor.examine import examine
     from controller.doctor.outputs import examine_outputs
@@ -33,7 +33,7 @@ def doctor(
 
     if stage is None and (write or outputs):
         raise UsageError(
-            "stage-missing", what="No stage was given.", remedy="Give the folder that holds, or is to hold, stage.toml."
+            "stage-missing", what="No stage was given.", remedy="Give the folder of stage.toml, existing or new."
         )
     with cancelled_by_signals() as cancel, console.reporter(as_json=as_json) as reporter:
         seen = examine(stage=stage, write_it=write, reporter=reporter, cancel=cancel)

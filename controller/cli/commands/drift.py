@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def drift(stage: StageFolder, as_json: Json = False) -> None:
-    """Tell from a few photographs whether camera, object or a projector moved or dimmed since the calibration."""
+    """Check with a few photographs whether anything moved, or a lamp dimmed, since the calibration."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.recalibrate import check_drift

@@ -12,10 +12,10 @@ from controller.cli.running import Json, StageFolder
 
 def keys(
     stage: StageFolder,
-    name: Annotated[str, typer.Option(help="The key's file is STAGE/keys/NAME.key.")] = "stage",
+    name: Annotated[str, typer.Option(help="Name of the key; its file is STAGE/keys/NAME.key.")] = "stage",
     as_json: Json = False,
 ) -> None:
-    """Make the key that signs a stage's bundles, and show the lines for stage.toml that make the stage trust it."""
+    """Make a key to sign the stage's bundles, and show the lines for stage.toml to trust it."""
     from controller.services.bundle import make_key
 
     made = make_key(stage, name)

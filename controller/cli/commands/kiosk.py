@@ -1,4 +1,4 @@
-"""Commands that ask for several operations of a kiosk; those of one operation are in ``controller.cli.derived``."""
+"""Commands that use several operations of a kiosk. Commands of one operation are in ``controller.cli.derived``."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from controller.core.errors import UsageError
 
 def results(
     stage: StageFolder,
-    run: Annotated[str | None, typer.Argument(help="A run's name; all runs with results if left out.")] = None,
+    run: Annotated[str | None, typer.Argument(help="A run's name (default: all runs with results).")] = None,
     as_json: Json = False,
 ) -> None:
-    """Grade and figures of a calibration; or which there are, and what the appearances achieve."""
+    """Show grade and figures of one calibration, or list all calibrations and the quality of the appearances."""
     if run is None:
         names, compared = _call(stage, "runs"), _call(stage, "comparisons")
-        lines = [*names, *(_achieved(one) for one in compared)]
+        lines = [*names, *(_achieved(result) for result in compared)]
         found = {"runs": names, "comparisons": compared}
         console.show_result(found if as_json else "\n".join(lines) or "There are none yet.", as_json=as_json)
         return
@@ -43,11 +43,11 @@ def _achieved(one: Mapping[str, Any]) -> str:
 
 def aim(
     stage: StageFolder,
-    picture: Annotated[Path | None, typer.Option(help="Write what the camera sees into this JPEG file.")] = None,
-    shots: Annotated[bool, typer.Option("--shots", help="Take test shots first, with every lamp lit.")] = False,
+    picture: Annotated[Path | None, typer.Option(help="Write the camera picture to this JPEG file.")] = None,
+    shots: Annotated[bool, typer.Option("--shots", help="First take test shots with all lamps on.")] = False,
     as_json: Json = False,
 ) -> None:
-    """What the running kiosk's projectors cover, and what is too dark, too grazing or out of focus."""
+    """Show what the projectors cover, and what is too dark, too oblique or out of focus. Needs a running kiosk."""
     from controller.kiosk.api.offline_dispatch import aiming_text
 
     if shots:
@@ -56,7 +56,7 @@ def aim(
         data = _call(stage, "camera-picture")
         if data is None:
             raise UsageError("picture-unknown", what="The camera shows no picture now.",
-                             remedy="See `velatura status`, or take the aiming page's test shot.")  # fmt: skip
+                             remedy="Check `velatura status`, or take a test shot on the aiming page.")  # fmt: skip
         picture.write_bytes(base64.b64decode(data))
     found = _call(stage, "aiming")
     console.show_result(found if as_json else aiming_text(found), as_json=as_json)
@@ -64,11 +64,11 @@ def aim(
 
 def settings(
     stage: StageFolder,
-    check: Annotated[Path | None, typer.Option(help="Check this stage.toml without using it.")] = None,
-    save: Annotated[Path | None, typer.Option(help="Check this stage.toml, and take it into use.")] = None,
+    check: Annotated[Path | None, typer.Option(help="Check this stage.toml only.")] = None,
+    save: Annotated[Path | None, typer.Option(help="Check this stage.toml and use it.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Print stage.toml, check another one, or take that into use."""
+    """Print stage.toml, check another one, or replace it."""
     if save is None and check is None:
         text = _call(stage, "settings")
         console.show_result({"text": text} if as_json else text, as_json=as_json)
@@ -77,7 +77,9 @@ def settings(
 
     file = save or check
     assert file is not None
-    op, said = ("save-settings", "These settings are in use.") if save else ("validate-settings", "They are right.")
+    op, said = (
+        ("save-settings", "The new settings are in use.") if save else ("validate-settings", "The settings are valid.")
+    )
     try:
         text = read_text(file)
     except (OSError, UnicodeDecodeError) as error:

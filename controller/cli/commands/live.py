@@ -18,21 +18,23 @@ if TYPE_CHECKING:
 def live(
     stage: StageFolder,
     source: Annotated[
-        Path, typer.Argument(help="A video file, a folder that fills with pictures, or a shared frame file.")
+        Path, typer.Argument(help="A video file, a folder that receives pictures, or a shared frame file.")
     ],
-    fps: Annotated[float, typer.Option(help="Take at most so many pictures a second.", min=0.1, max=240)] = 25.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end; a folder in turn.")] = False,
-    seconds: Annotated[float, typer.Option(help="How long; without it, until it ends or Ctrl-C.", min=0)] = 0.0,
+    fps: Annotated[float, typer.Option(help="Maximum pictures per second.", min=0.1, max=240)] = 25.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat the video, or the pictures of the folder.")] = False,
+    seconds: Annotated[
+        float, typer.Option(help="Duration in seconds (default: to the end or until Ctrl-C).", min=0)
+    ] = 0.0,
     into: Annotated[
         Path | None,
-        typer.Option(help="Touch no device; write to this frame file, which a player elsewhere shows live."),
+        typer.Option(help="Use no device: write to this frame file for another player."),
     ] = None,
     targets: Annotated[
-        bool, typer.Option("--targets", help="With --into: targets, for a player with shaders.")
+        bool, typer.Option("--targets", help="With --into: write targets, for a player with shaders.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Light the projectors and show a stream of targets as it comes, by base and scale."""
+    """Switch the projectors on and show a stream of targets live (base and scale)."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.live import feed, live

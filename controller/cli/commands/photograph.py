@@ -18,13 +18,11 @@ def photograph(
     stage: StageFolder,
     names: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Appearances of the installed bundle; all of them if none is given.", autocompletion=appearance_names
-        ),
+        typer.Argument(help="Appearances of the installed bundle (default: all).", autocompletion=appearance_names),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Photograph what the installed appearances achieve, compare with their targets, and write a report."""
+    """Photograph the installed appearances, compare them with their targets, and write a report."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.compare import photograph

@@ -17,12 +17,16 @@ if TYPE_CHECKING:
 
 
 def plan(
-    file: Annotated[Path, typer.Argument(metavar="PLAN.toml", help="Object, projectors, places and what is wanted.")],
-    out: Annotated[Path | None, typer.Option(help="The folder for plan.html and plan.json; else the file's.")] = None,
-    example: Annotated[bool, typer.Option("--example", help="Write a PLAN.toml to begin with; plan nothing.")] = False,
+    file: Annotated[
+        Path, typer.Argument(metavar="PLAN.toml", help="Plan file: object, projectors, places, requirements.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for plan.html and plan.json (default: the plan file's folder).")
+    ] = None,
+    example: Annotated[bool, typer.Option("--example", help="Only write an example PLAN.toml.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Choose where projectors stand, before there is a stage: predicted detail, light, grazing and focus on a mesh."""
+    """Plan projector positions on a mesh: predict detail, light, angle of incidence and focus."""
     if example:
         from controller.services.plan import write_example
 

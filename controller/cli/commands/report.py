@@ -13,12 +13,12 @@ from controller.cli.running import Json
 
 def report(
     where: Annotated[
-        Path, typer.Argument(metavar="RUN", help="A run's folder, STAGE/runs/...; or a stage: its newest.")
+        Path, typer.Argument(metavar="RUN", help="A run's folder (STAGE/runs/...), or a stage for its newest run.")
     ],
-    out: Annotated[Path | None, typer.Option(help="Where the report goes; else into the run's folder.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the report (default: the run's folder).")] = None,
     as_json: Json = False,
 ) -> None:
-    """Write report.html and report.json of a calibration, of photographs of appearances, or of a demo again."""
+    """Write report.html and report.json again for a calibration, for photographs, or for a demo."""
     from controller.services.report import report_of
 
     console.show_result(report_of(where, out), as_json=as_json)

@@ -1,4 +1,4 @@
-"""``velatura serve`` and ``init``, and how the kiosk is: its state, events and hours."""
+"""``velatura serve`` and ``init``, and the kiosk's state, events and opening hours."""
 
 from __future__ import annotations
 
@@ -21,31 +21,29 @@ if TYPE_CHECKING:
 
 def serve(
     stage: StageFolder,
-    panel: Annotated[str, typer.Option(help="HOST:PORT at which the panel listens.")] = "127.0.0.1:8377",
-    no_panel: Annotated[bool, typer.Option("--no-panel", help="Without the panel.")] = False,
-    name: Annotated[
-        list[str] | None, typer.Option(help="A further host name under which browsers may reach the panel.")
-    ] = None,
+    panel: Annotated[str, typer.Option(help="HOST:PORT where the panel listens.")] = "127.0.0.1:8377",
+    no_panel: Annotated[bool, typer.Option("--no-panel", help="Do not start the panel.")] = False,
+    name: Annotated[list[str] | None, typer.Option(help="Another host name for the panel; can be repeated.")] = None,
     certificate: Annotated[Path | None, typer.Option(help="TLS certificate (PEM) of the panel.")] = None,
     key: Annotated[Path | None, typer.Option(help="TLS key (PEM) of the panel.")] = None,
-    mqtt: Annotated[str | None, typer.Option(help="HOST[:PORT] of the building control's MQTT broker.")] = None,
-    mqtt_topic: Annotated[str, typer.Option(help="The first part of all MQTT topics.")] = "velatura",
-    mqtt_user: Annotated[str | None, typer.Option(help="User name at the broker.")] = None,
+    mqtt: Annotated[str | None, typer.Option(help="HOST[:PORT] of the MQTT broker for building control.")] = None,
+    mqtt_topic: Annotated[str, typer.Option(help="First part of all MQTT topics.")] = "velatura",
+    mqtt_user: Annotated[str | None, typer.Option(help="User name for the MQTT broker.")] = None,
     mqtt_password_file: Annotated[
-        Path | None, typer.Option(help="File that holds the password at the broker, and nothing else.")
+        Path | None, typer.Option(help="File that contains only the password for the MQTT broker.")
     ] = None,
     mqtt_certificates: Annotated[
-        Path | None, typer.Option(help="Authorities (PEM) with which the broker's TLS is checked; without it no TLS.")
+        Path | None, typer.Option(help="CA certificates (PEM) to check the MQTT broker (default: no TLS).")
     ] = None,
     leave_lit: Annotated[
-        bool, typer.Option("--leave-lit", help="Leave the lamps lit at the end, for a service that starts again.")
+        bool, typer.Option("--leave-lit", help="Leave the lamps on at exit, for a service that restarts.")
     ] = False,
     setup: Annotated[
-        bool, typer.Option("--setup", help="Start without a valid stage.toml, for the panel's first page.")
+        bool, typer.Option("--setup", help="Start without a valid stage.toml, for set-up in the panel.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Run the stage by its schedule, unattended, with the technician's panel, until Ctrl-C."""
+    """Run the stage unattended by its schedule, with the panel for the technician, until Ctrl-C."""
     from controller.cli.serve_command import PanelAddress, parse_address
     from controller.panel.mqtt.options import BrokerOptions
 
@@ -53,8 +51,11 @@ def serve(
     broker = None
     if mqtt is not None:
         if no_panel:
-            raise UsageError("mqtt-without-panel", what="MQTT is the panel's, and --no-panel leaves it out.",
-                             remedy="Leave out --no-panel; the panel may listen on this machine alone.")  # fmt: skip
+            raise UsageError(
+                "mqtt-without-panel",
+                what="MQTT needs the panel, but --no-panel is given.",
+                remedy="Remove --no-panel; the panel listens only on this machine by default.",
+            )
         usual = 1883 if mqtt_certificates is None else 8883
         where = parse_address(mqtt if ":" in mqtt else f"{mqtt}:{usual}")
         broker = BrokerOptions(*where, mqtt_topic, mqtt_user, mqtt_password_file, mqtt_certificates)
@@ -69,15 +70,15 @@ def serve(
 
 
 def init(
-    stage: Annotated[Path, typer.Argument(metavar="STAGE", help="The folder to set up; made if it is not there.")],
-    name: Annotated[str | None, typer.Option(help="What the object is called; asked for if left out.")] = None,
+    stage: Annotated[Path, typer.Argument(metavar="STAGE", help="The folder to set up; created if missing.")],
+    name: Annotated[str | None, typer.Option(help="Name of the object (default: you are asked).")] = None,
     focal_length_px: Annotated[
-        float | None, typer.Option(help="The lens's focal length in pixels of the camera's picture.", min=1.0)
+        float | None, typer.Option(help="Focal length in pixels of the camera picture.", min=1.0)
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; take what was found.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; use the devices found.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Find the devices, name the object, and write the stage's first stage.toml with its signing key."""
+    """Set up a stage: find the devices, name the object, and write stage.toml and a signing key."""
     from controller.kiosk.setup import set_up
 
     def ask(question: str, suggestion: str) -> str:
@@ -89,7 +90,7 @@ def init(
 
 
 def status(stage: StageFolder, as_json: Json = False) -> None:
-    """What the stage does now, and what is wrong."""
+    """Show what the stage does now, and its faults."""
     from controller.kiosk.api.offline_dispatch import status_of, status_text
 
     content = status_of(stage)
@@ -98,11 +99,11 @@ def status(stage: StageFolder, as_json: Json = False) -> None:
 
 def events(
     stage: StageFolder,
-    after: Annotated[int, typer.Option(help="Only events with a larger number.", min=0)] = 0,
-    level: Annotated[str, typer.Option(help="info, warning or error: no lesser ones.")] = "info",
+    after: Annotated[int, typer.Option(help="Only events after this number.", min=0)] = 0,
+    level: Annotated[str, typer.Option(help="Minimum level: info, warning or error.")] = "info",
     as_json: Json = False,
 ) -> None:
-    """The kiosk's event log."""
+    """Show the kiosk's event log."""
     from controller.kiosk.api.offline_dispatch import LEVELS, call
 
     if level not in LEVELS:
@@ -117,9 +118,11 @@ def schedule(
     zone: Annotated[str | None, typer.Option(help="Time zone, e.g. Europe/Vienna.")] = None,
     hours: Annotated[
         list[str] | None,
-        typer.Option(help="DAY=HH:MM-HH:MM or DAY=closed; replaces all rows. DAY: mon ... sun, or 2026-12-24."),
+        typer.Option(
+            help="DAY=HH:MM-HH:MM or DAY=closed; replaces all rows. DAY is mon to sun, or a date such as 2026-12-24."
+        ),
     ] = None,
-    drift_check: Annotated[str | None, typer.Option(help="HH:MM of the nightly check; empty: none.")] = None,
+    drift_check: Annotated[str | None, typer.Option(help="HH:MM of the nightly check;  for none.")] = None,
     as_json: Json = False,
 ) -> None:
     """Show the opening hours, or change them."""

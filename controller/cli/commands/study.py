@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 def study(
     names: Annotated[
-        list[str] | None, typer.Argument(help="Experiments, for example ablation; without names all but optional ones.")
+        list[str] | None, typer.Argument(help="Experiments, for example ablation (default: all except optional ones).")
     ] = None,
     size: Annotated[str, typer.Option(help="small, medium or paper.")] = "small",
-    out: Annotated[Path, typer.Option(help="Where the stages and their calibrations are kept.")] = Path("study"),
-    pages: Annotated[Path | None, typer.Option(help="Where the pages go; else into OUT/pages.")] = None,
-    seed: Annotated[int, typer.Option(help="Which of the random stages.", min=0, max=2**32 - 1)] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for the stages and their calibrations.")] = Path("study"),
+    pages: Annotated[Path | None, typer.Option(help="Folder for the pages (default: OUT/pages).")] = None,
+    seed: Annotated[int, typer.Option(help="Random seed of the stages.", min=0, max=2**32 - 1)] = 1,
     as_json: Json = False,
 ) -> None:
-    """Do the paper's experiments again on emulated stages, and write a page for each; goes on with unfinished ones."""
+    """Repeat the paper's experiments on emulated stages and write a page for each. Continues unfinished experiments."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.study import study

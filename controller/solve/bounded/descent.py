@@ -57,7 +57,7 @@ def block_coordinate_descent(
     inertia, kkt, least, iteration = 1.0, np.inf, np.inf, 0
     for iteration in range(1, control.most_iterations + 1):
         if control.cancelled is not None and control.cancelled():
-            raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again when wanted.")
+            raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again to repeat it.")
         squared_step = uphill = 0.0
         if iteration % RECOMPUTE_EVERY == 1:
             _write_forward(transport, x, light)

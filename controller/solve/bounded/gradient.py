@@ -64,7 +64,7 @@ def projected_step(
     columns: int,
     new: FloatImage,
 ) -> tuple[float, float]:
-    """Write one projected gradient step from ``y`` to ``new`` for the projector whose pixels begin at ``start``.
+    """Write one projected gradient step from ``y`` to ``new`` for the projector whose pixels start at ``start``.
 
     All arrays (3, pixels of all projectors), each projector row by row. ``gradient`` is that of the data; that of the
     smoothness is added here. It is overwritten with new - y. Returns two sums: majoriser x step^2, whose size measures

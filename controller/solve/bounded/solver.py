@@ -35,10 +35,10 @@ MOST_ITERATIONS: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """What a solve found.
+    """Result of a solve.
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
-    ``light`` (camera rows, columns, 3) float32: T p, what the frames add to the black image
+    ``light`` (camera rows, columns, 3) float32: T p, the frames' light without the black image
     ``objective``: weighted squared residual plus smoothness, in camera units squared
     ``kkt``: rms of the last projected, scaled gradient step, in units of projector light; 0 at the optimum
     ``converged``: the KKT residual fell below the tolerance before the cap on iterations
@@ -107,7 +107,7 @@ def solve_bounded(
     else:
         x = np.clip(frame_planes(start), 0, 1)
         if x.shape != problem.majoriser.shape:
-            raise _wrong("the frames to start from are not of the projectors' sizes")
+            raise _wrong("the start frames do not have the projectors' sizes")
     x[problem.majoriser == 0] = 0
     x, kkt, iterations = block_coordinate_descent(
         problem, x, IterationControl(tolerance, most_iterations, progress, cancelled)
@@ -130,13 +130,13 @@ def build_problem(
 ) -> Problem:
     """The equations of a solve, checked; the parameters are those of ``solve_bounded``."""
     if black.shape != target.shape or not np.isfinite(black).all():
-        raise _wrong("the black image is not finite or not of the target's size")
+        raise _wrong("the black image is not finite or does not have the target's size")
     if not 0 <= smoothness < np.inf:
         raise _wrong(f"a smoothness of {smoothness} is not a number of at least 0")
     counted = transport.object_mask.astype(np.float32)
     if weights is not None:
         if weights.shape != counted.shape or not np.isfinite(weights).all() or weights.min(initial=0) < 0:
-            raise _wrong("the weights are not finite numbers of at least 0, one a camera pixel")
+            raise _wrong("the weights are not finite numbers of at least 0, one for each camera pixel")
         counted *= weights
     return build_problem_from_planes(transport, image_planes(np.maximum(target - black, 0)), counted, smoothness)
 
@@ -184,7 +184,7 @@ def initial_point(problem: Problem) -> FloatImage:
 
 
 def smoothness_term(problem: Problem, x: FloatImage) -> float:
-    """What the smoothness equations add to the objective at ``x`` (3, pixels)."""
+    """The smoothness term of the objective at ``x`` (3, pixels)."""
     total = 0.0
     for n in range(len(problem.transport.sizes)):
         frame, across, down = (_frame_view(problem.transport, n, v) for v in (x, problem.across, problem.down))

@@ -19,7 +19,7 @@ from controller.core.errors import UsageError, WorkError
 
 TOLERANCE: Final = 1e-8
 OSQP_TOLERANCE: Final = 1e-5
-"""Splitting converges slowly; this is as near as it comes at its usual price."""
+"""Splitting converges slowly; this is its accuracy at the usual cost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ def solve_box(solver: str, problem: BoxProblem) -> Float64:
     if solver not in SOLVERS:
         raise UsageError(
             "solver-unknown",
-            what=f"There is no solver {solver} for regions.",
+            what=f"The solver {solver} for regions is unknown.",
             remedy=f"Choose one of {', '.join(SOLVERS)}.",
         )
     x = SOLVERS[solver](problem)

@@ -2,7 +2,7 @@
 
 The camera image is cut into regions of 16x16, each solved together with a margin around it, so that 25 % overlap. The
 phases take alternate rows and columns of regions; what an earlier phase has settled is held fixed in later ones. A
-region settles the pixels that lie in it; those of its margin are provisional, and its neighbours solve them again. The
+region determines its own pixels; those of its margin are provisional, and its neighbours solve them again. The
 regions of a phase don't touch each other, so their order does not matter. Earlier values being fixed, the result is
 near the optimum, not at it: the global solver (``bounded``) is the default, this one is for comparison
 (docs/decisions/0008).
@@ -38,7 +38,7 @@ PHASES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 @dataclass(frozen=True, slots=True)
 class RegionSolution:
-    """What the regions found.
+    """Result of the regions.
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
     ``light`` (camera rows, columns, 3) float32: T p
@@ -93,7 +93,7 @@ class Regions:
         )
 
     def core(self, i: int, j: int) -> Pixels:
-        """The projector pixels that lie in a region, without its margin."""
+        """The projector pixels of a region, without its margin."""
         region = i * self.counts[1] + j
         return np.sort(self._pixels[self._order[self._first[region] : self._first[region + 1]]])
 
@@ -163,7 +163,7 @@ def solve_regions(
             if progress is not None:
                 progress(done / total)
             if cancelled is not None and cancelled():
-                raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again when wanted.")
+                raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again to repeat it.")
     light = transport.forward_planes(x)
     objective = weighted_residual(light, problem.target, problem.weights, np.empty_like(light)) + smoothness_term(
         problem, x
@@ -195,7 +195,7 @@ def _solve_phase(
 
 
 def _centres(transport: LightTransport, pixels: Pixels) -> Pixels:
-    """(n, 2): camera row and column in which the middle of each projector pixel's light lies."""
+    """(n, 2): camera row and column of the centre of each projector pixel's light."""
     rows, columns = transport.camera_shape
     place = np.zeros((3, rows, columns), np.float32)
     place[0], place[1] = np.arange(rows)[:, None], np.arange(columns)[None, :]

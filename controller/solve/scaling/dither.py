@@ -28,7 +28,7 @@ def to_device(
 ) -> ByteImage:
     """Device values (rows, columns, 3) uint8 of linear light (rows, columns, 3) in [0, 1]; beyond that it is clipped.
 
-    ``phase``: where in the blue-noise tile this projector begins; superimposed projectors should differ in it.
+    ``phase``: this projector's offset in the blue-noise tile; superimposed projectors should have different ones.
     Raises UsageError("response-not-rising", "frame-shape-wrong").
     """
     if method != "blue-noise":
@@ -40,7 +40,7 @@ def to_device(
 
 
 def to_light(frame: ByteImage, radiometry: Radiometry) -> FloatImage:
-    """Linear light (rows, columns, 3) of device values, as the response says."""
+    """Linear light (rows, columns, 3) of device values, by the response."""
     return np.stack([radiometry.response[c][frame[..., c]] for c in range(3)], -1).astype(np.float32)
 
 

@@ -46,7 +46,7 @@ from controller.transport import LightTransport
 from controller.transport.simd.scaling import STEPS
 
 BLOCK_SIGMA_PX: Final = 0.56
-"""A projector pixel's Gaussian is about so many blocks wide, as a standard deviation: four blocks hold it."""
+"""Standard deviation of a projector pixel's Gaussian in blocks, about: four blocks contain it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +161,7 @@ class Interactive:
         )  # fmt: skip
 
     def _present(self) -> FloatImage:
-        """What the blocks have of base light, as their scale lies in memory, flat."""
+        """The blocks' shares of base light, flat, in the memory order of their scale."""
         rows, columns = self.maps.present.shape
         padded = np.zeros((self._size[0] * self._block, self._size[1] * self._block), np.float32)
         padded[:rows, :columns] = self.maps.present / np.float32(255)

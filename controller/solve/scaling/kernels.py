@@ -29,7 +29,7 @@ Used = npt.NDArray[np.int32]
 def scale_twos(
     picture: FloatImage, gain: FloatImage, offset: FloatImage, used: Used, columns: int, side: int, scale: FloatImage
 ) -> bool:
-    """The scale of blocks of two by two pixels of a radiance of ``columns`` a row; whether what was used is finite."""
+    """Scale of blocks of 2 x 2 pixels of a radiance with ``columns`` per row; whether all used values are finite."""
     rows, wide = used.shape[0], columns // 2
     good = np.ones(rows, np.bool_)
     for y in prange(rows):

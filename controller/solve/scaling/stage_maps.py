@@ -81,7 +81,7 @@ def scaling_maps(
 
 
 def _rounded_up(values: FloatImage) -> npt.NDArray[np.float16]:
-    """In half precision, and a little above: a target like the black image must come out black, not speckled."""
+    """In half precision, rounded up: a target like the black image must give black, not speckles."""
     near = (values * np.float32(1 + 1e-6)).astype(np.float16)
     return np.where(near < values, np.nextafter(near, np.float16(np.inf)), near)
 
@@ -105,7 +105,7 @@ def reduced(image: FloatImage, factor: int, times: float = 1.0) -> FloatImage:
 
 
 def footprints(transport: LightTransport, factor: int) -> tuple[FloatImage, FloatImage, FloatImage]:
-    """Where each projector pixel's weights lie in the target, reduced by ``factor``.
+    """Position of each projector pixel's weights in the target, reduced by ``factor``.
 
     Returns the means (pixels, 2) as (x, y), the standard deviations (pixels, 2), 0 where a pixel lights nothing, and
     the correlations (pixels,). Spreads are measured by how much a wave is dampened, which keeps single precision where
@@ -116,7 +116,7 @@ def footprints(transport: LightTransport, factor: int) -> tuple[FloatImage, Floa
     mean = _Means(transport)
     centre = np.stack([mean(x), mean(y)], axis=-1)
     across, down, both = (_variance(mean, wave) for wave in (x, y, x + y))
-    # What the mean over a target's pixel blurs already.
+    # The blur of the mean over a target's pixel.
     box = (factor**2 - 1) / 12
     variance = np.stack([across, down], axis=-1) - box
     sigma = np.sqrt(np.maximum(variance, (LEAST_SIGMA_PX * factor) ** 2)) / factor

@@ -68,7 +68,7 @@ def shipped_photograph(name: Literal["astronaut", "chelsea", "coffee"] = "astron
     if name not in PHOTOGRAPHS:
         raise UsageError(
             "photograph-unknown",
-            what=f"There is no photograph called {name!r}.",
+            what=f"The photograph {name!r} is unknown.",
             remedy=f"Choose one of {', '.join(PHOTOGRAPHS)}, or give a file.",
         )
     return srgb_to_linear(np.asarray(getattr(skimage.data, name)()))
@@ -107,7 +107,7 @@ def _read_encoded(path: Path) -> FloatImage:
     jpeg = data.startswith(b"\xff\xd8\xff")
     if not jpeg and not data.startswith(b"\x89PNG\r\n\x1a\n"):
         raise _unreadable(path, f"it is not an {_ALLOWED} file")
-    # decoders fill what is missing with grey and only print a warning
+    # decoders fill missing parts with grey and only print a warning
     if (jpeg and b"\xff\xd9" not in data[-4096:]) or (not jpeg and b"IEND" not in data[-4096:]):
         raise _unreadable(path, "its end is missing")
     try:

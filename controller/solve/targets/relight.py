@@ -29,7 +29,7 @@ def gloss(
     ----------
     light_direction : from the object towards a distant light, in the camera's frame (x right, y down, z away)
     shininess : exponent of the highlight; ``strength``: its peak, as a share of white
-    ambient : share of the light that comes from everywhere
+    ambient : share of the light that comes from all directions
     smoothing_px : standard deviation of the smoothing of the normals, which noise would otherwise make glitter
 
     Raises UsageError("light-direction-invalid") for a direction of no length.

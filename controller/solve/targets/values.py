@@ -17,7 +17,7 @@ class Target:
     """An appearance as seen from the camera.
 
     ``image`` (rows, columns, 3) float32, linear, finite, >= 0: 1 is a white object in uniform light; 0 outside ``mask``
-    ``mask`` (rows, columns) bool: where the target says something
+    ``mask`` (rows, columns) bool: valid pixels of the target
     """
 
     image: FloatImage
@@ -46,7 +46,7 @@ def _as_unit(values: npt.NDArray[Any]) -> FloatImage:
 
 
 CAMERA_FILTER_PX = 0.7
-"""What the camera's optics and the interpolation of its colours blur at least (``capture.raw.CAMERA_BLUR_PX``)."""
+"""Minimum blur of the camera's optics and colour interpolation (``capture.raw.CAMERA_BLUR_PX``)."""
 
 
 def through_camera(target: Target, *, sigma_px: float = CAMERA_FILTER_PX) -> Target:

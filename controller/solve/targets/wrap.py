@@ -28,7 +28,7 @@ _ROUNDEST = 4.0
 
 @dataclass(frozen=True, slots=True)
 class ObjectSpace:
-    """Where each camera pixel lies on the object, in metres along its surface.
+    """The position of each camera pixel on the object, in metres along its surface.
 
     ``across_m`` (rows, columns) float32: along the circumference to the right, 0 facing the camera
     ``up_m`` (rows, columns) float32: height above the object's middle; both finite inside ``mask``, 0 outside
@@ -55,8 +55,8 @@ def object_space(
     if not wanted.any():
         raise WorkError(
             "target-no-geometry",
-            what="No camera pixel of the object has a known position, so nothing can be put on it.",
-            remedy="Calibrate with the geometry step, and check that the object mask lies on the object.",
+            what="No camera pixel of the object has a known 3D position, so nothing can be wrapped on it.",
+            remedy="Calibrate with the geometry step, and check that the object mask covers the object.",
         )
     frame = _upright_frame(geometry.points_m[wanted], up)
     local = (geometry.points_m[wanted] @ frame.T).astype(np.float64)
@@ -110,7 +110,7 @@ def wrap_photograph(
     ink: float = 0.03,
     paper: float = 0.9,
 ) -> Target:
-    """A photograph printed and wrapped on the object: as large as it must be to cover what the camera sees of it.
+    """A photograph printed and wrapped on the object, large enough to cover its visible part.
 
     Parameters
     ----------

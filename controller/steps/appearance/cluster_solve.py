@@ -1,4 +1,4 @@
-"""A run's appearances made on other machines, each still a step of its own."""
+"""Solves a run's appearances on other machines; each is still its own step."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from controller.steps.appearance.solving import Answering, Wish
 
 
 class Spreading:
-    """Answers like ``steps.appearance.solving`` does: the first question sends those that come after it along.
+    """Solves like ``steps.appearance.solving``; the first request also submits those that follow.
 
-    Wishes with a step before their solving (Blender's) are sent when it is their turn.
+    Requests with a step before their solving (Blender's) are submitted when it is their turn.
     """
 
     def __init__(self, cluster: Cluster, calibrated: Calibrated, wishes: Sequence[Wish]) -> None:
@@ -25,10 +25,10 @@ class Spreading:
         self._spread: SpreadAppearances | None = None
 
     def __call__(self, wish: Wish, options: SolveOptions, context: Context) -> AppearanceResult:
-        """The answer to one wish."""
+        """The result of one request."""
         context.advance(0.0, f"{self._cluster.workers} workers")
         spread = self._spread or self._opened()
-        names = [one.name for one in self._wishes]
+        names = [other.name for other in self._wishes]
         for other in self._wishes[names.index(wish.name) :]:
             if other.name == wish.name or other.prepare is None:
                 context.check()
@@ -42,14 +42,14 @@ class Spreading:
         return self._spread
 
     def cancel(self) -> None:
-        """Let go of what is still under way."""
+        """Cancel the requests that are still running."""
         if self._spread is not None:
             self._spread.cancel()
 
 
 @contextlib.contextmanager
 def answering_on(scheduler: str | None, calibrated: Calibrated, wishes: Sequence[Wish]) -> Iterator[Answering | None]:
-    """What makes the appearances on the cluster behind ``scheduler``; None, and nothing is connected, without one.
+    """Solves appearances on the cluster of ``scheduler``; None without a scheduler.
 
     Raises what ``cluster.connect.connected`` raises.
     """

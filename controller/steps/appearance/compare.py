@@ -1,4 +1,4 @@
-"""The steps that show what is installed, photograph it, and compare each photograph with its stored target."""
+"""The steps that show and photograph installed appearances and compare each photograph with its stored target."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def compare_steps(
 ) -> list[Step]:
     """A step for each appearance, which leaves ``compared-NAME.npz`` and ``.json`` (``artefacts.comparison``).
 
-    ``bundle``: what identifies the installed bundle; the appearances were solved on ``calibrated``. What was
-    photographed on another day is not gone on with: the figures are those of the day on which they are asked for.
+    ``bundle``: identifies the installed bundle; the appearances were solved on ``calibrated``. Photographs of another
+    day are not used: all figures are from the day of the request.
     """
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     inputs = {"bundle": bundle, "calibration": calibrated.folder.name, "day": time.strftime("%Y-%m-%d"),
@@ -53,7 +53,7 @@ def compare_steps(
 
 
 def compared_mask(calibrated: Calibrated, solved: Solved) -> Mask:
-    """Where photograph and target are compared, (rows, columns): on the object, where the target can be reached."""
+    """Mask of the comparison, (rows, columns): pixels on the object where the target can be reached."""
     return solved.reachable & calibrated.calibration.object_mask
 
 
@@ -71,7 +71,7 @@ def _compare(
     display = bundle_display(rig)
     display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
     shown = display.play(name, deadline=context.deadline.within(20))
-    # The day is of the photograph's settings as well: yesterday's are not taken for today's.
+    # The day is part of the photograph's settings, so that yesterday's photographs are not reused.
     of = {"bundle": bundle, "appearance": name, "day": time.strftime("%Y-%m-%d")}
     photographed_s = time.time()
     picture = photograph_hdr(rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of)

@@ -1,4 +1,4 @@
-"""Live: pictures of a source made into frames and handed on, the newest first; told of: what is late, what is bad."""
+"""Live mode: makes frames from a source's pictures, always the newest, and counts late and bad ones."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from controller.solve.scaling.interactive import Interactive
 IDLE_S: Final = 0.002
 TOLD_EVERY_S: Final = 1.0
 DELAYS: Final = 4096
-"""Of so many pictures, the last ones, the delays are kept."""
+"""The delays of this many latest pictures are kept."""
 BUFFERS: Final = 3
-"""One that is shown, one that waits, one that is being made."""
+"""One shown, one waiting, one being made."""
 
 Frames = list[ByteImage]
 
 
 class Maker(Protocol):
-    """Makes of a source's picture what is handed on."""
+    """Converts a source's picture for the player."""
 
     def blank(self) -> Frames:
-        """What ``make`` writes to; its content is not defined."""
+        """The buffer for ``make``; its content is undefined."""
 
     def make(self, picture: LivePicture, into: Frames) -> None: ...
 
 
 class FrameMaker:
-    """Makes the projectors' frames, by base and scale on the processor; ``brightness``: the radiance of white."""
+    """Makes the projectors' frames by base and scale on the CPU; ``brightness``: the radiance of white."""
 
     def __init__(self, scaler: Interactive, brightness: float) -> None:
         self._scaler, self._brightness = scaler, brightness
@@ -67,7 +67,7 @@ class TargetMaker:
 
 @dataclass(slots=True)
 class LiveFigures:
-    """What became of the pictures of a source; ``trouble``: what was wrong with the last ``bad`` one."""
+    """Figures about a source's pictures; ``trouble``: the error of the last ``bad`` one."""
 
     made: int = 0
     late: int = 0
@@ -77,7 +77,7 @@ class LiveFigures:
     delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
 
     def told(self) -> dict[str, Any]:
-        """For a person or a machine; ``delay`` is from when a picture was due to when its frames were handed on."""
+        """As a dictionary for output; ``delay`` is from a picture's due time to the delivery of its frames."""
         delays = np.array(self.delays_s or [0.0])
         return {
             "made": self.made,
@@ -91,7 +91,7 @@ class LiveFigures:
 
 
 class _Mailbox:
-    """One set of frames, replaced by a newer one before it is taken; buffers go round."""
+    """Holds one set of frames; a newer set replaces it. Buffers are reused."""
 
     def __init__(self, buffers: list[Frames]) -> None:
         self._changed = threading.Condition()
@@ -126,12 +126,12 @@ class _Mailbox:
             return found
 
     def pass_over(self, error: UsageError) -> None:
-        """A picture that can't be shown: the last good one stays."""
+        """Count a picture that can't be shown; the last good one stays."""
         self.bad, self.trouble = self.bad + 1, f"{error.what} {error.remedy}"
 
     @property
     def empty_for_good(self) -> bool:
-        """Whether nothing is there and nothing will come; what came just before the end is still to be taken."""
+        """Whether it is closed and empty; a set that came just before closing can still be taken."""
         with self._changed:
             return self.ended and self._full is None
 
@@ -150,16 +150,16 @@ def run_live(
     seconds: float | None = None,
     tell: Callable[[LiveFigures], None] = lambda figures: None,
 ) -> LiveFigures:
-    """Hand on what ``maker`` makes of ``source`` until it ends, ``seconds`` have passed or ``tell`` raises.
+    """Show the pictures of ``source``, made by ``maker``, until it ends, ``seconds`` have passed or ``tell`` raises.
 
     Parameters
     ----------
-    show : called with what was made; it may be overwritten after that
-    rate_hz : pictures are taken at most so often; those that are due between two of them count as late
+    show : called with the finished frames; their buffer may be overwritten after that
+    rate_hz : maximum rate of pictures; those that are due in between count as late
     tell : called about once a second, and may raise to stop
 
-    A picture for which the source raises UsageError is passed over and counted as bad. Raises what else the source
-    raises, and ``show`` and ``tell``; the source is closed by then.
+    A picture for which the source raises UsageError is skipped and counted as bad. Raises other errors of the source,
+    ``show`` and ``tell``, after the source is closed.
     """
     box = _Mailbox([maker.blank() for _ in range(BUFFERS)])
     stop = threading.Event()

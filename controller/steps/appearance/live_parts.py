@@ -1,4 +1,4 @@
-"""What live mode needs of a calibration, read from a run (docs/reference/bundle-format.md, "Live section")."""
+"""Reads the data for live mode from a calibration run (docs/reference/bundle-format.md, "Live section")."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def live_arrays(run: Path, outputs: Mapping[str, tuple[str, tuple[int, int]]]) -
 
 
 def target_px(calibrated: Calibrated) -> tuple[int, int]:
-    """(width, height) of the targets, from the camera's picture; nothing is built for it."""
+    """(width, height) of the targets, from the camera's picture; builds nothing."""
     width, height = calibrated.camera_px or calibrated.calibration.black.shape[1::-1]
     factor = reduction((height, width))
     return -(-width // factor), -(-height // factor)
@@ -35,7 +35,7 @@ def live_maps(calibrated: Calibrated, outputs: Mapping[str, str]) -> LiveMaps:
     if not has_base(calibrated.base_folder):
         raise WorkError(
             "base-not-solved",
-            what=f"{calibrated.folder.name} holds no base image, which live targets are scaled from.",
+            what=f"{calibrated.folder.name} has no base image. Live targets need one.",
             remedy="Run `velatura appearance` on the stage first.",
         )
     calibration = calibrated.calibration

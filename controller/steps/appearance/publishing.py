@@ -1,4 +1,4 @@
-"""The steps from solved frames to a signed, installed bundle, and from there to photographs of what plays."""
+"""The steps from solved frames to a signed, installed bundle, and to photographs of the playing appearances."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ from hal.interfaces import BundleDisplay
 PLAYED = "played"
 """The kind of the photographs of appearances."""
 PHOTO_BRACKET = (0.7, 5.0)
-"""Exposures of an appearance's photograph, relative to the one at which its target's white fills the scale."""
+"""Exposures of an appearance's photograph, relative to the one at which its target's white reaches full scale."""
 PLAYBACK_RATE_HZ = 60.0
 METADATA = ("title", "mode", "exposure", "reachable_share", "fine_detail")
-"""Figures of the solving that a bundle tells; none of them differs between two solvings of the same."""
+"""Figures of the solve that a bundle contains; all are the same in a repeated solve."""
 SHOWN_MS = (15_000, 1_000)
-"""For how long the bundle's playlist suggests to show what stage.toml does not name, and to fade into it."""
+"""Show and fade times in the bundle's playlist for appearances without times in stage.toml."""
 
 
 def bundle_display(rig: Rig) -> BundleDisplay:
-    """The rig's display as one that plays bundles. Raises UsageError("display-plays-no-bundles")."""
+    """The rig's display, if it plays bundles. Raises UsageError("display-plays-no-bundles")."""
     if not isinstance(rig.display, BundleDisplay):
         raise UsageError(
             "display-plays-no-bundles",
-            what="This stage's display driver shows pictures but plays no bundles.",
-            remedy='Use the driver "player" under [display] in stage.toml.',
+            what="The display driver of this stage can't play bundles.",
+            remedy='Write driver = "player" under [display] in stage.toml.',
         )
     return rig.display
 
@@ -67,10 +67,10 @@ Outputs = Mapping[str, tuple[str, tuple[int, int]]]
 def publish_step(
     stage_folder: Path, outputs: Outputs, names: Sequence[str], *, stage: str, calibration: str, key: Path | None
 ) -> Step:
-    """Write, sign and install the bundle of these appearances; its artefacts are the bundle and its figures.
+    """Write, sign and install the bundle of these appearances; the artefacts are the bundle and its figures.
 
-    The bundle holds what else is solved on the calibration, too: see ``kept_names``. Publishing is cheap, and what it
-    holds depends on more than its own steps, so it is done in every run; nothing new gives the same bytes.
+    The bundle also holds other appearances solved on the calibration: see ``kept_names``. Publishing is cheap, and the
+    content depends on more than its own steps, so every run repeats it; unchanged content gives the same bytes.
 
     ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle.
     """
@@ -105,14 +105,21 @@ def _publish(
     )  # fmt: skip
     installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
     raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
-    stored = sum(blob.length for one in index.appearances for blobs in one.stripes.values() for blob in blobs)
+    stored = sum(
+        blob.length for appearance in index.appearances for blobs in appearance.stripes.values() for blob in blobs
+    )
     figures = BundleFigures(built.stat().st_size, raw / stored, installed.name, names)
     return [figures.write(context.folder), built]
 
 
 def _tell_dropped(slots: Path, names: Sequence[str], reporter: Reporter) -> None:
-    """Say which appearances of the installed bundle the new one lacks, since they belong to another calibration."""
-    dropped = [one.name for index in _installed(slots) for one in index.appearances if one.name not in names]
+    """Report appearances of the installed bundle that the new one lacks, because they have another calibration."""
+    dropped = [
+        appearance.name
+        for index in _installed(slots)
+        for appearance in index.appearances
+        if appearance.name not in names
+    ]
     if dropped:
         several = len(dropped) > 1
         reporter.say(
@@ -123,10 +130,10 @@ def _tell_dropped(slots: Path, names: Sequence[str], reporter: Reporter) -> None
 
 
 def kept_names(stage_folder: Path, run: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """``names``, and what else the folder ``run`` holds solved that stage.toml or the installed bundle names.
+    """``names``, and other appearances solved in ``run`` that stage.toml or the installed bundle names.
 
-    In stage.toml's order, then as installed, then as given. What was solved on another calibration is not kept: its
-    frames are for other light.
+    In stage.toml's order, then as installed, then as given. Appearances of another calibration are dropped: their
+    frames do not fit.
     """
     listed = []
     if (stage_folder / FILE).exists():
@@ -144,7 +151,7 @@ def hints_ms(stage_folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def _installed(slots: Path) -> list[Index]:
-    """What the current bundle of the folder ``slots`` holds; empty where there is none that can be read."""
+    """The names in the current bundle of the folder ``slots``; empty if none can be read."""
     file = current(slots)
     with contextlib.suppress(BundleError):
         if file is not None:
@@ -172,13 +179,13 @@ def publish_solved(
     hints_ms: Mapping[str, tuple[int, int]] | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> Index:
-    """Write the appearances that the folder ``run`` holds solved as a bundle at ``path``, signed with the key file.
+    """Write the solved appearances of the folder ``run`` to a bundle at ``path``, signed with the key file.
 
-    Where the folder ``slots`` has the same bundle installed, the file is that one, byte for byte. Else its revision is
-    one more than those installed bundles that ``trust`` lets pass. ``live``: with what the live mode needs.
-    ``hints_ms``: (shown, fade) by name for the playlist that the bundle suggests, else ``SHOWN_MS``.
-    ``check`` is called before each appearance, to stop the work by raising.
-    Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then as it was, or sound.
+    If the folder ``slots`` has the same bundle installed, the file is identical to it. Otherwise its revision is
+    one above those installed bundles that ``trust`` accepts. ``live``: include the live-mode data.
+    ``hints_ms``: (shown, fade) by name for the bundle's playlist, else ``SHOWN_MS``.
+    ``check`` is called before each appearance and may raise to stop the work.
+    Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then unchanged or intact.
     """
     thumbnails = Thumbnails(run, tuple(outputs))
 
@@ -214,9 +221,9 @@ def publish_solved(
 
 
 def created_unix_s(run: Path) -> int:
-    """When the calibration in the folder ``run`` was begun, so that publishing again gives the same bytes.
+    """Start time of the calibration in the folder ``run``, so that publishing again gives the same bytes.
 
-    The environment's SOURCE_DATE_EPOCH goes before it; 0 where neither tells.
+    The environment's SOURCE_DATE_EPOCH takes precedence; 0 if neither is known.
     """
     given = os.environ.get("SOURCE_DATE_EPOCH", "")
     if given.isascii() and given.isdigit() and int(given) <= 2**53:
@@ -233,13 +240,13 @@ def photograph_step(rig: Rig, names: Sequence[str], *, longest_exposure_s: float
         StepId(StepKind.PHOTOGRAPH),
         partial(_photograph, rig, tuple(names), longest_exposure_s),
         after=(StepId(StepKind.PUBLISH),),
-        title="Photographing what plays",
+        title="Photographing the installed appearances",
         weight=photographs_s(rig, names),
     )
 
 
 def photographs_s(rig: Rig, names: Sequence[str]) -> float:
-    """What showing and photographing these appearances costs (``steps.costs``)."""
+    """Cost in seconds of showing and photographing these appearances (``steps.costs``)."""
     return 3 * len(names) * costs.shot_s(costs.scale(projector.size_px for projector in rig.projectors))
 
 
@@ -264,8 +271,8 @@ def photograph_hdr(
 ) -> FloatImage:  # fmt: skip
     """Photograph what is shown now in HDR: (rows, columns, 3) float32, full scales per second.
 
-    ``kind`` and ``name`` identify the photographs, each of which has its number besides. ``white`` is the radiance of
-    the target's white; ``of`` names what is shown, for the journal.
+    ``kind`` and ``name`` identify the photographs, together with a number for each. ``white`` is the radiance of
+    the target's white; ``of`` names the picture shown, for the journal.
     """
     _, merged = take_hdr(rig, context, kind, name, white, longest_s, shown_at_s=shown_at_s, of=of)
     return np.asarray(np.nan_to_num(merged), np.float32)
@@ -275,19 +282,21 @@ def take_hdr(
     rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
     of: Mapping[str, str],
 ) -> tuple[list[Taken], FloatImage]:  # fmt: skip
-    """As ``photograph_hdr``: the photographs, and what they tell together, NaN where it is too bright for all."""
+    """As ``photograph_hdr``: the photographs, and their combination, NaN where it is too bright for all."""
     exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
     with kept_if_lit(rig, context) as row:
         for number, exposure_s in enumerate(exposures_s):
             identity = ShotId(kind, f"{name}-{number}")
             row.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
     taken = row.taken
-    merged = merge_brackets([one.read().measured() for one in taken], [one.exposure_s for one in taken]).radiance
+    merged = merge_brackets(
+        [photograph.read().measured() for photograph in taken], [photograph.exposure_s for photograph in taken]
+    ).radiance
     return taken, merged
 
 
 def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:
-    """Swap the appearances as fast as a display does, and measure how evenly they come."""
+    """Swap the appearances at the display's rate, and measure how regular the swaps are."""
     return Step(
         StepId(StepKind.PLAYBACK),
         partial(_playback, rig, tuple(names), seconds),

@@ -1,4 +1,4 @@
-"""Appearances that Blender renders, as a step of a run: shown progress, stopped at once, not repeated on resuming."""
+"""Blender renderings as steps of a run: with progress, stopped at once, not repeated on resuming."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from controller.steps.appearance.solving import Wish
 
 PREFIX: Final = "builtin:"
 RENDER_S: Final = 40.0
-"""At the small size on the reference machine."""
+"""At size small on the reference machine."""
 
 
 def blender_wish(
     name: str, calibrated: Calibrated, options: Mapping[str, Any], inputs: Mapping[str, str], *, folder: Path
 ) -> Wish:
-    """A wish whose target is rendered from ``options``: ``scene``, ``builtin:NAME`` (the default is marble) or a .blend
+    """A request whose target is rendered from ``options``: ``scene``, ``builtin:NAME`` (default: marble) or a .blend
     file relative to ``folder``; ``samples`` and ``seed``.
 
     Raises UsageError with code "blender-missing", "blender-scene-unknown" or "target-missing".
@@ -56,7 +56,7 @@ def blender_wish(
 
 
 def scene_wish(calibrated: Calibrated, scene: str, *, folder: Path) -> Wish:
-    """The wish of a scene given on the command line; ``builtin:marble`` is called marble, a file by its name."""
+    """The request for a scene given on the command line; ``builtin:marble`` is called marble, a file by its name."""
     name = scene.removeprefix(PREFIX) if scene.startswith(PREFIX) else Path(scene).stem
     return blender_wish(name, calibrated, {"scene": scene}, {"kind": "blender", "scene": scene}, folder=folder)
 
@@ -67,7 +67,7 @@ def _scene(scene: str, folder: Path) -> tuple[str | None, Path | None]:
         if builtin not in BUILTIN:
             raise UsageError(
                 "blender-scene-unknown",
-                what=f"There is no scene {scene!r}.",
+                what=f"The scene {scene!r} is unknown.",
                 remedy=f"Choose one of {', '.join(PREFIX + known for known in BUILTIN)}, or give a .blend file.",
             )
         return builtin, None
@@ -75,7 +75,7 @@ def _scene(scene: str, folder: Path) -> tuple[str | None, Path | None]:
     if not file.is_file():
         raise UsageError(
             "target-missing",
-            what=f"The scene {file} is not there.",
-            remedy="Put it there, or correct `scene`; paths are relative to the stage's folder.",
+            what=f"The scene file {file} does not exist.",
+            remedy="Add the file, or correct `scene`. Paths are relative to the stage's folder.",
         )
     return None, file

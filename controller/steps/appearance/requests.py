@@ -27,24 +27,24 @@ from controller.steps.appearance.rendering import blender_wish
 from controller.steps.appearance.solving import Wish
 
 TITLES: Mapping[str, str] = {
-    "photograph": "A photograph, wrapped on the object",
-    "pattern": "Its own pattern cancelled, another put on",
+    "photograph": "A photograph wrapped around the object",
+    "pattern": "Another pattern instead of the object's own",
     "checkerboard": "A checkerboard",
     "gloss": "A gloss",
     "recolour": "Recoloured",
     "picture": "A picture as seen from the camera",
     "blender": "Rendered by Blender",
 }
-"""Every kind of appearance, as a person calls it."""
+"""Title of every kind of appearance."""
 
 NEEDS_FILE = ("photograph", "picture")
 
 
 def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -> list[Wish]:
-    """The appearances of stage.toml with these names, or all of them, checked before anything is solved.
+    """The appearances of stage.toml with these names, or all, checked before anything is solved.
 
     Raises UsageError with code "appearance-unknown", "stage-key-value" or "stage-key-unknown" (with the line), and
-    "target-missing" for a file that is not there.
+    "target-missing" for a missing file.
     """
     tables = {table.name: table for table in stage.tables.appearances}
     unknown = [name for name in names if name not in tables]
@@ -52,7 +52,9 @@ def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -
         raise UsageError(
             "appearance-unknown",
             what=f"stage.toml has no appearance {unknown[0]!r}." if unknown else "stage.toml has no [[appearances]].",
-            remedy=f"It has {', '.join(tables)}." if tables else 'Add one: name and kind, for example kind = "gloss".',
+            remedy=f"Available: {', '.join(tables)}."
+            if tables
+            else 'Add one with name and kind, for example kind = "gloss".',
         )
     return [_wish(stage, tables[name], calibrated) for name in (names or tables)]
 
@@ -60,7 +62,7 @@ def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -
 def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
     if table.kind not in TITLES:
         raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
-    _ = table.hint_ms  # what is wrong with it is told before an hour of solving
+    _ = table.hint_ms  # report its errors before an hour of solving
     wanted = _options(table.kind)
     required = ("tint",) if table.kind == "recolour" else ()
     settings = table.settings({key: allowed(kind) for key, kind in wanted.items()}, required)
@@ -92,7 +94,7 @@ _MAKERS: Mapping[str, Callable[..., Target]] = {
 
 
 def _options(kind: str) -> dict[str, Any]:
-    """The settings of a kind with their types: the keyword arguments of what makes it."""
+    """The settings of a kind with their types: the keyword arguments of its maker."""
     if kind == "recolour":
         return {"tint": Colour}
     if kind == "blender":
@@ -106,17 +108,17 @@ def _options(kind: str) -> dict[str, Any]:
 
 
 _RENAMED: Mapping[str, str] = {"kind": "figure"}
-"""Arguments of makers that go by another name in stage.toml, where ``kind`` says which maker it is."""
+"""Arguments of makers with another name in stage.toml, where ``kind`` chooses the maker."""
 _ARGUMENTS: Mapping[str, str] = {written: name for name, written in _RENAMED.items()}
 
 
 def _check_picture(table: AppearanceTable, file: Path, camera_px: tuple[int, int] | None) -> None:
-    """Read a picture now, so that a wrong one is known before an hour of solving."""
+    """Read a picture now, so that an error shows before an hour of solving."""
     if not file.is_file():
         raise UsageError(
             "target-missing",
-            what=f"The picture {file} of appearance {table.name} is not there.",
-            remedy="Put it there, or correct `file` in stage.toml.",
+            what=f"The picture {file} of appearance {table.name} does not exist.",
+            remedy="Add the file, or correct `file` in stage.toml.",
         )
     picture = read_picture(file)
     size = camera_px if table.kind == "picture" else None
@@ -142,7 +144,7 @@ def _make(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: 
 
 
 def _as_it_is(calibrated: Calibrated) -> FloatImage:
-    """The object under white light, its brightest parts at 1."""
+    """The object under white light, scaled so that its brightest parts are 1."""
     light = calibrated.transport.reach()
     brightest = np.percentile(light[calibrated.transport.object_mask], 99)
     return np.asarray(np.clip(light / brightest, 0, 1), np.float32)

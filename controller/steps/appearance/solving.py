@@ -30,10 +30,10 @@ BASE = StepId(StepKind.BASE)
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """An appearance to be made: ``target`` gives its picture, reflectance-like, and where it says something.
+    """An appearance to solve: ``target`` gives its picture, like reflectance, and a mask of its valid pixels.
 
-    ``inputs`` are the hashes of what the target is made from; ``prepare``, where there is one, is a step's work before
-    the solving, for targets that take long, and ``prepare_s`` what it costs.
+    ``inputs`` are the hashes of the target's sources; ``prepare``, if given, is a step before
+    the solving, for slow targets, and ``prepare_s`` its cost.
     """
 
     name: str
@@ -45,13 +45,13 @@ class Wish:
 
 
 def base_choice(name: str) -> BaseChoice:
-    """The base image that a person typed. Raises UsageError("base-unknown")."""
+    """The base image with this name. Raises UsageError("base-unknown")."""
     known: tuple[BaseChoice, ...] = get_args(BaseChoice)
     for choice in known:
         if choice == name:
             return choice
     raise UsageError(
-        "base-unknown", what=f"There is no base image called {name}.", remedy=f"Choose one of {', '.join(known)}."
+        "base-unknown", what=f"The base image {name} is unknown.", remedy=f"Choose one of {', '.join(known)}."
     )
 
 
@@ -64,10 +64,10 @@ def solve_steps(
     *,
     answering: Answering | None = None,
 ) -> list[Step]:
-    """Solve the base, then each wish.
+    """Solve the base, then each request.
 
     ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``steps.costs``; ``answering``
-    makes the appearances elsewhere.
+    solves the appearances elsewhere.
     """
     steps = [
         Step(
@@ -123,7 +123,7 @@ def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context)
 
 
 def _watched(context: Context) -> Callable[[int, float], None]:
-    """Tells the run how far a solve is, whose end is not known; a stop takes hold in it."""
+    """Reports the progress of a solve whose end is unknown; a stop request raises here."""
 
     def progress(iteration: int, kkt: float) -> None:
         context.advance(1 - 1 / (1 + iteration / 60), f"iteration {iteration}")
@@ -132,7 +132,7 @@ def _watched(context: Context) -> Callable[[int, float], None]:
 
 
 Answering = Callable[[Wish, SolveOptions, Context], AppearanceResult]
-"""Makes an appearance, here or elsewhere."""
+"""Solves an appearance, here or elsewhere."""
 
 
 def _answer_here(calibrated: Calibrated, wish: Wish, options: SolveOptions, context: Context) -> AppearanceResult:
@@ -171,7 +171,7 @@ def _solve_appearance(
 
 
 def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dict[str, ByteImage]:
-    """8-bit frames by projector name, dithered, each projector at another place of the dither's tile."""
+    """8-bit frames by projector name, dithered, each projector at another offset of the dither tile."""
     return {
         part.name: to_device(values, part.radiometry, phase=(17 * n, 29 * n))
         for n, (part, values) in enumerate(zip(calibration.projectors, frames, strict=True))

@@ -1,4 +1,4 @@
-"""Small pictures of appearances as the camera should see them, for the panel and whoever looks into a bundle."""
+"""Small pictures of appearances as the camera should see them, for the panel and for bundles."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _XYZ_TO_SRGB: Final = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.
 
 
 class Thumbnails:
-    """Makes the thumbnails of a run's appearances, and keeps them in the run's folder until they are solved anew.
+    """Makes the thumbnails of a run's appearances, and keeps them in the run's folder until they are solved again.
 
-    The light transport is built for the first that is not kept.
+    Builds the light transport for the first thumbnail that is not stored yet.
     """
 
     def __init__(self, folder: Path, projectors: Sequence[str]) -> None:
@@ -33,7 +33,7 @@ class Thumbnails:
         self._calibrated: Calibrated | None = None
 
     def of(self, name: str) -> bytes | None:
-        """The PNG file of an appearance that the run holds solved; None where its calibration is not in the run."""
+        """The PNG file of a solved appearance of the run; None if its calibration is not in the run."""
         if (kept := read_thumbnail(self._folder, name)) is not None:
             return kept
         if not all(Light.path(self._folder, projector).exists() for projector in self._projectors):
@@ -52,9 +52,9 @@ class Thumbnails:
 
 
 def thumbnail(picture: FloatImage, camera_to_xyz: Float64, *, white: float) -> ByteImage:
-    """A camera picture (rows, columns, 3), linear, as sRGB of at most ``LONGEST_PX`` a side.
+    """A linear camera picture (rows, columns, 3) as sRGB of at most ``LONGEST_PX`` per side.
 
-    ``white``: the camera value that becomes the screen's white; ``camera_to_xyz`` (3, 3), equal values being D65 grey.
+    ``white``: the camera value for the screen's white; ``camera_to_xyz`` (3, 3): equal values are D65 grey.
     """
     rows, columns = picture.shape[:2]
     part = min(1.0, LONGEST_PX / max(rows, columns))

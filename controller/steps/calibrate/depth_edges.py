@@ -41,11 +41,11 @@ from controller.transport.edge_terms import edge_term
 
 EXPECTED_SHOTS: Final = 36
 TYPICAL: Final = 0.5
-"""Of the pixels whose blur sets the spacing: no ellipse is fitted here, so a few dots that meet do less harm."""
+"""Share of pixels whose blur sets the spacing. No ellipse is fitted here, so a few touching dots matter less."""
 
 
 def edge_steps(rig: Rig, projector: RigProjector, options: DotOptions, longest_exposure_s: float) -> list[Step]:
-    """Photograph the pixels at depth edges of one projector, and keep what the camera pixels saw of each."""
+    """Photograph the pixels at depth edges of one projector, and store each one's camera values."""
     name, scale = projector.name, costs.scale([projector.size_px])
     own = of_projectors([name], StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.EDGE_DOTS)
     return [
@@ -108,7 +108,7 @@ def _measure(projector: RigProjector, context: Context) -> Sequence[Path]:
 
 
 def terms_step(rig: Rig) -> Step:
-    """Compare what was measured with what the transport's model says, once, so that no solve has to."""
+    """Compare the measurement with the transport's model once, so that no solve has to."""
     names = [projector.name for projector in rig.projectors]
     return Step(
         StepId(StepKind.EDGE_TERMS),

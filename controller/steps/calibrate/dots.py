@@ -1,4 +1,4 @@
-"""The steps of the paper's mode: photographs of dots, and the metapixels that they give (paper 4.1, 4.2)."""
+"""The steps of the paper's mode: photographs of dots, and the metapixels fitted to them (paper 4.1, 4.2)."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from controller.steps.capture.dots import (
 )
 
 CLEAR_GAIN: Final = 0.2
-"""Of regularity, for which a fitted centre is moved; below it, folds and noise are moved and centres get worse."""
+"""Regularity above which a fitted centre is corrected; below it, correction of folds and noise makes it worse."""
 EXPECTED_SPACING_PX: Final = 7
-"""For the time left, before the blur is measured."""
+"""For the estimate of the time left, before the blur is measured."""
 
 
 def dot_steps(rig: Rig, options: DotOptions, *, longest_exposure_s: float) -> list[Step]:
-    """What a mode adds to ``calibration_steps``; for "fast" only the note of the mode."""
+    """The steps that a mode adds to ``calibration_steps``; for "fast" only the note of the mode."""
     steps: list[Step] = []
     for projector in rig.projectors:
         if options.mode == "auto":
@@ -104,7 +104,7 @@ def _photograph(
 
 
 def _photograph_name(pattern: DotPattern) -> str:
-    """Dots of another spacing are other photographs."""
+    """Dots with another spacing are different photographs."""
     return f"{pattern.spacing_px:02d}-{pattern.name}"
 
 

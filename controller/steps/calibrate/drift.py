@@ -1,4 +1,4 @@
-"""The steps of a drift check: N + 2 photographs, compared with what the calibration predicts."""
+"""The steps of a drift check: N + 2 photographs, compared with the calibration's prediction."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from controller.steps.capture.patterns import bracket
 from controller.steps.capture.photographs import Planned, take_all
 
 PATTERN = Pattern("drift", PatternKind.RANDOM, seed=17)
-"""Not the one on which a calibration is graded."""
+"""Not the pattern on which a calibration is graded."""
 FULL_SHARE = 0.7
-"""Of full scale, for the brightest places: room for light that came in since."""
+"""Share of full scale for the brightest pixels: room for additional light."""
 BLACK_TIMES = 8.0
 """The black photograph's exposure over that of white."""
 
@@ -41,7 +41,7 @@ def drift_steps(rig: Rig, calibrated: Calibrated, *, longest_exposure_s: float) 
             StepId(StepKind.DRIFT_PHOTOGRAPHS),
             partial(_photograph, rig, calibrated, longest_exposure_s),
             inputs=inputs,
-            title="Photographing what may have changed",
+            title="Taking the photographs of the drift check",
             weight=costs.shot_s(scale) * (len(rig.projectors) + 2),
         ),
         Step(
@@ -64,7 +64,7 @@ def exposure_for(light: FloatImage, available_s: Sequence[float], longest_s: flo
 
 
 def shown_frames(calibrated: Calibrated, pattern: Pattern) -> dict[str, ByteImage]:
-    """``pattern`` on each projector, in device values, by its measured response."""
+    """``pattern`` for each projector, in device values, by its measured response."""
     found = {}
     for part in calibrated.calibration.projectors:
         rows, columns = part.metapixels.valid.shape
@@ -98,7 +98,7 @@ def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     calibration = calibrated.calibration
     taken = TAKEN.read(context.folder)
     alone = TAKEN.by_projector(context.folder)
-    together = {one.name: one for one in taken if one.projector is None}
+    together = {photograph.name: photograph for photograph in taken if photograph.projector is None}
     seen = DriftPhotographs(
         black=together["black"].per_second(),
         white=together["white"].per_second(),
@@ -110,6 +110,6 @@ def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
 
 
 def linear_frames(calibrated: Calibrated, pattern: Pattern) -> list[FloatImage]:
-    """What ``shown_frames`` sends out: (rows, columns, 3) linear light a projector."""
+    """The light of ``shown_frames``: (rows, columns, 3), linear, for each projector."""
     sizes = [part.metapixels.valid.shape for part in calibrated.calibration.projectors]
     return [frame(pattern, (columns, rows)) for rows, columns in sizes]

@@ -30,7 +30,7 @@ from controller.steps.capture.patterns import capture_steps, code_step
 
 
 def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float) -> list[Step]:
-    """Everything from the first photograph to metapixels and geometry."""
+    """All steps from the first photograph to metapixels and geometry."""
     steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
     steps.append(camera_step(rig))
     names = [projector.name for projector in rig.projectors]
@@ -94,7 +94,7 @@ def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) ->
 
 
 _SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""IEC 61966-2-1; for a camera that does not tell its own colours."""
+"""IEC 61966-2-1; for a camera without its own colour matrix."""
 
 
 def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
@@ -106,7 +106,7 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
         raise CalibrationError(
             "projector-reaches-nothing",
             what=f"No pixel of projector {projector.name} was found on the object.",
-            remedy="Check that it is aimed at the object, in focus, not blocked, and that the room is dark.",
+            remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
         )
     context.advance(0.4, "correspondences")
     fitted = fit_pixels(captures, plan, correspondence)

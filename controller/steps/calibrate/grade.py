@@ -1,4 +1,4 @@
-"""The grade of a run's calibration, where it is bad and why, and the gate before anything that uses it."""
+"""Grades a run's calibration, shows where it is bad and why, and refuses one below the limit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from controller.steps.calibrate.drift import shown_frames
 from controller.steps.capture.photographs import Planned, take_all
 
 WORSE = 1.25
-"""A calibration this many times worse than the one before it is told of, though it passes the gate."""
+"""Warn about a calibration this many times worse than the previous one, even if its grade is sufficient."""
 
 
 def verify_step(calibrated: Calibrated, after: Sequence[StepId], scale: float) -> Step:
@@ -53,13 +53,13 @@ def verify_step(calibrated: Calibrated, after: Sequence[StepId], scale: float) -
 
 
 def verification_photographs_step(rig: Rig, calibrated: Calibrated, after: Sequence[StepId]) -> Step:
-    """Photograph the random pattern anew, for a calibration that was corrected."""
+    """Photograph the random pattern again, for a corrected calibration."""
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     return Step(
         StepId(StepKind.VERIFICATION_PHOTOGRAPHS),
         partial(_photograph, rig, calibrated),
         after=tuple(after),
-        title="Photographing the pattern to grade by",
+        title="Photographing the pattern for the grade",
         weight=costs.shot_s(scale) * len(rig.projectors),
     )
 
@@ -115,14 +115,14 @@ def _figures(found: Verification, why: ErrorAttribution) -> dict[str, object]:
 
 
 def grade_figures(folder: Path) -> dict[str, str]:
-    """For a command's result: each projector's error, and the map of where it is bad."""
+    """For a command's result: each projector's error, and the error map."""
     figures = graded(folder) or {}
     text = ", ".join(f"{name} {percent:.2f} %" for name, percent in figures.items())
     return {"error": text, "map": str(folder / PICTURE)} if figures else {}
 
 
 def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
-    """Let a calibration below the set grade pass, and say so loudly; harmless for one that passes anyway."""
+    """Accept a calibration below the limit, with a warning; no effect on one that passes."""
     worst = worst_of(folder)
     if worst is None or passes(folder, worst_grade):
         return
@@ -135,7 +135,7 @@ def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
 
 
 def below_grade(folder: Path, worst_grade: float) -> CalibrationError:
-    """The error for a calibration that does not pass."""
+    """The error for a calibration below the limit."""
     name, percent = worst_of(folder) or ("", float("nan"))
     reasons = read_grade_figures(folder)[name].get("reasons", [])
     because = f" {reasons[0]['sentence']}" if reasons else ""
@@ -143,23 +143,23 @@ def below_grade(folder: Path, worst_grade: float) -> CalibrationError:
         "calibration-below-grade",
         what=f"The calibration {folder.name} is not good enough to be published: projector {name} is predicted with "
         f"{percent:.1f} % error, and {worst_grade:g} % is the limit (worst_grade under [calibration]).{because}",
-        remedy=f"Look at {folder / PICTURE}, mend what it shows and calibrate again; or publish all the same with "
+        remedy=f"Check {folder / PICTURE}, correct the cause and calibrate again. To publish it anyway, use "
         "--accept-grade.",
     )
 
 
 def gate_step(worst_grade: float, *, accepted: bool, reporter: Reporter | None = None) -> Step:
-    """Refuse to go on with a calibration below the set grade. Raises CalibrationError("calibration-below-grade")."""
+    """Refuse a calibration below the limit. Raises CalibrationError("calibration-below-grade")."""
 
     def run(context: Context) -> Sequence[Path]:
         require(context.folder, worst_grade, accepted=accepted, reporter=reporter or context.reporter)
         return ()
 
-    return Step(StepId("gate"), run, title="Comparing the grade with what is asked", weight=0.01, always=True)
+    return Step(StepId("gate"), run, title="Comparing the grade with the limit", weight=0.01, always=True)
 
 
 def require(folder: Path, worst_grade: float, *, accepted: bool, reporter: Reporter) -> None:
-    """The gate itself. Raises CalibrationError("calibration-below-grade")."""
+    """The check itself. Raises CalibrationError("calibration-below-grade")."""
     if accepted:
         accept(folder, reporter, worst_grade)
     if not passes(folder, worst_grade):
@@ -167,7 +167,7 @@ def require(folder: Path, worst_grade: float, *, accepted: bool, reporter: Repor
 
 
 def compare_with_last(folder: Path, last: Path | None, reporter: Reporter) -> None:
-    """Say it when a new calibration is worse than the one that it replaces."""
+    """Warn if a new calibration is worse than the one that it replaces."""
     now, then = worst_of(folder), None if last is None else worst_of(last)
     if last is not None and now is not None and then is not None and now[1] > WORSE * then[1]:
         reporter.say(

@@ -1,7 +1,7 @@
-"""The steps of a quick recalibration: look what has changed, repeat that, keep the rest of the last calibration.
+"""The steps of a quick recalibration: find what has changed, repeat that, keep the rest of the last calibration.
 
-A projector that turned about its lens, or whose light changed, is corrected without codes: its white image is
-photographed anew, its correspondences and metapixels are moved. One that moved otherwise gets new codes. If camera or
+A projector that rotated about its lens, or whose light changed, is corrected without codes: its white image is
+photographed again, its correspondences and metapixels are moved. After other movements it gets new codes. If camera or
 object moved, everything is measured again.
 """
 
@@ -43,7 +43,7 @@ from controller.steps.capture.photographs import Planned, take_all
 
 
 class Way(enum.Enum):
-    """What a quick recalibration does with a step of the full one."""
+    """How a quick recalibration treats a step of the full one."""
 
     RUN = "run"
     KEEP = "keep"
@@ -55,7 +55,7 @@ def quick_steps(
 ) -> list[Step]:
     """From the drift check to the grade.
 
-    ``last``: the calibration that is brought up to date; ``full``: the steps of a full calibration, in the order and
+    ``last``: the calibration to update; ``full``: the steps of a full calibration, in the order and
     with the options of ``last``; each is run, kept or corrected once the drift is known
     """
     scale = costs.scale(projector.size_px for projector in rig.projectors)
@@ -79,23 +79,23 @@ def quick_steps(
 
 
 def _tell(context: Context) -> Sequence[Path]:
-    """Say what was found. Raises CalibrationError("projector-dark") where no calibration would help."""
+    """Report the drift. Raises CalibrationError("projector-dark") if no calibration would help."""
     drift = read_drift(context.folder)
     found = sentences(drift)
     for sentence in found[:-1] or found:
         context.reporter.say(sentence)
     if advice(drift) == "look":
         for taken in DRIFT.read(context.folder):
-            taken.path.unlink(missing_ok=True)  # the same command looks again, once the projector has been seen to
+            taken.path.unlink(missing_ok=True)  # the same command checks again after the projector is repaired
         raise CalibrationError("projector-dark", what=found[0], remedy=found[-1])
     if advice(drift) == "full":
-        context.reporter.say("All of it is measured again: nothing of the last calibration holds.", Level.WARNING)
+        context.reporter.say("Everything is measured again: the last calibration is no longer valid.", Level.WARNING)
     context.journal.record("drift", " ".join(found))
     return ()
 
 
 def chosen(rig: Rig, last: Calibrated, step: Step) -> Step:
-    """The step, run, kept or corrected as the drift will say."""
+    """The step, run, kept or corrected depending on the drift."""
 
     def run(context: Context) -> Sequence[Path]:
         way = way_of(step.id, read_drift(context.folder), mode_of(last.folder))
@@ -110,7 +110,7 @@ def chosen(rig: Rig, last: Calibrated, step: Step) -> Step:
 
 
 def way_of(step: StepId, drift: Drift, mode: str = "fast") -> Way:
-    """What becomes of a step of the full calibration. ``mode``: how the last one measured its metapixels."""
+    """How to treat a step of the full calibration. ``mode``: how the last one measured its metapixels."""
     if advice(drift) == "full":
         return Way.RUN
     if drift.nothing:
@@ -119,9 +119,9 @@ def way_of(step: StepId, drift: Drift, mode: str = "fast") -> Way:
         return Way.RUN
     if step.kind == StepKind.GEOMETRY:
         return Way.RUN if drift.moved else Way.KEEP
-    for one in drift.projectors:
-        if step.projector == one.name:
-            return _way_of(step.kind, one, mode)
+    for moved in drift.projectors:
+        if step.projector == moved.name:
+            return _way_of(step.kind, moved, mode)
     return Way.KEEP
 
 
@@ -129,7 +129,7 @@ def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
     if not one.known or (one.moved and not (one.turned_only and mode == "fast")):
         return Way.RUN
     if kind == StepKind.RADIOMETRY:
-        return Way.CORRECT  # black has been photographed anew
+        return Way.CORRECT  # black has been photographed again
     if kind == StepKind.LIGHT:
         return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
     return Way.CORRECT if kind == StepKind.PIXELS and one.moved else Way.KEEP
@@ -147,7 +147,7 @@ def keep(last: Path, step: StepId, context: Context) -> list[Path] | None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         try:
-            os.link(artefact.path, path)  # every writer replaces files and never changes them
+            os.link(artefact.path, path)  # all writers replace files and never change them
         except OSError:
             shutil.copy2(artefact.path, path)
         paths.append(path)

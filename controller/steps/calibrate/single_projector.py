@@ -1,8 +1,8 @@
-"""The steps that calibrate one projector anew and keep what the last calibration knows of the others.
+"""The steps that calibrate one projector again and keep the last calibration of the others.
 
-The others' photographs are not taken again, so nothing in them can tell that camera or object has moved since. The
-pattern of the grade is therefore photographed on every projector, one photograph each: if one of the others is
-predicted badly now, the gate keeps the old calibration.
+The others' photographs are not taken again, so they can't show whether camera or object has moved. The
+pattern of the grade is therefore photographed on every projector, one photograph each: if another projector is
+now predicted badly, the old calibration stays in use.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from controller.steps.calibrate.quick import Way, keep
 from controller.steps.capture.patterns import capture_steps
 
 ANEW = (StepKind.BLACK, StepKind.GEOMETRY, StepKind.EDGE_TERMS)
-"""Kinds of steps that concern every projector, and depend on what is measured anew."""
+"""Kinds of steps that concern every projector and depend on the new measurements."""
 EXPOSURE = StepId(StepKind.EXPOSURE)
 
 
@@ -37,10 +37,10 @@ def one_projector_steps(
 
     ``last`` and ``full`` as for ``steps.calibrate.quick.quick_steps``; ``projector``: the name of one of the rig's.
     """
-    own = tuple(one for one in rig.projectors if one.name == projector)
+    own = tuple(device for device in rig.projectors if device.name == projector)
     alone = capture_steps(dataclasses.replace(rig, projectors=own), longest_exposure_s=longest_exposure_s)
     exposing = next(step for step in alone if step.id == EXPOSURE)
-    # A run that goes on, for another projector or from another calibration, must not take these steps as done.
+    # A continued run for another projector, or from another calibration, must not count these steps as done.
     inputs = {"only": projector, "calibration": last.folder.name}
     steps = [
         dataclasses.replace(step, run=partial(_exposure, last, exposing) if step.id == EXPOSURE else step.run)
@@ -52,20 +52,20 @@ def one_projector_steps(
     now = Calibrated(run, last.projectors)
     done = [step.id for step in steps]
     steps.append(verification_photographs_step(rig, now, done))
-    scale = costs.scale(one.size_px for one in rig.projectors)
+    scale = costs.scale(device.size_px for device in rig.projectors)
     steps.append(verify_step(now, [*done, steps[-1].id], scale))
     return steps
 
 
 def way_of(step: StepId, projector: str) -> Way:
-    """What becomes of a step of the full calibration."""
+    """How to treat a step of the full calibration."""
     if step.kind in ANEW or step == EXPOSURE or step.projector == projector:
         return Way.RUN
     return Way.CORRECT if step.kind == StepKind.RADIOMETRY else Way.KEEP
 
 
 def _exposure(last: Calibrated, exposing: Step, context: Context) -> Sequence[Path]:
-    """The last calibration's exposures, that of the one projector found anew."""
+    """The last calibration's exposures, with a new one for this projector."""
     exposing.run(context)
     found = Exposures.read(context.folder)
     return [Exposures.write(context.folder, {**Exposures.read(last.folder), **found})]
@@ -78,7 +78,7 @@ def _kept(last: Calibrated, step: Step, way: Way, context: Context) -> Sequence[
     if way is Way.CORRECT:
         name = step.id.projector
         assert name is not None
-        # The room's light has been photographed anew, and counts for every projector.
+        # The room's light has been photographed again, and counts for every projector.
         light = dataclasses.replace(Light.read(context.folder, name), black=read_black(context.folder))
         light.write(context.folder, name)
     return kept

@@ -1,4 +1,4 @@
-"""Test shots: what aims projectors and camera, photographed in seconds and judged by ``calibrate.verify.aim``."""
+"""Test shots for aiming projectors and camera, taken in seconds and evaluated by ``calibrate.verify.aim``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LONGEST_PX: Final = 960
 def take_test_shots(
     rig: Rig, *, longest_exposure_s: float, deadline: Deadline, advance: Callable[[float, str], None]
 ) -> Path:
-    """Photograph 2 N + 2 pictures or a few more, judge them, and leave figures and picture in ``FOLDER``.
+    """Photograph 2 N + 2 pictures or a few more, evaluate them, and write figures and picture to ``FOLDER``.
 
     Returns that folder. Raises what the devices raise.
     """
@@ -43,7 +43,7 @@ def take_test_shots(
     folder.mkdir(parents=True, exist_ok=True)
     available = [value for value in rig.acquirer.exposures_s() if value <= longest_exposure_s]
     take = partial(_take, rig, folder, deadline)
-    white = {one.name: np.full_like(one.black(), 255) for one in rig.projectors}
+    white = {projector.name: np.full_like(projector.black(), 255) for projector in rig.projectors}
     exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_exposure_s)[0]
     for number in range(TRIES):
         advance(0.04 * number, "exposure")
@@ -54,14 +54,18 @@ def take_test_shots(
         exposure_s = choice.exposure_s
     black = take("black", {}, exposure_s)
     boards = []
-    for number, one in enumerate(rig.projectors):
-        advance(0.2 + 0.7 * number / len(rig.projectors), one.name)
+    for number, projector in enumerate(rig.projectors):
+        advance(0.2 + 0.7 * number / len(rig.projectors), projector.name)
         first, second = (
-            take(f"projector-{number}-{inverse}", {one.name: checkerboard(one.size_px, inverse=inverse)}, exposure_s)
+            take(
+                f"projector-{number}-{inverse}",
+                {projector.name: checkerboard(projector.size_px, inverse=inverse)},
+                exposure_s,
+            )
             for inverse in (False, True)
         )
         boards.append((first, second))
-    advance(0.9, "looking at the pictures")
+    advance(0.9, "evaluating the pictures")
     aim = assess_aim(black, boards)
     _keep_picture(folder, aim_overview(picture, aim))
     projectors = [{"projector": one.name, **asdict(found)}

@@ -1,4 +1,4 @@
-"""The steps that measure the camera itself: the stage's delay, a JPEG camera's response, noise, limits, bad pixels."""
+"""The steps that measure the stage's delay and the camera: JPEG response, noise, limits, bad pixels."""
 
 from __future__ import annotations
 
@@ -38,25 +38,25 @@ from controller.steps.capture.photographs import Planned, take_all
 RESPONSE_STOPS = (-6, -5, -4, -3, -2, -1, 0, 1, 2)
 """Exposures of a JPEG camera's bracket series, relative to the one at which white is well exposed."""
 BRIGHTNESS_OF_ALL = 0.7
-"""White of all projectors together is exposed so much shorter than their number asks for: nothing may clip."""
+"""Factor of a shorter exposure for white of all projectors together, so that nothing clips."""
 
 
 def delay_step(rig: Rig) -> Step:
-    """``delay.json``: how long after its presentation a picture is photographed whole; the acquirer waits as long.
+    """``delay.json``: time from a picture's presentation until it is completely visible; the acquirer waits so long.
 
-    After ``exposure``, of which it takes the shortest.
+    Runs after ``exposure`` and uses the shortest one.
     """
     return Step(
         StepId(StepKind.DELAY),
         partial(_measure_delay, rig),
         after=(StepId(StepKind.EXPOSURE),),
-        title="Measuring how late pictures appear",
+        title="Measuring the display's delay",
         weight=6 * LONGEST_S,
     )
 
 
 def response_steps(rig: Rig) -> list[Step]:
-    """The step ``camera-response`` of a camera without RAW; none for another."""
+    """The step ``camera-response`` for a camera without RAW; no step for other cameras."""
     if rig.camera.capabilities.raw:
         return []
     scale = costs.scale(projector.size_px for projector in rig.projectors)
@@ -72,7 +72,7 @@ def response_steps(rig: Rig) -> list[Step]:
 
 
 def camera_step(rig: Rig) -> Step:
-    """``camera.npz`` and ``camera.json``: what black and the projectors' whites tell of the camera."""
+    """``camera.npz`` and ``camera.json``: the camera's noise and limits, from black and the projectors' whites."""
     names = [projector.name for projector in rig.projectors]
     response = () if rig.camera.capabilities.raw else (StepId(StepKind.CAMERA_RESPONSE),)
     scale = costs.scale(projector.size_px for projector in rig.projectors)
@@ -86,8 +86,8 @@ def camera_step(rig: Rig) -> Step:
 
 
 def _exposure_of_all(rig: Rig, context: Context) -> float:
-    """At which white of all projectors together is surely not clipped."""
-    shortest = min(one.base_s for one in Exposures.read(context.folder).values())
+    """Exposure at which white of all projectors together is certainly not clipped."""
+    shortest = min(exposure.base_s for exposure in Exposures.read(context.folder).values())
     wanted = BRIGHTNESS_OF_ALL * shortest / len(rig.projectors)
     available = rig.acquirer.exposures_s()
     return max((value for value in available if value <= wanted), default=min(available))
@@ -100,7 +100,7 @@ def _measure_delay(rig: Rig, context: Context) -> Sequence[Path]:
     count = 0
 
     def look(white: bool, delay_s: float) -> FloatImage:
-        """Each picture follows the other one, which has been shown for long enough to be there."""
+        """Each picture follows the other one, which has been shown long enough to be visible."""
         nonlocal count
         context.advance(min(count / 10, 0.9), "display and camera")
         if not shown or shown[-1][0] == white:
@@ -122,7 +122,7 @@ def _measure_delay(rig: Rig, context: Context) -> Sequence[Path]:
 
 
 def _provisional(path: Path) -> FloatImage:
-    """A photograph by the nominal response, before the camera's own is known."""
+    """A photograph linearised by the nominal response, before the camera's own is known."""
     return read_photograph(path, response=nominal_response()).measured()
 
 
@@ -131,7 +131,7 @@ def _flat(rig: Rig, value: int) -> dict[str, ByteImage]:
 
 
 def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
-    """The bracket series of everything that the projectors light."""
+    """The bracket series of the lit scene."""
     whites: Mapping[str, ByteImage] = {p.name: np.full_like(p.black(), 255) for p in rig.projectors}
     middle = _exposure_of_all(rig, context)
     available = rig.acquirer.exposures_s()
@@ -139,8 +139,8 @@ def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
     plan = [Planned(str(number), lambda: whites, value) for number, value in enumerate(sorted(wanted))]
     paths = take_all(rig, context, plan, into=CAMERA_RESPONSE)
     taken = CAMERA_RESPONSE.read(context.folder)
-    images = [read_jpeg_values(one.path) for one in taken]
-    found = measure_response(images, [one.exposure_s for one in taken])
+    images = [read_jpeg_values(photograph.path) for photograph in taken]
+    found = measure_response(images, [photograph.exposure_s for photograph in taken])
     saved = CameraProfile(response=found.table).save(context.folder)
     content = {"misfit": found.misfit, "seen": found.seen, "black": found.black, "photographs": len(images)}
     figures = write_response_figures(context.folder, content)
@@ -208,7 +208,7 @@ def _samples(taken: Taken, profile: CameraProfile) -> FloatImage:
 def _of_jpeg(
     black: Sequence[Taken], whites: Sequence[Sequence[Taken]], context: Context
 ) -> tuple[CameraProfile, dict[str, object]]:
-    """Only the noise is left to measure: the response was before, and a JPEG has no black level and no mosaic."""
+    """Measure only the noise: the response is known, and a JPEG has no black level and no mosaic."""
     profile = black[0].profile or CameraProfile()
     pairs = []
     for series in whites:

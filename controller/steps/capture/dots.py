@@ -1,4 +1,4 @@
-"""Photographs of dots, as the paper's mode and the automatic one take them: long enough, in batches, where they fit."""
+"""Photographs of dots for the paper's mode and the automatic mode: exposure, batches, disk space."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from controller.steps.capture.patterns import bracket
 from controller.steps.capture.photographs import Planned, take_all
 
 BATCH: Final = 16
-"""Photographs between two looks at the lamps: so many are lost when one went off."""
+"""Photographs between two checks of the lamps: so many are lost if one went off."""
 SPARE_BYTES: Final = 500_000_000
 MOST_LIGHT: Final = 0.8
-"""Of the light at which white is well exposed, where a sharp dot is brightest."""
+"""Peak of a sharp dot, relative to well-exposed white."""
 LONGEST_GAIN: Final = 16.0
 
 
@@ -39,12 +39,12 @@ def of_sinusoids(folder: Path, projector: str) -> Metapixels:
 
 
 def spacing_of(options: DotOptions, known: Metapixels, *, share: float = 0.95) -> int:
-    """The dots' spacing: as asked for, or r >= 6.5 sigma by the blur of a ``share`` of pixels, at most 16."""
+    """The dots' spacing: as given, or r >= 6.5 sigma for the blur of a ``share`` of pixels, at most 16."""
     return options.spacing_px or min(dot_spacing(largest_sigma_px(known, share)), PAPER_SPACING_PX)
 
 
 def dot_exposure_s(rig: Rig, folder: Path, projector: str, known: Metapixels, longest_s: float) -> float:
-    """As much longer than for white as a dot is fainter, so that its light does not drown in noise."""
+    """Exposure for dots: longer than for white, because a dot is fainter."""
     gain = float(np.clip(MOST_LIGHT / peak_share(known), 1.0, LONGEST_GAIN))
     base_s = Exposures.read(folder)[projector].base_s
     return bracket(base_s, (gain,), rig.acquirer.exposures_s(), longest_s)[0]
@@ -56,7 +56,7 @@ def planned(projector: RigProjector, name: str, frame: Callable[[], ByteImage], 
 
 
 def take_in_batches(rig: Rig, context: Context, plan: Sequence[Planned], *, into: PhotographSet) -> list[Path]:
-    """``take_all`` with a look at the lamps every few photographs, each few a batch of the set."""
+    """``take_all`` with a check of the lamps every few photographs, in batches of the set."""
     paths: list[Path] = []
     for number, start in enumerate(range(0, len(plan), BATCH)):
         batch = plan[start : start + BATCH]
@@ -77,7 +77,7 @@ def read_batches(folder: Path, of: PhotographSet, photographs: int) -> Iterator[
 
 
 def check_disk(folder: Path, into: PhotographSet, photographs: int) -> None:
-    """Raise WorkError("no-space") before the first of hundreds of photographs of a projector, not at the last."""
+    """Raise WorkError("no-space") before the first of hundreds of photographs of a projector."""
     assert into.projector is not None
     first = codes_of(into.projector).read(folder)[0]
     bytes_each = first.path.stat().st_size

@@ -1,4 +1,4 @@
-"""Whether the lens file belongs to the camera's pictures, before a lamp is struck."""
+"""Checks that the lens file fits the camera's pictures, before a lamp is struck."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from controller.run.step_id import StepId
 
 
 def lens_check(rig: Rig, prior: CameraPrior) -> list[Step]:
-    """The step that takes one photograph, dark as it is, and compares its size with that of the lens file.
+    """The step that takes one photograph in the dark and compares its size with that of the lens file.
 
-    None where the focal length does not come from such a file. Raises UsageError("camera-intrinsics-wrong-size").
+    None if the focal length is not from such a file. Raises UsageError("camera-intrinsics-wrong-size").
     """
     size_px = prior.size_px
     if size_px is None:
@@ -36,9 +36,9 @@ def lens_check(rig: Rig, prior: CameraPrior) -> list[Step]:
         if (columns, rows) != size_px:
             raise UsageError(
                 "camera-intrinsics-wrong-size",
-                what=f"The lens was measured in pictures of {size_px[0]} x {size_px[1]} pixels, and the camera's have"
+                what=f"The lens file is for pictures of {size_px[0]} x {size_px[1]} pixels, but the camera's have"
                 f" {columns} x {rows}.",
-                remedy="Set the camera as it was for `velatura camera calibrate`, or calibrate its lens again.",
+                remedy="Use the camera settings of `velatura camera calibrate`, or calibrate the lens again.",
             )
         return ()
 

@@ -1,4 +1,4 @@
-"""The steps that photograph patterns: exposure, black, white, Gray code and mosaics, then what needs the response."""
+"""The steps that photograph patterns: exposure, black, white, Gray code, mosaics, then sinusoids."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from controller.steps.capture.photographs import Planned, take_all
 FIRST_EXPOSURE_S = 1 / 30
 EXPOSURE_TRIES = 8
 WHITE_EXPOSURES = 3
-"""At most as many photographs for one HDR white image."""
+"""Maximum number of photographs for one HDR white image."""
 BLACK_BRACKET = (8.0, 32.0)
 """Exposures of the HDR black image, relative to the one at which white is well exposed."""
 
@@ -42,7 +42,7 @@ def plans_of(rig: Rig) -> dict[str, PatternPlan]:
 
 
 def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
-    """All capture steps but the sinusoids, which wait for the radiometry (see ``code_step``)."""
+    """All capture steps except the sinusoids, which need the radiometry (see ``code_step``)."""
     inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
     plans = plans_of(rig)
     a_shot_s = _shot_s(rig)
@@ -81,7 +81,7 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
 
 
 def code_step(rig: Rig, projector: RigProjector) -> Step:
-    """The step that photographs the sinusoids and the random pattern, after its radiometry."""
+    """The step that photographs the sinusoids and the random pattern, after the radiometry."""
     plan = plan_patterns(projector.size_px)
     coded = [pattern for pattern in plan if pattern.needs_response]
     return Step(
@@ -113,14 +113,14 @@ def _find_exposures(rig: Rig, context: Context, longest_s: float) -> Sequence[Pa
 
 
 def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> Exposures:
-    """Photograph white until it is well exposed. These photographs are tries: they are not journalled."""
+    """Photograph white until it is well exposed. These test photographs are not journalled."""
     white = device_frame(_named(plan_patterns(projector.size_px), WHITE), projector.size_px)
     available = [value for value in rig.acquirer.exposures_s() if value <= longest_s]
     exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_s)[0]
     for number in range(EXPOSURE_TRIES):
         context.check()
         shot = Shot(f"try-{number}", rig.on_outputs({projector.name: white}), exposure_s)
-        # How late pictures appear is not known yet: the first photograph of this white waits for as long as any takes.
+        # The display's delay is not known yet: the first photograph of this white waits for the longest possible.
         file, confirmed_s = rig.acquirer.take(
             shot, context.folder / CAPTURES, deadline=context.deadline, wait_s=LONGEST_S if number == 0 else None
         )
@@ -132,11 +132,11 @@ def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_
             if brackets.settled:
                 return Exposures(choice.exposure_s, brackets.exposures_s)
         exposure_s = choice.exposure_s
-    rig.check_light(deadline=context.deadline)  # a dead lamp is not a matter of exposure
+    rig.check_light(deadline=context.deadline)  # a longer exposure does not help with a dead lamp
     raise CalibrationError(
         "exposure-not-found",
-        what=f"No exposure was found at which the white of projector {projector.name} is well exposed.",
-        remedy="Check that it shines on the object, that the room is dark, and the camera's aperture and ISO.",
+        what=f"No exposure suits the white light of projector {projector.name}.",
+        remedy="Check that it lights the object and the room is dark. Check the camera's aperture and ISO.",
     )
 
 
@@ -158,7 +158,7 @@ def _photograph_light(rig: Rig, projector: RigProjector, plan: PatternPlan, cont
 
 
 def _before_response(plan: PatternPlan) -> tuple[Pattern, ...]:
-    """What the response is measured with: the Gray code finds the mosaics' tiles."""
+    """Patterns for the response: the Gray code finds the mosaics' tiles."""
     return plan.of_kind(PatternKind.GRAY) + plan.of_kind(PatternKind.COLOUR_TILES)
 
 
@@ -185,7 +185,7 @@ def _named(plan: PatternPlan, name: str) -> Pattern:
 
 
 def _patterns(plan: PatternPlan) -> str:
-    """Tells plans apart: a run that was begun with other patterns takes these anew."""
+    """Identifies a plan: a run that was started with other patterns takes these again."""
     return hashlib.sha256(f"{CELL_PX} {plan}".encode()).hexdigest()[:16]
 
 

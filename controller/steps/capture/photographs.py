@@ -1,4 +1,4 @@
-"""Photographs of a run: each taken once, journalled by itself, listed in an index that later steps read."""
+"""Photographs of a run: each is taken once, has its own journal entry, and is listed in an index for later steps."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ from hal.errors import DeviceError
 
 MORE_DELAY_S = 0.1
 LOOK_EVERY_S = 30.0
-"""After so long the lamps are looked at between two photographs: so much work a lamp that dies costs, at most."""
+"""Time between two checks of the lamps: at most this much work is lost when a lamp fails."""
 
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A photograph to be taken: ``frames`` by projector name, made when they are needed; the others are black.
+    """A photograph to take: ``frames`` by projector name, made when needed; the others are black.
 
-    ``projector``: the one that shines alone, where the set is not already of one
+    ``projector``: the only one lit, if the set is not for a single projector already
     """
 
     name: str
@@ -58,9 +58,9 @@ class Planned:
 
 
 def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, into: PhotographSet) -> list[Path]:
-    """Take what is not there yet; return the index file and the photographs.
+    """Take the missing photographs; return the index file and all photographs.
 
-    A photograph that the journal knows, taken of the same frames with the same exposure, is not taken again.
+    A photograph in the journal with the same frames and the same exposure is not taken again.
     """
     use_delay(rig, context.folder)
     before: _Before | None = None
@@ -71,12 +71,12 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, into: Photo
             one, before = _take(rig, context, planned, into.shot(planned.name, planned.projector), before)
             row.add(one)
             watch.look(context)
-    return [into.write(context.folder, row.taken), *(one.path for one in row.taken)]
+    return [into.write(context.folder, row.taken), *(photograph.path for photograph in row.taken)]
 
 
 @dataclass(slots=True)
 class Row:
-    """Photographs that are taken one after the other, and how many of them have all lamps' light for certain."""
+    """A row of photographs, and how many of them certainly have the light of all lamps."""
 
     rig: Rig
     context: Context
@@ -85,23 +85,23 @@ class Row:
     _looked_at_s: float = field(default_factory=time.monotonic)
 
     def add(self, one: Taken) -> None:
-        """Raises as ``Rig.check_light``: now and then the lamps are looked at, so that none is missed for long."""
+        """Check the lamps from time to time. Raises as ``Rig.check_light``."""
         self.taken.append(one)
         if time.monotonic() - self._looked_at_s >= LOOK_EVERY_S:
             self.look(self.context.deadline)
 
     def look(self, deadline: Deadline) -> None:
-        """Look at the lamps; if one is not well, forget the photographs since the last look. Raises as it does."""
-        if not any(one.fresh for one in self.taken[self._sure :]):
+        """Check the lamps; if one fails, discard the photographs since the last check. Raises as ``check_light``."""
+        if not any(photograph.fresh for photograph in self.taken[self._sure :]):
             return
         try:
             self.rig.check_light(deadline=deadline)
         except Cancelled:
             raise
         except DeviceError:
-            for one in self.taken[self._sure :]:
-                if one.fresh:
-                    one.path.unlink(missing_ok=True)
+            for photograph in self.taken[self._sure :]:
+                if photograph.fresh:
+                    photograph.path.unlink(missing_ok=True)
             del self.taken[self._sure :]
             raise
         self._sure, self._looked_at_s = len(self.taken), time.monotonic()
@@ -109,25 +109,24 @@ class Row:
 
 @contextlib.contextmanager
 def kept_if_lit(rig: Rig, context: Context) -> Iterator[Row]:
-    """For a row of photographs, added to it as they are taken. If a lamp is not well at its end, those since it was
-    last looked at are forgotten, because some may lack its light: also where the row did not end, which may have been
-    stopped for that.
+    """A row to which photographs are added as they are taken. If a lamp has failed at its end, or when it is stopped,
+    the photographs since the last check are discarded, because some may lack its light.
 
-    Raises as ``Rig.check_light``. A run that goes on takes the forgotten ones again.
+    Raises as ``Rig.check_light``. A continued run takes the discarded ones again.
     """
     row = Row(rig, context)
     try:
         yield row
         row.look(context.deadline)
     except BaseException:
-        # In a time of its own, and in silence: what ended the row is what the caller has to tell.
+        # With its own time limit, and without an error: the caller reports the error that ended the row.
         with contextlib.suppress(DeviceError):
             row.look(in_seconds(sum(guard.answer_s for guard in rig.guards)))
         raise
 
 
 def use_delay(rig: Rig, folder: Path) -> None:
-    """Let the acquirer wait as long as the run in ``folder`` has found necessary; nothing before it has."""
+    """Set the acquirer's waiting time to the one measured in ``folder``, if any."""
     wait_s = longest_wait_s(folder)
     if wait_s is not None:
         rig.acquirer.set_delay(wait_s)
@@ -135,7 +134,7 @@ def use_delay(rig: Rig, folder: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Before:
-    """The photograph that was taken last: what it should show, and what it shows."""
+    """The previous photograph: what it should show, and what it shows."""
 
     frames: Mapping[str, ByteImage]
     shows: Thumbprint
@@ -150,7 +149,7 @@ def _take(
     if known is not None:
         return _taken(identity, known.path, read_exposure(known.path)), None
     shot = Shot(capture_name(identity), frames, planned.exposure_s)
-    # Each photograph is compared with the one before, so the first of a row has to be right for certain.
+    # Each photograph is compared with the previous one, so the first of a row must be right for certain.
     wait_s = max(LONGEST_S, rig.acquirer.wait_s) if rig.acquirer.protected and before is None else None
     file, exposure_s = rig.acquirer.take(
         shot, captures_folder(context.folder, identity), deadline=context.deadline, wait_s=wait_s
@@ -168,10 +167,10 @@ def _take(
 def _not_the_one_before(
     rig: Rig, context: Context, identity: ShotId, shot: Shot, first: tuple[Path, float, Thumbprint], before: Thumbprint
 ) -> tuple[Path, float, Thumbprint]:
-    """The photograph as it is where it differs from the one before; else one taken long after.
+    """The photograph if it differs from the previous one; otherwise one taken much later.
 
-    Where that one differs at last, the pictures have become later than was measured, and from now on more is waited.
-    Where it does not, the two pictures look alike to the camera.
+    If the later one differs, the display's delay has grown, and the waiting time becomes longer from now on.
+    If not, the two pictures look the same to the camera.
     """
     if not same_picture(first[2], before):
         return first
@@ -195,7 +194,7 @@ def _not_the_one_before(
 def take_photograph(
     rig: Rig, context: Context, identity: ShotId, exposure_s: float, *, shown_at_s: float, of: Mapping[str, str]
 ) -> Taken:
-    """Photograph what is shown since ``shown_at_s``; ``of`` says what that is, for the journal."""
+    """Photograph the picture shown since ``shown_at_s``; ``of`` names it for the journal."""
     use_delay(rig, context.folder)
     profile = load_profile(context.folder)
     settings = {"exposure_s": repr(exposure_s), **of}

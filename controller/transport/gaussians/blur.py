@@ -70,7 +70,7 @@ def sharpened(image: FloatImage, taps: FloatImage) -> FloatImage:
 
 
 def without_blur(metapixels: Metapixels, sigma_px: tuple[float, float, float]) -> Metapixels:
-    """The metapixels as they lie on the object: their covariances less the camera's, averaged over its channels."""
+    """The metapixels on the object: their covariances minus the camera's, averaged over its channels."""
     variance = float(np.mean(np.square(sigma_px)))
     if variance == 0:
         return metapixels

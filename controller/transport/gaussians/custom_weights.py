@@ -24,7 +24,7 @@ from controller.transport.gaussians.patches import (
 from controller.transport.simd.gaussians import LANES
 
 MOST_BYTES: Final = 8 << 30
-"""Of the boxes and what products need beside them; beyond it a machine stops answering instead of saying so."""
+"""Limit of memory for the boxes and the products; above it the machine would hang."""
 
 
 def patches_of_weights(weights: Sequence[sp.csr_matrix[np.float64]], camera_shape: tuple[int, int]) -> Patches:
@@ -42,7 +42,7 @@ def patches_of_weights(weights: Sequence[sp.csr_matrix[np.float64]], camera_shap
         raise UsageError(
             "weights-wrong",
             what=f"The weights are not numbers from 0 to 1 with one row for each of {pixels} camera pixels.",
-            remedy="Make them for the camera image of this calibration.",
+            remedy="Compute them for the camera image of this calibration.",
         )
     whole = sp.csc_matrix(sp.hstack(list(weights), format="csc"))
     whole.eliminate_zeros()
@@ -73,7 +73,7 @@ def _check_size(cells: int, margin: npt.NDArray[np.int64]) -> None:
             "weights-too-wide",
             what=f"The weights of projector pixels span up to {margin[0]} x {margin[1]} camera pixels, and would take "
             f"{needed / 1e9:.0f} GB of memory.",
-            remedy="Leave out weights that are far from a projector pixel's own place, or use a smaller camera image.",
+            remedy="Remove weights far from a projector pixel's position, or use a smaller camera image.",
         )
 
 

@@ -39,18 +39,18 @@ def number(value: int) -> Any:
 
 
 def pointer(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Where the data of an array begins; ``kind`` is its numba type."""
+    """Address of an array's data; ``kind`` is its numba type."""
     return context.make_array(kind)(context, builder, value=array).data
 
 
 def field_pointer(context: Any, builder: Any, kind: Any, values: Any, name: str) -> Any:
-    """Where the data of an array begins that is a field of a named tuple."""
+    """Address of the data of an array that is a field of a named tuple."""
     at = kind.fields.index(name)
     return pointer(context, builder, kind.types[at], builder.extract_value(values, at))
 
 
 def address(builder: Any, data: Any, index: Any, vector: Any) -> Any:
-    """The address of a vector that begins at an element."""
+    """The address of a vector that starts at an element."""
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 

@@ -1,4 +1,4 @@
-"""Parts of T over windows as plain sparse matrices: for solvers that want their equations written out."""
+"""Parts of T over windows as plain sparse matrices, for solvers that need explicit equations."""
 
 from __future__ import annotations
 

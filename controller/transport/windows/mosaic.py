@@ -16,7 +16,7 @@ from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
 
 BORDER: Final = 2
-"""Rows and columns whose neighbours, or neighbours' neighbours, may lie outside."""
+"""Rows and columns whose neighbours, or neighbours' neighbours, may be outside."""
 GREEN: Final = 1
 STRIP: Final = 16
 """Rows of a picture that fit a core's second cache, three planes of them."""

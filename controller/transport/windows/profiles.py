@@ -16,7 +16,7 @@ from controller.core.arrays import FloatImage
 
 PHASE_BITS: Final = 8
 PHASES: Final = 1 << PHASE_BITS
-"""Positions between two pixels that are told apart: to 1/512 of a projector pixel."""
+"""Positions between two pixels: to 1/512 of a projector pixel."""
 SMALLEST_PX: Final = 0.2
 STEP: Final = 1.02
 KINDS: Final = 150
@@ -61,7 +61,7 @@ def build_profiles() -> Profiles:
     rows = []
     for s, n in zip(sigma, size, strict=True):
         apart = position[:, None] - (np.arange(n) - (n // 2 - 1))[None, :]
-        # relative to the nearest pixel, lest all vanish between two pixels of a narrow one
+        # relative to the nearest pixel, so that not all vanish between two pixels of a narrow one
         exponent = -0.5 * (apart / s) ** 2
         share = np.exp(exponent - exponent.max(axis=1, keepdims=True))
         rows.append((share / share.sum(axis=1, keepdims=True)).ravel())

@@ -33,7 +33,7 @@ MOST_SHEAR: Final = 1.2
 LEAST_SHEAR: Final = 3
 """Steps up to this are taken as none, because windows without are faster."""
 LEAST_INSIDE: Final = 0.05
-"""A site whose window lies outside the frame but for this share is not lit by it."""
+"""A site with less than this share of its window inside the frame is not lit by it."""
 BEYOND: Final = 2
 UPRIGHT, SKEWED, OTHER = 0, 1, 2
 SORTS: Final = 3

@@ -101,7 +101,7 @@ class WindowTransport(LightTransport):
             interpolate(sites, self.colours, out)
 
     def _sampled(self, white: FloatImage) -> FloatImage:
-        """(3, rows, columns): a picture again as it is made of its own samples."""
+        """(3, rows, columns): a picture interpolated again from its own samples."""
         planes = image_planes(white)
         if not self.colours.size:
             return planes

@@ -38,12 +38,12 @@ class SensorState(enum.IntEnum):
 
 
 USABLE: Final = (SensorState.UNKNOWN, SensorState.READY)
-"""States in which a reading counts."""
+"""States in which a reading is valid."""
 
 
 @dataclass(frozen=True, slots=True)
 class LightReading:
-    """Illuminance in lux, >= 0, and what the sensor says of itself."""
+    """Illuminance in lux, >= 0, and the sensor's state."""
 
     illuminance_lux: float
     state: SensorState
@@ -71,7 +71,7 @@ def parse_reading(report: Sequence[int]) -> LightReading:
         raise _wrong(f"a reading of {len(data)} bytes")
     _, state, _, value = _READING.unpack(data)
     if state not in SensorState.__members__.values():
-        raise _wrong(f"the state {state}, which does not exist")
+        raise _wrong(f"the unknown state {state}")
     return LightReading(value * LUX_UNIT, SensorState(state))
 
 
@@ -87,5 +87,5 @@ def _wrong(what: str) -> ProtocolError:
     return ProtocolError(
         "light-sensor-protocol",
         what=f"The light sensor sent {what}.",
-        remedy="Unplug it and plug it in again; if it happens again, replace it.",
+        remedy="Unplug it and plug it in again. If this happens again, replace it.",
     )

@@ -1,8 +1,8 @@
 """Reports of the USB relay boards that call themselves USBRelay1 to USBRelay8 (16c0:05df). No I/O.
 
 The boards have one 8-byte feature report without number: five characters of serial number, two unused bytes, and one
-bit a relay. Commands are the same length: command, channel, zeros. Both begin with report number 0 where they pass
-through hidapi. Sources: the V-USB relay firmware as Debian's ``usbrelay`` and ``pyhid-usb-relay`` speak to it.
+bit per relay. Commands have the same length: command, channel, zeros. In hidapi both begin with report number 0.
+Sources: Debian's ``usbrelay`` and ``pyhid-usb-relay``, which use the V-USB relay firmware.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _NAME: Final = re.compile(r"USBRelay([1-8])")
 
 @dataclass(frozen=True, slots=True)
 class RelayState:
-    """A board's own account of itself: its serial number, and for each channel whether it passes current."""
+    """A board's report: its serial number, and for each channel whether the relay is closed."""
 
     serial: str
     closed: tuple[bool, ...]
 
 
 def channels_of(product: str) -> int | None:
-    """Number of relays of a board by its USB product name, None for a device that is no such board.
+    """Number of relays of a board by its USB product name, None for other devices.
 
-    Vendor 16c0 and product 05df are shared by many makers' HID devices; only the name tells.
+    Many makers' HID devices share vendor 16c0 and product 05df; only the name is specific.
     """
     found = _NAME.fullmatch(product)
     return int(found[1]) if found else None
@@ -48,7 +48,7 @@ def switch_report(channel: int, closed: bool) -> bytes:
     if not 1 <= channel <= MOST_CHANNELS:
         raise ProtocolError(
             "relay-channel",
-            what=f"Channel {channel} cannot be addressed on a relay board.",
+            what=f"A relay board has no channel {channel}.",
             remedy=f"Use a channel from 1 to {MOST_CHANNELS}.",
             theirs=False,
         )
@@ -74,5 +74,5 @@ def _wrong(what: str) -> ProtocolError:
     return ProtocolError(
         "relay-protocol",
         what=f"The relay board sent {what}.",
-        remedy="Unplug it and plug it in again; if it happens again, replace it.",
+        remedy="Unplug it and plug it in again. If this happens again, replace it.",
     )

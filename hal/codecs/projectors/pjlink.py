@@ -1,4 +1,4 @@
-"""Codec of PJLink class 1, and the simple part of class 2: bytes in, values out, and back. It does no I/O.
+"""Codec of PJLink class 1 and the simple part of class 2: bytes to values and back, without I/O.
 
 Source: "PJLink Specifications" 1.04 (class 1) and 2.10 (class 2) of JBMIA: TCP port 4352, lines of at most 136 bytes
 that end in CR, a greeting first, answers within 2 s, closed after 30 s idle.
@@ -54,7 +54,7 @@ class Failure(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """The projector's first line. ``random`` is the salt of the password, or None where none is asked for."""
+    """The projector's first line. ``random`` is the salt for the password, or None if no password is needed."""
 
     random: str | None
 
@@ -69,7 +69,7 @@ class LampStatus:
 
 @dataclass(frozen=True, slots=True)
 class MuteStatus:
-    """What is blocked: the picture, the sound."""
+    """Whether picture and sound are blocked."""
 
     video: bool
     audio: bool
@@ -100,17 +100,17 @@ def parse_second_level(line: bytes) -> bytes | None:
 
 
 def second_level_digest(theirs: bytes, ours: bytes, password: str) -> bytes:
-    """What goes before the first command after ``PJLINK 2``: our random number, then the SHA-256 digest, both in hex.
+    """Prefix of the first command after ``PJLINK 2``: our random number, then the SHA-256 digest, both in hex.
 
     ``theirs`` and ``ours``: 16 bytes each; the digest is of both xor-ed, in hex, and the password. The specification
-    2.10 could not be had; three clients and emulators of other authors agree on this.
+    2.10 was not available; three clients and emulators of other authors agree on this.
     """
     mixed = bytes(a ^ b for a, b in zip(theirs, ours, strict=True)).hex()
     return (ours.hex() + hashlib.sha256((mixed + password).encode("utf-8")).hexdigest()).encode("ascii")
 
 
 def digest(random: str, password: str) -> bytes:
-    """What goes before the first command when the greeting has a random number: md5, 32 hex digits (5.1)."""
+    """Prefix of the first command if the greeting has a random number: md5, 32 hex digits (5.1)."""
     return hashlib.md5((random + password).encode("utf-8"), usedforsecurity=False).hexdigest().encode("ascii")
 
 
@@ -120,28 +120,28 @@ def command(name: str, parameter: str = "?", *, pj_class: PjClass = 1) -> bytes:
         raise ProtocolError(
             "pjlink-command-wrong",
             what=f"{name!r} with {parameter!r} is not a PJLink command.",
-            remedy="This is a mistake in the driver; report it.",
+            remedy="This is a mistake in the driver. Report it to the maintainers.",
             theirs=False,
         )
     return f"%{pj_class}{name} {parameter}\r".encode("ascii")
 
 
 def parse_answer(line: bytes, name: str, *, pj_class: PjClass = 1) -> str | Failure:
-    """The text after ``=`` of the answer to ``name``, or the failure that it tells.
+    """The text after ``=`` of the answer to ``name``, or the reported failure.
 
     Raises ProtocolError for an answer to another command, of another class, too long, or no answer at all.
     """
     match = _ANSWER.fullmatch(line)
     if match is None or match[2].decode("ascii").upper() != name or int(match[1]) != pj_class:
         raise _broken(line, f"an answer to {name}")
-    # Names may be UTF-8 (class 2); a byte that is not must not stop the rest.
+    # Names may be UTF-8 (class 2); an invalid byte must not stop the rest.
     text = match[3].decode("utf-8", "replace")
     failures = {failure.value: failure for failure in Failure}
     return failures.get(text.upper(), text)
 
 
 def is_refusal(line: bytes) -> bool:
-    """Whether a line says that the password was wrong."""
+    """Whether a line reports a wrong password."""
     return line.strip(b"\0 \r\n>").upper() == b"PJLINK ERRA"
 
 
@@ -192,7 +192,7 @@ def parse_input(text: str) -> str:
 
 
 def parse_inputs(text: str) -> tuple[str, ...]:
-    """INST: the inputs there are, e.g. ``11 12 31`` (4.9)."""
+    """INST: the existing inputs, e.g. ``11 12 31`` (4.9)."""
     words = text.split(" ")
     if len(words) > MOST_INPUTS:
         raise _broken(text.encode(), "a list of inputs")
@@ -224,6 +224,6 @@ def parse_class(text: str) -> PjClass:
 def _broken(line: bytes, wanted: str) -> ProtocolError:
     return ProtocolError(
         "pjlink-garbage",
-        what=f'The projector sent "{escaped(line[:80])}" where PJLink has {wanted}.',
-        remedy="Check that the address is the projector's PJLink port, and update the projector's firmware.",
+        what=f'The projector sent "{escaped(line[:80])}" instead of {wanted} of PJLink.',
+        remedy="Check that the address is the projector's PJLink port. Update the projector's firmware.",
     )

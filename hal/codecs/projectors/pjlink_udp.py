@@ -1,8 +1,8 @@
-"""Codec of what PJLink class 2 sends by UDP: the search for projectors, and their notifications. It does no I/O.
+"""Codec of PJLink class 2 by UDP: the search for projectors, and their notifications. No I/O.
 
 Source: "PJLink Specifications" 2.10 of JBMIA, 3.2 and 3.3: UDP port 4352 on both sides. A controller broadcasts
-``%2SRCH``; every projector answers within 10 s, at a moment of its own, with its MAC address. A projector tells the
-controllers that are registered in its menu when it comes up, and when its errors, power or input change.
+``%2SRCH``; every projector answers within 10 s, after a delay of its own, with its MAC address. A projector notifies
+the controllers registered in its menu when it starts, and when its errors, power or input change.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class Here:
 
 @dataclass(frozen=True, slots=True)
 class CameUp:
-    """A projector's network came up: it has just started, and takes commands now."""
+    """A projector has just started and accepts commands now."""
 
     mac: str
 
 
 @dataclass(frozen=True, slots=True)
 class TroubleChanged:
-    """Its errors are these now; words as of ``hal.codecs.projectors.pjlink.parse_errors``, none: all is well again."""
+    """Its errors are these now; words as in ``hal.codecs.projectors.pjlink.parse_errors``; empty: no error any more."""
 
     trouble: tuple[str, ...]
 
@@ -55,10 +55,10 @@ class InputChanged:
     input: str
 
 
-Told = Here | CameUp | TroubleChanged | PowerChanged | InputChanged
+Notification = Here | CameUp | TroubleChanged | PowerChanged | InputChanged
 
 
-def parse_datagram(data: bytes) -> tuple[Told, ...]:
+def parse_datagram(data: bytes) -> tuple[Notification, ...]:
     """Read a datagram: one line or several, each with its CR.
 
     Raises ProtocolError for anything else; nothing of a datagram counts then.
@@ -66,17 +66,17 @@ def parse_datagram(data: bytes) -> tuple[Told, ...]:
     lines = data[: LONGEST_DATAGRAM + 1].rstrip(b"\0").split(b"\r")
     if len(data) > LONGEST_DATAGRAM or len(lines) < 2 or lines.pop() != b"":
         raise _garbage(data)
-    return tuple(_told(line) for line in lines)
+    return tuple(_parsed(line) for line in lines)
 
 
 def is_notification(line: bytes) -> bool:
-    """Whether a line is a notification: some projectors send them to the TCP connection too, before an answer."""
+    """Whether a line is a notification: some projectors send them on the TCP connection, too, before an answer."""
     match = _LINE.match(line.lstrip(b"\0"))
-    # ERST, POWR and INPT are questions of class 1 and 2 as well: only these two can never be an answer.
+    # ERST, POWR and INPT are also queries of class 1 and 2: only these two can never be an answer.
     return match is not None and match[1].upper() in (b"ACKN", b"LKUP")
 
 
-def _told(line: bytes) -> Told:
+def _parsed(line: bytes) -> Notification:
     match = _LINE.fullmatch(line)
     if match is None:
         raise _garbage(line)
@@ -101,6 +101,6 @@ def _mac(text: str) -> str:
 def _garbage(data: bytes) -> ProtocolError:
     return ProtocolError(
         "pjlink-garbage",
-        what=f'A datagram "{escaped(data[:80])}" is nothing that PJLink sends.',
-        remedy="Nothing needs to be done; something else on the network uses UDP port 4352.",
+        what=f'A datagram "{escaped(data[:80])}" is not from PJLink.',
+        remedy="Do nothing: another program on the network uses UDP port 4352.",
     )

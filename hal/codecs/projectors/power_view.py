@@ -1,9 +1,9 @@
-"""The power state of a projector that only ever answers "on" or "off".
+"""The power state of a projector that answers only "on" or "off".
 
-Several serial families tell of warming and cooling by unsolicited lines, or not at all. This keeps what was seen and
-when, so that a fresh answer can be read in its light. A lamp that went off counts as hot until it told of standby or
-its cooling time is over; a lamp that came on counts as warming for its warm-up time. Families that answer "warming" and
-"cooling" themselves are believed. Pure: the caller brings the clock.
+Several serial families report warming and cooling by unsolicited lines, or not at all. This class keeps observations
+and their times to interpret a new answer. A lamp that went off counts as hot until it reports standby or its cooling
+time is over; a lamp that came on counts as warming for its warm-up time. If a family answers "warming" and "cooling"
+itself, its answers count. Pure: the caller gives the time.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from hal.values import LampRules, Power
 
 
 class PowerView:
-    """Reads power answers in the light of commands and notices. Times are seconds of one monotonic clock.
+    """Interprets power answers with the previous commands and notices. Times are seconds of one monotonic clock.
 
-    ``tells``: the states that this family names in its power answers.
+    ``tells``: the states in this family's power answers.
     """
 
     def __init__(self, rules: LampRules, tells: frozenset[Power] = frozenset()) -> None:
@@ -28,7 +28,7 @@ class PowerView:
 
     @property
     def trouble(self) -> tuple[str, ...]:
-        """What the projector reported since it was last switched on, in order."""
+        """The projector's reports since it was last switched on, in order."""
         return tuple(self._trouble)
 
     @property
@@ -37,7 +37,7 @@ class PowerView:
         return any(not word.endswith("-warning") for word in self._trouble)
 
     def switched_on(self, now_s: float) -> None:
-        """The projector accepted an on command; what it reported before is history."""
+        """The projector accepted an on command; earlier reports no longer count."""
         self._trouble.clear()
         self._enter(Power.WARMING, now_s, told=False)
 
@@ -46,7 +46,7 @@ class PowerView:
         self._enter(Power.COOLING, now_s, told=False)
 
     def noticed_power(self, power: Power, now_s: float) -> None:
-        """The projector told of its power unasked."""
+        """The projector reported its power unasked."""
         if power in (Power.WARMING, Power.COOLING):
             self._enter(power, now_s, told=True)
         else:
@@ -61,7 +61,7 @@ class PowerView:
         return self._phase_at(now_s) is not None or self._last in (Power.WARMING, Power.COOLING)
 
     def told(self, power: Power, now_s: float) -> bool:
-        """Whether the projector itself said, unasked, that it is in ``power`` now."""
+        """Whether the projector itself reported ``power``, unasked."""
         return self._told and self._phase_at(now_s) is power
 
     def answered(self, answer: Power, now_s: float) -> Power:
@@ -80,7 +80,7 @@ class PowerView:
             return Power.ON
         phase = self._phase_at(now_s)
         if phase is Power.COOLING:
-            # It burns again, or still: when it goes out, its cooling begins anew.
+            # It is on again, or still: when it goes off, its cooling starts again.
             self._phase = None
         elif changed and phase is None:
             self._enter(Power.WARMING, now_s, told=False)

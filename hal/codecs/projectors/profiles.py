@@ -1,7 +1,7 @@
-"""Device profiles of projectors: what a family sends, answers and needs, as a validated value (``firmware_configs/``).
+"""Device profiles of projector families, as validated values (``firmware_configs/``).
 
-Words for trouble: a word that ends in ``-warning`` (``lamp-hours-warning``) tells of something to look at; any other
-(``lamp-failed``, ``over-temperature``, ``fan-failed``, ``cover-open``) of a projector that cannot go on.
+Words for faults: a word that ends in ``-warning`` (``lamp-hours-warning``) needs attention later; any other
+(``lamp-failed``, ``over-temperature``, ``fan-failed``, ``cover-open``) means that the projector can't work.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _DAY_S: Final = 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How patient a driver is, in seconds.
+    """A driver's time limits, in seconds.
 
     ``answer_s``: until an answer counts as lost; ``late_s``: until a lost answer can no longer arrive late;
     ``command_s``: until a power command is acknowledged; ``confirm_s``: until an accepted power command shows in the
@@ -35,20 +35,20 @@ class Timing:
 
     @property
     def question_s(self) -> float:
-        """The longest that a question may take: its turn after one whose answer was lost, and then two answers."""
+        """The longest time of a query: waiting after one with a lost answer, and then two answers."""
         return self.boot_interval_s + self.late_s + 2 * self.answer_s
 
     @property
     def switch_s(self) -> float:
-        """The longest that switching may take: a question before it, the command, and its confirmation."""
+        """The longest time of switching: a query before it, the command, and its confirmation."""
         return 2 * self.question_s + self.command_s + self.confirm_s
 
 
 @dataclass(frozen=True, slots=True)
 class ProjectorProfile:
-    """A family of projectors. ``serial`` is None for those that speak PJLink.
+    """A family of projectors. ``serial`` is None for PJLink.
 
-    ``unknown``: commands and questions whose codes nobody could find; the driver refuses what would need them.
+    ``unknown``: commands and queries with unknown codes; the driver refuses calls that need them.
     """
 
     name: str
@@ -100,9 +100,9 @@ def _lamp(table: Table) -> LampRules:
         minimum_off_s=table.seconds("minimum_off_s", 0, _DAY_S),
     )
     if rules.stable_s < rules.warm_up_s:
-        raise table.wrong("stable_s", "a lamp cannot be stable before it has warmed up (warm_up_s)")
+        raise table.wrong("stable_s", "it must not be less than warm_up_s")
     if rules.minimum_off_s < rules.cool_down_s:
-        raise table.wrong("minimum_off_s", "a lamp cannot strike again before it has cooled (cool_down_s)")
+        raise table.wrong("minimum_off_s", "it must not be less than cool_down_s")
     table.finish()
     return rules
 
@@ -117,12 +117,10 @@ def _timing(table: Table) -> Timing:
         boot_interval_s=table.seconds("boot_interval_s", 0, 60),
     )
     if timing.late_s < timing.answer_s:
-        raise table.wrong("late_s", "an answer cannot be late before it is due (answer_s)")
+        raise table.wrong("late_s", "it must not be less than answer_s")
     if timing.boot_interval_s < timing.interval_s:
-        raise table.wrong(
-            "boot_interval_s", "a starting projector must not be asked more often than others (interval_s)"
-        )
+        raise table.wrong("boot_interval_s", "it must not be less than interval_s")
     if timing.confirm_s < timing.boot_interval_s:
-        raise table.wrong("confirm_s", "there must be time for one question (boot_interval_s)")
+        raise table.wrong("confirm_s", "it must leave time for one query (boot_interval_s)")
     table.finish()
     return timing

@@ -1,4 +1,4 @@
-"""Codec of table-driven serial projectors: bytes in, values out, and back, as a profile says. It does no I/O.
+"""Codec of serial projectors by a profile's table: bytes to values and back, without I/O.
 
 Source: the command tables of ``firmware_configs/projectors``, each of which names its documents.
 """
@@ -23,7 +23,7 @@ _SHAPE_PARTS: Final = re.compile(r"\{value\}|\{any\}|\?\*\d+|\?| |[^{?]+|.", re.
 
 
 class Reply(enum.Enum):
-    """What a line means when it is neither an answer nor a notice. NOTHING: an echo, a prompt, a line to ignore."""
+    """Meaning of a line that is neither an answer nor a notice. NOTHING: an echo, a prompt, a line to ignore."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -33,9 +33,9 @@ class Reply(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer to a question: the text where the profile has ``{value}``, or the word that it stands for.
+    """The answer to a query: the text at ``{value}`` of the profile, or its word.
 
-    In binary frames it is hexadecimal, unless the question says how it reads.
+    In binary frames it is hexadecimal, unless the query defines its notation.
     """
 
     value: str
@@ -43,7 +43,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """A line that the projector sent unasked. Either ``power`` or ``trouble`` is told."""
+    """A line that the projector sent unasked, with either ``power`` or ``trouble``."""
 
     power: Power | None
     trouble: str | None
@@ -147,7 +147,7 @@ def _notice(table: SerialTable, text: str) -> Notice:
             return Notice(None, word)
     if not (len(code) <= 4 and code.isascii() and code.isalnum()):
         raise _garbage(text.encode("latin-1"))
-    # A code that the manual does not list is worth a look, and no reason to stop.
+    # Report a code that is not in the manual, but do not stop.
     return Notice(None, f"notice-{code.lower()}-warning")
 
 
@@ -196,7 +196,7 @@ def _pattern(shape: str, flags: int, binary: bool) -> re.Pattern[str]:
 
 
 def parse_power(value: str) -> Power:
-    """The power state that an answer's value names. Raises ProtocolError for any other word."""
+    """The power state of an answer's value. Raises ProtocolError for any other word."""
     try:
         return Power(value)
     except ValueError:
@@ -220,6 +220,6 @@ def parse_hours(value: str, per_hour: int = 1) -> int:
 def _garbage(line: bytes) -> ProtocolError:
     return ProtocolError(
         "projector-garbage",
-        what=f'The projector sent "{escaped(line[:64])}", which its protocol does not have.',
-        remedy="Check the baud rate, the cable, and that the profile in stage.toml is the one of this model.",
+        what=f'The projector sent "{escaped(line[:64])}", which is not in its profile.',
+        remedy="Check the baud rate, the cable, and that the profile in stage.toml is for this model.",
     )

@@ -26,9 +26,9 @@ _HEX_SHAPE: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """One question: what to send, the shapes of its answer (``{value}`` marks the value) and what values mean.
+    """One query: its bytes, the shapes of its answer (``{value}`` marks the value) and the meaning of values.
 
-    ``absent``: values that say "not known now"; ``unknown``: power states of which only the number is known.
+    ``absent``: values for "not known now"; ``unknown``: power states with an unknown meaning.
     ``reads``: how a number or name is written: ``text``, or in binary frames ``little-endian``, ``big-endian`` and
     ``ascii`` (up to a NUL). ``per_hour``: units of lamp time in an hour.
     """
@@ -44,7 +44,7 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Notices:
-    """Lines that the projector sends unasked: ``prefix`` and a code, which tells of its power or of trouble."""
+    """Lines that the projector sends unasked: ``prefix`` and a code for its power or a fault."""
 
     prefix: str
     power: Mapping[str, Power]
@@ -53,7 +53,7 @@ class Notices:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """How long an answer is that carries its own length.
+    """Format of answers that carry their own length.
 
     ``count_at``: offset of the count in the frame; ``hexadecimal``: the count is two hex digits, else one byte;
     ``overhead``: bytes of the frame that the count leaves out; ``checksum``: the last byte is the sum of all others.
@@ -67,11 +67,11 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Quirks:
-    """What a family does beyond its table.
+    """Special behaviour of a family.
 
     ``prompt``: bytes before a line that mean nothing; ``echo``: what was sent comes back first, any number of times;
-    ``any_case``: letters count whatever their case; ``quote``: a terminator between two of these ends nothing;
-    ``abnormal_terminator``: in an abnormal state an answer ends in this, and the terminator never comes.
+    ``any_case``: upper and lower case are the same; ``quote``: a terminator between two of these does not end the line;
+    ``abnormal_terminator``: in an abnormal state an answer ends in this instead of the terminator.
     """
 
     prompt: str = ""
@@ -87,7 +87,7 @@ class SerialTable:
 
     Answers end in ``terminator``, or carry their length (``frame``). ``binary``: commands and shapes are written as
     hexadecimal bytes, where ``?`` stands for any byte and ``?*9`` for nine. ``cooling``: replies that refuse because
-    the lamp cools; ``ignored``: lines that say nothing.
+    the lamp cools; ``ignored``: lines without meaning.
     """
 
     baud: int
@@ -109,7 +109,7 @@ class SerialTable:
 def parse_serial(root: Table, unknown: tuple[str, ...]) -> SerialTable:
     """Read the tables ``serial``, ``commands``, ``queries``, ``replies``, ``notices``, ``frame`` and ``quirks``.
 
-    ``unknown``: commands and questions that nobody knows for this family; they must be absent. Raises ProtocolError as
+    ``unknown``: commands and queries with unknown codes; they must be absent. Raises ProtocolError as
     ``hal.codecs.projectors.profiles.parse_profile``.
     """
     line = root.table("serial")
@@ -120,7 +120,7 @@ def parse_serial(root: Table, unknown: tuple[str, ...]) -> SerialTable:
         raise line.wrong("terminator", "it is empty")
     address = line.string("address", "")
     if not ((address.isascii() and address.isalnum()) or not address):
-        raise line.wrong("address", f"{address!r} is not made of letters and digits")
+        raise line.wrong("address", f"{address!r} may have only letters and digits")
     replies = root.table("replies")
     made = SerialTable(
         baud=line.whole("baud", 300, 921_600),
@@ -151,7 +151,7 @@ def _frame(table: Table) -> Frame:
         checksum=table.choice("checksum", ("sum", "none")) == "sum",
     )
     if made.overhead <= made.count_at:
-        raise table.wrong("overhead", "it must take in the bytes up to the count (count_at)")
+        raise table.wrong("overhead", "it must include the bytes up to the count (count_at)")
     table.finish()
     return made
 
@@ -175,7 +175,7 @@ def _commands(table: Table, unknown: tuple[str, ...], binary: bool) -> dict[str,
         if table.has(name) or (name.startswith("power") and name not in unknown):
             commands[name] = _template(table, name, table.string(name), {"address"}, binary)
     if ("shutter_close" in commands) != ("shutter_open" in commands):
-        raise table.wrong("shutter_close", "shutter_close and shutter_open must both be there, or neither")
+        raise table.wrong("shutter_close", "give both shutter_close and shutter_open, or neither")
     table.finish()
     return commands
 
@@ -187,24 +187,24 @@ def _queries(table: Table, unknown: tuple[str, ...], binary: bool) -> dict[str, 
         if table.has(name) or (name == "power" and name not in unknown):
             queries[name] = _query(table.table(name), name, binary)
     if not queries:
-        raise table.wrong("power", "there must be one question at least, to see whether the projector is there")
+        raise table.wrong("power", "give at least one query, to check for the projector")
     table.finish()
     return queries
 
 
 def _check_unknown(table: Table, name: str, unknown: tuple[str, ...]) -> None:
     if name in unknown and table.has(name):
-        raise table.wrong(name, "it stands in profile.unknown as well")
+        raise table.wrong(name, "it is also in profile.unknown")
 
 
 def _query(table: Table, name: str, binary: bool) -> Query:
     values = table.mapping("values", allowed=POWERS if name == "power" else None)
     if name == "power" and not {"on", "off"} <= set(values.values()):
-        raise table.wrong("values", "it must say which answers mean on and off")
+        raise table.wrong("values", "it must list the answers for on and off")
     answers = table.strings("answers")
     for answer in answers:
         if _template(table, "answers", answer, {"value", "any"}, binary).count("{value}") != 1:
-            raise table.wrong("answers", f"{answer!r} must hold {{value}} once")
+            raise table.wrong("answers", f"{answer!r} must contain {{value}} once")
     reads = table.choice("reads", tuple(READS), "text")
     if READS[reads] == "hex" and not binary:
         raise table.wrong("reads", f'{reads!r} needs serial.notation = "hex"')
@@ -226,18 +226,18 @@ def _notices(table: Table) -> Notices:
     trouble = table.mapping("trouble")
     for code, word in trouble.items():
         if code in power:
-            raise table.wrong("trouble", f"the code {code} stands in power as well")
+            raise table.wrong("trouble", f"the code {code} is also in power")
         if not _WORD.fullmatch(word):
             raise table.wrong("trouble", f"{word!r} is not lower case with hyphens")
     prefix = table.string("prefix", "")
     if (power or trouble) and not prefix:
-        raise table.wrong("prefix", "notices need the prefix that they begin with")
+        raise table.wrong("prefix", "notices need a prefix")
     table.finish()
     return Notices(prefix, power, trouble)
 
 
 def _shapes(table: Table, key: str, binary: bool, *, required: bool = True) -> tuple[str, ...]:
-    """Lines that mean something; an empty one (the bare terminator) may."""
+    """Lines with a meaning; one of them may be empty (only the terminator)."""
     shapes = table.strings(key, None if required else (), empty=True)
     for shape in shapes:
         if shape:
@@ -254,7 +254,7 @@ def _template(table: Table, key: str, text: str, allowed: Iterable[str], binary:
             raise table.wrong(key, f"{{{name}}} is not one of the placeholders {{{', '.join(sorted(allowed))}}}")
     wild = "address" not in allowed
     if binary and (not _HEX_SHAPE.fullmatch(text) or (not wild and not set("?{").isdisjoint(text))):
-        raise table.wrong(key, f"{text!r} is not made of bytes such as 0F with spaces between them")
+        raise table.wrong(key, f"{text!r} must be bytes such as 0F with spaces between them")
     _bytes(table, key, text)
     return text
 
@@ -263,4 +263,4 @@ def _bytes(table: Table, key: str, text: str) -> bytes:
     try:
         return text.encode("latin-1")
     except UnicodeEncodeError:
-        raise table.wrong(key, f"{text!r} holds a character that is not a byte (Latin-1)") from None
+        raise table.wrong(key, f"{text!r} has a character that is not a byte (Latin-1)") from None

@@ -1,4 +1,4 @@
-"""Typed reading of a TOML text that names the line of whatever is wrong. Pure: text in, values out."""
+"""Typed reading of a TOML text; errors name the line. Pure: text in, values out."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def parse_toml(text: str, *, file: str) -> Table:
 
 
 class Table:
-    """One table of the document. Ask for every key that is allowed, then call ``finish``."""
+    """One table of the document. Read every allowed key, then call ``finish``."""
 
     def __init__(self, data: Mapping[str, Any], path: tuple[str, ...], text: str, file: str) -> None:
         self._data = data
@@ -96,12 +96,12 @@ class Table:
         return Table(values, (*self._path, key), self._text, self._file)
 
     def finish(self) -> None:
-        """Refuse every key that was not asked for."""
+        """Refuse every key that was not read."""
         for key in self._data:
             if key not in self._asked:
                 near = difflib.get_close_matches(key, self._asked, n=1)
                 hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise self.wrong(key, f"there is no such key{hint} (allowed: {', '.join(sorted(self._asked))})")
+                raise self.wrong(key, f"the key is unknown{hint} (allowed: {', '.join(sorted(self._asked))})")
 
     def wrong(self, key: str, why: str) -> ProtocolError:
         dotted = ".".join((*self._path, key))
@@ -119,7 +119,7 @@ class Table:
         return value
 
     def _line(self, key: str) -> int | None:
-        """The line where ``key`` stands, else the one where its table (or the key of its inline table) begins."""
+        """The line of ``key``, else the first line of its table (or of the key of its inline table)."""
         for path in (self._path, self._path[:-1]):
             if (line := _find(self._text, path, key)) is not None:
                 return line
@@ -147,6 +147,6 @@ def _wrong(file: str, line: int | None, why: str) -> ProtocolError:
     return ProtocolError(
         "profile-wrong",
         what=f"The device profile {where} is wrong: {why}.",
-        remedy="Correct the profile, or name another one in stage.toml.",
+        remedy="Correct the profile, or use another one in stage.toml.",
         theirs=False,
     )

@@ -1,6 +1,6 @@
 """The datasets of PTP: DeviceInfo, StorageInfo, ObjectInfo, DevicePropDesc (ISO 15740 5.5 and 13.3.3).
 
-``parse`` raises ProtocolError for anything that is not a whole dataset. Bytes after it are allowed: vendors append.
+``parse`` raises ProtocolError for an incomplete dataset. Further bytes are allowed: vendors append data.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _STRING: Final = 0xFFFF
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What the device is and can do (answer to 1001)."""
+    """The device's identity and capabilities (answer to 1001)."""
 
     vendor_extension: int
     operations: frozenset[int]
@@ -37,7 +37,7 @@ class DeviceInfo:
 
     @classmethod
     def parse(cls, data: Buffer) -> Self:
-        read = Reader(data, "a description of itself")
+        read = Reader(data, "a device description")
         _, vendor, _ = read.number("H"), read.number("I"), read.number("H")
         read.string()
         read.number("H")
@@ -151,7 +151,7 @@ class PropertyDescription:
         if form not in (Form.NONE, Form.RANGE, Form.ENUMERATION):
             raise broken(f"a setting whose values have form {form}")
         count = (0, 3, read.number("H") if form == Form.ENUMERATION else 0)[form]
-        # Every value takes at least a byte, so a count that lies ends here and not in memory.
+        # Every value takes at least a byte, so a wrong count raises here and allocates no memory.
         values = tuple(read_value(read, data_type) for _ in range(count))
         return cls(code, data_type, access == 1, default, current, Form(form), values)
 
@@ -199,10 +199,10 @@ def pack_value(data_type: int, value: Value) -> bytes:
         if isinstance(value, tuple) and data_type ^ _ARRAY in _NUMBER_CODES:
             return pack_array(_NUMBER_CODES[data_type ^ _ARRAY], value)
     except struct.error:
-        pass  # the same sentence serves: the number is too large for the type
+        pass  # the message fits here, too: the number is too large for the type
     raise ProtocolError(
         "camera-value",
         what=f"The value {value!r} does not fit the camera's type 0x{data_type:04x}.",
-        remedy="Report this; the driver and the camera disagree about a setting.",
+        remedy="Report this to the maintainers: the driver and the camera disagree about a setting.",
         theirs=False,
     )

@@ -76,13 +76,13 @@ class PropertyChanged:
 
     @property
     def number(self) -> int:
-        """The value as an integer: its first four bytes, or as many as there are."""
+        """The value as an integer, from at most its first four bytes."""
         return int.from_bytes(self.data[:4], "little")
 
 
 @dataclass(frozen=True, slots=True)
 class ValuesChanged:
-    """A property takes these values now. For IMAGE_FORMAT see ``formats``; else 32-bit ``values``."""
+    """A property accepts these values now. For IMAGE_FORMAT see ``formats``; else 32-bit ``values``."""
 
     code: int
     values: tuple[int, ...] = ()
@@ -129,7 +129,7 @@ class ImagePart:
 
 
 ImageFormat = tuple[ImagePart, ...]
-"""The one or two files that a picture consists of."""
+"""The one or two files of a picture."""
 
 
 def parse_records(data: Buffer) -> tuple[EosRecord, ...]:
@@ -172,7 +172,7 @@ def _record(code: int, read: Reader) -> EosRecord:
 def _values(read: Reader) -> ValuesChanged:
     code, kind, count = read.numbers("I", 3)
     if kind != 3:
-        return ValuesChanged(code)  # strings and blobs; nothing that this driver chooses from
+        return ValuesChanged(code)  # strings and blobs, which this driver does not set
     if count > _MOST_VALUES:
         raise broken(f"a setting with {count} allowed values")
     if code == EosProperty.IMAGE_FORMAT:
@@ -233,7 +233,7 @@ def pack_setting(code: int, value: int | ImageFormat) -> bytes:
 
 
 def exposure_of(code: int) -> float | None:
-    """Seconds of a shutter code; None for bulb, auto and codes that are no time.
+    """Seconds of a shutter code; None for bulb, auto and other codes without a time.
 
     0x38 is one second and eight codes are a stop. The exact power of two is what the shutter does: a body that shows
     1/60 exposes for 1/64 second, one that shows 30 for 32; photometry needs the exact one.

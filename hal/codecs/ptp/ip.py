@@ -1,4 +1,4 @@
-"""PTP/IP packets (CIPA DC-005): what travels on the two TCP connections to a camera. No I/O.
+"""PTP/IP packets (CIPA DC-005) of the two TCP connections to a camera. No I/O.
 
 Every packet is u32 length, u32 type, body; little endian; the length counts the eight bytes of the header.
 """
@@ -14,7 +14,7 @@ from hal.errors import ProtocolError
 
 HEADER: Final = struct.Struct("<II")
 LARGEST_CONTROL: Final = 4096
-"""Bytes of any packet that is not Data or EndData; a friendly name is the longest thing in one."""
+"""Largest size of packets other than Data and EndData; a friendly name is their longest part."""
 LARGEST_DATA: Final = 0x1000_0000
 VERSION: Final = 0x0001_0000
 UNKNOWN_TOTAL: Final = frozenset({0xFFFF_FFFF, 0xFFFF_FFFF_FFFF_FFFF})
@@ -27,7 +27,7 @@ _LONGEST_NAME: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class InitCommandRequest:
-    """First packet on the command connection: who calls."""
+    """First packet on the command connection: the caller's name."""
 
     TYPE: ClassVar[int] = 1
     guid: bytes
@@ -37,7 +37,7 @@ class InitCommandRequest:
 
 @dataclass(frozen=True, slots=True)
 class InitCommandAck:
-    """The camera takes the call; ``connection`` names it on the event connection."""
+    """The camera accepts; ``connection`` identifies it on the event connection."""
 
     TYPE: ClassVar[int] = 2
     connection: int
@@ -59,7 +59,7 @@ class InitEventAck:
 
 @dataclass(frozen=True, slots=True)
 class InitFail:
-    """``reason``: 1 this caller is not wanted, 2 busy with another one, 3 not said."""
+    """``reason``: 1 caller rejected, 2 busy with another one, 3 not specified."""
 
     TYPE: ClassVar[int] = 5
     reason: int
@@ -198,8 +198,8 @@ def pack(packet: Packet) -> bytes:
     except struct.error as error:
         raise ProtocolError(
             "camera-packet",
-            what=f"A packet for the camera holds a number that does not fit: {error}.",
-            remedy="Report this; the driver asked the camera for something impossible.",
+            what=f"A packet for the camera has a number that does not fit: {error}.",
+            remedy="Report this mistake of the driver to the maintainers.",
             theirs=False,
         ) from error
     return HEADER.pack(HEADER.size + len(body), packet.TYPE) + body
@@ -237,7 +237,7 @@ def _utf16(name: str) -> bytes:
 
 
 def _name(read: Reader) -> str:
-    """A name ends with its terminator, and the version follows; some cameras leave the terminator out."""
+    """A name ends with its terminator, and the version follows; some cameras omit the terminator."""
     units: list[int] = []
     while read.left > 4 and len(units) <= _LONGEST_NAME:
         unit = read.number("H")

@@ -35,7 +35,7 @@ class ClassRequest(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class DeviceStatus:
-    """What the device says about itself (0x67): a response code, and the pipes that it has halted."""
+    """The device's status (0x67): a response code, and its halted pipes."""
 
     code: int
     halted: tuple[int, ...] = ()
@@ -71,7 +71,7 @@ def parse_event(data: Buffer) -> tuple[int, tuple[int, ...]]:
     """(code, parameters) of an event container. Bytes beyond its length are ignored: some bodies pad the packet."""
     length, kind, code, _ = parse_header(data)
     if kind != EVENT or length > len(data) - HEADER.size:
-        raise broken(f"{len(data)} bytes on its event pipe that are no event")
+        raise broken(f"{len(data)} bytes on its event pipe that are not an event")
     return code, parse_parameters(memoryview(data)[HEADER.size : HEADER.size + length])
 
 
@@ -83,8 +83,8 @@ def pack_command(code: int, transaction: int, parameters: tuple[int, ...] = ()) 
     except struct.error as error:
         raise ProtocolError(
             "camera-packet",
-            what=f"A command for the camera holds a number that does not fit: {error}.",
-            remedy="Report this; the driver asked the camera for something impossible.",
+            what=f"A command for the camera has a number that does not fit: {error}.",
+            remedy="Report this mistake of the driver to the maintainers.",
             theirs=False,
         ) from error
 

@@ -1,7 +1,7 @@
 """Picture Transfer Protocol: codes and the bounded reading and writing of its values (ISO 15740, little endian).
 
-Bytes in, values out, and back; no I/O. What a camera sends is hostile input: whatever is wrong with it ends in
-``ProtocolError``, and nothing is reserved for a length that the bytes at hand do not hold.
+Bytes to values and back; no I/O. A camera's data is untrusted input: every error in it raises
+``ProtocolError``, and no memory is reserved for more bytes than received.
 """
 
 from __future__ import annotations
@@ -117,19 +117,19 @@ def broken(what: str) -> ProtocolError:
     return ProtocolError(
         "camera-protocol",
         what=f"The camera sent {what}.",
-        remedy="Switch the camera off and on; if it happens again, report it together with the transcript.",
+        remedy="Switch the camera off and on. If it happens again, report it with the transcript.",
     )
 
 
 def printable(text: str) -> str:
-    """``text`` from a device with everything that is not printable replaced, so that no log or terminal obeys it."""
+    """``text`` from a device with unprintable characters replaced, so that a log or terminal is not affected."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 class Reader:
     """Reads little-endian values from one dataset, never past its end.
 
-    Every method raises ProtocolError where the bytes are too few. ``name`` is for that error's sentence.
+    Every method raises ProtocolError if there are too few bytes. ``name`` is for the message.
     """
 
     __slots__ = ("_at", "_data", "_name")
@@ -193,7 +193,7 @@ def pack_string(text: str) -> bytes:
     if len(data) > 2 * LONGEST_STRING or "\0" in text:
         raise ProtocolError(
             "camera-string",
-            what="A text for the camera is too long or holds a zero character.",
+            what="A text for the camera is too long or contains a zero character.",
             remedy="Use at most 254 plain characters.",
             theirs=False,
         )

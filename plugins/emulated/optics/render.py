@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
-from plugins.emulated.optics.jit import compiled
+from hal.runtime.jit import compiled
 from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX, Samples
 from plugins.emulated.optics.truth import BenchTruth, LightTruth
 

@@ -1,1 +1,1 @@
-"""What Canon EOS bodies do in their own way. Entry: `body`."""
+"""The special behaviour of Canon EOS bodies. Entry: `body`."""

@@ -1,4 +1,4 @@
-"""Canon EOS bodies, old (910F, such as the EOS 400D) and new (9128/9129): chosen by what the body lists, not by model.
+"""Canon EOS bodies, old (910F, such as the EOS 400D) and new (9128/9129): chosen by their operations, not by model.
 
 Sequences as libgphoto2 documents them from traces; see ``hal.codecs.ptp.eos`` for the bytes.
 """
@@ -24,10 +24,10 @@ from plugins.ptp.shot import Picture, Shot
 _BLOCK: Final = 1 << 20
 """Some bodies stop answering when asked for more at once."""
 _HOST_SPACE: Final = (0x0FFF_FFFF, 0x1000, 1)
-"""What 911A tells the body of this computer's free space, so that it does not refuse to expose."""
+"""The free space of this computer that 911A reports to the body, so that it does not refuse to expose."""
 _LONGEST_BULB_S: Final = 900.0
 _FULL: Final = 7
-"""Why a release did nothing: the memory is full."""
+"""Result of a release with full memory."""
 
 
 class EosBody:
@@ -54,7 +54,7 @@ class EosBody:
 
     def prepare(self, *, deadline: Deadline) -> None:
         for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
-            self._channel.ask(operation, 1, doing="let itself be controlled", deadline=deadline)
+            self._channel.ask(operation, 1, doing="accept remote control", deadline=deadline)
         # Also at the first connection: a program that was killed may have left both as they were.
         self._shutter.close()
         self._shutter.let_go()
@@ -96,7 +96,7 @@ class EosBody:
         pause_s = 0.01
         aimed_again = self._to_card
         while True:
-            # Anew each time: while the body was busy, an earlier picture may have been finished.
+            # At each attempt: while the body was busy, an earlier picture may have been finished.
             self._forget_old_pictures(deadline)
             shot.known = self._channel.handles(deadline)
             reply = self._shutter.press(shot, bulb=self._bulb_s is not None, deadline=deadline)
@@ -104,7 +104,7 @@ class EosBody:
                 return
             shot.not_fired()
             if _full(reply) and not aimed_again:
-                # Its card is full, but no card was meant: it has changed the target by itself.
+                # Its card is full, but the card is not the target: it has changed the target by itself.
                 aimed_again = self._target_changed = True
                 self._aim_at_target(deadline, again=True)
                 continue
@@ -132,7 +132,7 @@ class EosBody:
                 before = len(shot.found)
                 self._look_again(shot, deadline)
                 if len(shot.found) > before and not shot.recovering:
-                    self._channel.diary.add("camera-event-lost", "The camera did not tell of a picture that it has.")
+                    self._channel.diary.add("camera-event-lost", "The camera has a picture that it did not report.")
                 listing_due_s = shot.age_s() + timing.grace_s
             if len(shot.found) >= expected or (shot.found and shot.overdue(timing)):
                 self._check_target(shot, deadline)
@@ -189,7 +189,7 @@ class EosBody:
         return self._shutter.bulb and self._state.bulb() is not None
 
     def _needs_bulb(self, exposure_s: float, exposures: Collection[float]) -> bool:
-        """Whether the wanted time is longer than what the body times by itself, and bulb can do it."""
+        """Whether the exposure is longer than the body's own times, and bulb can do it."""
         return self._can_bulb and bool(exposures) and 2**0.5 * max(exposures) < exposure_s <= _LONGEST_BULB_S
 
     def _take_in(self, shot: Shot) -> None:
@@ -199,16 +199,16 @@ class EosBody:
         self._state.fresh.clear()
 
     def _check_target(self, shot: Shot, deadline: Deadline) -> None:
-        """A picture on the card, though this computer was named as its target: the body has changed it by itself."""
+        """A picture on the card, although this computer was the target: the body has changed it by itself."""
         if not self._to_card and not all(picture.waiting for picture in shot.found.values()):
             self._target_changed = True
             self._channel.diary.add("camera-target-changed", "The camera stored a picture on its card unasked.")
             self._aim_at_target(deadline, again=True)
 
     def _aim_at_target(self, deadline: Deadline, *, again: bool = False) -> None:
-        """Let pictures go to this computer, or to the card; looked at each time, for bodies change it by themselves.
+        """Send pictures to this computer, or to the card; checked each time, because bodies change it by themselves.
 
-        ``again``: do not believe what the body has said of it.
+        ``again``: set it even if the body has reported it.
         """
         self._talk.drain(deadline)
         if not self._state.knows(EosProperty.CAPTURE_DESTINATION):
@@ -224,12 +224,12 @@ class EosBody:
             self._channel.ask(
                 Operation.EOS_HOST_CAPACITY,
                 *_HOST_SPACE,
-                doing="take note of this computer's space",
+                doing="accept this computer's free space",
                 deadline=deadline,
             )
 
     def _forget_old_pictures(self, deadline: Deadline) -> None:
-        """What waits from before this shot belongs to an earlier one, and must not be taken for this one."""
+        """Drop pictures that belong to an earlier shot."""
         self._talk.drain(deadline)
         for old in self._state.fresh:
             if old.waiting:
@@ -237,7 +237,7 @@ class EosBody:
         self._state.fresh.clear()
 
     def _look_again(self, shot: Shot, deadline: Deadline) -> None:
-        """A record may have been lost: list the card, or have the body report everything anew."""
+        """A record may have been lost: list the card, or let the body report everything again."""
         if not self._to_card:
             self._channel.ask(Operation.EOS_SET_EVENT_MODE, 1, doing="report everything", deadline=deadline)
             self._talk.drain(deadline)

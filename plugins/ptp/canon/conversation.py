@@ -1,4 +1,4 @@
-"""Talking with a Canon EOS body: what it reports, what it is set to, and that it stays awake."""
+"""Communication with a Canon EOS body: its reports, its settings, and keeping it awake."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MOST_DRAINS: Final = 200
 
 
 class EosTalk:
-    """A channel to a body, and what the body has said on it."""
+    """A channel to a body, and the body's reports."""
 
     def __init__(self, channel: Channel) -> None:
         self.channel = channel
@@ -24,9 +24,9 @@ class EosTalk:
         self._alive_at_s = time.monotonic()
 
     def drain(self, deadline: Deadline) -> None:
-        """Take in all records until an answer has none."""
+        """Read records until an answer has none."""
         for _ in range(_MOST_DRAINS):
-            reply = self.channel.ask(Operation.EOS_GET_EVENT, doing="say what has changed", deadline=deadline)
+            reply = self.channel.ask(Operation.EOS_GET_EVENT, doing="report its changes", deadline=deadline)
             records = parse_records(reply.data)
             self.state.take(records)
             if self.state.falls_asleep:
@@ -36,16 +36,16 @@ class EosTalk:
                 return
 
     def keep_alive(self, deadline: Deadline, *, at_once: bool = False) -> None:
-        """Say that somebody is there, unless that was said just now."""
+        """Keep it awake, unless that was just done."""
         due = at_once or time.monotonic() - self._alive_at_s >= self.channel.timing.keep_alive_s
         if due and self.channel.has(Operation.EOS_KEEP_DEVICE_ON):
             self.channel.once(Operation.EOS_KEEP_DEVICE_ON, deadline=deadline)
             self._alive_at_s = time.monotonic()
 
     def set(self, code: EosProperty, value: int | ImageFormat, deadline: Deadline, *, again: bool = False) -> int:
-        """Set a property and wait until the body says so (C189); return what it says.
+        """Set a property and wait until the body reports it (C189); return the reported value.
 
-        ``again``: also where the body has said that it is so already.
+        ``again``: also if the body has reported this value already.
         """
         wanted = pack_setting(code, value)[8:]
         if not again and self.state.is_set(code, wanted):
@@ -71,7 +71,7 @@ class EosTalk:
             if self.state.knows(code):
                 return
             if until.passed:
-                # What is set is unknown now; a new connection begins with a full report.
+                # The setting is unknown now; a new connection starts with a full report.
                 self.channel.link.close()
                 raise DeviceTimeout(
                     "camera-not-confirmed",

@@ -16,7 +16,7 @@ _WHOLE_FRAME: Final = (0x0020_0000, 0, 0)
 
 
 class EosView:
-    """``on`` while the mirror is up for it."""
+    """``on`` while live view is active."""
 
     def __init__(self, talk: EosTalk) -> None:
         self._talk = talk
@@ -45,12 +45,12 @@ class EosView:
             if reply.ok:
                 return parse_view(reply.data)
             if not reply.busy:
-                raise refused(reply, "show what it sees")
+                raise refused(reply, "show live view")
             if until.passed:
                 raise DeviceTimeout(
                     "camera-no-view",
-                    what="The camera showed no frame of live view in time.",
-                    remedy="Switch live view on in its menu, leave its menus, then try again.",
+                    what="The camera sent no live view picture in time.",
+                    remedy="Enable live view in its menu, leave its menus, then try again.",
                 )
             talk.drain(deadline)
             until.sleep(0.02)

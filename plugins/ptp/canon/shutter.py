@@ -1,4 +1,4 @@
-"""The shutter button of a Canon EOS body, and bulb: pressed once, and let go whatever happens."""
+"""The shutter button of a Canon EOS body, and bulb: pressed once, and always released."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from plugins.ptp.shot import Shot
 _HALF, _FULL = 1, 2
 _LET_GO_S: Final = 2.0
 _RELEASE_ERRORS: Final = {
-    1: ("camera-autofocus", "its autofocus found nothing", "Switch the lens to manual focus, then try again."),
+    1: ("camera-autofocus", "its autofocus failed", "Switch the lens to manual focus, then try again."),
     3: ("camera-mirror", "its mirror is up", "Leave live view and switch mirror lock-up off, then try again."),
-    7: ("card-full", "its memory is full", "Empty or replace the card, then go on; nothing was exposed."),
-    8: ("card-unusable", "its card is write-protected", "Slide the card's lock back; nothing was exposed."),
+    7: ("card-full", "its memory is full", "Empty or replace the card, then continue. Nothing was exposed."),
+    8: ("card-unusable", "its card is write-protected", "Unlock the card. Nothing was exposed."),
 }
 
 
 class EosShutter:
-    """Presses and lets go; what the answers mean is the caller's."""
+    """Presses and releases; the caller interprets the answers."""
 
     def __init__(self, talk: EosTalk) -> None:
         self._talk = talk
@@ -30,11 +30,11 @@ class EosShutter:
 
     @property
     def bulb(self) -> bool:
-        """Whether the body can be told to open the shutter and to close it."""
+        """Whether the body has commands to open and close the shutter."""
         return self._channel.has(Operation.EOS_BULB_START) and self._channel.has(Operation.EOS_BULB_END)
 
     def press(self, shot: Shot, *, bulb: bool, deadline: Deadline) -> Reply:
-        """Press and let go. The answer that decides is the one to the full press."""
+        """Press and release. The answer to the full press decides."""
         if bulb:
             return self._hold(shot, deadline)
         patience_s = self._channel.timing.answer_s + 2 * shot.exposure_s
@@ -48,11 +48,11 @@ class EosShutter:
             shot.fire()
             return self._channel.once(Operation.EOS_RELEASE_ON, _FULL, 0, patience_s=patience_s, deadline=deadline)
         finally:
-            # Whatever came of it: a body whose button stays down takes no further picture.
+            # In every case: a body whose button stays down takes no further picture.
             self.let_go()
 
     def let_go(self) -> None:
-        """With time of its own, so that neither the caller's deadline nor its cancellation leaves the button down."""
+        """With its own deadline, so that the caller's deadline or cancellation does not leave the button down."""
         for button in (_FULL, _HALF):
             if self._channel.has(Operation.EOS_RELEASE_OFF) and not self._channel.link.broken:
                 self._channel.once(Operation.EOS_RELEASE_OFF, button, deadline=in_seconds(_LET_GO_S))
@@ -65,7 +65,7 @@ class EosShutter:
     def _hold(self, shot: Shot, deadline: Deadline) -> Reply:
         """Hold the shutter open for the exposure."""
         shot.fire()
-        # Not cancelled before its answer is here: that would end the connection, and leave the shutter open.
+        # Not cancelled before its answer: that would end the connection, and leave the shutter open.
         opened = self._channel.once(Operation.EOS_BULB_START, deadline=Deadline(deadline.at_s))
         if not opened.ok or any(opened.parameters[:1]):
             return opened
@@ -88,7 +88,7 @@ def released(reply: Reply) -> bool:
 
 
 def not_released(code: int) -> DeviceRefused:
-    """The error for a press that the body answered with this reason."""
+    """The error for this answer of the body to a press."""
     name, why, remedy = _RELEASE_ERRORS.get(
         code, ("camera-not-released", f"it gave the unknown reason {code}", "Switch it off and on, then try again.")
     )

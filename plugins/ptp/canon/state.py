@@ -1,4 +1,4 @@
-"""What a Canon EOS body has reported about itself, and what can be chosen from it."""
+"""The reported state of a Canon EOS body, and its possible settings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hal.values import CameraCapabilities
 
 
 class EosState:
-    """The values and allowed values of a body's properties, as its records told them."""
+    """The values and allowed values of a body's properties, from its records."""
 
     def __init__(self) -> None:
         self.fresh: list[ObjectAdded] = []
@@ -38,7 +38,7 @@ class EosState:
         self._formats: tuple[ImageFormat, ...] = ()
 
     def take(self, records: Iterable[EosRecord]) -> None:
-        """Take records in; new files are added to ``fresh``, in order."""
+        """Read records; new files are added to ``fresh``, in order."""
         for record in records:
             match record:
                 case PropertyChanged(code, data):
@@ -68,18 +68,18 @@ class EosState:
         return code in self._values
 
     def forget(self, code: EosProperty) -> None:
-        """The value is about to change: what comes next is the new one."""
+        """The value is about to change: the next report is the new one."""
         self._values.pop(code, None)
 
     def assume(self, code: EosProperty, data: bytes) -> None:
-        """Take a value for set, unless the body has said something else."""
+        """Assume a value is set, unless the body has reported another one."""
         self._values.setdefault(code, data)
 
     def is_set(self, code: EosProperty, data: bytes) -> bool:
         return self._values.get(code, b"")[: len(data)] == data
 
     def number(self, code: EosProperty) -> int:
-        """A value as an integer; 0 where nothing was reported."""
+        """A value as an integer; 0 if it was not reported."""
         return int.from_bytes(self._values.get(code, b"")[:4], "little")
 
     def allowed(self, code: EosProperty) -> tuple[int, ...]:
@@ -91,7 +91,7 @@ class EosState:
         return {seconds: code for code in codes if (seconds := exposure_of(code)) is not None}
 
     def bulb(self) -> int | None:
-        """The shutter code of bulb, where the body takes it now."""
+        """The shutter code of bulb, if the body accepts it now."""
         codes = self.allowed(EosProperty.SHUTTER) if self._manual() else ()
         return next((code for code in BULB_CODES if code in codes), None)
 
@@ -99,7 +99,7 @@ class EosState:
         return BATTERY_PERCENT.get(self.number(EosProperty.BATTERY)) if self.knows(EosProperty.BATTERY) else None
 
     def warnings(self) -> list[str]:
-        """What is set on the body itself and will be in the way."""
+        """Settings at the body itself that cause problems."""
         focus = self.knows(EosProperty.FOCUS_MODE) and self.number(EosProperty.FOCUS_MODE) != MANUAL_FOCUS
         return ["autofocus-on"] * focus + ["mode-dial"] * (not self._manual())
 
@@ -115,15 +115,15 @@ class EosState:
         return None if data is None else parse_image_format(data)
 
     def pick_format(self, *, raw: bool, both: bool = False) -> ImageFormat | None:
-        """The best format of a kind: full-size RAW, alone where the body has it; else one full-size fine JPEG.
+        """The best format of a kind: full-size RAW, alone if the body has it; else one full-size fine JPEG.
 
-        ``both``: RAW and JPEG, where the body has that.
+        ``both``: RAW and JPEG, if the body has that.
         """
         known = self._formats
         if not known and (current := self.current_format()):
             known = (current,)
-        able = [one for one in known if any(part.raw == raw for part in one)]
-        return min(able, default=None, key=lambda one: (both and raw and len(one) == 1, _rank(one, raw)))
+        able = [format_ for format_ in known if any(part.raw == raw for part in format_)]
+        return min(able, default=None, key=lambda format_: (both and raw and len(format_) == 1, _rank(format_, raw)))
 
     def _manual(self) -> bool:
         return not self.knows(EosProperty.EXPOSURE_MODE) or self.number(EosProperty.EXPOSURE_MODE) == MANUAL_EXPOSURE

@@ -1,7 +1,7 @@
 """PTP/IP: a camera behind two TCP connections, one for commands and one for events (CIPA DC-005).
 
 One thread at a time may use a link. Everything waits with the caller's deadline and stops when it is cancelled; a
-transaction that was left in the middle breaks the link, because its late answer could be taken for the next one.
+unfinished transaction breaks the link, because its late answer could be taken for the next one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class PtpIpLink:
     def connect(cls, address: PtpIpAddress, *, transcript: Transcript | None = None, deadline: Deadline) -> Self:
         """Open both connections and introduce this computer; ``transcript`` records all but picture data.
 
-        Raises DeviceGone("camera-off") where nobody listens, DeviceBusy where another computer holds the camera,
+        Raises DeviceGone("camera-off") without an answer, DeviceBusy if another computer uses the camera,
         DeviceRefused where the camera does not know this one, DeviceTimeout.
         """
         link = cls(Wire.connect(address.host, address.command_port, deadline=deadline), transcript)
@@ -82,7 +82,7 @@ class PtpIpLink:
             self._send(self._command, packets, deadline)
             return self._answer(number, sink, most, deadline)
         except BaseException:
-            # The rest of the answer may still come; nobody must take it for the next one.
+            # The rest of the answer may still come; it must not be taken for the next one.
             self.close()
             raise
 
@@ -108,7 +108,7 @@ class PtpIpLink:
 
     def _introduce(self, address: PtpIpAddress, deadline: Deadline) -> None:
         name = socket.gethostname()
-        # The same computer always says the same, so that a camera that pairs asks its owner only once.
+        # A computer always sends the same name, so that a camera asks for pairing only once.
         guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"velatura.{name}").bytes
         self._send(self._command, ptp_ip.pack(ptp_ip.InitCommandRequest(guid, f"Velatura {name}"[:39])), deadline)
         accepted = self._packet(self._command, deadline)
@@ -128,7 +128,7 @@ class PtpIpLink:
         total: int | None = None
         received = 0
         while True:
-            still_time(deadline)  # also against a camera that never stops talking
+            still_time(deadline)  # also against a camera that never stops sending
             length, kind = ptp_ip.parse_header(self._exactly(self._command, ptp_ip.HEADER.size, deadline))
             if kind in ptp_ip.DATA_TYPES:
                 if length < 4:
@@ -136,7 +136,7 @@ class PtpIpLink:
                 self._belongs(int.from_bytes(self._exactly(self._command, 4, deadline), "little"), number)
                 received += length - 4
                 if total is None or received > total or received > most:
-                    raise broken(f"{received} bytes of data where {total} were announced and {most} allowed")
+                    raise broken(f"{received} bytes of data; {total} were announced and {most} are allowed")
                 self._stream(length - 4, take, deadline)
                 continue
             packet = ptp_ip.parse(kind, self._exactly(self._command, length, deadline))
@@ -145,12 +145,12 @@ class PtpIpLink:
                     self._belongs(transaction, number)
                     total = most if announced in ptp_ip.UNKNOWN_TOTAL else announced
                     if total > most:
-                        raise broken(f"{total} bytes of data where at most {most} were expected")
+                        raise broken(f"{total} bytes of data instead of at most {most}")
                     declared = announced
                 case ptp_ip.Response(code, transaction, parameters):
                     self._belongs(transaction, number)
                     if total is not None and declared not in ptp_ip.UNKNOWN_TOTAL and received != total:
-                        raise broken(f"{received} bytes of data where {total} were announced")
+                        raise broken(f"{received} bytes of data instead of {total}")
                     return Reply(code, parameters, bytes(kept))
                 case _:
                     self._aside(packet, self._command, deadline)
@@ -185,7 +185,7 @@ class PtpIpLink:
                 raise broken(f"a packet of type {packet.TYPE} at the wrong moment")
 
     def _pump(self) -> None:
-        """Take in whatever lies on the event connection, without waiting."""
+        """Read the event connection, without waiting."""
         if self._events is None:
             return
         try:
@@ -247,10 +247,10 @@ def _unwelcome(packet: ptp_ip.Packet) -> DeviceError:
         return DeviceBusy(
             "camera-in-use",
             what="The camera is connected to another computer.",
-            remedy="End the other connection, or switch the camera off and on, then try again.",
+            remedy="Close the other connection, or switch the camera off and on. Then try again.",
         )
     return DeviceRefused(
         "camera-refused-pairing",
         what="The camera does not accept this computer.",
-        remedy="Pair it in the camera's network menu (the name begins with Velatura), then try again.",
+        remedy="Pair it in the camera's network menu (its name starts with Velatura). Then try again.",
     )

@@ -1,4 +1,4 @@
-"""TCP towards a PTP/IP camera: addresses, and sockets whose every wait has a deadline and can be cancelled."""
+"""TCP to a PTP/IP camera: addresses, and sockets with deadlines and cancellation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CONNECT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class PtpIpAddress:
-    """Where a camera listens: host, command port, event port (the same one on most cameras)."""
+    """A camera's address: host, command port, event port (the same on most cameras)."""
 
     host: str
     command_port: int
@@ -44,11 +44,11 @@ class PtpIpAddress:
 
 
 def still_time(deadline: Deadline) -> None:
-    """Raise Cancelled or DeviceTimeout where the caller's time is over."""
+    """Raise Cancelled, or DeviceTimeout after the caller's deadline."""
     deadline.check(
         "camera-no-answer",
         what="The camera did not answer in time.",
-        remedy="Check that it is awake and that its network is good; switch it off and on if it stays silent.",
+        remedy="Check that it is awake, and check its network. If it does not answer, switch it off and on.",
     )
 
 
@@ -60,7 +60,7 @@ class Wire:
 
     @classmethod
     def connect(cls, host: str, port: int, *, deadline: Deadline) -> Self:
-        """Open a connection. Raises DeviceGone("camera-off") where nobody listens, at the latest after 5 s."""
+        """Open a connection. Raises DeviceGone("camera-off") without an answer, after at most 5 s."""
         still_time(deadline)
         try:
             connection = connected(host, port, deadline.within(_CONNECT_S))
@@ -78,7 +78,7 @@ class Wire:
                 view = view[self._socket.send(view) :]
             except BlockingIOError:
                 still_time(deadline)
-                with contextlib.suppress(ValueError):  # closed meanwhile by another thread: sending tells
+                with contextlib.suppress(ValueError):  # closed meanwhile by another thread: sending raises
                     select.select([], [self._socket], [], min(SLICE_S, deadline.left_s()))
             except OSError as error:
                 raise camera_lost(error.strerror or str(error)) from error
@@ -123,4 +123,4 @@ def readable(wires: Iterable[Wire | None], seconds: float) -> bool:
     try:
         return bool(open_ones) and bool(select.select(open_ones, [], [], seconds)[0])
     except OSError:
-        return True  # closed meanwhile by another thread: reading tells
+        return True  # closed meanwhile by another thread: reading raises

@@ -1,1 +1,1 @@
-"""PTP over USB. Entry: `bus` finds a camera, `link` talks to it."""
+"""PTP over USB. Entry: `bus` finds a camera, `link` communicates with it."""

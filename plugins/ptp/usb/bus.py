@@ -55,7 +55,7 @@ class UsbAddress:
 
 @dataclass(frozen=True, slots=True)
 class UsbCamera:
-    """A still camera on the bus. ``serial`` of its USB descriptor: "" where it has none or may not be read."""
+    """A still camera on the bus. ``serial`` of its USB descriptor: "" if it has none or can't be read."""
 
     device: Any
     vendor: int
@@ -70,9 +70,9 @@ class UsbCamera:
 
 
 def usb_cameras() -> list[UsbCamera]:
-    """Every still camera on every bus, by port. Raises DeviceRefused where there is no libusb."""
+    """Every still camera on every bus, by port. Raises DeviceRefused without libusb."""
     try:
-        return sorted(_cameras(), key=lambda one: one.port)
+        return sorted(_cameras(), key=lambda camera: camera.port)
     except usb.core.NoBackendError as error:
         raise DeviceRefused(
             "usb-no-library",
@@ -82,7 +82,7 @@ def usb_cameras() -> list[UsbCamera]:
 
 
 class UsbFinder:
-    """Opens the camera of an address, and after it was plugged in again the very same one, wherever it is then."""
+    """Opens the camera of an address, and the same camera again after it was plugged in elsewhere."""
 
     def __init__(self, address: UsbAddress, *, transcript: Transcript | None = None) -> None:
         self._address = address
@@ -90,7 +90,7 @@ class UsbFinder:
         self._known = address.serial
 
     def connect(self, deadline: Deadline) -> PtpUsbLink:
-        """Raises DeviceGone("camera-off") where it is not there, DeviceRefused where two could be meant, DeviceBusy."""
+        """Raises DeviceGone("camera-off") if it is missing, DeviceRefused if several cameras fit, DeviceBusy."""
         still_time(deadline)
         camera = self._choose(usb_cameras())
         pipes = PyusbPipes.open(camera.device)
@@ -101,11 +101,13 @@ class UsbFinder:
     def _choose(self, cameras: list[UsbCamera]) -> UsbCamera:
         wanted = self._address
         if self._known:
-            fitting = [one for one in cameras if one.serial.lstrip("0") == self._known.lstrip("0")]
+            fitting = [camera for camera in cameras if camera.serial.lstrip("0") == self._known.lstrip("0")]
         elif wanted.port:
-            fitting = [one for one in cameras if one.port == wanted.port]
+            fitting = [camera for camera in cameras if camera.port == wanted.port]
         elif wanted.vendor:
-            fitting = [one for one in cameras if (one.vendor, one.product) == (wanted.vendor, wanted.product)]
+            fitting = [
+                camera for camera in cameras if (camera.vendor, camera.product) == (wanted.vendor, wanted.product)
+            ]
         else:
             fitting = cameras
         if len(fitting) == 1:
@@ -115,7 +117,7 @@ class UsbFinder:
         raise DeviceRefused(
             "camera-which",
             what=f"There are {len(fitting)} cameras that fit: {'; '.join(map(str, fitting))}.",
-            remedy="Name one by its serial number or port, for example usb:1-2.",
+            remedy="Give a serial number or port, for example usb:1-2.",
         )
 
     def _not_there(self, cameras: list[UsbCamera]) -> DeviceGone:
@@ -131,7 +133,7 @@ def _cameras() -> Iterator[UsbCamera]:
                 continue
             port = f"{device.bus}-{'.'.join(map(str, device.port_numbers or ()))}"
         except usb.core.USBError:
-            continue  # it has just left, or may not even be looked at
+            continue  # it was just unplugged, or can't be read
         yield UsbCamera(device, device.idVendor, device.idProduct, port, _serial(device))
 
 

@@ -1,6 +1,6 @@
-"""The interrupt pipe of a camera on USB: a thread of its own reads the events, and closes the pipes if it is the last.
+"""The interrupt pipe of a camera on USB: a thread reads the events, and closes the pipes if it is the last user.
 
-It reads in slices, because a read cannot be ended from elsewhere.
+It reads in short waits, because another thread can't end a read.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MOST_EVENTS: Final = 10_000
 
 
 class InterruptReader:
-    """Reads from ``start`` to ``close``. ``ended``: why the camera is gone, None while it is there."""
+    """Reads from ``start`` to ``close``. ``ended``: why the camera is gone, None while it is connected."""
 
     def __init__(self, pipes: Pipes) -> None:
         self._pipes = pipes
@@ -46,7 +46,7 @@ class InterruptReader:
             return bool(self._events) or self._news.wait(seconds)
 
     def close(self) -> None:
-        """Stop reading, and close the pipes; harmless before ``start``."""
+        """Stop reading, and close the pipes; may be called before ``start``."""
         self._stop.set()
         if self._reader.is_alive():
             self._reader.join(3 * _SLICE_S)
@@ -54,7 +54,7 @@ class InterruptReader:
             self._release()
 
     def _release(self) -> None:
-        """Close the pipes once: never under the feet of a reader that a dead bus holds; then the reader does it."""
+        """Close the pipes once. If a dead bus still blocks the reader, the reader closes them later."""
         with self._news:
             released, self._released = self._released, True
         if not released:
@@ -79,7 +79,7 @@ class InterruptReader:
                         self._events.append(LinkEvent(code, parameters))
                         self._news.notify_all()
             except ProtocolError:
-                continue  # a lost event is made up for by asking; see the bodies
+                continue  # the bodies query the state after a lost event
             except PipeStalled:
                 stalls += 1
                 self._stop.wait(min(1.0, 0.05 * stalls))

@@ -35,7 +35,7 @@ _RESET_S: Final = 2.0
 _EMPTY_S: Final = 0.01
 _MOST_LEFTOVERS: Final = 256
 _MOST_ODD: Final = 16
-"""Empty packets and answers to earlier requests that are passed over before an answer."""
+"""Maximum number of empty packets and answers to earlier requests before an answer."""
 
 
 class PtpUsbLink:
@@ -55,7 +55,7 @@ class PtpUsbLink:
 
     @classmethod
     def over(cls, pipes: Pipes, *, transcript: Transcript | None = None, deadline: Deadline) -> Self:
-        """Begin on ``pipes``: end what another program has left unfinished. Closes them where that fails."""
+        """Start on ``pipes``: end unfinished transactions of another program. Closes the pipes if that fails."""
         link = cls(pipes, transcript=transcript)
         try:
             link._tidy_up(deadline)
@@ -96,7 +96,7 @@ class PtpUsbLink:
         finally:
             with self._ending:
                 self._at_work = False
-                # The rest of the answer may still come; nobody must take it for the next one.
+                # The rest of the answer may still come; it must not be taken for the next one.
                 closed = self._closed = self._closed or not finished
             if closed:
                 self._let_go(unfinished=not finished)
@@ -116,7 +116,7 @@ class PtpUsbLink:
                 return
 
     def close(self) -> None:
-        """A thread that is in a transaction notices, and lets go itself: the pipes are not closed under its feet."""
+        """A thread in a transaction notices this and closes the pipes itself."""
         with self._ending:
             at_work, closed, self._closed = self._at_work, self._closed, True
         if not closed and not at_work:
@@ -135,7 +135,7 @@ class PtpUsbLink:
             raise camera_lost("it was closed")
 
     def _tidy_up(self, deadline: Deadline) -> None:
-        """A camera that is not ready is reset; what still lies in its pipe belongs to nobody."""
+        """Reset a camera that is not ready; drop old data in its pipe."""
         if self._status() not in (None, Answer.OK):
             with contextlib.suppress(PipeStalled):
                 self._pipes.send_request(ClassRequest.RESET, b"", _REQUEST_S)
@@ -147,10 +147,10 @@ class PtpUsbLink:
             still_time(deadline)
             if not self._patiently(lambda: self._pipes.read(self._block, _EMPTY_S)):
                 return
-        raise broken("data that nobody asked for, without an end")
+        raise broken("unrequested data without an end")
 
     def _status(self) -> int | None:
-        """The code of its status; None where the camera does not know the request."""
+        """The code of its status; None if the camera does not support the request."""
         try:
             return ptp_usb.parse_status(self._pipes.ask_request(ClassRequest.STATUS, 64, _REQUEST_S)).code
         except (PipeStalled, ProtocolError):
@@ -172,7 +172,7 @@ class PtpUsbLink:
         return self._pipes.write(piece, min(_SLICE_S if piece else _EMPTY_S, max(0.001, deadline.left_s())))
 
     def _patiently(self, work: Callable[[], Result]) -> Result:
-        """Do ``work``; where the camera stalls, clear the halt and do it once more."""
+        """Do ``work``; if the camera stalls, clear the halt and do it again."""
         try:
             return work()
         except PipeStalled:
@@ -238,7 +238,7 @@ class PtpUsbLink:
             buffer = self._buffer(len(self._block) if length < 0 else length - received)
             count, late = self._read(buffer, deadline)
             if length >= 0 and count > length - received:
-                # Some send the response behind the data, without a packet's end between them.
+                # Some cameras send the response directly after the data, in the same packet.
                 self._spare = buffer[length - received : count].tobytes()
                 count = length - received
             received += count
@@ -278,4 +278,4 @@ class PtpUsbLink:
 
 
 def _nowhere(piece: memoryview) -> None:
-    """Takes what belongs to an earlier request."""
+    """Drops data of an earlier request."""

@@ -1,4 +1,4 @@
-"""The pipes of a still camera on USB, through pyusb; and what is asked of any other way to such pipes."""
+"""The pipes of a still camera on USB, through pyusb, and their interface."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PyusbPipes:
     def open(cls, device: Any) -> Self:
         """Claim the still image interface of a pyusb ``device``.
 
-        Raises DeviceBusy("camera-in-use") where another program has it, DeviceRefused("camera-permission") where this
+        Raises DeviceBusy("camera-in-use") if another program has it, DeviceRefused("camera-permission") if this
         user may not use it, DeviceGone, DeviceRefused("camera-no-interface").
         """
         try:
@@ -169,13 +169,13 @@ def _pipes_of(interface: Any) -> tuple[tuple[int, int, int], int]:
 def _no_interface() -> DeviceRefused:
     return DeviceRefused(
         "camera-no-interface",
-        what="The USB device offers no still image interface.",
+        what="The USB device has no still image interface.",
         remedy="Set the camera's USB mode to PTP, PC connection or remote control.",
     )
 
 
 def _milliseconds(seconds: float) -> int:
-    """0 would mean for ever."""
+    """0 would mean without limit."""
     return max(1, round(1000 * seconds))
 
 
@@ -189,13 +189,13 @@ def _cannot_open(error: usb.core.USBError) -> DeviceError:
     if error.errno == errno.EBUSY:
         return DeviceBusy(
             "camera-in-use",
-            what="Another program has opened the camera.",
-            remedy="End photo programs and the desktop's file manager (gvfs-gphoto2-volume-monitor), then try again.",
+            what="The camera is in use by another program.",
+            remedy="Close photo programs and the desktop's file manager (gvfs-gphoto2-volume-monitor), then try again.",
         )
     if error.errno in (errno.EACCES, errno.EPERM):
         return DeviceRefused(
             "camera-permission",
             what="This user may not use the camera on the USB bus.",
-            remedy=f"Install the udev rule {RULE} (its first lines say how), then plug the camera in again.",
+            remedy=f"Install the udev rule {RULE} (see its first lines), then plug the camera in again.",
         )
     return camera_lost(error.strerror or str(error))

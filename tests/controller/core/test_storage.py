@@ -44,9 +44,9 @@ def test_a_full_disk_is_told_in_a_sentence_with_a_remedy(tmp_path: Path) -> None
         with Path("/dev/full").open("wb") as full:  # the kernel itself says that there is no space
             full.write(b"x" * 100_000)
 
-    with pytest.raises(WorkError, match="no space left") as error:
+    with pytest.raises(WorkError, match="disk has no space for file") as error:
         stream_atomically(tmp_path / "file", write)
-    assert "Free some" in error.value.remedy
+    assert "Free space on the disk" in error.value.remedy
     assert list(tmp_path.iterdir()) == []
 
 

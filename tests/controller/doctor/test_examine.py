@@ -133,7 +133,7 @@ def test_a_stage_that_is_well_has_no_problem_and_no_lamp_was_struck(hall: Hall) 
     assert "1200 lamp hours" in str(seen.tried[0].answer)
     assert wire.lamp.strikes == 0
     assert json.loads(json.dumps(seen.as_json()))["healthy"] is True
-    assert "No problem was found." in seen.as_text()
+    assert "No problems found." in seen.as_text()
 
 
 def test_every_problem_says_what_it_is_and_what_to_do(hall: Hall) -> None:
@@ -191,7 +191,7 @@ def test_a_relay_board_is_never_added_by_guess(hall: Hall) -> None:
     before = (hall.folder / "stage.toml").read_text()
     seen = hall.examine(write=True)
     assert codes(seen) == ["not-in-stage"]
-    assert "feeds" in seen.findings[0].problem.remedy
+    assert "with the projector of each relay" in seen.findings[0].problem.remedy
     assert seen.written == ()
     assert (hall.folder / "stage.toml").read_text() == before
 

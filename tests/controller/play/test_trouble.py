@@ -26,7 +26,7 @@ def test_a_disk_that_is_full_at_the_start_is_told(tmp_path: Path) -> None:
     command = ["prlimit", "--fsize=8192", *player, "--frames", str(tmp_path / "f")]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert ended.returncode == 1
-    assert "no space left to write s.inbox" in ended.stderr
+    assert "disk has no space for s.inbox" in ended.stderr
     assert not [path for path in tmp_path.iterdir() if path.suffix != ".lock"], "nothing half made stays"
 
 

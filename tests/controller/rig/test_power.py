@@ -52,7 +52,7 @@ def test_power_up_waits_for_lamps_that_must_rest() -> None:
     assert power_down(room.guards, clock=room.world) == ()
     power_up(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
     assert [lamp.sins for lamp in room.lamps] == [[], [], []]
-    assert any("rests" in note for _, note in room.notes)
+    assert any("must stay off for" in note for _, note in room.notes)
 
 
 def test_a_silent_projector_is_named_before_any_lamp_is_struck() -> None:
@@ -218,7 +218,7 @@ def test_a_lamp_that_was_switched_off_by_hand_rests_before_the_technician_is_ask
     off_s = room.world.time_s
     light(room.guards[:1], deadline=in_seconds(600), advance=room.advance, clock=room.world, tell=tell)
     assert told[1] - off_s >= RULES.minimum_off_s
-    assert any("rests" in note for _, note in room.notes)
+    assert any("must stay off for" in note for _, note in room.notes)
 
 
 def test_the_mains_of_a_projector_that_cannot_be_switched_stay_on() -> None:

@@ -118,7 +118,7 @@ def test_a_failing_journal_does_not_hide_what_went_wrong(journal: Journal) -> No
     with pytest.raises(WorkError) as error:
         Runner([Step(StepId("a"), fails)], journal).run("test", deadline=in_seconds(10))
     assert error.value.code == "too-dark"
-    assert any("could not be journalled" in note for note in error.value.__notes__)
+    assert any("could not be written to the journal" in note for note in error.value.__notes__)
 
 
 def test_cancel_takes_hold_between_steps_and_inside_them(journal: Journal) -> None:
@@ -137,7 +137,7 @@ def test_cancel_takes_hold_between_steps_and_inside_them(journal: Journal) -> No
 
 
 def test_a_run_out_of_time_says_that_it_can_go_on(journal: Journal) -> None:
-    with pytest.raises(WorkError, match="goes on from the last finished step") as error:
+    with pytest.raises(WorkError, match="to continue after the last finished step") as error:
         Runner([Step(StepId("a"), writes("a", []))], journal).run("test", deadline=in_seconds(0))
     assert error.value.code == "run-too-slow"
 

@@ -62,7 +62,7 @@ def test_a_bundle_without_its_targets_is_refused_and_a_part_of_them_is_told(stag
     checked, told = check_stage(stage), Told()
     (stage / "runs" / RUN / "appearance-gold.npz").unlink()
     assert installed(checked, (), told).names == ("marble",)
-    assert told.said == ["Nothing is known of the target of gold: left out."]
+    assert told.said == ["Not photographed, because the target is missing: gold."]
     assert refusal(stage, ("gold",)) == "targets-missing"
     shutil.move(stage / "runs" / RUN, stage / "runs" / "20260102-120000-calibrate")
     assert refusal(stage) == "targets-missing"

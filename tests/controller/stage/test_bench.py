@@ -32,7 +32,7 @@ def test_what_the_bench_refuses_is_raised_as_it_tells_it(tmp_path: Path) -> None
         pytest.fail("there is no stage to serve")
     assert refused.value.code == "bench-file-missing"
     assert "velatura demo --prepare-only" in refused.value.remedy
-    assert said == ["Starting the bench: an emulated stage in a process of its own."]
+    assert said == ["Starting the bench (the emulated stage)."]
 
 
 def test_a_stop_while_it_starts_ends_it(tmp_path: Path) -> None:

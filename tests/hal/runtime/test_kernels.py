@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import types
 
-from hal.runtime.kernels import TABLES, Compilation, are_compiled, decode, encode, record
+from hal.runtime import kernels
+from hal.runtime.kernels import TABLES, Compilation, are_compiled, decode, encode, main, record
 
 MODULE = "controller.solve.bounded.gradient"
 """A small one."""
@@ -95,3 +96,29 @@ def test_a_compilation_that_is_closed_ends_its_processes_at_once(
 
 def test_a_module_that_does_not_exist_fails_and_says_so_in_its_exit_code(tmp_path: Path) -> None:
     assert _compile(tmp_path, "controller.nothing").returncode != 0
+
+
+@pytest.fixture
+def table_of_a_missing_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = tmp_path / "kernels.json"
+    table.write_text(json.dumps({"controller.nothing": {"kernel": [["float32"]]}}))
+    monkeypatch.setattr(kernels, "TABLES", (table,))
+    monkeypatch.setenv("VELATURA_CACHE", str(tmp_path))
+
+
+@pytest.mark.usefixtures("table_of_a_missing_module")
+def test_a_table_of_a_missing_module_counts_as_not_compiled() -> None:
+    assert not are_compiled()
+    with Compilation(processes=1) as compilation:
+        assert compilation.wait(60)
+        assert compilation.failed == ("controller.nothing",)
+    assert not are_compiled()
+
+
+@pytest.mark.usefixtures("table_of_a_missing_module")
+def test_compiling_names_a_missing_module_and_the_remedy(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compile"]) == 1
+    assert capsys.readouterr().err == (
+        "velatura: The module controller.nothing in the kernel tables does not exist. "
+        "Run `python -m hal.runtime.kernels record`.\n"
+    )

@@ -42,7 +42,7 @@ def test_a_projector_that_takes_its_time_is_found_and_the_deadline_is_kept(liste
 def test_changes_are_heard_in_order_though_a_search_ran_meanwhile(listener: PjLinkListener) -> None:
     lamp = EmulatedLamp(LampTiming(0.4, 0.4))
     with EmulatedPjLinkUdp(lamp, mac=MAC, controller=("127.0.0.1", listener.port)) as projector:
-        assert listener.heard(deadline=in_seconds(20)).told == CameUp(MAC)
+        assert listener.heard(deadline=in_seconds(20)).notification == CameUp(MAC)
         lamp.strike()
         listener.search(deadline=in_seconds(20), to=projector.address, patience_s=0.7)
         projector.select_input("32")
@@ -55,7 +55,7 @@ def test_changes_are_heard_in_order_though_a_search_ran_meanwhile(listener: PjLi
             TroubleChanged(("lamp-failed",)),
             InputChanged("32"),
         }
-        told = [listener.heard(deadline=in_seconds(20)).told for _ in expected]
+        told = [listener.heard(deadline=in_seconds(20)).notification for _ in expected]
     assert set(told) == expected
     assert told[:2] == [PowerChanged(Power.WARMING), PowerChanged(Power.ON)]
 
@@ -64,7 +64,7 @@ def test_noise_on_the_port_is_counted_and_changes_nothing(listener: PjLinkListen
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for data in (b"hello", b"%2POWR=9\r", b"x" * 5000, b"%2SRCH\r", b"%2POWR=1\r"):
             stranger.sendto(data, ("127.0.0.1", listener.port))
-    assert listener.heard(deadline=in_seconds(20)).told == PowerChanged(Power.ON)
+    assert listener.heard(deadline=in_seconds(20)).notification == PowerChanged(Power.ON)
     assert listener.ignored == 3
 
 

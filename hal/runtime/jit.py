@@ -1,6 +1,6 @@
 """Numba with types: ``compiled`` keeps a kernel's signature visible to the type checker.
 
-The first call compiles for seconds; the machine code is kept (``hal.runtime.compute``), so later runs start at once.
+The first call compiles for seconds. The machine code is kept (``hal.runtime.compute``), so later runs start at once.
 """
 
 from __future__ import annotations
