@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
+from plugins.emulated.optics.indirect.transfer import Transfer
 from plugins.emulated.optics.jit import compiled
 from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX, Samples
 from plugins.emulated.optics.truth import BenchTruth, LightTruth
@@ -72,8 +73,9 @@ def pixel_profiles(fill_factor: float) -> tuple[npt.NDArray[np.float32], npt.NDA
 class Renderer:
     """Keeps the last layers of each projector, since most frames are shown more than once and by one projector."""
 
-    def __init__(self, truth: BenchTruth, samples: Samples) -> None:
+    def __init__(self, truth: BenchTruth, samples: Samples, transfer: Transfer | None = None) -> None:
         self._truth = truth
+        self._transfer = transfer
         self._samples = samples
         self._profiles = [pixel_profiles(p.light.fill_factor) for p in truth.projectors]
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
@@ -95,6 +97,8 @@ class Renderer:
         for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
             if level > 0.0:
                 total += np.float32(level) * self._layer(index, frame, digests[index])
+        if self._transfer is not None:
+            total += self._albedo * self._returned(self._transfer, frames, levels)
         if self._truth.indirect > 0.0:
             # The mean light on what the camera sees stands for what object and room throw back.
             lit = (total - self._ambient).sum(axis=0, dtype=np.float64) / np.maximum(self._albedo.sum(axis=0), 1e-9)
@@ -102,6 +106,15 @@ class Renderer:
         image = self._through_lens(total)
         self._last = (key, image)
         return image
+
+    def _returned(self, transfer: Transfer, frames: Sequence[ByteImage], levels: Sequence[float]) -> FloatImage:
+        """Irradiance (P, 3) that object and surfaces throw back."""
+        direct = np.zeros((transfer.back.shape[2], 3), dtype=np.float32)
+        for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
+            if level > 0.0:
+                sent = emitted(self._truth.projectors[index].light, frame)
+                direct += np.float32(level) * transfer.direct(index, sent)
+        return transfer.returned(direct)
 
     def _layer(self, index: int, frame: ByteImage, digest: bytes) -> FloatImage:
         """One projector's light (P, 3) at full lamp, summed over each camera pixel's samples."""

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
 from hal.runtime.files import read_text
-from plugins.emulated.tables import Between, dump, load
+from plugins.emulated.tables import Between, OneOf, dump, load
 
 Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]
@@ -147,6 +147,17 @@ class ObjectTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class SurfaceTruth:
+    """A flat part of the room, table or wall: a parallelogram from ``corner_m``; ``albedo`` on both sides."""
+
+    name: str
+    corner_m: Annotated[Three, Between(-100.0, 100.0)]
+    across_m: Annotated[Three, Between(-100.0, 100.0)]
+    along_m: Annotated[Three, Between(-100.0, 100.0)]
+    albedo: Annotated[Three, Between(0.0, 0.95)]
+
+
+@dataclass(frozen=True, slots=True)
 class MainsTruth:
     """A relay and whose mains go through it. ``relay``: the board's name in bench/usb.toml; ``feeds``: projectors;
 
@@ -169,6 +180,9 @@ class BenchTruth:
     ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder;
     ``mains``: which emulated relays feed which projectors, whose mains are on otherwise;
     ``indirect``: the share of all projected light that object and room throw back evenly on the object.
+
+    ``surfaces``: of the room round the object; ``engine``: "direct" for light straight from the projectors alone,
+    "radiosity" for light between object and surfaces, too, which counts it on so many ``patches``.
     """
 
     size: str
@@ -184,6 +198,9 @@ class BenchTruth:
     scenario: str = ""
     mains: tuple[MainsTruth, ...] = ()
     indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
+    surfaces: tuple[SurfaceTruth, ...] = ()
+    engine: Annotated[str, OneOf("direct", "radiosity")] = "direct"
+    patches: Annotated[int, Between(10, 20000)] = 2000
 
 
 def write_truth(stage: Path, truth: BenchTruth) -> None:
