@@ -27,8 +27,9 @@ FloatImage = npt.NDArray[np.float32]
 
 RAYS: Final = 512
 """That leave each patch."""
+PROJECTOR_RAYS: Final = 500_000
 PATCHES_AT_ONCE: Final = 1024
-NEAREST: Final = 8
+NEAREST: Final = 10
 """Patches between which a camera pixel's light is interpolated."""
 TURN: Final = 3.0
 """So many sizes of a patch count as far as a turn of the normal by one radian."""
@@ -109,7 +110,11 @@ def _form_factors(patches: Patches, rng: np.random.Generator, progress: Progress
         block = sparse.coo_matrix((np.full(len(row), 1.0 / RAYS), (row, found[hit])), shape=(len(sides), count))
         rows.append(block.tocsr())
         progress(min(first + PATCHES_AT_ONCE, count) / count)
-    return sparse.vstack(rows).tocsr()
+    found = sparse.vstack(rows)
+    # Both ways between two patches carry the same, so each is counted twice: areas times factors are symmetric.
+    area = np.repeat(np.add.reduceat(patches.areas, patches.starts[:-1]), 2)
+    both = sparse.diags(area) @ found
+    return (sparse.diags(0.5 / area) @ (both + both.T)).tocsr()
 
 
 def _leaving(patches: Patches, face: Integers, side: Floats, drawn: Floats) -> tuple[Floats, Floats]:
@@ -128,22 +133,28 @@ def _leaving(patches: Patches, face: Integers, side: Floats, drawn: Floats) -> t
 
 
 def _arriving(projector: ProjectorTruth, patches: Patches) -> sparse.csr_matrix:
-    """Irradiance (2G, K) on the patches of each pixel of a projector: its power goes where its middle's ray goes.
+    """Irradiance (2G, K) on the patches of each pixel of a projector: its power goes where rays through it go.
 
     The power of a pixel follows from ``rays``: the light on a surface times the area that the pixel covers there.
     """
     lens, light = projector.lens, projector.light
     width, height = lens.size_px
-    y, x = (part.ravel().astype(np.float64) for part in np.mgrid[:height, :width])
-    rays = directions(projector.pose, lens, x, y)
-    found = patches.hit(np.broadcast_to(np.asarray(projector.pose.position_m), rays.shape), rays).patch
-    corner = ((x - 0.5 * (width - 1)) / (0.5 * width)) ** 2 + ((y - 0.5 * (height - 1)) / (0.5 * height)) ** 2
-    power = light.brightness * light.reference_m**2 * np.maximum(1.0 - light.vignetting * corner / 2.0, 0.0)
-    power = power * _solid(projector, x, y)
-    hit = found >= 0
+    pixel = np.arange(width * height)
+    parts = int(np.clip(np.ceil(np.sqrt(PROJECTOR_RAYS / len(pixel))), 1, 16))
     area = np.add.reduceat(patches.areas, patches.starts[:-1])
-    shares = power[hit] / area[found[hit] // 2]
-    return sparse.csr_matrix((shares, (found[hit], np.flatnonzero(hit))), shape=(2 * patches.count, len(x)))
+    total = sparse.csr_matrix((2 * patches.count, len(pixel)))
+    for n in range(parts * parts):
+        x = pixel % width + (n % parts + 0.5) / parts - 0.5
+        y = pixel // width + (n // parts + 0.5) / parts - 0.5
+        rays = directions(projector.pose, lens, x, y)
+        found = patches.hit(np.broadcast_to(np.asarray(projector.pose.position_m), rays.shape), rays).patch
+        corner = ((x - 0.5 * (width - 1)) / (0.5 * width)) ** 2 + ((y - 0.5 * (height - 1)) / (0.5 * height)) ** 2
+        power = light.brightness * light.reference_m**2 * np.maximum(1.0 - light.vignetting * corner / 2.0, 0.0)
+        power *= _solid(projector, x, y) / parts**2
+        hit = np.flatnonzero(found >= 0)
+        shares = power[hit] / area[found[hit] // 2]
+        total = total + sparse.csr_matrix((shares, (found[hit], hit)), shape=total.shape)
+    return total
 
 
 def _solid(projector: ProjectorTruth, x: Floats, y: Floats) -> Floats:
@@ -201,10 +212,7 @@ def _reached(factors: sparse.csr_matrix, lit: npt.NDArray[np.bool_], seen: Integ
 
 
 def _blended(patches: Patches, kept: Integers, seen: Hits) -> sparse.csr_matrix:
-    """Weights (cells, P) of the patches near each cell's point that face as it does: smooth, and 1 in sum.
-
-    Franke and Little's weights ((R - d) / (R d))^2, with R the distance of the farthest.
-    """
+    """Weights (cells, P) of the patches near each cell's point that face as it does: smooth, and 1 in sum."""
     group = kept // 2
     facing = patches.directions[group] * (1.0 - 2.0 * (kept % 2))[:, None]
     body = np.where(seen.patch >= 0, patches.body[seen.patch // 2], -1)
@@ -218,7 +226,7 @@ def _blended(patches: Patches, kept: Integers, seen: Hits) -> sparse.csr_matrix:
             part.reshape(len(mine), -1) for part in tree.query(places, k=min(NEAREST, len(near)), workers=-1)
         )
         reach = 1.001 * away[:, -1:]
-        weight = ((reach - away) / np.maximum(reach * away, 1e-12)) ** 2
+        weight = (1.0 - (away / reach) ** 2) ** 2
         weight /= weight.sum(axis=1, keepdims=True)
         rows = np.repeat(mine, found.shape[1])
         blend = blend + sparse.csr_matrix((weight.ravel(), (rows, near[found].ravel())), shape=blend.shape)
