@@ -79,6 +79,7 @@ def demo(
     ] = None,
     out: Annotated[Path, typer.Option(help="Where the stage and the report go.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Which of the random stages.", min=0, max=2**32 - 1)] = 1,
+    room: Annotated[str | None, typer.Option(help="The stage's light: dark, room or hard. If omitted: dark.")] = None,
     prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Write OUT/stage and stop there.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -88,7 +89,7 @@ def demo(
         from controller.demo.job import demo
 
         return demo(
-            size=size, object_file=object, out=out, seed=seed, prepare_only=prepare_only,
+            size=size, object_file=object, out=out, seed=seed, room=room, prepare_only=prepare_only,
             reporter=reporter, cancel=cancel,
         )  # fmt: skip
 

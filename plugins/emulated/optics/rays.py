@@ -63,7 +63,7 @@ def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None,
 
     ``progress`` is called with the share that is done, 0..1.
     """
-    key = _key(truth, furnished(stage_object, truth.surfaces))
+    key = key_of(truth, stage_object)
     path = None if cache is None else cache / CACHE
     found = None if path is None else _read(path, key)
     if found is None:
@@ -207,7 +207,9 @@ def _in_shadow(projector: ProjectorTruth, scene: Any, points: Floats, distance: 
     return np.asarray(scene.run(origin, ray, output=1)["tfar"] < distance - SHADOW_BIAS_M)
 
 
-def _key(truth: BenchTruth, scene: Scene) -> str:
+def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
+    """A text that differs where the rays of stages do."""
+    scene = furnished(stage_object, truth.surfaces)
     digest = hashlib.sha256(f"{VERSION}\n".encode())
     projectors = [part for p in truth.projectors for part in (p.pose, p.lens, p.focus, p.light)]
     for part in (truth.camera.pose, truth.camera.lens, *projectors):

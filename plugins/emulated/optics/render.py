@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, TypeAlias
 
 import cv2
@@ -21,7 +21,8 @@ from scipy.special import erf
 from plugins.emulated.optics.indirect.transfer import Transfer
 from plugins.emulated.optics.jit import compiled
 from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX, Samples
-from plugins.emulated.optics.truth import BenchTruth, LightTruth
+from plugins.emulated.optics.truth import BenchTruth, LightTruth, ProjectorTruth
+from plugins.emulated.optics.veil import veiled
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
@@ -42,11 +43,33 @@ def response(light: LightTruth) -> npt.NDArray[np.float64]:
     return np.asarray(power + np.asarray(light.s_curve) * power * (1.0 - power) * (2.0 * power - 1.0))
 
 
+def channels(light: LightTruth, frame: ByteImage) -> FloatImage:
+    """Linear light (rows, columns, 3) of a frame's red, green and blue before mixing."""
+    table = light.black_level + (1.0 - light.black_level) * response(light)
+    each = np.stack([table[:, c].astype(np.float32)[frame[..., c]] for c in range(3)], axis=-1)
+    if light.white_segment > 0.0:
+        each += np.float32(light.white_segment) * each.min(axis=-1, keepdims=True)
+    return each
+
+
 def emitted(light: LightTruth, frame: ByteImage) -> FloatImage:
     """Linear light (rows, columns, 3) in the camera's channels that a frame's pixels send out; white is about 1."""
-    table = light.black_level + (1.0 - light.black_level) * response(light)
-    channels = np.stack([table[:, c].astype(np.float32)[frame[..., c]] for c in range(3)], axis=-1)
-    return channels @ np.asarray(light.mixing, dtype=np.float32).T
+    return veiled(channels(light, frame) @ np.asarray(light.mixing, dtype=np.float32).T, light.glare)
+
+
+def sent_by_panels(
+    projector: ProjectorTruth, frame: ByteImage, at_px: FloatImage
+) -> Iterator[tuple[FloatImage, FloatImage]]:
+    """What is sent out, in parts that lie alike: each with where it lies at points whose pixels are ``at_px``."""
+    light, panels = projector.light, projector.panels
+    if panels.aligned:
+        yield emitted(light, frame), at_px
+        return
+    each, mixing = channels(light, frame), np.asarray(light.mixing, dtype=np.float32)
+    centre = np.asarray(projector.lens.centre_px)
+    for c in range(3):
+        at = (at_px - np.asarray(panels.shift_px[c]) - centre) / (1.0 + panels.magnified[c]) + centre
+        yield veiled(each[..., c : c + 1] * mixing[:, c], light.glare), at.astype(np.float32)
 
 
 @functools.lru_cache(maxsize=4)
@@ -122,16 +145,18 @@ class Renderer:
         if digest in kept:
             kept.move_to_end(digest)
             return kept[digest]
-        padded = cv2.copyMakeBorder(
-            emitted(self._truth.projectors[index].light, frame), *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0
-        )
         samples, (profiles, radii) = self._samples, self._profiles[index]
         gloss = samples.gloss[index]
         albedo = samples.albedo + gloss[:, None] if gloss.size else samples.albedo
-        layer = _lit_pixels(
-            np.ascontiguousarray(padded), samples.at_px[index], samples.gain[index], samples.blur[index],
-            albedo, samples.starts, profiles, radii,
-        )  # fmt: skip
+        layer: FloatImage | None = None
+        for sent, at_px in sent_by_panels(self._truth.projectors[index], frame, samples.at_px[index]):
+            padded = cv2.copyMakeBorder(sent, *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0)
+            part = _lit_pixels(
+                np.ascontiguousarray(padded), at_px, samples.gain[index], samples.blur[index],
+                albedo, samples.starts, profiles, radii,
+            )  # fmt: skip
+            layer = part if layer is None else layer + part
+        assert layer is not None
         kept[digest] = layer
         if len(kept) > LAYERS_KEPT:
             kept.popitem(last=False)
@@ -145,6 +170,7 @@ class Renderer:
         sigma = self._truth.camera.psf_sigma_px
         if sigma > 0.05:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)
+        image = veiled(image, self._truth.camera.glare)
         image *= self._vignette[..., None]
         image.flags.writeable = False
         return image

@@ -1,8 +1,7 @@
 """From projector frames to the light that comes back: radiosity between patches, solved once for all frames.
 
 With irradiance E of the projectors on the patches, albedo R and form factors F, the light that comes back is
-I = F R (E + I), so I = (1 - F R)^-1 F R E: every number of bounces. Form factors are counted from rays that leave each
-patch as diffuse light does, which needs no separate test of visibility.
+I = F R (E + I), so I = (1 - F R)^-1 F R E: every number of bounces.
 """
 
 from __future__ import annotations
@@ -14,21 +13,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.spatial import cKDTree
-from scipy.stats import qmc
 
-from plugins.emulated.optics.furnished import Scene
-from plugins.emulated.optics.indirect.patches import CLEAR_M, Hits, Patches, patches_of
-from plugins.emulated.optics.rays import Progress, directions
+from plugins.emulated.optics.indirect.patches import Hits, Patches
+from plugins.emulated.optics.indirect.scattering import Scattering
+from plugins.emulated.optics.rays import directions
 from plugins.emulated.optics.truth import BenchTruth, CameraTruth, ProjectorTruth
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 FloatImage = npt.NDArray[np.float32]
 
-RAYS: Final = 512
-"""That leave each patch."""
 PROJECTOR_RAYS: Final = 500_000
-PATCHES_AT_ONCE: Final = 1024
 NEAREST: Final = 10
 """Patches between which a camera pixel's light is interpolated."""
 TURN: Final = 3.0
@@ -60,20 +55,17 @@ class Transfer:
         return np.asarray((self.blend @ light)[self.cells], dtype=np.float32)
 
 
-def transfer_of(
-    truth: BenchTruth, scene: Scene, pixels: npt.NDArray[np.int32], progress: Progress = lambda share: None
-) -> Transfer:
+def transfer_of(truth: BenchTruth, scattering: Scattering, pixels: npt.NDArray[np.int32]) -> Transfer:
     """Work everything out; ``pixels``: ``Samples.pixels``."""
-    patches = patches_of(scene, truth.patches)
+    patches, factors = scattering.patches, scattering.factors
     arrive = sparse.vstack([_arriving(projector, patches) for projector in truth.projectors]).tocsr()
-    factors = _form_factors(patches, np.random.default_rng([truth.seed, 4]), progress)
     cells, seen = _seen(truth.camera, patches, pixels)
     total = np.asarray(arrive.sum(axis=1)).reshape(len(truth.projectors), -1).sum(axis=0)
     kept = _reached(factors, total > 0.0, seen.patch)
     blend = _blended(patches, kept, seen)
     lit, used = np.flatnonzero(total[kept] > 0.0), np.flatnonzero(blend.getnnz(axis=0))
     factors, albedo = factors[kept][:, kept], patches.albedo[kept // 2]
-    back = [_all_bounces(factors, albedo[:, channel])[np.ix_(used, lit)] for channel in range(3)]
+    back = [_all_bounces(factors, albedo[:, channel], lit)[used] for channel in range(3)]
     first = 2 * patches.count * np.arange(len(truth.projectors))
     return Transfer(
         arrive=tuple(arrive[n + kept[lit]].astype(np.float32) for n in first),
@@ -83,53 +75,9 @@ def transfer_of(
     )
 
 
-def _all_bounces(factors: sparse.csr_matrix, albedo: Floats) -> FloatImage:
+def _all_bounces(factors: sparse.csr_matrix, albedo: Floats, lit: Integers) -> FloatImage:
     once = (factors @ sparse.diags(albedo)).toarray().astype(np.float32)
-    return np.asarray(np.linalg.solve(np.eye(len(once), dtype=np.float32) - once, once), dtype=np.float32)
-
-
-def _form_factors(patches: Patches, rng: np.random.Generator, progress: Progress) -> sparse.csr_matrix:
-    """Share (2G, 2G) of what a patch sees that is each other patch."""
-    whole = np.concatenate([[0.0], np.cumsum(patches.areas)])
-    numbers = qmc.Sobol(5, seed=rng).random(RAYS)
-    count = 2 * patches.count
-    rows = []
-    for first in range(0, count, PATCHES_AT_ONCE):
-        sides = np.arange(first, min(first + PATCHES_AT_ONCE, count))
-        drawn = (numbers[None] + rng.random((len(sides), 1, 5))) % 1.0
-        begin, end = whole[patches.starts[sides // 2]], whole[patches.starts[sides // 2 + 1]]
-        place = begin[:, None] + drawn[..., 0] * (end - begin)[:, None]
-        face = np.searchsorted(whole, place.ravel(), side="right") - 1
-        face = np.clip(
-            face.reshape(place.shape), *(patches.starts[sides // 2 + n][:, None] - n for n in (0, 1))
-        ).ravel()
-        points, rays = _leaving(patches, face, np.repeat(1.0 - 2.0 * (sides % 2), RAYS), drawn[..., 1:].reshape(-1, 4))
-        found = patches.hit(points, rays).patch
-        hit = found >= 0
-        row = np.repeat(np.arange(len(sides)), RAYS)[hit]
-        block = sparse.coo_matrix((np.full(len(row), 1.0 / RAYS), (row, found[hit])), shape=(len(sides), count))
-        rows.append(block.tocsr())
-        progress(min(first + PATCHES_AT_ONCE, count) / count)
-    found = sparse.vstack(rows)
-    # Both ways between two patches carry the same, so each is counted twice: areas times factors are symmetric.
-    area = np.repeat(np.add.reduceat(patches.areas, patches.starts[:-1]), 2)
-    both = sparse.diags(area) @ found
-    return (sparse.diags(0.5 / area) @ (both + both.T)).tocsr()
-
-
-def _leaving(patches: Patches, face: Integers, side: Floats, drawn: Floats) -> tuple[Floats, Floats]:
-    """Points evenly on faces, and rays from there, as many as the cosine to the normal on that side."""
-    root, share = np.sqrt(drawn[:, :1]), drawn[:, 1:2]
-    corners = patches.corners[face]
-    points = (1.0 - root) * corners[:, 0] + root * (1.0 - share) * corners[:, 1] + root * share * corners[:, 2]
-    normals = patches.normals[face] * side[:, None]
-    helper = np.where(np.abs(normals[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    first = np.cross(normals, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normals, first)
-    turn, sine = 2.0 * np.pi * drawn[:, 2:3], np.sqrt(drawn[:, 3:4])
-    rays = sine * (np.cos(turn) * first + np.sin(turn) * second) + np.sqrt(1.0 - drawn[:, 3:4]) * normals
-    return points + CLEAR_M * normals, rays
+    return np.asarray(np.linalg.solve(np.eye(len(once), dtype=np.float32) - once, once[:, lit]), dtype=np.float32)
 
 
 def _arriving(projector: ProjectorTruth, patches: Patches) -> sparse.csr_matrix:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 
-from plugins.emulated.optics.furnished import furnished
+from plugins.emulated.optics.indirect.scattering import scattering_of
 from plugins.emulated.optics.indirect.transfer import transfer_of
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import cast
@@ -89,7 +89,7 @@ def test_light_that_bounces_is_mitsubas(make: Callable[[], StageObject], least_s
     stage_object = make()
     truth, frame = stage_of(stage_object), frame_of(4)
     samples = cast(truth, stage_object, lambda share: None)
-    transfer = transfer_of(truth, furnished(stage_object, ()), samples.pixels)
+    transfer = transfer_of(truth, scattering_of(stage_object, truth.patches, truth.seed), samples.pixels)
     direct = Renderer(truth, samples).light([frame], [1.0])
     found = Renderer(truth, samples, transfer).light([frame], [1.0]).astype(np.float64)
     shape = mitsuba_mesh(stage_object, tmp_path)
