@@ -1,15 +1,23 @@
-"""What differs from pixel to pixel and from shot to shot in a camera and in lamps; each drawn from the stage's seed."""
+"""What lenses, sensors and lamps do beyond the ideal.
+
+What differs from pixel to pixel and from shot to shot is drawn from the stage's seed.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from plugins.emulated.optics.truth import CameraTruth, LampTruth
 
+SPREAD: Final = 0.15
+"""Standard deviation of the veil, in picture widths."""
+COARSE_PX: Final = 96
+"""The veil is smooth, so it is worked out in a picture that is so wide."""
 HOT_E_PER_S: Final = 2e4
 """Mean dark current of hot pixels; each has its own, by an exponential law."""
 FLICKER_S: Final = 0.1
@@ -52,3 +60,17 @@ def flickering(lamp: LampTruth, exposure_s: float, rng: np.random.Generator) -> 
     if not lamp.flicker:
         return 1.0
     return max(0.0, 1.0 + lamp.flicker / np.sqrt(1.0 + exposure_s / FLICKER_S) * float(rng.standard_normal()))
+
+
+def veiled(image: npt.NDArray[np.float32], share: float) -> npt.NDArray[np.float32]:
+    """A share of the light goes astray in a lens and lies as a veil over the whole picture.
+
+    (1 - share) image + share image * Gaussian, for light (rows, columns, 3); what leaves the picture is lost.
+    """
+    if share <= 0.0:
+        return image
+    rows, columns = image.shape[:2]
+    coarse = cv2.resize(image, (COARSE_PX, max(1, round(COARSE_PX * rows / columns))), interpolation=cv2.INTER_AREA)
+    veil = cv2.GaussianBlur(coarse, (0, 0), SPREAD * COARSE_PX, borderType=cv2.BORDER_CONSTANT)
+    whole = cv2.resize(veil, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(np.float32(1.0 - share) * image + np.float32(share) * whole, dtype=np.float32)

@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
+from plugins.emulated.optics.flaws import veiled
 from plugins.emulated.optics.indirect.transfer import Transfer
 from plugins.emulated.optics.jit import compiled
 from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX, Samples
 from plugins.emulated.optics.truth import BenchTruth, LightTruth, ProjectorTruth
-from plugins.emulated.optics.veil import veiled
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]

@@ -73,7 +73,7 @@ class Sensor:
 class CameraTruth:
     """The camera. ``vignetting``: share of light lost in the image's corners; ``raw``: False makes JPEG files only.
 
-    ``glare``: share of the light that its lens spreads over the whole picture (``veil``).
+    ``glare``: share of the light that its lens spreads over the whole picture (``flaws.veiled``).
     """
 
     pose: Pose
