@@ -50,8 +50,12 @@ def ideal(truth: BenchTruth) -> BenchTruth:
     return dataclasses.replace(truth, engine="radiosity", ambient=(0.0, 0.0, 0.0), camera=camera)
 
 
-def test_an_integrating_sphere_has_even_light_by_its_formula(tiny_truth: BenchTruth) -> None:
-    truth, thing = dataclasses.replace(ideal(tiny_truth), patches=600), sphere()
+def test_an_integrating_sphere_has_even_light_by_its_formula(
+    tiny_truth: BenchTruth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Many rays from few patches, so that chance counts for less than the tolerance.
+    monkeypatch.setattr("plugins.emulated.optics.indirect.scattering.RAYS", 4096)
+    truth, thing = dataclasses.replace(ideal(tiny_truth), patches=200), sphere()
     samples = cast(truth, thing, lambda share: None)
     transfer = transfer_of(truth, scattering_of(thing, truth.patches, 1), samples.pixels)
     arrived, power = np.zeros((transfer.back.shape[2], 3), np.float32), np.zeros(3)
