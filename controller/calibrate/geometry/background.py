@@ -37,7 +37,7 @@ def room_pixels(points_m: FloatImage) -> Mask:
     A pixel without a point counts as its nearest neighbour with one. None is the room's where no plane reaches the
     picture's border.
     """
-    known = np.isfinite(points_m).all(axis=2)
+    known = np.asarray(np.isfinite(points_m).all(axis=2), dtype=np.bool_)
     room = np.zeros(known.shape, dtype=np.bool_)
     border, rng = _border(known.shape), np.random.default_rng(0)
     if np.mean(known[border]) < AT_BORDER:
@@ -68,7 +68,7 @@ def _plane(
     if not len(row):
         return None
     some = points_m[left][rng.integers(0, len(row), POINTS)].astype(np.float64)
-    best, most = None, LEAST * np.count_nonzero(np.isfinite(points_m[..., 0])) / len(row) * POINTS
+    best, most = None, LEAST * float(np.count_nonzero(np.isfinite(points_m[..., 0]))) / len(row) * POINTS
     apart = round(APART * left.shape[0])
     for start in rng.integers(0, len(row), TRIALS):
         beside = rng.integers(-apart, apart + 1, (2, 3))
@@ -84,7 +84,7 @@ def _plane(
             if len(inliers) < 0.5 * most:
                 break
             plane = _through(inliers)
-        count = np.count_nonzero(np.abs(some @ plane[:3] + plane[3]) < thick)
+        count = float(np.count_nonzero(np.abs(some @ plane[:3] + plane[3]) < thick))
         if count > most and np.mean(everything @ plane[:3] + plane[3] < -thick) < BEHIND:
             best, most = plane, count
     return best

@@ -126,7 +126,8 @@ def _groups(scene: Scene, faces: Integers, wanted: int) -> tuple[Floats, Integer
     corners, normals, source = corners[areas > 0.0], normals[areas > 0.0], source[areas > 0.0]
     middle = corners.mean(axis=1)
     whole = scene.vertices[scene.faces[source]].astype(np.float64)
-    weights = trimesh.triangles.points_to_barycentric(whole, middle, method="cross")
+    to_weights: Any = trimesh.triangles.points_to_barycentric
+    weights = to_weights(whole, middle, method="cross")
     albedo = scene.albedo(middle, source.astype(np.int32), weights.astype(np.float32))
     axis = np.abs(normals).argmax(axis=1)
     side = 2 * axis + (normals[np.arange(len(axis)), axis] > 0.0)
@@ -151,7 +152,8 @@ def _cut(scene: Scene, faces: Integers, longest: float) -> tuple[Floats, Integer
     large = np.linalg.norm(whole - np.roll(whole, 1, axis=1), axis=2).max(axis=1) > longest
     if not large.any():
         return whole, faces
-    vertices, pieces, source = trimesh.remesh.subdivide_to_size(
+    subdivide: Any = trimesh.remesh.subdivide_to_size
+    vertices, pieces, source = subdivide(
         scene.vertices.astype(np.float64), scene.faces[faces[large]], longest, max_iter=20, return_index=True
     )
     return np.concatenate([whole[~large], vertices[pieces]]), np.concatenate([faces[~large], faces[large][source]])
