@@ -12,6 +12,7 @@ import trimesh
 
 from hal.errors import DeviceError
 from plugins.emulated.bench import EmulatedBench
+from plugins.emulated.optics.furnished import furnished
 from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.indirect.scattering import scattering_of
 from plugins.emulated.optics.indirect.transfer import Transfer, transfer_of
@@ -158,3 +159,5 @@ def test_a_surface_of_no_use_is_refused() -> None:
     assert load(dump(good), SurfaceTruth, file="bench.toml") == good
     with pytest.raises(DeviceError, match=r"between 0 and 0\.95"):
         load(dump(good).replace("[0.5, 0.5, 0.5]", "[1.0, 0.5, 0.5]"), SurfaceTruth, file="bench.toml")
+    with pytest.raises(DeviceError, match=r"'wall' in bench\.toml has no area"):
+        furnished(sphere(), (dataclasses.replace(good, along_m=good.across_m),))
