@@ -11,7 +11,8 @@ SIZE ?= small
 empty :=
 OBJECT_NAME = $(notdir $(basename $(subst $(empty) $(empty),_,$(OBJECT))))
 quoted = '$(subst ','\'',$(1))'
-OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))
+ROOM ?=
+OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))$(if $(ROOM),-$(ROOM))
 SEED ?= 1
 OBJECT ?=
 NAME ?=
@@ -29,7 +30,7 @@ DOCS_PYTHON ?= .venv/bin/python
 
 demo:
 	@.ci/setup demo
-	@.venv/bin/velatura demo --size $(SIZE) --out $(call quoted,$(OUT)) --seed $(SEED) $(if $(OBJECT),--object $(call quoted,$(OBJECT)))
+	@.venv/bin/velatura demo --size $(SIZE) --out $(call quoted,$(OUT)) --seed $(SEED) $(if $(ROOM),--room $(ROOM)) $(if $(OBJECT),--object $(call quoted,$(OBJECT)))
 
 blender:
 	@.ci/setup-blender

@@ -79,6 +79,7 @@ def demo(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the stage and the report.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Random seed of the stage.", min=0, max=2**32 - 1)] = 1,
+    room: Annotated[str | None, typer.Option(help="Light of the stage: dark, room or hard (default: dark).")] = None,
     prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Only write OUT/stage.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -88,7 +89,7 @@ def demo(
         from controller.demo.job import demo
 
         return demo(
-            size=size, object_file=object, out=out, seed=seed, prepare_only=prepare_only,
+            size=size, object_file=object, out=out, seed=seed, room=room, prepare_only=prepare_only,
             reporter=reporter, cancel=cancel,
         )  # fmt: skip
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from controller.artefacts.geometry import read_geometry_figures
+from controller.artefacts.geometry import known_points_m, read_geometry_figures
 from controller.artefacts.modes import mode_of, read_metapixels
 from controller.artefacts.photographs import BLACK, Taken, codes_of, light_of
 from controller.artefacts.projectors import Light, Pixels
+from controller.calibrate.geometry.background import room_pixels
 from controller.calibrate.values import (
     Calibration,
     Correspondence,
@@ -66,7 +67,10 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     black = np.nan_to_num(light.black)
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)
-    return Calibration(tuple(parts), black, object_mask(parts), light.camera_to_xyz, camera_blur_px, mosaic)
+    mask = object_mask(parts)
+    if (points_m := known_points_m(folder)) is not None:
+        mask &= ~room_pixels(points_m)
+    return Calibration(tuple(parts), black, mask, light.camera_to_xyz, camera_blur_px, mosaic)
 
 
 def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.NDArray[np.int64] | None]:

@@ -65,6 +65,11 @@ def read_points_m(run: Path) -> FloatImage:
     return points
 
 
+def known_points_m(run: Path) -> FloatImage | None:
+    """As ``read_points_m``; None before the geometry is known."""
+    return read_points_m(run) if npz_path(run, StepKind.GEOMETRY).exists() else None
+
+
 def read_geometry_figures(run: Path) -> Any:
     """The content of ``geometry.json``; {} if it is missing."""
     path = json_path(run, StepKind.GEOMETRY)

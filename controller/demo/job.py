@@ -12,7 +12,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.kinds import StepKind, of_projectors
 from controller.artefacts.published import write_photograph
 from controller.artefacts.solved import read_solved
-from controller.demo.stage import prepare
+from controller.demo.stage import DEFAULT_ROOM, prepare
 from controller.report.demo import write_demo_report
 from controller.rig.rig import Rig
 from controller.run.progress import Reporter
@@ -46,6 +46,7 @@ def demo(
     object_file: Path | None,
     out: Path,
     seed: int,
+    room: str | None = None,
     prepare_only: bool,
     reporter: Reporter,
     cancel: threading.Event,
@@ -54,7 +55,7 @@ def demo(
 
     Raises what ``demo.stage.prepare``, the configuration, the devices and the steps raise; the lamps are safe by then.
     """
-    stage = prepare(out.resolve(), size=size, object_file=object_file, seed=seed)
+    stage = prepare(out.resolve(), size=size, object_file=object_file, seed=seed, room=room or DEFAULT_ROOM)
     checked = check_stage(stage)
     if prepare_only:
         return {"stage": str(stage)}

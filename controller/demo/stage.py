@@ -25,6 +25,8 @@ from hal.errors import DeviceError
 MARK = "demo.json"
 BUILDING = ".stage.part"
 PHOTOGRAPH = "photograph.png"
+DEFAULT_ROOM = "dark"
+"""Until the solver knows light that comes back from object and room."""
 POWER_DOWN_S = 10.0
 """Emulated lamps go off at once; a dead bench must not delay the end of the demo."""
 
@@ -36,19 +38,19 @@ APPEARANCES: tuple[dict[str, Any], ...] = (
 )
 
 
-def prepare(out: Path, *, size: str, object_file: Path | None, seed: int) -> Path:
+def prepare(out: Path, *, size: str, object_file: Path | None, seed: int, room: str = DEFAULT_ROOM) -> Path:
     """The stage folder ``out/stage`` for these options, created now or by an earlier demo.
 
     Raises UsageError("demo-folder-taken") if ``out`` holds a stage with other options, and what the bench refuses (a
-    mesh without faces, an unknown size) before anything is written.
+    mesh without faces, an unknown size or room) before anything is written.
     """
     stage = out / "stage"
-    wishes = {"size": size, "seed": seed, "object": _object_digest(object_file)}
+    wishes = {"size": size, "seed": seed, "object": _object_digest(object_file), "room": room}
     if (mark := stage / MARK).exists():
         if _read_mark(mark) != wishes:
             raise UsageError(
                 "demo-folder-taken",
-                what=f"{out} contains a demo with another size, object or seed.",
+                what=f"{out} contains a demo with another size, object, seed or room.",
                 remedy="Choose another folder with --out, or delete this one.",
             )
         return stage
@@ -67,7 +69,7 @@ def _build(out: Path, stage: Path, wishes: Mapping[str, Any], object_file: Path 
     building, there = out / BUILDING, out.exists()
     shutil.rmtree(building, ignore_errors=True)
     try:
-        tables = _write(building, size=wishes["size"], object_file=object_file, seed=wishes["seed"])
+        tables = _write(building, wishes, object_file=object_file)
         write_stage(building / "stage.toml", tables)
         write_atomically(building / MARK, json.dumps(wishes).encode())
         building.rename(stage)
@@ -80,11 +82,13 @@ def _build(out: Path, stage: Path, wishes: Mapping[str, Any], object_file: Path 
         raise
 
 
-def _write(stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
+def _write(stage: Path, wishes: Mapping[str, Any], *, object_file: Path | None) -> Mapping[str, Any]:
+    size = wishes["size"]
     try:
-        devices = bench_of(stage).prepare(stage, size=size, object_file=object_file, seed=seed)
+        bench = bench_of(stage, {"room": wishes["room"]})
+        devices = bench.prepare(stage, size=size, object_file=object_file, seed=wishes["seed"])
     except DeviceError as error:
-        kind = UsageError if error.code.startswith(("size-", "object-")) else WorkError
+        kind = UsageError if error.code.startswith(("size-", "object-", "setting-")) else WorkError
         raise kind(error.code, what=error.what, remedy=error.remedy) from error
     _write_photograph(stage / PHOTOGRAPH)
     public = generate_key(stage / KEY_FILE)
@@ -99,8 +103,8 @@ def _write(stage: Path, *, size: str, object_file: Path | None, seed: int) -> Ma
 
 def _read_mark(mark: Path) -> object:
     try:
-        return json.loads(mark.read_bytes())
-    except (OSError, ValueError):
+        return {"room": "dark", **json.loads(mark.read_bytes())}  # a demo from before rooms has none
+    except (OSError, ValueError, TypeError):
         return None
 
 

@@ -25,6 +25,7 @@ from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
 from plugins.emulated.optics.bumps import bumps_of, write_bumps
 from plugins.emulated.optics.objects import load_object
+from plugins.emulated.optics.rooms import DARK, arranged
 from plugins.emulated.optics.staging import (
     FAST_LAMP,
     FAST_PROFILE,
@@ -34,8 +35,8 @@ from plugins.emulated.optics.staging import (
     random_truth,
     size_named,
 )
-from plugins.emulated.optics.stands import SETTINGS, Stands, read_stands
-from plugins.emulated.optics.truth import FOLDER, CameraTruth, ObjectTruth, read_truth, write_truth
+from plugins.emulated.optics.stands import SETTINGS, Stands, read_room, read_stands
+from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World, object_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
@@ -51,10 +52,11 @@ PORTS: Final = range(20000, 32768)
 
 
 class EmulatedBench:
-    """``hal.interfaces.Bench``. ``stands``: where the projectors of a stage that it prepares shall stand."""
+    """``hal.interfaces.Bench``. ``stands``: where the projectors of a stage that it prepares shall stand; ``room``."""
 
-    def __init__(self, stands: Stands | None = None) -> None:
+    def __init__(self, stands: Stands | None = None, room: str = DARK) -> None:
         self._stands = stands or Stands()
+        self._room = room
 
     def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
         """Write ``bench.toml`` and ``bench/``; return the device tables of stage.toml (see ``hal.interfaces.Bench``).
@@ -69,7 +71,7 @@ class EmulatedBench:
             stage_object = load_object(object_file)
             kept = ObjectTruth("mesh", OBJECT_FILE, seed)
         shape = stage_object if stage_object is not None else object_of(stage, kept)
-        truth = random_truth(size, seed, shape, kept, _free_ports(), self._stands)
+        truth = arranged(random_truth(size, seed, shape, kept, _free_ports(), self._stands), self._room, shape)
         profile = quick_profile(LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s), stable_s=FAST_LAMP.stable_s)
         with _explained(stage):
             for folder in (FOLDER, "run"):
@@ -167,7 +169,10 @@ def _start(
         script = stage / truth.scenario
     scenario = read_scenario(script) if script is not None else None
     check_mains(truth.mains, truth.projectors, usb)
-    lamps = [EmulatedLamp(LampTiming(p.lamp.warm_up_s, p.lamp.cool_down_s)) for p in truth.projectors]
+    timings = [
+        LampTiming(one.warm_up_s, one.cool_down_s, one.drift, one.drift_s) for one in (p.lamp for p in truth.projectors)
+    ]
+    lamps = [EmulatedLamp(timing) for timing in timings]
 
     def progress(share: float) -> None:
         if stopped.is_set():
@@ -200,6 +205,10 @@ def _start(
         stack.enter_context(Mains(truth.mains, wires, bus.moves, out.mains))
         out.environment(bus.environment)
     return world
+
+
+def _timing(lamp: LampTruth) -> LampTiming:
+    return LampTiming(lamp.warm_up_s, lamp.cool_down_s, lamp.drift, lamp.drift_s)
 
 
 def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:
@@ -285,7 +294,7 @@ def _stop_on_signals(stopped: threading.Event) -> Iterator[None]:
 
 
 def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> EmulatedBench:
-    return EmulatedBench(read_stands(settings, context.stage))
+    return EmulatedBench(read_stands(settings, context.stage), read_room(settings))
 
 
 DRIVER: Final = Driver(

@@ -29,6 +29,16 @@ class Between:
     high: float
 
 
+@dataclasses.dataclass(frozen=True, slots=True, init=False)
+class OneOf:
+    """In ``Annotated[str, OneOf("a", "b")]``: the text must be one of these."""
+
+    allowed: tuple[str, ...]
+
+    def __init__(self, *allowed: str) -> None:
+        object.__setattr__(self, "allowed", allowed)
+
+
 _ANY_NUMBER: Final = Between(-math.inf, math.inf)
 
 
@@ -101,7 +111,7 @@ class _Reader:
         values = {key: self.value(content[key], hints[key], (*path, key)) for key in fields if key in content}
         return kind(**values)
 
-    def value(self, item: Any, hint: Any, path: Path_, limits: Between = _ANY_NUMBER) -> Any:
+    def value(self, item: Any, hint: Any, path: Path_, limits: Between | OneOf = _ANY_NUMBER) -> Any:
         if get_origin(hint) is Annotated:
             return self.value(item, get_args(hint)[0], path, get_args(hint)[1])
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
@@ -112,7 +122,7 @@ class _Reader:
             return self._sequence(item, get_args(hint), path, limits)
         return self._scalar(item, hint, path, limits)
 
-    def _sequence(self, item: Any, hints: tuple[Any, ...], path: Path_, limits: Between) -> tuple[Any, ...]:
+    def _sequence(self, item: Any, hints: tuple[Any, ...], path: Path_, limits: Between | OneOf) -> tuple[Any, ...]:
         open_ended = len(hints) == 2 and hints[1] is Ellipsis
         if not isinstance(item, list) or (not open_ended and len(item) != len(hints)) or not item:
             count = "one or more" if open_ended else str(len(hints))
@@ -122,11 +132,15 @@ class _Reader:
             self.value(one, hint, (*path, i), limits) for i, (one, hint) in enumerate(zip(item, each, strict=True))
         )
 
-    def _scalar(self, item: Any, hint: type, path: Path_, limits: Between) -> Any:
+    def _scalar(self, item: Any, hint: type, path: Path_, limits: Between | OneOf) -> Any:
         if hint is float and isinstance(item, int) and not isinstance(item, bool):
             item = float(item)
         if type(item) is not hint or (isinstance(item, float) and not math.isfinite(item)):
             raise self._error("wrong", path, f"must be {_ALLOWED[hint]}")
+        if isinstance(limits, OneOf):
+            if item not in limits.allowed:
+                raise self._error("wrong", path, f"is {item!r}, and must be one of {', '.join(limits.allowed)}")
+            return item
         if isinstance(item, int | float) and not limits.low <= item <= limits.high:
             raise self._error("wrong", path, f"is {item}, and must lie between {limits.low:g} and {limits.high:g}")
         return item

@@ -32,7 +32,17 @@ from scipy.spatial.transform import Rotation
 from hal.errors import DeviceError
 from hal.runtime.files import read_text
 from plugins.emulated.optics.rays import directions
-from plugins.emulated.optics.truth import FOLDER, BenchTruth, Lens, Matrix, Pose, ProjectorTruth, Three, Two
+from plugins.emulated.optics.truth import (
+    FOLDER,
+    BenchTruth,
+    Lens,
+    Matrix,
+    Pose,
+    ProjectorTruth,
+    SurfaceTruth,
+    Three,
+    Two,
+)
 from plugins.emulated.tables import Between, dump, load
 
 FILE: Final = f"{FOLDER}/bumps.toml"
@@ -187,7 +197,7 @@ def _shortest_turn(here: Floats, there: Floats) -> Floats:
 
 
 def _object_moved(truth: BenchTruth, bump: Bump) -> BenchTruth:
-    """An object that moves among still devices looks as devices that all move the other way round a still object."""
+    """An object that moves among still devices looks as devices and room that move the other way round it."""
     turn = Rotation.from_rotvec(np.deg2rad(bump.turn_deg)).as_matrix()
     move = 1e-3 * np.asarray(bump.move_mm)
 
@@ -195,9 +205,17 @@ def _object_moved(truth: BenchTruth, bump: Bump) -> BenchTruth:
         position = turn.T @ (np.asarray(pose.position_m) - move)
         return Pose(_three(position), _three(Rotation.from_matrix(pose.rotation @ turn).as_rotvec()))
 
-    camera = dataclasses.replace(truth.camera, pose=other_way(truth.camera.pose))
-    projectors = tuple(dataclasses.replace(one, pose=other_way(one.pose)) for one in truth.projectors)
-    return dataclasses.replace(truth, camera=camera, projectors=projectors)
+    def surface(one: SurfaceTruth) -> SurfaceTruth:
+        across, along = (_three(turn.T @ np.asarray(side)) for side in (one.across_m, one.along_m))
+        corner = _three(turn.T @ (np.asarray(one.corner_m) - move))
+        return dataclasses.replace(one, corner_m=corner, across_m=across, along_m=along)
+
+    return dataclasses.replace(
+        truth,
+        camera=dataclasses.replace(truth.camera, pose=other_way(truth.camera.pose)),
+        projectors=tuple(dataclasses.replace(one, pose=other_way(one.pose)) for one in truth.projectors),
+        surfaces=tuple(surface(one) for one in truth.surfaces),
+    )
 
 
 def _three(values: Floats) -> Three:

@@ -45,6 +45,17 @@ class StageObject:
     texture: npt.NDArray[np.float32]
     parts: npt.NDArray[np.int32]
 
+    @property
+    def object_faces(self) -> int:
+        """All of them (``furnished.Scene``)."""
+        return len(self.faces)
+
+    def fingerprint(self) -> list[npt.NDArray[Any]]:
+        """Arrays that differ where the object does."""
+        paint = np.frombuffer(self.paint.encode(), dtype=np.uint8)
+        names = ("vertices", "faces", "normals", "corner_values", "texture", "parts")
+        return [paint, *(getattr(self, name) for name in names)]
+
     def albedo(self, points: Floats, faces: npt.NDArray[np.int32], weights: npt.NDArray[np.float32]) -> Rgb:
         """Linear RGB (N, 3) float32 at points (N, 3) on ``faces`` (N,), with corner weights (N, 3) that sum to 1."""
         if self.paint == "vase-and-bust":

@@ -19,12 +19,13 @@ import numpy.typing as npt
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
+from plugins.emulated.optics.furnished import Scene, furnished
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.truth import BenchTruth, Lens, Pose, ProjectorTruth
 from plugins.emulated.tables import dump
 
 CACHE: Final = "rays.npz"
-VERSION: Final = 2
+VERSION: Final = 3
 ROWS_AT_ONCE: Final = 1 << 20
 SHADOW_BIAS_M: Final = 2e-4
 SIGMA_STEP_PX: Final = 1.0 / 64.0
@@ -62,7 +63,7 @@ def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None,
 
     ``progress`` is called with the share that is done, 0..1.
     """
-    key = _key(truth, stage_object)
+    key = key_of(truth, stage_object)
     path = None if cache is None else cache / CACHE
     found = None if path is None else _read(path, key)
     if found is None:
@@ -75,13 +76,14 @@ def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None,
 
 def cast(truth: BenchTruth, stage_object: StageObject, progress: Progress) -> Samples:
     """Cast every ray of the stage."""
+    things = furnished(stage_object, truth.surfaces)
     scene = rtcore_scene.EmbreeScene(robust=True)
-    TriangleMesh(scene, stage_object.vertices, stage_object.faces)
+    TriangleMesh(scene, things.vertices, things.faces)
     width, height = truth.camera.lens.size_px
     rows = max(1, ROWS_AT_ONCE // (width * truth.subsamples**2))
     blocks = []
     for first in range(0, height, rows):
-        blocks.append(_cast_rows(truth, stage_object, scene, first, min(first + rows, height)))
+        blocks.append(_cast_rows(truth, things, scene, first, min(first + rows, height)))
         progress(min(first + rows, height) / height)
     counts = np.concatenate([block["counts"] for block in blocks])
     pixels = np.flatnonzero(counts).astype(np.int32)
@@ -118,9 +120,7 @@ def directions(pose: Pose, lens: Lens, x: Floats, y: Floats) -> Floats:
     return np.asarray(local @ pose.rotation)
 
 
-def _cast_rows(
-    truth: BenchTruth, stage_object: StageObject, scene: Any, first: int, last: int
-) -> dict[str, npt.NDArray[Any]]:
+def _cast_rows(truth: BenchTruth, things: Scene, scene: Any, first: int, last: int) -> dict[str, npt.NDArray[Any]]:
     camera, s = truth.camera, truth.subsamples
     width = camera.lens.size_px[0]
     within = (np.arange(s) + 0.5) / s - 0.5
@@ -133,15 +133,16 @@ def _cast_rows(
     counts = hit.reshape(-1, s * s).sum(axis=1)
     ray, faces = ray[hit], found["primID"][hit]
     weights = np.stack((1.0 - found["u"][hit] - found["v"][hit], found["u"][hit], found["v"][hit]), axis=-1)
-    points = np.einsum("nk,nkc->nc", weights.astype(np.float64), stage_object.vertices[stage_object.faces[faces]])
-    normals = np.einsum("nk,nkc->nc", weights, stage_object.normals[faces]).astype(np.float64)
+    points = np.einsum("nk,nkc->nc", weights.astype(np.float64), things.vertices[things.faces[faces]])
+    normals = np.einsum("nk,nkc->nc", weights, things.normals[faces]).astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     normals *= _facing(found["Ng"][hit].astype(np.float64), normals, ray)[:, None]
     lit = [_lit(projector, scene, points, normals) for projector in truth.projectors]
-    gloss = [_highlight(truth, projector, points, normals, ray) / (s * s) for projector in truth.projectors]
+    on_object = faces < things.object_faces
+    gloss = [_highlight(truth, one, points, normals, ray, on_object) / (s * s) for one in truth.projectors]
     return {
         "counts": counts,
-        "albedo": (stage_object.albedo(points, faces, weights) / (s * s)).astype(np.float32),
+        "albedo": (things.albedo(points, faces, weights) / (s * s)).astype(np.float32),
         "at_px": np.stack([at for at, _, _ in lit]),
         "gain": np.stack([gain for _, gain, _ in lit]),
         "blur": np.stack([blur for _, _, blur in lit]),
@@ -177,7 +178,14 @@ def _lit(
     return at.astype(np.float32), np.where(reach, gain, 0.0).astype(np.float32), blur
 
 
-def _highlight(truth: BenchTruth, projector: ProjectorTruth, points: Floats, normals: Floats, ray: Floats) -> Floats:
+def _highlight(
+    truth: BenchTruth,
+    projector: ProjectorTruth,
+    points: Floats,
+    normals: Floats,
+    ray: Floats,
+    on_object: npt.NDArray[np.bool_],
+) -> Floats:
     """What a highlight adds to the albedo at points, in the direction of the camera; nothing (0,) without gloss."""
     strength, exponent = truth.object.gloss, truth.object.gloss_exponent
     if strength <= 0.0:
@@ -186,7 +194,7 @@ def _highlight(truth: BenchTruth, projector: ProjectorTruth, points: Floats, nor
     half = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9) - ray
     half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
     cosine = np.clip(np.sum(half * normals, axis=1), 0.0, 1.0)
-    return np.asarray(strength * (exponent + 8.0) / 8.0 * cosine**exponent)
+    return np.asarray(on_object * strength * (exponent + 8.0) / 8.0 * cosine**exponent)
 
 
 def _in_shadow(projector: ProjectorTruth, scene: Any, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:
@@ -199,16 +207,16 @@ def _in_shadow(projector: ProjectorTruth, scene: Any, points: Floats, distance: 
     return np.asarray(scene.run(origin, ray, output=1)["tfar"] < distance - SHADOW_BIAS_M)
 
 
-def _key(truth: BenchTruth, stage_object: StageObject) -> str:
+def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
+    """A text that differs where the rays of stages do."""
+    scene = furnished(stage_object, truth.surfaces)
     digest = hashlib.sha256(f"{VERSION}\n".encode())
     projectors = [part for p in truth.projectors for part in (p.pose, p.lens, p.focus, p.light)]
     for part in (truth.camera.pose, truth.camera.lens, *projectors):
         digest.update(dump(part).encode())
-    digest.update(
-        f"{truth.subsamples} {stage_object.paint} {truth.object.gloss} {truth.object.gloss_exponent}".encode()
-    )
-    for name in ("vertices", "faces", "normals", "corner_values", "texture", "parts"):
-        digest.update(np.ascontiguousarray(getattr(stage_object, name)).tobytes())
+    digest.update(f"{truth.subsamples} {truth.object.gloss} {truth.object.gloss_exponent}".encode())
+    for array in scene.fingerprint():
+        digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 

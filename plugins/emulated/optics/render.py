@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, TypeAlias
 
 import cv2
@@ -19,8 +19,10 @@ import numpy.typing as npt
 from scipy.special import erf
 
 from hal.runtime.jit import compiled
+from plugins.emulated.optics.flaws import veiled
+from plugins.emulated.optics.indirect.transfer import Transfer
 from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX, Samples
-from plugins.emulated.optics.truth import BenchTruth, LightTruth
+from plugins.emulated.optics.truth import BenchTruth, LightTruth, ProjectorTruth
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
@@ -41,11 +43,33 @@ def response(light: LightTruth) -> npt.NDArray[np.float64]:
     return np.asarray(power + np.asarray(light.s_curve) * power * (1.0 - power) * (2.0 * power - 1.0))
 
 
+def channels(light: LightTruth, frame: ByteImage) -> FloatImage:
+    """Linear light (rows, columns, 3) of a frame's red, green and blue before mixing."""
+    table = light.black_level + (1.0 - light.black_level) * response(light)
+    each = np.stack([table[:, c].astype(np.float32)[frame[..., c]] for c in range(3)], axis=-1)
+    if light.white_segment > 0.0:
+        each += np.float32(light.white_segment) * each.min(axis=-1, keepdims=True)
+    return each
+
+
 def emitted(light: LightTruth, frame: ByteImage) -> FloatImage:
     """Linear light (rows, columns, 3) in the camera's channels that a frame's pixels send out; white is about 1."""
-    table = light.black_level + (1.0 - light.black_level) * response(light)
-    channels = np.stack([table[:, c].astype(np.float32)[frame[..., c]] for c in range(3)], axis=-1)
-    return channels @ np.asarray(light.mixing, dtype=np.float32).T
+    return veiled(channels(light, frame) @ np.asarray(light.mixing, dtype=np.float32).T, light.glare)
+
+
+def sent_by_panels(
+    projector: ProjectorTruth, frame: ByteImage, at_px: FloatImage
+) -> Iterator[tuple[FloatImage, FloatImage]]:
+    """What is sent out, in parts that lie alike: each with where it lies at points whose pixels are ``at_px``."""
+    light, panels = projector.light, projector.panels
+    if panels.aligned:
+        yield emitted(light, frame), at_px
+        return
+    each, mixing = channels(light, frame), np.asarray(light.mixing, dtype=np.float32)
+    centre = np.asarray(projector.lens.centre_px)
+    for c in range(3):
+        at = (at_px - np.asarray(panels.shift_px[c]) - centre) / (1.0 + panels.magnified[c]) + centre
+        yield veiled(each[..., c : c + 1] * mixing[:, c], light.glare), at.astype(np.float32)
 
 
 @functools.lru_cache(maxsize=4)
@@ -72,8 +96,9 @@ def pixel_profiles(fill_factor: float) -> tuple[npt.NDArray[np.float32], npt.NDA
 class Renderer:
     """Keeps the last layers of each projector, since most frames are shown more than once and by one projector."""
 
-    def __init__(self, truth: BenchTruth, samples: Samples) -> None:
+    def __init__(self, truth: BenchTruth, samples: Samples, transfer: Transfer | None = None) -> None:
         self._truth = truth
+        self._transfer = transfer
         self._samples = samples
         self._profiles = [pixel_profiles(p.light.fill_factor) for p in truth.projectors]
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
@@ -95,6 +120,8 @@ class Renderer:
         for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
             if level > 0.0:
                 total += np.float32(level) * self._layer(index, frame, digests[index])
+        if self._transfer is not None:
+            total += self._albedo * self._returned(self._transfer, frames, levels)
         if self._truth.indirect > 0.0:
             # The mean light on what the camera sees stands for what object and room throw back.
             lit = (total - self._ambient).sum(axis=0, dtype=np.float64) / np.maximum(self._albedo.sum(axis=0), 1e-9)
@@ -103,22 +130,33 @@ class Renderer:
         self._last = (key, image)
         return image
 
+    def _returned(self, transfer: Transfer, frames: Sequence[ByteImage], levels: Sequence[float]) -> FloatImage:
+        """Irradiance (P, 3) that object and surfaces throw back."""
+        direct = np.zeros((transfer.back.shape[2], 3), dtype=np.float32)
+        for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
+            if level > 0.0:
+                sent = emitted(self._truth.projectors[index].light, frame)
+                direct += np.float32(level) * transfer.direct(index, sent)
+        return transfer.returned(direct)
+
     def _layer(self, index: int, frame: ByteImage, digest: bytes) -> FloatImage:
         """One projector's light (P, 3) at full lamp, summed over each camera pixel's samples."""
         kept = self._layers[index]
         if digest in kept:
             kept.move_to_end(digest)
             return kept[digest]
-        padded = cv2.copyMakeBorder(
-            emitted(self._truth.projectors[index].light, frame), *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0
-        )
         samples, (profiles, radii) = self._samples, self._profiles[index]
         gloss = samples.gloss[index]
         albedo = samples.albedo + gloss[:, None] if gloss.size else samples.albedo
-        layer = _lit_pixels(
-            np.ascontiguousarray(padded), samples.at_px[index], samples.gain[index], samples.blur[index],
-            albedo, samples.starts, profiles, radii,
-        )  # fmt: skip
+        layer: FloatImage | None = None
+        for sent, at_px in sent_by_panels(self._truth.projectors[index], frame, samples.at_px[index]):
+            padded = cv2.copyMakeBorder(sent, *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0)
+            part = _lit_pixels(
+                np.ascontiguousarray(padded), at_px, samples.gain[index], samples.blur[index],
+                albedo, samples.starts, profiles, radii,
+            )  # fmt: skip
+            layer = part if layer is None else layer + part
+        assert layer is not None
         kept[digest] = layer
         if len(kept) > LAYERS_KEPT:
             kept.popitem(last=False)
@@ -132,6 +170,7 @@ class Renderer:
         sigma = self._truth.camera.psf_sigma_px
         if sigma > 0.05:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)
+        image = veiled(image, self._truth.camera.glare)
         image *= self._vignette[..., None]
         image.flags.writeable = False
         return image

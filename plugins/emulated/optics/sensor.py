@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from plugins.emulated.optics.flaws import SensorFlaws
 from plugins.emulated.optics.truth import Sensor
 
 REFERENCE_APERTURE_F = 8.0
@@ -21,6 +22,7 @@ def mosaic(
     exposure_s: float,
     iso: int,
     aperture_f: float,
+    flaws: SensorFlaws | None = None,
 ) -> npt.NDArray[np.uint16]:
     """Raw values (rows, columns) of linear light (rows, columns, 3), RGGB; even numbers of rows and columns.
 
@@ -31,6 +33,9 @@ def mosaic(
     for row, column, channel in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):
         electrons[row::2, column::2] = light[row::2, column::2, channel]
     electrons *= np.float32(sensor.electrons_per_light_s * exposure_s * (REFERENCE_APERTURE_F / aperture_f) ** 2)
+    if flaws is not None:
+        electrons *= flaws.response
+        electrons += np.float32(exposure_s) * flaws.dark_e_per_s
     np.minimum(electrons, np.float32(sensor.full_well_e), out=electrons)
     noise = rng.standard_normal(electrons.shape, dtype=np.float32)
     electrons += noise * np.sqrt(electrons + np.float32(sensor.read_noise_e**2))

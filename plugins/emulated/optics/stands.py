@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 from hal.errors import PluginError
 from hal.escapes import toml_value
 from hal.runtime.files import read_text
+from plugins.emulated.optics.rooms import DARK, ROOMS
 from plugins.emulated.optics.truth import Lens, Pose, ProjectorTruth, Three, Two
 from plugins.emulated.tables import Between, load
 
@@ -94,6 +95,7 @@ SETTINGS: Final = {
     "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}; if omitted: {DEFAULT}",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
     " throw_ratio, centre_share, focus_m, lumens and pupil_m",
+    "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
 }
 
 
@@ -120,6 +122,14 @@ def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
     if len({stand.name for stand in stands}) != len(stands):
         raise _wrong("stands", [stand.name for stand in stands])
     return Stands(len(stands), stands)
+
+
+def read_room(settings: Mapping[str, Any]) -> str:
+    """From the settings of the bench. Raises PluginError("setting-wrong")."""
+    room = settings.get("room", DARK)
+    if room not in ROOMS:
+        raise _wrong("room", room)
+    return str(room)
 
 
 def _wrong(key: str, value: object) -> PluginError:

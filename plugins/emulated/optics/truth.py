@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
 from hal.runtime.files import read_text
-from plugins.emulated.tables import Between, dump, load
+from plugins.emulated.tables import Between, OneOf, dump, load
 
 Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]
@@ -52,7 +52,9 @@ class Lens:
 class Sensor:
     """A 12-bit Bayer sensor (RGGB). ``electrons_per_light_s``: photo-electrons of linear light 1 in 1 s at f/8;
 
-    ``electrons_per_step``: of one raw step at ISO 100; ``contrast``: how far the JPEG tone curve leaves sRGB.
+    ``electrons_per_step``: of one raw step at ISO 100; ``contrast``: how far the JPEG tone curve leaves sRGB;
+    ``response_spread``: of pixels, relative; ``hot_pixels``: their share; ``shutter_spread``: of exposure times round
+    what the camera says, relative, the same at each time for the same speed.
     """
 
     electrons_per_light_s: Annotated[float, Between(1.0, 1e9)]
@@ -62,11 +64,17 @@ class Sensor:
     black_level: Annotated[int, Between(0, 1023)]
     white_level: Annotated[int, Between(1024, 4095)]
     contrast: Annotated[float, Between(0.0, 0.9)] = 0.25
+    response_spread: Annotated[float, Between(0.0, 0.3)] = 0.0
+    hot_pixels: Annotated[float, Between(0.0, 0.1)] = 0.0
+    shutter_spread: Annotated[float, Between(0.0, 0.3)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class CameraTruth:
-    """The camera. ``vignetting``: share of light lost in the image's corners; ``raw``: False makes JPEG files only."""
+    """The camera. ``vignetting``: share of light lost in the image's corners; ``raw``: False makes JPEG files only.
+
+    ``glare``: share of the light that its lens spreads over the whole picture (``flaws.veiled``).
+    """
 
     pose: Pose
     lens: Lens
@@ -77,6 +85,7 @@ class CameraTruth:
     psf_sigma_px: Annotated[float, Between(0.0, 10.0)]
     vignetting: Annotated[float, Between(0.0, 0.95)]
     raw: bool = True
+    glare: Annotated[float, Between(0.0, 0.5)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +103,9 @@ class LightTruth:
 
     ``brightness``: linear light of white on a white plane facing the lens at ``reference_m``;
     ``mixing``: camera channel (row) by projector channel (column), lamp colour included;
-    ``gamma``, ``s_curve``: response per channel, see ``render.response``; ``black_level``: share of white at value 0
+    ``gamma``, ``s_curve``: response per channel, see ``render.response``; ``black_level``: share of white at value 0;
+    ``glare``: share of the light that the lens spreads over the whole picture; ``white_segment``: of a colour wheel,
+    which adds so many times the least of the three channels to each of them, so that colours do not add up to white
     """
 
     brightness: Annotated[float, Between(0.0, 1e3)]
@@ -105,15 +116,39 @@ class LightTruth:
     gamma: Annotated[Three, Between(0.5, 4.0)]
     s_curve: Annotated[Three, Between(0.0, 0.5)]
     mixing: Annotated[Matrix, Between(0.0, 2.0)]
+    glare: Annotated[float, Between(0.0, 0.5)] = 0.0
+    white_segment: Annotated[float, Between(0.0, 2.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class LampTruth:
-    """Seconds from strike to full light, from strike to stable light, and from off to cool."""
+    """Seconds from strike to full light, from strike to stable light, and from off to cool.
+
+    ``flicker``: spread of its light in short exposures, relative; ``drift``: so much more light it has at first, which
+    falls by e in each ``drift_s`` after the strike.
+    """
 
     warm_up_s: Annotated[float, Between(0.0, 3600.0)]
     stable_s: Annotated[float, Between(0.0, 3600.0)]
     cool_down_s: Annotated[float, Between(0.0, 3600.0)]
+    flicker: Annotated[float, Between(0.0, 0.3)] = 0.0
+    drift: Annotated[float, Between(-0.5, 0.5)] = 0.0
+    drift_s: Annotated[float, Between(1.0, 1e5)] = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class Panels:
+    """Where the pictures of red, green and blue lie: shifted by projector pixels (x, y), and larger by a share.
+
+    ``shift_px``: panels that are not aligned; ``magnified``: lateral chromatic aberration, from the lens' axis.
+    """
+
+    shift_px: Annotated[tuple[Two, Two, Two], Between(-3.0, 3.0)] = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    magnified: Annotated[Three, Between(-0.01, 0.01)] = (0.0, 0.0, 0.0)
+
+    @property
+    def aligned(self) -> bool:
+        return not (any(self.magnified) or any(any(shift) for shift in self.shift_px))
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +164,7 @@ class ProjectorTruth:
     focus: Focus
     light: LightTruth
     lamp: LampTruth
+    panels: Panels = Panels()
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +180,17 @@ class ObjectTruth:
     seed: Annotated[int, Between(0, 2**63 - 1)]
     gloss: Annotated[float, Between(0.0, 1.0)] = 0.0
     gloss_exponent: Annotated[float, Between(1.0, 1e4)] = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceTruth:
+    """A flat part of the room, table or wall: a parallelogram from ``corner_m``; ``albedo`` on both sides."""
+
+    name: str
+    corner_m: Annotated[Three, Between(-100.0, 100.0)]
+    across_m: Annotated[Three, Between(-100.0, 100.0)]
+    along_m: Annotated[Three, Between(-100.0, 100.0)]
+    albedo: Annotated[Three, Between(0.0, 0.95)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +216,9 @@ class BenchTruth:
     ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder;
     ``mains``: which emulated relays feed which projectors, whose mains are on otherwise;
     ``indirect``: the share of all projected light that object and room throw back evenly on the object.
+
+    ``surfaces``: of the room round the object; ``engine``: "direct" for light straight from the projectors alone,
+    "radiosity" for light between object and surfaces, too, which counts it on so many ``patches``.
     """
 
     size: str
@@ -184,6 +234,9 @@ class BenchTruth:
     scenario: str = ""
     mains: tuple[MainsTruth, ...] = ()
     indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
+    surfaces: tuple[SurfaceTruth, ...] = ()
+    engine: Annotated[str, OneOf("direct", "radiosity")] = "direct"
+    patches: Annotated[int, Between(10, 20000)] = 2000
 
 
 def write_truth(stage: Path, truth: BenchTruth) -> None:

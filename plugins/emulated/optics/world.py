@@ -16,6 +16,8 @@ from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
 from plugins.emulated.optics.bumps import FILE as BUMPS
 from plugins.emulated.optics.bumps import bumped, read_bumps
 from plugins.emulated.optics.dng import PictureFacts, dng, with_exif
+from plugins.emulated.optics.flaws import exposed_s, flickering, sensor_flaws
+from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.objects import StageObject, default_object
 from plugins.emulated.optics.rays import Progress, samples_of
 from plugins.emulated.optics.render import Renderer
@@ -44,11 +46,16 @@ class World:
     ) -> None:
         self._stage, self._set_up, self._truth = stage, truth, truth
         self._lamps = tuple(lamps)
-        self._samples = samples_of(truth, object_of(stage, truth.object), stage / FOLDER, progress)
-        self._renderer = Renderer(truth, self._samples)
+        thing = object_of(stage, truth.object)
+        self._samples = samples_of(truth, thing, stage / FOLDER, progress)
+        self._indirect = Indirect(thing, stage / FOLDER)
+        transfer = self._indirect.transfer(truth, self._samples.pixels, progress, keep=True)
+        self._renderer = Renderer(truth, self._samples, transfer)
         self._bumps_seen: tuple[int, int] | None = None
         self._visible = VisibleFrames(stage / truth.frames, truth.latency_s)
         self._rng = np.random.default_rng([truth.seed, 2])
+        self._flicker = np.random.default_rng([truth.seed, 5])
+        self._flaws = sensor_flaws(truth.camera, truth.seed)
 
     def __enter__(self) -> World:
         self._visible.__enter__()
@@ -83,7 +90,8 @@ class World:
         samples = self._samples
         if bumps.bump:
             samples = samples_of(truth, object_of(self._stage, truth.object), None, lambda share: None)
-        self._truth, self._renderer = truth, Renderer(truth, samples)
+        transfer = self._indirect.transfer(truth, samples.pixels, lambda share: None, keep=not bumps.bump)
+        self._truth, self._renderer = truth, Renderer(truth, samples, transfer)
         return len(bumps.bump)
 
     def expose(self, settings: ShotSettings) -> ShotFiles:
@@ -94,6 +102,8 @@ class World:
         time.sleep(settings.exposure_s * self._truth.time_scale)
         end_s = time.monotonic()
         levels = [0.5 * (first + lamp.light_level()) for first, lamp in zip(before, self._lamps, strict=True)]
+        for index, projector in enumerate(self._truth.projectors):
+            levels[index] *= flickering(projector.lamp, settings.exposure_s, self._flicker)
         light = self._mixed(self._visible.during(start_s, end_s), levels)
         return self._files(light, settings, taken)
 
@@ -131,9 +141,10 @@ class World:
             light,
             camera.sensor,
             self._rng,
-            exposure_s=settings.exposure_s,
+            exposure_s=exposed_s(camera, self._truth.seed, settings.exposure_s),
             iso=settings.iso,
             aperture_f=settings.aperture_f,
+            flaws=self._flaws,
         )
         facts = PictureFacts(
             exposure_s=settings.exposure_s,

@@ -7,6 +7,7 @@ any driver's opinion of it.
 from __future__ import annotations
 
 import enum
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -26,10 +27,15 @@ class LampPhase(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class LampTiming:
-    """Seconds from strike to full light, and from off to standby."""
+    """Seconds from strike to full light, and from off to standby.
+
+    ``drift``: share of light more at first, which falls by e in each ``drift_s``.
+    """
 
     warm_up_s: float
     cool_down_s: float
+    drift: float = 0.0
+    drift_s: float = 300.0
 
 
 class EmulatedLamp:
@@ -93,14 +99,18 @@ class EmulatedLamp:
             return LampPhase.STANDBY
 
     def light_level(self) -> float:
-        """Share of the projector's full light, 0..1: 0 when dark or behind the shutter, rising while it warms."""
+        """Share of the projector's full light: 0 when dark or behind the shutter, rising while it warms; then drifting
+        towards 1.
+        """
         with self._lock:
             if self._lit_since is None or self._shutter_closed:
                 return 0.0
+            burning_s = self._clock() - self._lit_since
+            drift = 1.0 + self._timing.drift * math.exp(-burning_s / self._timing.drift_s)
             if self._timing.warm_up_s <= 0:
-                return 1.0
-            warmth = min(1.0, (self._clock() - self._lit_since) / self._timing.warm_up_s)
-            return FIRST_LIGHT + (1.0 - FIRST_LIGHT) * warmth
+                return drift
+            warmth = min(1.0, burning_s / self._timing.warm_up_s)
+            return drift * (FIRST_LIGHT + (1.0 - FIRST_LIGHT) * warmth)
 
     @property
     def hours(self) -> int:

@@ -13,7 +13,7 @@ import pytest
 from controller.config import load_stage
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.demo import stage as module
-from controller.demo.stage import BUILDING, MARK, prepare
+from controller.demo.stage import BUILDING, DEFAULT_ROOM, MARK, prepare
 from hal.errors import DeviceError
 
 TABLES = {
@@ -28,6 +28,7 @@ class ModelBench:
 
     def __init__(self) -> None:
         self.prepared: list[Path] = []
+        self.rooms: list[str] = []
         self.error: BaseException | None = None
 
     def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
@@ -45,12 +46,19 @@ class ModelBench:
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> ModelBench:
     bench = ModelBench()
-    monkeypatch.setattr(module, "bench_of", lambda stage: bench)
+
+    def bench_of(stage: Path, settings: Mapping[str, Any]) -> ModelBench:
+        bench.rooms.append(settings["room"])
+        return bench
+
+    monkeypatch.setattr(module, "bench_of", bench_of)
     return bench
 
 
-def prepared(out: Path, *, size: str = "small", seed: int = 1, object_file: Path | None = None) -> Path:
-    return prepare(out, size=size, seed=seed, object_file=object_file)
+def prepared(
+    out: Path, *, size: str = "small", seed: int = 1, object_file: Path | None = None, room: str = DEFAULT_ROOM
+) -> Path:
+    return prepare(out, size=size, seed=seed, object_file=object_file, room=room)
 
 
 def test_it_writes_a_stage_that_reads_and_signs_with_a_private_key(bench: ModelBench, tmp_path: Path) -> None:
@@ -74,12 +82,13 @@ def test_the_same_wishes_find_it_again_and_others_are_refused(bench: ModelBench,
     assert prepared(tmp_path / "out", object_file=mesh) == stage
     assert (stage / "keys" / "stage.key").read_bytes() == key
     assert len(bench.prepared) == 1
-    for wishes in ({"seed": 2}, {"size": "medium"}, {"object_file": None}):
+    assert bench.rooms == [DEFAULT_ROOM]
+    for wishes in ({"seed": 2}, {"size": "medium"}, {"object_file": None}, {"room": "hard"}):
         with pytest.raises(UsageError) as refused:
             prepared(tmp_path / "out", **{"object_file": mesh, **wishes})  # type: ignore[arg-type]
         assert refused.value.code == "demo-folder-taken"
     mesh.write_text("v 1 1 1")
-    with pytest.raises(UsageError, match="another size, object or seed"):
+    with pytest.raises(UsageError, match="another size, object, seed or room"):
         prepared(tmp_path / "out", object_file=mesh)
 
 
@@ -135,3 +144,20 @@ def test_an_object_that_can_not_be_read_is_told(bench: ModelBench, tmp_path: Pat
         prepared(tmp_path / "out", object_file=tmp_path)
     assert refused.value.code == "object-missing"
     assert bench.prepared == []
+
+
+def test_a_demo_from_before_rooms_goes_on_as_one_in_the_dark(bench: ModelBench, tmp_path: Path) -> None:
+    stage = prepared(tmp_path / "out", room="dark")
+    mark = json.loads((stage / "demo.json").read_bytes())
+    del mark["room"]
+    (stage / "demo.json").write_text(json.dumps(mark))
+    assert prepared(tmp_path / "out", room="dark") == stage
+    with pytest.raises(UsageError):
+        prepared(tmp_path / "out", room="room")
+
+
+def test_an_unknown_room_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="dark, room, hard") as refused:
+        prepared(tmp_path / "out", room="cellar")
+    assert refused.value.code == "setting-wrong"
+    assert not (tmp_path / "out").exists()

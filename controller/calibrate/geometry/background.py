@@ -1,0 +1,107 @@
+"""Which camera pixels see the room instead of the object: table and walls are flat, and have everything before them."""
+
+from __future__ import annotations
+
+from typing import Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import distance_transform_edt, median_filter
+
+from controller.core.arrays import FloatImage, Mask
+
+Floats: TypeAlias = npt.NDArray[np.float64]
+
+MOST_PLANES: Final = 6
+TRIALS: Final = 300
+APART: Final = 0.12
+"""A plane is begun from three pixels this near to each other, in picture heights, then fitted to all that it holds."""
+REFITS: Final = 2
+POINTS: Final = 2000
+"""So many points stand for all when planes are looked for."""
+THICK: Final = 0.003
+"""Farthest that a plane's points lie from it, in distances from the camera to the middle of what it sees."""
+BEHIND: Final = 0.01
+"""Share of the points that may lie behind a plane, as points that are wrong do."""
+LEAST: Final = 0.03
+"""Share of the points that a plane holds."""
+LEAST_OBJECT: Final = 0.1
+"""Share of the points that are not the room's; with fewer, the flat surfaces are themselves the object."""
+BORDER: Final = 0.02
+"""Width of the picture's border, as a share of its height."""
+AT_BORDER: Final = 0.03
+"""Share of the picture's border that a plane of the room takes: an object stands inside the picture."""
+
+
+def room_pixels(points_m: FloatImage) -> Mask:
+    """Pixels (rows, columns) that see flat surfaces of the room; ``points_m``: as ``Geometry``, NaN where unknown.
+
+    A pixel without a point counts as its nearest neighbour with one. None is the room's where no plane reaches the
+    picture's border, or where hardly anything else is seen.
+    """
+    known = np.asarray(np.isfinite(points_m).all(axis=2), dtype=np.bool_)
+    room = np.zeros(known.shape, dtype=np.bool_)
+    border, rng = _border(known.shape), np.random.default_rng(0)
+    if np.mean(known[border]) < AT_BORDER:
+        return room
+    everything = points_m[known][rng.integers(0, np.count_nonzero(known), POINTS)].astype(np.float64)
+    thick = THICK * float(np.median(np.linalg.norm(everything, axis=1)))
+    for _ in range(MOST_PLANES):
+        left = known & ~room
+        plane = _plane(points_m, left, everything, thick, rng)
+        if plane is None:
+            break
+        near = left & (np.abs(points_m @ plane[:3] + plane[3]) < thick)
+        if np.mean(near[border]) < AT_BORDER:
+            break
+        room |= near
+    if not room.any() or np.count_nonzero(known & ~room) < LEAST_OBJECT * np.count_nonzero(known):
+        return np.zeros_like(room)
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    whole: Mask = median_filter(room[tuple(nearest)], size=5)
+    return whole
+
+
+def _plane(
+    points_m: FloatImage, left: Mask, everything: Floats, thick: float, rng: np.random.Generator
+) -> Floats | None:
+    """The plane (normal towards the camera, offset) that holds most pixels ``left``, with nothing behind it."""
+    row, column = np.nonzero(left)
+    if not len(row):
+        return None
+    some = points_m[left][rng.integers(0, len(row), POINTS)].astype(np.float64)
+    best, most = None, LEAST * float(np.count_nonzero(np.isfinite(points_m[..., 0]))) / len(row) * POINTS
+    apart = round(APART * left.shape[0])
+    for start in rng.integers(0, len(row), TRIALS):
+        beside = rng.integers(-apart, apart + 1, (2, 3))
+        rows, columns = row[start] + beside[0], column[start] + beside[1]
+        if rows.min() < 0 or columns.min() < 0 or rows.max() >= left.shape[0] or columns.max() >= left.shape[1]:
+            continue
+        three = points_m[rows, columns].astype(np.float64)
+        if not left[rows, columns].all():
+            continue
+        plane = _through(three)
+        for _ in range(REFITS):
+            inliers = some[np.abs(some @ plane[:3] + plane[3]) < thick]
+            if len(inliers) < 0.5 * most:
+                break
+            plane = _through(inliers)
+        count = float(np.count_nonzero(np.abs(some @ plane[:3] + plane[3]) < thick))
+        if count > most and np.mean(everything @ plane[:3] + plane[3] < -thick) < BEHIND:
+            best, most = plane, count
+    return best
+
+
+def _through(points: Floats) -> Floats:
+    """The plane nearest to points; the camera, at the origin, is before it."""
+    middle = points.mean(axis=0)
+    normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
+    normal *= -np.sign(normal @ middle) or 1.0
+    return np.append(normal, -normal @ middle)
+
+
+def _border(shape: tuple[int, ...]) -> Mask:
+    wide = max(1, round(BORDER * shape[0]))
+    border = np.ones(shape, dtype=np.bool_)
+    border[wide:-wide, wide:-wide] = False
+    return border

@@ -1,0 +1,77 @@
+"""What lenses, sensors and lamps do beyond the ideal.
+
+What differs from pixel to pixel and from shot to shot is drawn from the stage's seed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from plugins.emulated.optics.truth import CameraTruth, LampTruth
+
+SPREAD: Final = 0.15
+"""Standard deviation of the veil, in picture widths."""
+COARSE_PX: Final = 96
+"""The veil is smooth, so it is worked out in a picture that is so wide."""
+HOT_E_PER_S: Final = 2e4
+"""Mean dark current of hot pixels; each has its own, by an exponential law."""
+FLICKER_S: Final = 0.1
+"""Flicker averages out over exposures that are longer."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFlaws:
+    """``response`` (rows, columns): factor of each pixel; ``dark_e_per_s``: its dark current."""
+
+    response: npt.NDArray[np.float32]
+    dark_e_per_s: npt.NDArray[np.float32]
+
+
+def sensor_flaws(camera: CameraTruth, seed: int) -> SensorFlaws | None:
+    """Of this very sensor; None where it has none."""
+    sensor = camera.sensor
+    if not (sensor.response_spread or sensor.hot_pixels):
+        return None
+    rng, shape = np.random.default_rng([seed, 6]), camera.lens.size_px[::-1]
+    response = 1.0 + sensor.response_spread * rng.standard_normal(shape)
+    hot = rng.random(shape) < sensor.hot_pixels
+    return SensorFlaws(
+        response=np.maximum(response, 0.0).astype(np.float32),
+        dark_e_per_s=(hot * rng.exponential(HOT_E_PER_S, shape)).astype(np.float32),
+    )
+
+
+def exposed_s(camera: CameraTruth, seed: int, exposure_s: float) -> float:
+    """How long the shutter is open when the camera says ``exposure_s``: each speed has an error of its own."""
+    spread = camera.sensor.shutter_spread
+    if not spread:
+        return exposure_s
+    speed = np.random.default_rng([seed, 7, round(1e6 * exposure_s)])
+    return exposure_s * float(np.exp(spread * speed.standard_normal()))
+
+
+def flickering(lamp: LampTruth, exposure_s: float, rng: np.random.Generator) -> float:
+    """Factor on a lamp's mean light during one exposure."""
+    if not lamp.flicker:
+        return 1.0
+    return max(0.0, 1.0 + lamp.flicker / math.sqrt(1.0 + exposure_s / FLICKER_S) * float(rng.standard_normal()))
+
+
+def veiled(image: npt.NDArray[np.float32], share: float) -> npt.NDArray[np.float32]:
+    """A share of the light goes astray in a lens and lies as a veil over the whole picture.
+
+    (1 - share) image + share image * Gaussian, for light (rows, columns, 3); what leaves the picture is lost.
+    """
+    if share <= 0.0:
+        return image
+    rows, columns = image.shape[:2]
+    coarse = cv2.resize(image, (COARSE_PX, max(1, round(COARSE_PX * rows / columns))), interpolation=cv2.INTER_AREA)
+    veil = cv2.GaussianBlur(coarse, (0, 0), SPREAD * COARSE_PX, borderType=cv2.BORDER_CONSTANT)
+    whole = cv2.resize(veil, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(np.float32(1.0 - share) * image + np.float32(share) * whole, dtype=np.float32)

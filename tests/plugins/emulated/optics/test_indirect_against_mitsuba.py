@@ -1,0 +1,109 @@
+"""Light between surfaces against Mitsuba's path tracer, over lit pixels, with its noise taken off."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from plugins.emulated.optics.indirect.scattering import scattering_of
+from plugins.emulated.optics.indirect.transfer import transfer_of
+from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.rays import cast
+from plugins.emulated.optics.render import Renderer
+from plugins.emulated.optics.truth import BenchTruth
+from tests.plugins.emulated.optics.mitsuba_stage import (
+    frame_of,
+    ideal_stage,
+    inside,
+    mi,
+    mitsuba_mesh,
+    object_of_mesh,
+    scene_of,
+)
+
+Image = npt.NDArray[np.float64]
+SIZE_PX = (80, 60)
+BOUNCES = 12
+SAMPLES = 256
+
+
+def corner() -> StageObject:
+    """Two walls and a floor in three colours."""
+    left, back, right = np.array([(-0.19, 0.0, -0.05), (0.0, 0.0, 0.12), (0.19, 0.0, -0.05)])
+    up, low = np.array([0.0, -0.14, 0.0]), np.array([0.0, 0.12, 0.0])
+    walls = [(left + up, back + up, back + low, left + low), (back + up, right + up, right + low, back + low)]
+    corners = np.concatenate([*walls, (left + low, back + low, right + low, left + low + right - back)])
+    faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * n for n in range(3)])
+    colours = np.repeat([(0.8, 0.3, 0.25), (0.75, 0.75, 0.7), (0.3, 0.6, 0.75)], 4, axis=0)
+    found = object_of_mesh(trimesh.Trimesh(corners, faces, process=False), colours)
+    flat = np.cross(corners[faces[:, 1]] - corners[faces[:, 0]], corners[faces[:, 2]] - corners[faces[:, 0]])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    return dataclasses.replace(found, normals=np.repeat(flat[:, None], 3, axis=1).astype(np.float32))
+
+
+def bowl() -> StageObject:
+    """Half a ball, open towards the devices."""
+    ball = trimesh.creation.icosphere(4, 0.16)
+    half = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] > 0.0], process=False)
+    half.remove_unreferenced_vertices()
+    return object_of_mesh(half, np.full((len(half.vertices), 3), (0.8, 0.6, 0.4)))
+
+
+def two_objects() -> StageObject:
+    """A ball beside a box, a finger's width apart."""
+    ball, box = trimesh.creation.icosphere(4, 0.085), trimesh.creation.box((0.15, 0.2, 0.15))
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec((0.0, 0.5, 0.0)).as_matrix()
+    box.apply_transform(turn)
+    box.unmerge_vertices()
+    ball.apply_translation((-0.09, 0.02, 0.0))
+    box.apply_translation((0.11, 0.0, 0.03))
+    colours = np.repeat([(0.8, 0.7, 0.3), (0.3, 0.5, 0.8)], [len(ball.vertices), len(box.vertices)], axis=0)
+    vertices = np.concatenate([ball.vertices, box.vertices])
+    faces = np.concatenate([ball.faces, box.faces + len(ball.vertices)])
+    return object_of_mesh(trimesh.Trimesh(vertices, faces, process=False), colours)
+
+
+def stage_of(stage_object: StageObject) -> BenchTruth:
+    truth = ideal_stage(stage_object)
+    lens = dataclasses.replace(truth.camera.lens, size_px=SIZE_PX, focal_px=170.0, centre_px=(39.5, 29.5))
+    camera = dataclasses.replace(truth.camera, lens=lens)
+    return dataclasses.replace(truth, camera=camera, subsamples=8, engine="radiosity")
+
+
+def path_traced(truth: BenchTruth, shape: dict[str, Any], frame: npt.NDArray[np.uint8], seed: int) -> Image:
+    scene = scene_of(truth, shape, frame)
+    scene["integrator"] = {"type": "path", "max_depth": BOUNCES, "rr_depth": 100}
+    scene["sensor"]["film"] |= {"width": SIZE_PX[0], "height": SIZE_PX[1]}
+    scene["sensor"]["sampler"] = {"type": "multijitter", "sample_count": SAMPLES, "seed": seed}
+    return np.array(mi.render(mi.load_dict(scene)), dtype=np.float64)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "least_share"), [(corner, 0.15), (bowl, 0.25), (two_objects, 0.01)])
+def test_light_that_bounces_is_mitsubas(make: Callable[[], StageObject], least_share: float, tmp_path: Path) -> None:
+    stage_object = make()
+    truth, frame = stage_of(stage_object), frame_of(4)
+    samples = cast(truth, stage_object, lambda share: None)
+    transfer = transfer_of(truth, scattering_of(stage_object, truth.patches, truth.seed), samples.pixels)
+    direct = Renderer(truth, samples).light([frame], [1.0])
+    found = Renderer(truth, samples, transfer).light([frame], [1.0]).astype(np.float64)
+    shape = mitsuba_mesh(stage_object, tmp_path)
+    halves = [path_traced(truth, shape, frame, seed) for seed in (1, 2)]
+    wanted = (halves[0] + halves[1]) / 2.0
+    lit = inside(direct, wanted.astype(np.float32), around=3)
+    noise = float(np.mean((halves[0] - halves[1])[lit] ** 2)) / 4.0
+    level = float(np.mean(wanted[lit] ** 2))
+    assert noise <= 0.015**2 * level
+    assert np.mean((found - direct)[lit]) >= least_share * np.mean(wanted[lit])
+    assert np.mean((found - wanted)[lit] ** 2) - noise <= 0.02**2 * level
+    # Summed over the picture, noise and pixels at edges hardly count.
+    assert found[lit].mean() == pytest.approx(wanted[lit].mean(), rel=0.005)
