@@ -14,6 +14,10 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 
 import generate  # noqa: E402 - it lies beside this file
+import pyglet  # noqa: E402
+
+# pyglet opens a window when its OpenGL module is imported, and there may be no display.
+pyglet.options["shadow_window"] = False
 
 project = "Velatura"
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
