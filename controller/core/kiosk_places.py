@@ -15,7 +15,7 @@ PLAYER_OPTIONS: Final = STATE / "player.options"
 
 
 def is_installed(stage: Path) -> bool:
-    """Whether ``stage`` is the one that this computer's services run, and this user (theirs, or root) may reach them."""
+    """Whether ``stage`` is the one that this computer's services run, and this user is theirs, or root."""
     if stage.resolve() != STAGE:
         return False
     try:

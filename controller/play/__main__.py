@@ -74,7 +74,8 @@ def _run(options: argparse.Namespace) -> int:
             what=f"A rate of {options.rate:g} pictures a second is not possible.",
             remedy=f"Give a rate from 1 to {MAX_RATE_HZ:g}.",
         )
-    trust = Trust(_trusted(options.trusted), options.allow_unsigned, tuple(map(load_public_key, options.revoked)))
+    keys, revoked = (tuple(map(load_public_key, paths)) for paths in (options.trusted, options.revoked))
+    trust = Trust(keys, options.allow_unsigned, revoked)
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(Server(options.socket))
         inbox = FrameFile(options.socket.with_name(options.socket.name + ".inbox"), sizes)
@@ -97,17 +98,6 @@ def _run(options: argparse.Namespace) -> int:
         if start is not None and not broken.is_set() and not player.skipped:
             start.ended()
     return 1 if broken.is_set() else 0
-
-
-def _trusted(files: Sequence[Path]) -> tuple[bytes, ...]:
-    """The keys that are there. What only a missing one has signed is refused, and anything else plays."""
-    there = []
-    for file in files:
-        if file.exists():
-            there.append(load_public_key(file))
-        else:
-            tell(f"The key file {file} does not exist. Bundles that are signed with this key do not play.")
-    return tuple(there)
 
 
 def _counted_start(bundle: Path | None) -> CountedStart | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from controller.core.storage import runtime_folder
@@ -65,6 +66,19 @@ def test_every_line_has_its_place_and_fits() -> None:
         rows = np.flatnonzero(image.any(axis=(1, 2)))
         assert np.count_nonzero(np.diff(rows) > 1) == len(LINES) - 1, "one gap between two lines"
         assert not image[:, [0, -1]].any()
+
+
+def test_a_telephone_reads_the_address_that_others_reach() -> None:
+    lines = ("velatura", "https://192.0.2.17:8377/", "technician", "abcd-efgh-2345-wxyz")
+    sizes = (OutputSize("P1", 1400, 1050), OutputSize("P2", 800, 600))
+    for turn in range(len(sizes)):
+        image = notice(sizes, lines, turn).pixels[turn]
+        read, _, _ = cv2.QRCodeDetector().detectAndDecode(image)
+        assert read == lines[1]
+        text = image[image.shape[0] // 2 :]
+        assert np.count_nonzero(np.diff(np.flatnonzero(text.any(axis=(1, 2)))) > 1) == len(lines) - 1
+    seen = notice(sizes, ("velatura", "http://127.0.0.1:8377/"), 0).pixels[0]
+    assert not cv2.QRCodeDetector().detect(seen)[0]
 
 
 def test_a_one_time_password_is_taken_as_the_projectors_show_it(tmp_path: Path) -> None:
