@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Final
 
+USER: Final = "velatura"
 STATE: Final = Path("/var/lib/velatura")
 STAGE: Final = STATE / "stage"
 RUNTIME: Final = Path("/run/velatura")
