@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import time
@@ -38,13 +39,16 @@ def install(
     """Make this computer a kiosk, and start it. ``outputs_again``: look which projectors are plugged in, also where
     that was done before.
 
-    Raises UsageError("kiosk-system-unknown", "kiosk-has-desktop", "kiosk-place-hidden"), WorkError("kiosk-step-failed").
+    Raises UsageError("kiosk-system-unknown", "kiosk-has-desktop" or "kiosk-place-hidden"), and
+    WorkError("kiosk-step-failed").
     """
     check(system, prefix)
     _packages(system)
     _user(system)
     changed = [system.write(path, text) for path, text in files.shipped(prefix).items()]
     _folders(system)
+    if not os.path.lexists(system.at(files.COMMAND)):
+        system.run("ln", "--symbolic", str(prefix / "bin" / "velatura"), str(files.COMMAND))
     _panel(system)
     if any(changed):
         system.run("systemctl", "daemon-reload")
@@ -156,6 +160,9 @@ def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None
     looks like one that is gone.
     """
     if not again and system.read(files.X_OUTPUTS) is not None:
+        return
+    if system.dry:
+        say("Then the X server is asked what is plugged in, and its settings and the player's outputs are written.")
         return
     found = placed(connected(system.look("xrandr", "--verbose", more=_X) or ""))
     if not found:
