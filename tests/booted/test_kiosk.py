@@ -125,8 +125,7 @@ def playing(bare: Kiosk, prepared: Path) -> Kiosk:
     machine.call("mv", STAGE / "new.toml", STAGE / described.name)
     machine.wait_for(lambda: machine.called("velatura", "status", STAGE, user="velatura").returncode == 0)
     machine.call("velatura", "bundle", "install", STAGE / "noise.vel", STAGE, user="velatura")
-    machine.wait_for(lambda: "1" in machine.velatura("status")["appearances"])
-    machine.velatura("show", "1")
+    machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "1", user="velatura").returncode == 0)
     machine.wait_for(lambda: bare.shows(noise(OUTPUTS, 1)))
     return bare
 
@@ -190,8 +189,9 @@ def test_the_picture_stays_when_the_controller_restarts(playing: Kiosk) -> None:
 
 def test_a_backup_is_restored_on_this_debians_python(playing: Kiosk) -> None:
     machine = playing.machine
-    path = machine.velatura("backup")["path"]
-    machine.call("velatura", "restore", STAGE, path, user="velatura")
+    machine.velatura("backup")
+    (backup,) = machine.at(STAGE / "kiosk" / "archives").glob("backup-*")
+    machine.call("velatura", "restore", STAGE, STAGE / "kiosk" / "archives" / backup.name, user="velatura")
     machine.wait_for(lambda: machine.called("velatura", "status", STAGE).returncode == 0, within_s=AGAIN_S)
     machine.wait_for(lambda: playing.shows(noise(OUTPUTS, 1)), within_s=PICTURE_S)
 

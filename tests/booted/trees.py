@@ -37,7 +37,8 @@ def tree(suite: str) -> Path:
     folder = cache_folder() / "tests" / f"{suite}-{digest.hexdigest()[:12]}"
     if not folder.exists():
         part = folder.with_name(f".{folder.name}.part")
-        shutil.rmtree(part, ignore_errors=True)
+        for cut_off in folder.parent.glob(f".{suite}-*.part"):
+            shutil.rmtree(cut_off)
         part.mkdir(parents=True)
         _bootstrap(suite, part)
         _environment(suite, part)
