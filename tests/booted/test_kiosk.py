@@ -29,6 +29,8 @@ PICTURE_S = 60.0
 """From the boot of a bare Debian with the package to a picture."""
 AGAIN_S = 30.0
 """After one service was killed; on a loaded machine."""
+LONG_S = 240.0
+"""A calibration and an appearance; on a loaded machine."""
 pytestmark = pytest.mark.slow
 
 
@@ -210,6 +212,25 @@ def test_after_a_power_cut_the_picture_is_back_by_itself(playing: Kiosk) -> None
     assert took_s < PICTURE_S
     playing.machine.wait_for(lambda: playing.machine.velatura("status")["state"] == "playing")
     assert {playing.machine.restarts(name) for name in SERVICES} == {0}
+
+
+def test_a_calibration_uses_the_same_player_and_what_it_made_plays(playing: Kiosk) -> None:
+    machine = playing.machine
+    described = machine.at(STAGE / "stage.toml")
+    text = re.sub(r'(driver = "player"\n)', r'\1frames = "run/outputs.frame"\n', described.read_text())
+    first, _, _ = text.partition("[[appearances]]")
+    (machine.at(STAGE) / "new.toml").write_text(f'{first}[[appearances]]\nname = "board"\nkind = "checkerboard"\n')
+    machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
+    machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
+    machine.wait_for(lambda: machine.called("velatura", "status", STAGE).returncode == 0)
+    player = machine.call("systemctl", "show", "--property=MainPID", "velatura-player")
+    machine.call("velatura", "recalibrate", STAGE, user="velatura")
+    machine.wait_for(
+        lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0, within_s=LONG_S
+    )
+    machine.wait_for(lambda: machine.velatura("status")["playing"] == "board", within_s=LONG_S)
+    assert machine.call("systemctl", "show", "--property=MainPID", "velatura-player") == player
+    assert machine.restarts("velatura-controller") == 0
 
 
 def test_uninstalling_leaves_the_stage_and_nothing_that_starts(playing: Kiosk) -> None:

@@ -60,7 +60,7 @@ class AttachedPlayer:
         raise WorkError(
             "player-not-started",
             what="The player of this computer does not answer.",
-            remedy="`journalctl -u velatura-player` tells why; systemd goes on starting it.",
+            remedy="Read the reason with `journalctl -u velatura-player`. systemd starts it again until it runs.",
         )
 
     def _fits(self, answer: Mapping[str, Any]) -> bool:
