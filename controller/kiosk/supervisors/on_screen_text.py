@@ -53,7 +53,7 @@ def _draw_code(image: npt.NDArray[np.uint8], address: str) -> int:
     code = np.kron(modules, np.ones((size, size), np.uint8))
     left, above = (image.shape[1] - len(code)) // 2, (round(_CODE_SHARE * image.shape[0]) - len(code)) // 2
     image[above : above + len(code), left : left + len(code)] = code[:, :, None]
-    return above + len(code)
+    return int(above + len(code))
 
 
 def put(inbox: Path, outputs: Sequence[OutputSize], frames: FrameSet) -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.kiosk_places import RUNTIME
 from controller.kiosk.install import steps
 from controller.kiosk.install.system import System
 from controller.play.__main__ import _parser
@@ -34,7 +35,7 @@ class Recorded(System):
         if words[0] == "openssl":
             self.write(Path(words[words.index("-keyout") + 1]), "a key")
         if words[0] == "systemd-tmpfiles":
-            self.folder(steps.RUNTIME)
+            self.folder(RUNTIME)
 
 
 @pytest.fixture
