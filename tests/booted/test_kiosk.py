@@ -141,6 +141,15 @@ def test_without_a_stage_the_projectors_show_the_way_to_the_panel(bare: Kiosk) -
     assert 'name="password"' in bare.machine.fetched(f"{address}login")
 
 
+def test_the_set_up_page_can_ask_which_projectors_there_are(bare: Kiosk) -> None:
+    machine = bare.machine
+    process = machine.call("systemctl", "show", "--value", "--property=MainPID", "velatura-controller").strip()
+    settings = machine.read(Path(f"/proc/{process}/environ")).decode().split("\0")
+    display = [one for one in settings if one.startswith(("DISPLAY=", "XAUTHORITY="))]
+    inside = ["nsenter", f"--target={process}", "--mount", "runuser", "-u", "velatura", "--"]
+    assert "DUMMY0 connected" in machine.call(*inside, "env", *display, "xrandr")
+
+
 def test_the_first_password_is_told_once_and_not_in_the_journal(bare: Kiosk) -> None:
     program = (
         "import sys; from pathlib import Path; from controller.kiosk.store.accounts import stage_accounts;"
@@ -194,11 +203,13 @@ def test_the_picture_stays_when_the_controller_restarts(playing: Kiosk) -> None:
 
 def test_a_backup_is_restored_on_this_debians_python(playing: Kiosk) -> None:
     machine = playing.machine
+    restarts = machine.restarts("velatura-controller")
     machine.velatura("backup")
     (backup,) = machine.at(STAGE / "kiosk" / "archives").glob("backup-*")
     machine.call("velatura", "restore", STAGE, STAGE / "kiosk" / "archives" / backup.name, user="velatura")
     machine.wait_for(lambda: machine.called("velatura", "status", STAGE).returncode == 0)
     machine.wait_for(lambda: playing.shows(noise(OUTPUTS, 1)))
+    assert machine.restarts("velatura-controller") == restarts, "it begins anew without an end"
 
 
 def test_after_a_power_cut_the_picture_is_back_by_itself(playing: Kiosk) -> None:
@@ -214,8 +225,8 @@ def test_a_calibration_uses_the_same_player_and_what_it_made_plays(playing: Kios
     machine = playing.machine
     described = machine.at(STAGE / "stage.toml")
     text = re.sub(r'(driver = "player"\n)', r'\1frames = "run/outputs.frame"\n', described.read_text())
-    first, _, _ = text.partition("[[appearances]]")
-    (machine.at(STAGE) / "new.toml").write_text(f'{first}[[appearances]]\nname = "board"\nkind = "checkerboard"\n')
+    first, _, _ = text.partition("\n[[appearances]]")
+    (machine.at(STAGE) / "new.toml").write_text(f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n')
     machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
     machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
     machine.wait_for(lambda: machine.called("velatura", "status", STAGE).returncode == 0)
