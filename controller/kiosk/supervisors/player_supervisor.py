@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -97,8 +98,12 @@ class PlayerKeeper:
             self._trouble(Decision(error.code, error.what, error.remedy, "error"))
 
     def close(self) -> None:
-        """Black, and the player's end, for good."""
+        """Black, and the player's end, for good. One of somebody else runs on, and shows what is wanted last."""
         self._closed = True
+        if self._attach is not None and self._process is not None and self.want == BLACK:
+            # One that does not answer is its starter's to end.
+            with contextlib.suppress(OSError, ValueError, KeyError, VelaturaError):
+                self._ask({"op": "stop"}, 3.0)
         self._disconnect()
         if (process := self._process) is not None:
             process.terminate()

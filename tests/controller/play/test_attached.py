@@ -18,6 +18,7 @@ from controller.kiosk.supervisors.player_supervisor import PlayerKeeper
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings, hello
 from tests.controller.play.conftest import OUTPUTS
+from tests.controller.play.wire import Wire
 from tests.waiting import wait_for
 
 
@@ -109,6 +110,21 @@ def test_its_end_is_noticed_and_the_keeper_goes_on_with_the_next_one(starter: St
     assert [one.code for one in told] == ["player-started", "player-died", "player-started"]
     assert starter.starts == 2
     keeper.close()
+
+
+def test_a_service_that_ends_leaves_the_player_black(starter: Starter, tmp_path: Path) -> None:
+    keeper = PlayerKeeper(
+        tmp_path,
+        lambda _: settings(tmp_path),
+        lambda _: None,
+        attach=lambda chosen: AttachedPlayer(starter.socket, starter.options, chosen),
+    )
+    keeper.step()
+    with Wire(starter.socket) as wire:
+        wire.ask("identify")
+        keeper.close()
+        assert wire.ask("status")["showing"] == "black"
+    assert starter.starts == 1
 
 
 def test_where_none_is_started_the_journal_is_named(tmp_path: Path) -> None:
