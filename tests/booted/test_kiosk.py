@@ -13,6 +13,7 @@ import pytest
 from tests.booted.kiosk import SERVICES, Kiosk, built_wheel, installed, prepared_stage
 from tests.booted.machine import ADDRESS, STAGE
 from tests.booted.trees import SUITES
+from tests.campaigns.power_cuts import cut, kept, lost
 
 PICTURE_S = 60.0
 """From the boot of a bare Debian with the package to a picture."""
@@ -129,12 +130,11 @@ def test_a_backup_is_restored_on_this_debians_python(playing: Kiosk) -> None:
     assert machine.restarts("velatura-controller") == restarts, "it begins anew without an end"
 
 
-def test_after_a_power_cut_the_picture_is_back_by_itself(playing: Kiosk) -> None:
-    playing.machine.cut_off()
-    playing.machine.switch_on()
-    took_s = playing.machine.wait_for(playing.shows)
-    assert took_s < PICTURE_S
+def test_after_a_power_cut_the_picture_is_back_by_itself_and_nothing_is_lost(playing: Kiosk) -> None:
+    before = kept(playing)
+    assert cut(playing, after_s=2.5) < PICTURE_S
     playing.machine.wait_for(lambda: playing.state == "playing")
+    assert lost(playing, before) == []
     assert {playing.machine.restarts(name) for name in SERVICES} == {0}
 
 
