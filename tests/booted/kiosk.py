@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -57,8 +58,9 @@ class Kiosk:
         return bool(np.array_equal(screen, wanted))
 
     def answers(self) -> bool:
-        """Whether a command reaches the service."""
-        return self.machine.called("velatura", "status", STAGE, user="velatura").returncode == 0
+        """Whether a command reaches the service, and not the folder alone."""
+        done = self.machine.called("velatura", "status", STAGE, "--json", user="velatura")
+        return done.returncode == 0 and json.loads(done.stdout)["result"].get("serving", True)
 
     def read_code(self) -> str:
         """What a telephone reads from the projectors; empty without a QR code."""
