@@ -9,6 +9,7 @@ time, and settings, key, bundle and events were there at the end.
 
 from __future__ import annotations
 
+import argparse
 import random
 import sys
 import tempfile
@@ -18,6 +19,7 @@ from typing import Final
 
 from tests.booted.kiosk import Kiosk, built_wheel, installed, prepared_stage
 from tests.booted.machine import STAGE
+from tests.booted.trees import SUITES
 
 LATEST_S: Final = 20.0
 KEPT: Final = ("stage.toml", "keys/stage.key")
@@ -44,13 +46,14 @@ def lost(kiosk: Kiosk, before: dict[str, bytes]) -> list[str]:
     """What was there before and is not now."""
     now = kept(kiosk)
     gone = [name for name in KEPT if now[name] != before[name]]
-    bundle = ["bundle", "verify", STAGE / "bundles" / "current", "--stage", STAGE]
-    gone += ["bundle"] if kiosk.machine.called("velatura", *bundle, user="velatura").returncode else []
+    bundle = STAGE / "bundles" / "current"
+    checked = kiosk.machine.called("velatura", "bundle", "verify", bundle, "--stage", STAGE, user="velatura")
+    gone += ["bundle"] if checked.returncode else []
     events = {row["code"] for row in kiosk.machine.velatura("events")["events"]}
     return gone + ([] if "playing" in events else ["events"])
 
 
-def main(cuts: int = 100, seed: int = 1, suite: str = "bookworm") -> int:
+def main(cuts: int, seed: int, suite: str) -> int:
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -70,4 +73,9 @@ def main(cuts: int = 100, seed: int = 1, suite: str = "bookworm") -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*map(int, sys.argv[1:3]), *sys.argv[3:]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cuts", type=int, nargs="?", default=100)
+    parser.add_argument("seed", type=int, nargs="?", default=1)
+    parser.add_argument("suite", choices=SUITES, nargs="?", default="bookworm")
+    options = parser.parse_args()
+    sys.exit(main(options.cuts, options.seed, options.suite))
