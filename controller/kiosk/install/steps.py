@@ -26,7 +26,7 @@ AMD: Final = "xserver-xorg-video-amdgpu"
 GROUPS: Final = ("dialout", "plugdev", "video", "render")
 SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
 TARGET: Final = "velatura.target"
-DEBIAN: Final = (12, 13)
+DEBIAN: Final = ("12", "13")
 NO_OUTPUTS: Final = [("projector", 1024, 768)]
 """For the player, while nothing is plugged in."""
 READY_S: Final = 60.0
@@ -87,11 +87,11 @@ def check(system: System, prefix: Path) -> None:
     told = dict(
         re.findall(r'^(ID|VERSION_ID)="?([^"\n]*)"?$', system.read(Path("/etc/os-release")) or "", re.MULTILINE)
     )
-    if told.get("ID") != "debian" or int(told.get("VERSION_ID") or 0) not in DEBIAN:
+    if told.get("ID") != "debian" or told.get("VERSION_ID") not in DEBIAN:
         raise UsageError(
             "kiosk-system-unknown",
             what=f"This is {told.get('ID', 'an unknown system')} {told.get('VERSION_ID', '')}, not Debian 12 or 13.",
-            remedy="Install Debian 12 or 13, or follow docs/how-to/install-kiosk.md by hand.",
+            remedy="Install Debian 12 or 13 on this computer.",
         )
     if (system.look("systemctl", "is-active", "display-manager") or "").strip() == "active":
         raise UsageError(
