@@ -43,6 +43,7 @@ test-setup:
 	@.ci/setup-blender
 	@.ci/system-packages
 	@.venv/bin/python -m hal.runtime.kernels compile
+	@.venv/bin/python -m tests.booted.trees
 
 check:
 	@.ci/setup test

@@ -217,7 +217,7 @@ def _streams(folder: Path, scaler: Interactive, target: ByteImage, *, paper: boo
     ]
     rows = []
     with start_player(folder, settings) as player:
-        display = DRIVER.open({"socket": "player.sock"}, OpenContext(stage=folder), in_seconds(20))
+        display = DRIVER.open({}, OpenContext(stage=folder, runtime=folder), in_seconds(20))
         assert isinstance(display, PlayerDisplay)
         for figure, source, has_goal in kinds:
             cpu_s = time.process_time(), _cpu_s(player.pid)

@@ -53,7 +53,7 @@ def measure(size: str) -> list[Row]:
         settings = _settings(place, swaps)
         rows = [_imports(), starting(place, settings)]
         with start_player(place, settings) as player:
-            display = DRIVER.open({"socket": "player.sock"}, OpenContext(stage=place), in_seconds(20))
+            display = DRIVER.open({}, OpenContext(stage=place, runtime=place), in_seconds(20))
             assert isinstance(display, PlayerDisplay)
             try:
                 rows += _sustained(display, len(swaps), paper=paper)
@@ -125,7 +125,7 @@ def starting(place: Path, settings: PlayerSettings) -> Row:
     for _ in range(STARTS):
         began = time.perf_counter()
         with start_player(place, settings):
-            display = DRIVER.open({"socket": "player.sock"}, OpenContext(stage=place), in_seconds(20))
+            display = DRIVER.open({}, OpenContext(stage=place, runtime=place), in_seconds(20))
             display.play("a0", deadline=in_seconds(20))
             times.append(time.perf_counter() - began)
             used_s.append(processor_s(int(display.identity(deadline=in_seconds(5)).serial)))

@@ -30,6 +30,7 @@ from controller.cli import console, derived
 from controller.cli.commands import accounts as account_commands
 from controller.cli.commands import bundle as bundle_commands
 from controller.cli.commands import camera as camera_commands
+from controller.cli.commands import installation as installation_commands
 from controller.cli.commands import kiosk as kiosk_commands
 from controller.cli.commands import serve as serve_commands
 from controller.cli.commands.doctor import doctor
@@ -238,6 +239,7 @@ GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
     "account": (account_commands.SUMMARY, account_commands.COMMANDS),
     "bundle": (bundle_commands.SUMMARY, bundle_commands.COMMANDS),
     "camera": (camera_commands.SUMMARY, camera_commands.COMMANDS),
+    "kiosk": (installation_commands.SUMMARY, installation_commands.COMMANDS),
 }
 """Commands of two words: the first word, what the group is for, and its commands."""
 

@@ -19,6 +19,7 @@ NEEDS_THE_DEMO: Final = (
 """Meanwhile their workers would only wait: they have other tests first, and these at once when it is there."""
 LONGEST_FIRST: Final = (
     MAKES_THE_DEMO,
+    "tests/booted/test_kiosk.py",
     "tests/end_to_end/test_going_on.py",
     "tests/plugins/test_on_usb_bus.py",
     "tests/controller/panel/test_in_browser.py",

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 import threading
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from controller.config.loader import FILE
+from controller.core import kiosk_places
 from controller.core.errors import UsageError, VelaturaError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import NAME, ControlServer
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.operations.dispatch import socket_table
+from controller.kiosk.panel_address import PanelAccess, addresses, keep_first_login
 from controller.kiosk.service import serving
 from controller.kiosk.store.accounts import FOLDER
 from controller.panel.mqtt.options import BrokerOptions
+from controller.play.control.notify import Notifier
 from controller.run.progress import Level, Reporter
 from hal.errors import DeviceError
 
@@ -68,32 +76,39 @@ def serve(
     if panel is not None:
         _check_panel(panel)
     kiosk = StageKiosk(stage)
+    notifier = Notifier()
     with contextlib.ExitStack() as stack:
-        first, socket_served = True, False
+        stack.callback(notifier.stopping)
+        first, socket_served, entrance = True, False, None
         while not cancel.is_set():
             kiosk.reload.clear()
             try:
-                with serving(stage, cancel, leave_lit=leave_lit) as service:
+                with serving(stage, cancel, leave_lit=leave_lit, alive=notifier.alive) as service:
                     kiosk.attach(service)
                     if not socket_served:
                         socket_served = True
                         path = runtime_folder(stage) / NAME
                         stack.enter_context(ControlServer(path, socket_table(kiosk.holders())))
                     if first:
-                        _open_panel(stack, kiosk, panel, reporter)
+                        entrance = _open_panel(stack, kiosk, panel, reporter)
                         reporter.say(f"The kiosk {stage.name} is running.")
                         first = False
+                        notifier.ready()
                     _wait(kiosk, cancel)
                 kiosk.detach()
             except (VelaturaError, DeviceError) as error:
                 if first and not setup:
                     raise
-                kiosk.attach(None, f"{error.what} {error.remedy}" if (stage / "stage.toml").exists() else "")
+                missing = not (stage / FILE).exists()
+                kiosk.attach(None, "" if missing else f"{error.what} {error.remedy}")
                 reporter.say(f"{error.what} {error.remedy}", Level.ERROR)
                 if first:
-                    _open_panel(stack, kiosk, panel, reporter)
+                    entrance = _open_panel(stack, kiosk, panel, reporter)
                     first = False
-                kiosk.reload.wait(RETRY_S)
+                    notifier.ready()
+                again_s = time.monotonic() + RETRY_S
+                with _set_up_picture(kiosk, entrance):
+                    _wait(kiosk, cancel, notifier.alive, partial(_may_begin, stage, missing=missing, again_s=again_s))
     return {"served": str(stage)}
 
 
@@ -113,18 +128,45 @@ def _check_panel(where: PanelAddress) -> None:
     check_port(where.host, where.port)
 
 
-def _wait(kiosk: StageKiosk, cancel: threading.Event) -> None:
-    while not cancel.is_set() and not kiosk.reload.is_set():
+def _may_begin(stage: Path, *, missing: bool, again_s: float) -> bool:
+    """Whether it is time to try the stage again: once there is one, or after a while."""
+    return (stage / FILE).exists() if missing else time.monotonic() > again_s
+
+
+def _wait(
+    kiosk: StageKiosk,
+    cancel: threading.Event,
+    alive: Callable[[], None] = lambda: None,
+    over: Callable[[], bool] = lambda: False,
+) -> None:
+    while not (cancel.is_set() or kiosk.reload.is_set() or over()):
+        alive()
         cancel.wait(0.2)
 
 
-def _open_panel(stack: contextlib.ExitStack, kiosk: StageKiosk, panel: PanelAddress | None, reporter: Reporter) -> None:
-    if panel is not None:
-        stack.enter_context(_panel(kiosk, panel, reporter))
+def _set_up_picture(kiosk: StageKiosk, entrance: PanelAccess | None) -> contextlib.AbstractContextManager[None]:
+    """How to reach the panel, on the projectors of an installed kiosk that has no stage yet."""
+    if entrance is None or (kiosk.stage / FILE).exists() or not kiosk_places.is_installed(kiosk.stage):
+        return contextlib.nullcontext()
+    from controller.kiosk.supervisors.setup_picture import shown
+
+    return shown(entrance.lines)
+
+
+def _open_panel(
+    stack: contextlib.ExitStack, kiosk: StageKiosk, panel: PanelAddress | None, reporter: Reporter
+) -> PanelAccess | None:
+    return None if panel is None else stack.enter_context(_panel(kiosk, panel, reporter))
+
+
+def _journalled() -> bool:
+    """Whether what is printed is kept in systemd's journal, where a password must not stand (systemd.exec(5))."""
+    output = os.fstat(sys.stdout.fileno())
+    return os.environ.get("JOURNAL_STREAM") == f"{output.st_dev}:{output.st_ino}"
 
 
 @contextlib.contextmanager
-def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterator[None]:
+def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterator[PanelAccess]:
     """The panel in its own thread. The player is another process, so that no page delays a picture."""
     from controller.kiosk.store.accounts import FIRST_ACCOUNT
     from controller.panel.app import make_panel
@@ -142,12 +184,17 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
     kiosk.sessions_ended = app.state.panel.sessions.end_all
     server = PanelServer(app, options)
     address = server.start()
-    reporter.say(f"The panel is at {address}.")
+    for one in addresses(address) or (address,):
+        reporter.say(f"The panel is at {one}.")
+    entrance = PanelAccess(address, () if password is None else (FIRST_ACCOUNT, password), lambda: accounts.entered)
     if password is not None:
-        reporter.say(f"First login: {FIRST_ACCOUNT}, password {password} (once).", Level.WARNING)
+        if _journalled():
+            keep_first_login(runtime_folder(kiosk.stage), FIRST_ACCOUNT, password)
+        else:
+            reporter.say(f"First login: {FIRST_ACCOUNT}, password {password} (once).", Level.WARNING)
         # Only capitals can be shown, and the one-time password is taken in capitals, too.
-        kiosk.announce(("velatura", address, FIRST_ACCOUNT, password), lambda: accounts.entered)
+        kiosk.announce(entrance.lines(), lambda: accounts.entered)
     try:
-        yield
+        yield entrance
     finally:
         server.stop()

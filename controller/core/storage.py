@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from controller.core import kiosk_places
 from controller.core.errors import UsageError, WorkError
 
 
@@ -109,8 +110,11 @@ def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
 def runtime_folder(stage: Path) -> Path:
     """A short, private folder for this stage's sockets (a unix socket's path has at most 107 bytes).
 
-    Under ``$XDG_RUNTIME_DIR`` or the system's temporary folder; mode 0700 and owned by this user, or refused.
+    Under ``$XDG_RUNTIME_DIR`` or the system's temporary folder; mode 0700 and owned by this user, or refused. The
+    stage of an installed kiosk has the folder of its services, so that commands find them.
     """
+    if kiosk_places.is_installed(stage):
+        return kiosk_places.RUNTIME
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
     digest = hashlib.sha256(str(stage.resolve()).encode()).hexdigest()[:12]
     folder = base / f"velatura-{os.getuid()}-{digest}"

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from controller.core import kiosk_places
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.decide.clock import TrustedClock, beginning
@@ -27,9 +28,9 @@ from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.kiosk.supervisors.lamp_history import LampHistory
-from controller.kiosk.supervisors.player_supervisor import PlayerKeeper
+from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
+from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
-from controller.play.control.notify import Notifier
 from controller.run.state_machine import State
 from controller.stage.calibrations import finished_calibrations, stage_trust
 from controller.stage.check import Checked, check_stage
@@ -45,7 +46,9 @@ AFTER_CRASH_S: Final = 5.0
 
 
 class Service:
-    """One stage that runs by itself. ``changed`` is called after every step that may have changed something."""
+    """One stage that runs by itself. ``changed`` is called after every step that may have changed something, ``alive``
+    by the loop as long as it turns.
+    """
 
     def __init__(self, checked: Checked, log: EventLog) -> None:
         stage = checked.stage
@@ -53,7 +56,10 @@ class Service:
         self.runtime = runtime_folder(stage.folder)
         self.bundles = BundleStore(stage.folder, stage_trust(stage))
         self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
-        self.player = PlayerKeeper(self.runtime, self._settings, log.tell)
+        attach = partial(AttachedPlayer, kiosk_places.PLAYER_SOCKET, kiosk_places.PLAYER_OPTIONS)
+        installed = kiosk_places.is_installed(stage.folder)
+        self.player = PlayerSupervisor(self.runtime, self._settings, log.tell, attach=attach if installed else None)
+        self.alive: Callable[[], None] = lambda: None
         self.devices = Devices(checked, self.runtime, log.tell)
         self.devices.scene = self._scene
         self.lamp_history = LampHistory(stage.folder)
@@ -95,9 +101,7 @@ class Service:
         self._thread("old photographs", purge_old, TIDY_S, first_s=TIDY_S)
 
     def run(self, cancel: threading.Event) -> None:
-        """Decide, over and over, until ``cancel``. Feeds systemd's watchdog."""
-        notifier = Notifier()
-        ready = False
+        """Decide, over and over, until ``cancel``."""
         while not cancel.is_set():
             try:
                 self._decide()
@@ -107,12 +111,8 @@ class Service:
                 self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
                 cancel.wait(AFTER_CRASH_S)
                 continue
-            if not ready and self.player.view.shown is not None:
-                ready = True
-                notifier.ready()
-            notifier.alive()
+            self.alive()
             cancel.wait(STEP_S)
-        notifier.stopping()
 
     def _decide(self) -> None:
         self.reconciler.step()
@@ -187,6 +187,7 @@ class Service:
     def _wait_until_dark(self) -> None:
         until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
         while any(one.may_light for one in self.devices.projectors) and time.monotonic() < until_s:
+            self.alive()
             time.sleep(0.1)
         names = [projector.name for projector in self.devices.projectors if projector.view.maybe_lit]
         if names:
@@ -230,8 +231,10 @@ class Service:
 
 
 @contextlib.contextmanager
-def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) -> Iterator[Service]:
-    """A started service, its loop in a thread; ended, with the lamps cooled, on leaving.
+def serving(
+    stage: Path, cancel: threading.Event, *, leave_lit: bool = False, alive: Callable[[], None] = lambda: None
+) -> Iterator[Service]:
+    """A started service, its loop in a thread; ended, with the lamps cooled, on leaving. ``alive``: as ``Service``'s.
 
     Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
     """
@@ -250,6 +253,7 @@ def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool = False) ->
         log = EventLog(checked.stage.folder / EventLog.FILE)
         with contextlib.closing(log):
             service = Service(checked, log)
+            service.alive = alive
             ended = threading.Event()
             loop = threading.Thread(target=service.run, args=(ended,), name="reconciler", daemon=True)
             try:

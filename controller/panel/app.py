@@ -20,6 +20,7 @@ from starlette.routing import Route
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.panel_address import EVERYWHERE
 from controller.kiosk.store.accounts import Accounts
 from controller.panel import answers, api
 from controller.panel.answers import FAILURES
@@ -78,7 +79,10 @@ def make_panel(
         *api.entries(panel),
         *(Entry("GET", f"/static/{name}", "public", None, _static(name)) for name in STATIC),
     ]
-    guard = Middleware(Guard, hosts=options.hosts, body_limits=api.body_limits(panel), tls=options.tls)
+    guard = Middleware(
+        Guard, hosts=options.hosts, body_limits=api.body_limits(panel), tls=options.tls,
+        any_address=options.host in EVERYWHERE,
+    )  # fmt: skip
     app = Starlette(
         routes=_routes(panel, table),
         middleware=[guard],

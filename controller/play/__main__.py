@@ -36,7 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m controller.play", description="Velatura's player.")
+    parser = argparse.ArgumentParser(
+        prog="python -m controller.play",
+        description="Velatura's player. @FILE stands for the arguments in a file, one a line.",
+        fromfile_prefix_chars="@",
+    )
     parser.add_argument("--socket", type=Path, required=True, help="unix socket to serve; made with mode 0600")
     parser.add_argument("--outputs", required=True, help="NAME:WIDTHxHEIGHT of each output, with commas between")
     where = parser.add_mutually_exclusive_group(required=True)

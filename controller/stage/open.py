@@ -14,6 +14,7 @@ from controller.bundle.signing import write_public_key
 from controller.capture.acquire import Acquirer
 from controller.config import Stage
 from controller.config.models import OpenConfigTable
+from controller.core import kiosk_places
 from controller.core.storage import runtime_folder
 from controller.play.control.launch import PlayerProcess, PlayerSettings, replace_player
 from controller.rig.ambient_light import Darkness
@@ -57,8 +58,8 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
         driver, settings = checked.camera
         camera = cast("Camera", open_device(stage.tables.camera, driver, settings, context, deadline))
         _closed_by(stack, camera)
-        # If the stage names the player's socket, a player runs already, for instance under systemd.
-        if checked.stage.tables.display.driver == "player" and "socket" not in checked.display[1]:
+        # The player of an installed kiosk is systemd's.
+        if checked.stage.tables.display.driver == "player" and not kiosk_places.is_installed(stage.folder):
             stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
         display = cast("Display", open_device(stage.tables.display, driver, settings, context, deadline))
@@ -149,13 +150,16 @@ def player_settings(stage: Stage, runtime: Path, *, plays: bool) -> PlayerSettin
     # As the link, so that the player drops a bundle that never shows a picture. Not for a
     # calibration, which must work with any installed bundle.
     bundle = stage.folder / "bundles" / CURRENT
+    # What systemd starts the player with lasts: it must not change with the first bundle, nor go with the power.
+    installed = kiosk_places.is_installed(stage.folder)
+    keys = kiosk_places.STATE if installed else runtime
     return PlayerSettings(
         outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
         frames=frames,
         where={output.name: output.where for output in table.outputs if output.where is not None},
-        bundle=bundle if plays and bundle.is_symlink() else None,
-        trusted=_key_files(stage.tables.bundle.trusted_keys, runtime, "trusted"),
-        revoked=_key_files(stage.tables.bundle.revoked_keys, runtime, "revoked"),
+        bundle=bundle if plays and (installed or bundle.is_symlink()) else None,
+        trusted=_key_files(stage.tables.bundle.trusted_keys, keys, "trusted"),
+        revoked=_key_files(stage.tables.bundle.revoked_keys, keys, "revoked"),
         allow_unsigned=stage.tables.bundle.allow_unsigned,
     )
 

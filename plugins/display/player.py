@@ -144,15 +144,13 @@ def _live(told: Mapping[str, Any] | None) -> LiveStatus | None:
 
 
 def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PlayerDisplay:
-    path = context.stage / settings["socket"] if "socket" in settings else None
-    if path is None and context.runtime is not None:
-        path = context.runtime / "player.sock"
-    if path is None:
+    if context.runtime is None:
         raise PluginError(
             "player-socket-unknown",
-            what="The player's socket is not given in stage.toml or the command.",
-            remedy='Set socket = "..." in [display].',
+            what="The command does not say where the player's socket is.",
+            remedy="Give OpenContext the folder of the socket player.sock as its runtime.",
         )
+    path = context.runtime / "player.sock"
     try:
         tables = settings.get("outputs")
         expected = tables and tuple(OutputInfo(t["name"], int(t["width_px"]), int(t["height_px"])) for t in tables)
@@ -175,6 +173,5 @@ DRIVER = Driver(
     settings={
         "outputs": "list of tables with name, width_px and height_px, in stage order",
         "frames": "file, relative to the stage, in which the player shows frames instead of windows (memory output)",
-        "socket": "the player's socket, relative to the stage; default: player.sock in the stage's runtime folder",
     },
 )

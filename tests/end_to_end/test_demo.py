@@ -91,7 +91,7 @@ def played_again(stage: Path, folder: Path) -> float:
     """Swaps a second of four seconds of the installed bundle in a player of its own."""
     settings = replace(player_settings(check_stage(stage).stage, folder, plays=True), frames=folder / "out.frame")
     with start_player(folder, settings):
-        display = DRIVER.open({"socket": "player.sock"}, OpenContext(stage=folder), in_seconds(20))
+        display = DRIVER.open({}, OpenContext(stage=folder, runtime=folder), in_seconds(20))
         assert isinstance(display, PlayerDisplay)
         before = display.playing(deadline=in_seconds(20)).swaps
         items = [(name, 1 / 60) for name in APPEARANCES]

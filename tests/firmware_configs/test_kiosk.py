@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.core.kiosk_places import PLAYER_OPTIONS, PLAYER_SOCKET, STAGE
 from controller.play.__main__ import _parser
 from controller.play.control.launch import PlayerSettings, start_player
 from tests.controller.play.display.xorg import HEIGHT, WIDTH, running_server
@@ -52,15 +53,24 @@ def setting(unit: str, key: str) -> str:
     return found[1]
 
 
-def test_the_players_command_is_one_that_it_understands() -> None:
-    text = setting("velatura-player.service", "ExecStart").replace("${OUTPUTS}", "P1:1400x1050")
-    line = text.replace("${BUNDLE}", "/b").replace("$OPTIONS", "--where P1=HDMI-1 --trusted /etc/velatura/stage.pub")
-    program, *arguments = shlex.split(line)
+def test_the_players_command_is_one_that_it_understands(tmp_path: Path) -> None:
+    wanted = PlayerSettings([("P1", 1400, 1050)], None, where={"P1": "HDMI-1"}, trusted=[Path("/k.pub")])
+    options = tmp_path / "options"
+    options.write_text("".join(f"{word}\n" for word in wanted.arguments()))
+    text = setting("velatura-player.service", "ExecStart")
+    program, *arguments = shlex.split(text.replace(f"@{PLAYER_OPTIONS}", f"@{options}"))
     assert (program, *arguments[:2]) == ("/opt/velatura/bin/python", "-m", "controller.play")
-    options = _parser().parse_args(arguments[2:])
-    assert options.windows
-    assert options.resume
-    assert options.socket.parent == Path("/run") / setting("velatura-player.service", "RuntimeDirectory")
+    read = _parser().parse_args(arguments[2:])
+    assert read.windows
+    assert read.resume
+    assert (read.outputs, read.where, read.trusted) == ("P1:1400x1050", ["P1=HDMI-1"], [Path("/k.pub")])
+    assert read.socket == PLAYER_SOCKET
+
+
+def test_the_controllers_command_serves_the_stage_and_says_when_it_is_ready() -> None:
+    words = shlex.split(setting("velatura-controller.service", "ExecStart"))
+    assert words == ["/opt/velatura/bin/velatura", "serve", str(STAGE), "--setup", "$OPTIONS"]
+    assert setting("velatura-controller.service", "Type") == "notify"
 
 
 def test_a_hung_player_is_replaced_within_five_seconds() -> None:
@@ -74,15 +84,10 @@ def test_an_x_server_with_our_settings_starts_and_the_player_on_it(tmp_path: Pat
     shutil.copy(CONFIGS / "x11" / "10-velatura.conf", settings)
     with running_server(tmp_path, settings_folder=settings) as outputs:
         log = (tmp_path / "log").read_text()
-        for option in re.findall(r'Option ("\w+" "\w+")', (settings / "10-velatura.conf").read_text()):
+        everywhere, _, _ = (settings / "10-velatura.conf").read_text().partition("OutputClass")
+        for option in re.findall(r'Option ("\w+" "\w+")', everywhere):
             assert f"(**) Option {option}" in log or "Disable" in option
         chosen = PlayerSettings([("P1", WIDTH, HEIGHT)], None, where={"P1": "DUMMY1"})
         with start_player(tmp_path, chosen) as player, Wire(player.socket) as wire:
             assert wire.ask("identify")["ok"]
             assert outputs.picture(WIDTH)[0].all()
-
-
-def test_the_outputs_file_has_one_mode_for_all() -> None:
-    text = (CONFIGS / "x11" / "20-velatura-outputs.conf").read_text()
-    assert len(set(re.findall(r"^  Modeline .*$", text, re.MULTILINE))) == 1
-    assert len(re.findall(r'"Enable" "true"', text)) == len(re.findall(r'Section "Monitor"', text))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ from controller.core.errors import VelaturaError, WorkError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
+from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover
 
 ANSWER_S: Final = 0.8
@@ -31,11 +33,12 @@ STARTS_WITH_BUNDLE: Final = 4
 """Failed starts in a row after which the player is started without the installed bundle, so that it shows black."""
 
 
-class PlayerKeeper:
-    """The player of a stage; see ``ports.PlayerPort``.
+class PlayerSupervisor:
+    """The player of a stage; see ``decide.interfaces.PlayerPort``.
 
     ``settings`` is asked at each start (the flag: with the installed bundle); ``tell`` hears what happens. ``notice``:
-    lines of text that one projector after the other shows as long as nothing else is wanted than black.
+    lines of text that one projector after the other shows as long as nothing else is wanted than black. ``attach``:
+    gets hold of a player that somebody else starts, instead of starting one.
     """
 
     def __init__(
@@ -45,12 +48,14 @@ class PlayerKeeper:
         tell: Callable[[Decision], object],
         *,
         monotonic: Callable[[], float] = time.monotonic,
+        attach: Callable[[PlayerSettings], AttachedPlayer] | None = None,
     ) -> None:
         self._runtime, self._settings, self._tell, self._monotonic = runtime, settings, tell, monotonic
         self.want: Showing | None = BLACK
         self.identifying = False
         self.notice: tuple[str, ...] = ()
-        self._process: PlayerProcess | None = None
+        self._attach = attach
+        self._process: PlayerProcess | AttachedPlayer | None = None
         self._channel: socket.socket | None = None
         self._view = PlayerView()
         self._identities: dict[str, Path] = {}
@@ -95,8 +100,12 @@ class PlayerKeeper:
             self._trouble(Decision(error.code, error.what, error.remedy, "error"))
 
     def close(self) -> None:
-        """Black, and the player's end, for good."""
+        """Black, and the player's end, for good. One of somebody else runs on, and shows what is wanted last."""
         self._closed = True
+        if self._attach is not None and self._process is not None and self.want == BLACK:
+            # One that does not answer is its starter's to end.
+            with contextlib.suppress(OSError, ValueError, KeyError, VelaturaError):
+                self._ask({"op": "stop"}, 3.0)
         self._disconnect()
         if (process := self._process) is not None:
             process.terminate()
@@ -104,10 +113,9 @@ class PlayerKeeper:
     # -- starting
 
     def _start(self) -> None:
-        end_leftover(self._runtime)
         try:
             with_bundle = self._failed < STARTS_WITH_BUNDLE or self._failed % 10 == 0
-            self._process = PlayerProcess(self._runtime, self._settings(with_bundle))
+            self._process = self._player(self._settings(with_bundle))
             if self._closed:
                 # While it was made ready: it would show its picture after the service's end.
                 self._process.terminate()
@@ -129,6 +137,12 @@ class PlayerKeeper:
             # The player may have gone back to the bundle before while it started; then the link has moved, too.
             self._identities[str(hello["bundle"])] = installed.resolve()
         self._tell(Decision("player-started", "The player is running."))
+
+    def _player(self, settings: PlayerSettings) -> PlayerProcess | AttachedPlayer:
+        if self._attach is not None:
+            return self._attach(settings)
+        end_leftover(self._runtime)
+        return PlayerProcess(self._runtime, settings)
 
     def _restart(self, why: Decision) -> None:
         assert self._process is not None

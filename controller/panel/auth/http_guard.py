@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from typing import Final
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -32,10 +33,15 @@ class BodyTooLarge(Exception):
 
 
 class Guard:
-    """Wraps the panel. ``hosts`` without port; ``body_limits`` bytes by path, for the paths that take uploads."""
+    """Wraps the panel. ``hosts`` without port; ``any_address``: IP addresses, too; ``body_limits`` bytes by path, for
+    the paths that take uploads.
+    """
 
-    def __init__(self, app: ASGIApp, *, hosts: tuple[str, ...], body_limits: dict[str, int], tls: bool) -> None:
+    def __init__(
+        self, app: ASGIApp, *, hosts: tuple[str, ...], body_limits: dict[str, int], tls: bool, any_address: bool = False
+    ) -> None:
         self._app, self._hosts, self._limits = app, frozenset(host.lower() for host in hosts), body_limits
+        self._any_address = any_address
         self._headers = {**HEADERS, "strict-transport-security": "max-age=31536000"} if tls else HEADERS
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -64,13 +70,22 @@ class Guard:
         headers = Headers(scope=scope)
         host = headers.get("host", "").lower()
         name = host if host.endswith("]") else host.rpartition(":")[0] or host
-        if name not in self._hosts:
+        if name not in self._hosts and not (self._any_address and _is_address(name)):
             # A page of another name that resolves to this machine must not reach it (DNS rebinding).
             return PlainTextResponse("This host name is not allowed. Start the kiosk with --name to allow it.", 421)
         length = headers.get("content-length", "0")
         if not length.isascii() or not length.isdigit() or int(length[:18]) > self._limit(scope):
             return PlainTextResponse("Too large.", 413, headers={"connection": "close"})
         return None
+
+
+def _is_address(name: str) -> bool:
+    """Whether a name needs no resolving, so that nobody else can let it resolve to this machine."""
+    try:
+        ipaddress.ip_address(name.strip("[]"))
+    except ValueError:
+        return False
+    return True
 
 
 def _limited(receive: Receive, most: int) -> Receive:

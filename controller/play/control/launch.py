@@ -50,6 +50,19 @@ class PlayerSettings:
     resume: bool = False
     suggested: bool = False
 
+    def arguments(self) -> list[str]:
+        """Them as the player's command line has them."""
+        words = ["--outputs", ",".join(f"{name}:{width}x{height}" for name, width, height in self.outputs)]
+        words += ["--windows"] if self.frames is None else ["--frames", str(self.frames)]
+        words += [word for name, place in self.where.items() for word in ("--where", f"{name}={place}")]
+        words += [] if self.bundle is None else ["--bundle", str(self.bundle)]
+        words += [word for key in self.trusted for word in ("--trusted", str(key))]
+        words += [word for key in self.revoked for word in ("--revoked", str(key))]
+        words += ["--allow-unsigned"] if self.allow_unsigned else []
+        words += ["--resume"] if self.resume else []
+        words += ["--suggested"] if self.suggested else []
+        return [*words, "--rate", f"{self.rate_hz:g}"]
+
 
 class PlayerProcess:
     """A running player. Use as a context manager, or call ``terminate``; it goes on if its starter dies.
@@ -64,18 +77,8 @@ class PlayerProcess:
         self._process = self._start()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        settings = self._settings
         command = [sys.executable, "-m", "controller.play", "--socket", str(self.socket)]
-        command += ["--outputs", ",".join(f"{name}:{width}x{height}" for name, width, height in settings.outputs)]
-        command += ["--windows"] if settings.frames is None else ["--frames", str(settings.frames)]
-        command += [word for name, place in settings.where.items() for word in ("--where", f"{name}={place}")]
-        command += [] if settings.bundle is None else ["--bundle", str(settings.bundle)]
-        command += [word for key in settings.trusted for word in ("--trusted", str(key))]
-        command += [word for key in settings.revoked for word in ("--revoked", str(key))]
-        command += ["--allow-unsigned"] if settings.allow_unsigned else []
-        command += ["--resume"] if settings.resume else []
-        command += ["--suggested"] if settings.suggested else []
-        command += ["--rate", f"{settings.rate_hz:g}"]
+        command += self._settings.arguments()
         with self.log.open("wb") as log:
             # A session of its own: Ctrl-C is for the supervisor, which ends the player when the lamps are safe.
             return subprocess.Popen(  # noqa: S603
@@ -112,16 +115,11 @@ class PlayerProcess:
         )
 
     def _hello(self, timeout_s: float) -> dict[str, Any]:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
-            channel.settimeout(max(0.01, timeout_s))
-            channel.connect(str(self.socket))
-            channel.sendall(b'{"op":"hello"}\n')
-            line = channel.makefile("rb").readline()
-        answer = json.loads(line) if line.endswith(b"\n") else {}
+        answer = hello(self.socket, timeout_s)
         # A player that served here before may be on its way out still.
         if answer.get("pid") != self.pid:
             raise ConnectionError
-        return dict(answer)
+        return answer
 
     def terminate(self, timeout_s: float = _END_S) -> int:
         """Ask the player to leave black and end; kill it if it does not in time. Returns its exit code."""
@@ -146,6 +144,16 @@ class PlayerProcess:
         self.terminate()
 
 
+def hello(path: Path, timeout_s: float) -> dict[str, Any]:
+    """What the player that serves ``path`` says of itself; empty while it ends. Raises OSError."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
+        channel.settimeout(max(0.01, timeout_s))
+        channel.connect(str(path))
+        channel.sendall(b'{"op":"hello"}\n')
+        line = channel.makefile("rb").readline()
+    return dict(json.loads(line)) if line.endswith(b"\n") else {}
+
+
 def _environment() -> dict[str, str]:
     # The player does no linear algebra; its threads would cost a fifth of the time that its imports take.
     return {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
@@ -156,10 +164,15 @@ def end_leftover(runtime: Path, timeout_s: float = _END_S) -> bool:
 
     For the holder of the stage's lock only: to anybody else that player may be of use. One that hangs is killed.
     """
+    return end_serving(runtime / SOCKET_NAME, timeout_s)
+
+
+def end_serving(path: Path, timeout_s: float = _END_S) -> bool:
+    """End the player that serves the socket ``path``, if there is one, and wait for its end."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(1.0)
         try:
-            channel.connect(str(runtime / SOCKET_NAME))
+            channel.connect(str(path))
             pid, _, _ = struct.unpack("3i", channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
             process = os.pidfd_open(pid)
         except OSError:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import httpx
 import pytest
 
 from controller.kiosk.store.accounts import Role
 from controller.panel.auth.identity import Entry
-from tests.controller.panel.served import Served, csrf
+from controller.panel.context import PanelOptions
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.controller.panel.served import Served, csrf, served
 
 PUBLIC = {"/login", "/static/style.css", "/static/panel.js", "/static/icon.svg"}
 NAMES = {Role.VIEWER: "vera", Role.OPERATOR: "otto", Role.TECHNICIAN: "tina"}
@@ -123,6 +127,18 @@ def test_another_name_that_leads_to_this_machine_is_not_answered(panel: Served) 
     with panel.client() as client:
         for host in ("evil.example", "evil.example:8377", "", "127.0.0.1.evil.example", "[::2]:80"):
             assert client.get("/login", headers={"host": host}).status_code == 421, host
+
+
+def test_a_panel_for_the_network_answers_to_every_address_and_to_no_other_name(tmp_path: Path) -> None:
+    options = PanelOptions(folder=tmp_path / "private", host="0.0.0.0")
+    with served(MemoryKiosk(tmp_path), tmp_path / "private", options=options) as panel, panel.client() as client:
+        for host, answer in (
+            ("192.0.2.7:8377", 200),
+            ("[2001:db8::7]:8377", 200),
+            ("evil.example:8377", 421),
+            ("192.0.2.7.evil.example", 421),
+        ):
+            assert client.get("/login", headers={"host": host}).status_code == answer, host
 
 
 def test_every_answer_carries_the_headers_that_keep_scripts_out(panel: Served) -> None:

@@ -33,7 +33,7 @@ __all__ = ["framebuffer"]
 def display_of(folder: Path, *, windows: bool) -> Iterator[PlayerDisplay]:
     settings = PlayerSettings(OUTPUTS, None if windows else folder / "out.frame", allow_unsigned=True)
     with start_player(folder, settings):
-        display = DRIVER.open({"socket": "player.sock"}, OpenContext(stage=folder), in_seconds(20))
+        display = DRIVER.open({}, OpenContext(stage=folder, runtime=folder), in_seconds(20))
         assert isinstance(display, PlayerDisplay)
         with contextlib.closing(display):
             yield display

@@ -93,6 +93,7 @@ def test_a_restored_calibration_counts_though_there_is_a_newer_one(stage: Path) 
 HOSTILE: dict[str, Callable[[tarfile.TarFile], None]] = {
     "leads out": lambda packed: add(packed, "../stage.toml"),
     "leads out deeper": lambda packed: add(packed, "bundles/../../stage.toml"),
+    "link up": lambda packed: add(packed, "bundles/current", b"", tarfile.SYMTYPE, ".."),
     "link out": lambda packed: add(packed, "bundles/current", b"", tarfile.SYMTYPE, "../../etc/passwd"),
     "hard link": lambda packed: add(packed, "stage.toml", b"", tarfile.LNKTYPE, "/etc/passwd"),
     "device": lambda packed: add(packed, "stage.toml", b"", tarfile.CHRTYPE),

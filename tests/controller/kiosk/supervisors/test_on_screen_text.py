@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from controller.core.storage import runtime_folder
@@ -12,7 +13,7 @@ from controller.kiosk.decide.interfaces import BLACK
 from controller.kiosk.store.accounts import Accounts
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice
-from controller.kiosk.supervisors.player_supervisor import NOTICE_TURN_S, PlayerKeeper
+from controller.kiosk.supervisors.player_supervisor import NOTICE_TURN_S, PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
 from controller.play.frames import FrameSet, OutputSize
 from controller.run.state_machine import State
@@ -40,7 +41,9 @@ def test_the_player_shows_the_lines_on_one_output_after_the_other_and_black_when
     told: list[Decision] = []
     frames, now_s = tmp_path / "outputs.frame", 0.0
     settings = PlayerSettings([(one.name, one.width_px, one.height_px) for one in OUTPUTS], frames)
-    supervisor = PlayerKeeper(runtime_folder(tmp_path), lambda plays: settings, told.append, monotonic=lambda: now_s)
+    supervisor = PlayerSupervisor(
+        runtime_folder(tmp_path), lambda plays: settings, told.append, monotonic=lambda: now_s
+    )
 
     def wait_for(wanted: FrameSet) -> None:
         until_s = time.monotonic() + 60
@@ -65,6 +68,19 @@ def test_every_line_has_its_place_and_fits() -> None:
         rows = np.flatnonzero(image.any(axis=(1, 2)))
         assert np.count_nonzero(np.diff(rows) > 1) == len(LINES) - 1, "one gap between two lines"
         assert not image[:, [0, -1]].any()
+
+
+def test_a_telephone_reads_the_address_that_others_reach() -> None:
+    lines = ("velatura", "https://192.0.2.17:8377/", "technician", "abcd-efgh-2345-wxyz")
+    sizes = (OutputSize("P1", 1400, 1050), OutputSize("P2", 800, 600))
+    for turn in range(len(sizes)):
+        image = notice(sizes, lines, turn).pixels[turn]
+        read, _, _ = cv2.QRCodeDetector().detectAndDecode(image)
+        assert read == lines[1]
+        text = image[image.shape[0] // 2 :]
+        assert np.count_nonzero(np.diff(np.flatnonzero(text.any(axis=(1, 2)))) > 1) == len(lines) - 1
+    seen = notice(sizes, ("velatura", "http://127.0.0.1:8377/"), 0).pixels[0]
+    assert not cv2.QRCodeDetector().detect(seen)[0]
 
 
 def test_a_one_time_password_is_taken_as_the_projectors_show_it(tmp_path: Path) -> None:

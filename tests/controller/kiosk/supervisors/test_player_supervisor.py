@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from controller.kiosk.supervisors import player_supervisor as player_keeper
-from controller.kiosk.supervisors.player_supervisor import PlayerKeeper
+from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
 
 
@@ -37,6 +37,6 @@ def test_a_player_that_starts_after_its_keeper_was_closed_is_ended(
         keeper.close()  # the service ends while the start is prepared
         return PlayerSettings([("P1", 8, 8)], tmp_path / "outputs.frame")
 
-    keeper = PlayerKeeper(tmp_path, settings, lambda _: None)
+    keeper = PlayerSupervisor(tmp_path, settings, lambda _: None)
     keeper.step()
     assert [process.alive for process in running] == [False]

@@ -1,0 +1,25 @@
+"""Where `velatura kiosk install` puts the stage that this computer's services run, and their private folder."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+USER: Final = "velatura"
+STATE: Final = Path("/var/lib/velatura")
+STAGE: Final = STATE / "stage"
+RUNTIME: Final = Path("/run/velatura")
+PLAYER_SOCKET: Final = RUNTIME / "player.sock"
+PLAYER_OPTIONS: Final = STATE / "player.options"
+"""One argument a line, for the player that systemd starts."""
+
+
+def is_installed(stage: Path) -> bool:
+    """Whether ``stage`` is the one that this computer's services run, and this user is theirs, or root."""
+    if stage.resolve() != STAGE:
+        return False
+    try:
+        return RUNTIME.stat().st_uid == os.getuid() or os.getuid() == 0
+    except OSError:
+        return False

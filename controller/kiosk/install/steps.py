@@ -1,0 +1,194 @@
+"""The installation, step by step. Each step looks first, so that it can be repeated."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from controller.core.errors import UsageError
+from controller.core.kiosk_places import PLAYER_OPTIONS, RUNTIME, STAGE, STATE, USER
+from controller.kiosk.install import files
+from controller.kiosk.install.outputs import connected, placed, player_outputs, x_configuration
+from controller.kiosk.install.system import System
+from controller.kiosk.panel_address import FIRST_LOGIN
+from controller.play.control.launch import PlayerSettings
+
+PACKAGES: Final = (
+    "xserver-xorg-core", "xauth", "x11-xserver-utils", "libgl1-mesa-dri", "libgl1", "libxrandr2", "libxext6",
+    "libusb-1.0-0", "libhidapi-libusb0", "openssl",
+)  # fmt: skip
+AMD: Final = "xserver-xorg-video-amdgpu"
+GROUPS: Final = ("dialout", "plugdev", "video", "render")
+SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
+TARGET: Final = "velatura.target"
+DEBIAN: Final = ("12", "13")
+NO_OUTPUTS: Final = [("projector", 1024, 768)]
+"""For the player, while nothing is plugged in."""
+READY_S: Final = 60.0
+_X: Final = {"DISPLAY": ":0", "XAUTHORITY": "/run/velatura-x11/cookie"}
+
+
+def install(
+    system: System, *, outputs_again: bool, say: Callable[[str], None], prefix: Path = Path(sys.prefix)
+) -> None:
+    """Make this computer a kiosk, and start it. ``outputs_again``: look which projectors are plugged in, also where
+    that was done before.
+
+    Raises UsageError("kiosk-system-unknown", "kiosk-has-desktop" or "kiosk-place-hidden"), and
+    WorkError("kiosk-step-failed").
+    """
+    check(system, prefix)
+    _packages(system)
+    _user(system)
+    changed = [system.write(path, text) for path, text in files.shipped(prefix).items()]
+    _folders(system)
+    if not os.path.lexists(system.at(files.COMMAND)):
+        system.run("ln", "--symbolic", str(prefix / "bin" / "velatura"), str(files.COMMAND))
+    _panel(system)
+    if any(changed):
+        system.run("systemctl", "daemon-reload")
+        system.run("udevadm", "control", "--reload", may_fail=True)
+        system.run("udevadm", "trigger", may_fail=True)
+    system.run("systemctl", "enable", "--quiet", TARGET)
+    system.run("systemctl", "start", "velatura-x11")
+    _outputs(system, again=outputs_again, say=say)
+    if any(changed):
+        system.run("systemctl", "restart", *SERVICES[1:])
+    system.run("systemctl", "start", TARGET)
+    if not system.dry:
+        _first_login(system, say)
+
+
+def uninstall(system: System, *, purge: bool, prefix: Path = Path(sys.prefix)) -> None:
+    """Take everything back but the stage and the packages. ``purge``: the stage, the settings and the user, too."""
+    for unit in (TARGET, *SERVICES):
+        system.run("systemctl", "disable", "--now", "--quiet", unit, may_fail=True)
+    for path in (*files.shipped(prefix), files.X_OUTPUTS, PLAYER_OPTIONS):
+        system.remove(path)
+    if system.at(files.COMMAND).is_symlink():
+        system.remove(files.COMMAND)
+    system.remove(RUNTIME)
+    system.run("systemctl", "daemon-reload", may_fail=True)
+    system.run("udevadm", "control", "--reload", may_fail=True)
+    if purge:
+        system.remove(STATE)
+        system.remove(files.CONFIGURATION)
+        if system.look("getent", "passwd", USER) is not None:
+            system.run("userdel", USER)
+
+
+def check(system: System, prefix: Path) -> None:
+    """Refuse a computer on which the kiosk would not work."""
+    told = dict(
+        re.findall(r'^(ID|VERSION_ID)="?([^"\n]*)"?$', system.read(Path("/etc/os-release")) or "", re.MULTILINE)
+    )
+    if told.get("ID") != "debian" or told.get("VERSION_ID") not in DEBIAN:
+        raise UsageError(
+            "kiosk-system-unknown",
+            what=f"This is {told.get('ID', 'an unknown system')} {told.get('VERSION_ID', '')}, not Debian 12 or 13.",
+            remedy="Install Debian 12 or 13 on this computer.",
+        )
+    if (system.look("systemctl", "is-active", "display-manager") or "").strip() == "active":
+        raise UsageError(
+            "kiosk-has-desktop",
+            what="A desktop runs on this computer, and it uses the projectors' outputs.",
+            remedy="Switch it off: systemctl disable --now display-manager",
+        )
+    if prefix.is_relative_to("/home") or prefix.is_relative_to("/root"):
+        raise UsageError(
+            "kiosk-place-hidden",
+            what=f"Velatura is installed in {prefix}, which the services can't see.",
+            remedy="Install it into /opt/velatura.",
+        )
+
+
+def _packages(system: System) -> None:
+    cards = system.look("sh", "-c", "cat /sys/class/drm/card*/device/vendor") or ""
+    wanted = (*PACKAGES, *((AMD,) if "0x1002" in cards else ()))
+    told = system.look("dpkg-query", "--show", "--showformat", "${Package} ${db:Status-Status}\n") or ""
+    there = {line.split()[0] for line in told.splitlines() if line.endswith(" installed")}
+    # Debian 13 calls some libraries with 64-bit times by another name, and provides the old one.
+    missing = [name for name in wanted if name not in there and f"{name}t64" not in there]
+    if missing:
+        system.run("apt-get", "update", "--quiet")
+        system.run("apt-get", "install", "--yes", "--no-install-recommends", *missing)
+
+
+def _user(system: System) -> None:
+    if system.look("getent", "passwd", USER) is None:
+        system.run("useradd", "--system", "--home-dir", str(STATE), "--shell", "/usr/sbin/nologin", USER)
+    there = (system.look("id", "--name", "--groups", USER) or "").split()
+    missing = [name for name in GROUPS if name not in there]
+    for name in missing:
+        if system.look("getent", "group", name) is None:
+            system.run("groupadd", "--system", name)
+    if missing:
+        system.run("usermod", "--append", "--groups", ",".join(missing), USER)
+
+
+def _folders(system: System) -> None:
+    owner = f"{USER}:{USER}"
+    system.folder(files.CONFIGURATION)
+    system.folder(STATE, mode=0o750, owner=owner)
+    system.folder(STAGE, mode=0o750, owner=owner)
+    if not system.at(RUNTIME).is_dir():
+        system.run("systemd-tmpfiles", "--create", "/etc/tmpfiles.d/velatura.conf")
+
+
+def _panel(system: System) -> None:
+    host = (system.look("hostname") or system.read(Path("/etc/hostname")) or "velatura").strip()
+    if system.read(files.KEY) is None:
+        names = f"subjectAltName=DNS:{host},DNS:{host}.local"
+        system.run(
+            "openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
+            "-days", "7300", "-subj", f"/CN={host}", "-addext", names,
+            "-keyout", str(files.KEY), "-out", str(files.CERTIFICATE),
+        )  # fmt: skip
+        system.run("chown", f"root:{USER}", str(files.KEY))
+        system.run("chmod", "0640", str(files.KEY))
+    if system.read(files.CONTROLLER_OPTIONS) is None:
+        system.write(files.CONTROLLER_OPTIONS, files.controller_options(host))
+
+
+def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None:
+    """X settings and the player's outputs, from what is plugged in; only once, because a projector that is off later
+    looks like one that is gone.
+    """
+    if not again and system.read(files.X_OUTPUTS) is not None:
+        return
+    if system.dry:
+        say("Then the X server is asked what is plugged in, and its settings and the player's outputs are written.")
+        return
+    found = placed(connected(system.look("xrandr", "--verbose", more=_X) or ""))
+    if not found:
+        say("No projector is plugged in and switched on. Type `velatura kiosk install --outputs` once they are.")
+    else:
+        say("Projectors: " + ", ".join(f"{one.name} with {one.mode.name}" for one in found) + ".")
+        if system.write(files.X_OUTPUTS, x_configuration(found)):
+            system.run("systemctl", "restart", "velatura-x11")
+    # A stage has outputs of its own, which the service writes there.
+    if system.read(STAGE / "stage.toml") is None:
+        settings = PlayerSettings(player_outputs(found) or NO_OUTPUTS, None, bundle=STAGE / "bundles" / "current")
+        text = "".join(f"{word}\n" for word in settings.arguments())
+        if system.write(PLAYER_OPTIONS, text, mode=0o600, owner=f"{USER}:{USER}"):
+            system.run("systemctl", "try-restart", "velatura-player")
+
+
+def _first_login(system: System, say: Callable[[str], None]) -> None:
+    """Tell the one-time password of a new kiosk, once."""
+    until_s = time.monotonic() + READY_S
+    while system.look("systemctl", "is-active", "--quiet", "velatura-controller") is None:
+        if time.monotonic() > until_s:
+            say("The controller is not ready yet. `systemctl status velatura-controller` tells why.")
+            return
+        time.sleep(0.5)
+    told = system.read(RUNTIME / FIRST_LOGIN)
+    if told is not None:
+        account, password = told.split()
+        say(f"First login: {account}, password {password} (once).")
+        system.at(RUNTIME / FIRST_LOGIN).unlink()

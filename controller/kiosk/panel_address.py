@@ -1,0 +1,63 @@
+"""Under which addresses browsers reach the panel of this computer, and how somebody logs in first."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import ipaddress
+import socket
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from controller.core.storage import write_atomically
+
+FIRST_LOGIN: Final = "first-login"
+"""In the runtime folder: the one-time password of a kiosk whose output goes to the journal, for the installation."""
+
+EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104 - compared with, not listened at
+_GET_ADDRESS: Final = 0x8915
+"""SIOCGIFADDR: an interface's IPv4 address (netdevice(7))."""
+
+
+def own_addresses() -> tuple[str, ...]:
+    """The IPv4 addresses of this computer in its networks, without those that only itself knows."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
+        for _, name in socket.if_nameindex():
+            # An interface without an address has nothing to tell.
+            with contextlib.suppress(OSError):
+                told = fcntl.ioctl(channel, _GET_ADDRESS, struct.pack("256s", name.encode()[:15]))
+                found.append(ipaddress.ip_address(told[20:24]))
+    return tuple(str(one) for one in found if not one.is_loopback)
+
+
+def addresses(told: str) -> tuple[str, ...]:
+    """The addresses for people, of a panel that listens at ``told`` (``https://0.0.0.0:8377/``)."""
+    for host in EVERYWHERE:
+        if f"//{host}:" in told or f"//[{host}]:" in told:
+            at = told.rpartition(":")[2]
+            scheme = told.partition(":")[0]
+            return tuple(f"{scheme}://{own}:{at}" for own in own_addresses())
+    return (told,)
+
+
+@dataclass(frozen=True, slots=True)
+class PanelAccess:
+    """Where the panel is (``told``: as its server says), and the account and one-time password until ``entered``."""
+
+    told: str
+    login: tuple[str, ...]
+    entered: Callable[[], bool]
+
+    def lines(self) -> tuple[str, ...]:
+        """For a projector."""
+        where = addresses(self.told)[:1] or ("connect this computer to a network",)
+        return ("velatura", *where, *(() if self.entered() else self.login))
+
+
+def keep_first_login(runtime: Path, account: str, password: str) -> None:
+    """Where only the services' user and root read it, and only until the computer is switched off."""
+    write_atomically(runtime / FIRST_LOGIN, f"{account} {password}\n".encode(), mode=0o600)

@@ -1,0 +1,128 @@
+"""An installed kiosk on a booted machine, and the stage that is put on it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from controller.bundle.signing import load_signing_key
+from controller.bundle.writer import NewAppearance, write_bundle
+from tests.booted.machine import STAGE, Machine
+from tests.booted.trees import ROOT, tree
+from tests.controller.play.wire import noise
+
+OUTPUTS: Final = [(name, 280, 210) for name in ("P1", "P2", "P3")]
+SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
+APPEARANCE: Final = "1"
+_SEED: Final = 1
+
+
+@dataclass(frozen=True)
+class Kiosk:
+    """``dry``, ``told``: what its installation printed that only would have been done, and that was."""
+
+    machine: Machine
+    dry: str
+    told: str
+
+    @property
+    def password(self) -> str:
+        found = re.search(r"password (\S+) \(once\)", self.told)
+        assert found is not None, self.told
+        return found[1]
+
+    @property
+    def state(self) -> str:
+        return str(self.machine.velatura("status")["state"])
+
+    def shows(self) -> bool:
+        """Whether the X server shows the stage's appearance, to the byte, and nothing else."""
+        screen = self.machine.screen()
+        if screen is None:
+            return False
+        wanted = np.zeros_like(screen)
+        beside = np.concatenate(list(noise(OUTPUTS, _SEED).values()), axis=1)
+        wanted[: beside.shape[0], : beside.shape[1]] = beside
+        return bool(np.array_equal(screen, wanted))
+
+    def answers(self) -> bool:
+        """Whether a command reaches the service, and not the folder alone."""
+        done = self.machine.called("velatura", "status", STAGE, "--json", user="velatura")
+        return done.returncode == 0 and json.loads(done.stdout)["result"].get("serving", True)
+
+    def read_code(self) -> str:
+        """What a telephone reads from the projectors; empty without a QR code."""
+        screen = self.machine.screen()
+        return "" if screen is None else str(cv2.QRCodeDetector().detectAndDecode(np.ascontiguousarray(screen))[0])
+
+    def put_stage(self, stage: Path) -> None:
+        """Copy a stage of ``prepared_stage`` there, as somebody does; then it plays."""
+        machine, described = self.machine, stage / "stage.toml"
+        place = machine.at(STAGE)
+        shutil.copytree(stage, place, dirs_exist_ok=True, ignore=shutil.ignore_patterns(described.name))
+        machine.call("chown", "--recursive", "velatura:velatura", STAGE)
+        machine.call("systemctl", "enable", "--now", "bench")
+        machine.wait_for(lambda: os.path.lexists(place / "run" / "tty-left"))
+        shutil.copy(described, place / "new.toml")
+        machine.call("chown", "velatura:velatura", STAGE / "new.toml")
+        machine.call("mv", STAGE / "new.toml", STAGE / described.name)
+        machine.wait_for(self.answers)
+        machine.call("velatura", "bundle", "install", STAGE / "noise.vel", STAGE, user="velatura")
+        showing = ("velatura", "show", STAGE, APPEARANCE)
+        machine.wait_for(lambda: machine.called(*showing, user="velatura").returncode == 0)
+        machine.wait_for(self.shows)
+        machine.wait_for(lambda: self.state == "playing")
+
+
+@contextmanager
+def installed(suite: str, wheel: Path, folder: Path) -> Iterator[Kiosk]:
+    """A kiosk without a stage, right after its installation on a bare Debian."""
+    with Machine(tree(suite), wheel, folder) as machine:
+        machine.switch_on()
+        dry = machine.call("/opt/velatura/bin/velatura", "kiosk", "install", "--dry-run")
+        assert not machine.at(STAGE).exists()
+        yield Kiosk(machine, dry, machine.call("/opt/velatura/bin/velatura", "kiosk", "install"))
+
+
+def built_wheel(folder: Path) -> Path:
+    """Velatura as it is released, built from a copy."""
+    source, out = folder / "source", folder / "wheel"
+    for name in ("controller", "hal", "plugins", "firmware_configs"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*build, "--wheel-dir", out, source], check=True)
+    (found,) = out.glob("*.whl")
+    return found
+
+
+def prepared_stage(folder: Path) -> Path:
+    """The demo's stage for projectors at an X server, with a bundle beside it."""
+    words = ["demo", "--prepare-only", "--out", str(folder / "out")]
+    subprocess.run([sys.executable, "-m", "controller", *words], check=True, cwd=ROOT, capture_output=True)
+    stage = folder / "out" / "stage"
+    described = stage / "stage.toml"
+    described.write_text(re.sub(r"^frames = .*\n", "", described.read_text(), flags=re.MULTILINE))
+    write_bundle(
+        stage / "noise.vel",
+        stage="demo small",
+        calibration="c",
+        created_unix_s=0,
+        outputs=OUTPUTS,
+        appearances=[NewAppearance(APPEARANCE, noise(OUTPUTS, _SEED))],
+        key=load_signing_key(stage / "keys" / "stage.key"),
+    )
+    return stage

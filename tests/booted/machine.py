@@ -1,0 +1,200 @@
+"""A Debian that systemd boots in a container, with a disk of its own: switched on, spoken to, cut off and on again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+STAGE: Final = Path("/var/lib/velatura/stage")
+LONGEST_S: Final = 300.0
+"""Far beyond what anything here takes, for machines that do much else meanwhile."""
+ADDRESS: Final = "192.0.2.7"
+"""Of the machine in a network where it is alone."""
+_PATH: Final = "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+_SCREEN: Final = """
+Section "Device"
+  Identifier "dummy"
+  Driver "dummy"
+  VideoRam 64000
+EndSection
+Section "Monitor"
+  Identifier "every"
+  HorizSync 1-1000
+  VertRefresh 5-200
+EndSection
+Section "Screen"
+  Identifier "dummy"
+  Device "dummy"
+  Monitor "every"
+  DefaultDepth 24
+EndSection
+"""
+"""Outputs without graphics hardware, of which one is connected."""
+_BENCH: Final = """
+[Service]
+User=velatura
+Environment=HOME=/var/lib/velatura
+ExecStart=/opt/velatura/bin/velatura emulate /var/lib/velatura/stage
+[Install]
+WantedBy=multi-user.target
+"""
+_NETWORK: Final = f"""
+[Unit]
+Before=network.target
+Wants=network.target
+[Service]
+Type=oneshot
+ExecStart=/bin/sh -c "ip link add net0 type bridge; ip address add {ADDRESS}/24 dev net0; ip link set net0 up"
+[Install]
+WantedBy=multi-user.target
+"""
+_PHOTOGRAPH: Final = """
+import ctypes, sys
+class Image(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_int) for name in ("width", "height", "offset", "format")] + [("data", ctypes.c_void_p)]
+x = ctypes.CDLL("libX11.so.6")
+x.XOpenDisplay.restype = x.XGetImage.restype = ctypes.c_void_p
+x.XDefaultRootWindow.restype = ctypes.c_ulong
+display = x.XOpenDisplay(b":0")
+if not display:
+    sys.exit("X does not answer")
+display = ctypes.c_void_p(display)
+size = x.XDisplayWidth(display, 0), x.XDisplayHeight(display, 0)
+root = ctypes.c_ulong(x.XDefaultRootWindow(display))
+image = Image.from_address(x.XGetImage(display, root, 0, 0, *size, ctypes.c_ulong(0xFFFFFFFF), 2))
+with open("/tmp/screen", "wb") as file:
+    file.write(bytes(ctypes.string_at(image.data, size[0] * size[1] * 4)))
+print(*size)
+"""
+"""What the X server shows, read without anything of ours."""
+_FETCH: Final = """
+import ssl, sys, urllib.request
+context = ssl._create_unverified_context()
+print(urllib.request.urlopen(sys.argv[1], timeout=20, context=context).read().decode())
+"""
+
+
+class Machine:
+    """``tree`` is not changed: what the machine writes goes to ``folder``. A context manager: ends it."""
+
+    def __init__(self, tree: Path, wheel: Path, folder: Path) -> None:
+        self._root, self._folder = folder / "root", folder
+        for name in ("root", "written", "work"):
+            (folder / name).mkdir()
+        layers = f"lowerdir={tree},upperdir={folder / 'written'},workdir={folder / 'work'}"
+        subprocess.run(["mount", "-t", "overlay", "overlay", "-o", layers, str(self._root)], check=True)
+        shutil.copy(wheel, self._root / "opt")
+        self.write(Path("/etc/hostname"), "kiosk\n")
+        self.write(Path("/etc/X11/xorg.conf.d/00-dummy.conf"), _SCREEN)
+        self.write(Path("/etc/systemd/system/bench.service"), _BENCH)
+        self.write(Path("/etc/systemd/system/lonely-network.service"), _NETWORK)
+        self.write(Path("/opt/photograph.py"), _PHOTOGRAPH)
+        wants = self.at(Path("/etc/systemd/system/multi-user.target.wants"))
+        wants.mkdir(parents=True, exist_ok=True)
+        (wants / "lonely-network.service").symlink_to("/etc/systemd/system/lonely-network.service")
+        pip = ["/opt/velatura/bin/pip", "install", "--quiet", "--no-index", "--no-deps", f"/opt/{wheel.name}"]
+        subprocess.run(["chroot", str(self._root), *pip], check=True)
+        self._container: subprocess.Popen[bytes] | None = None
+        self._init = 0
+
+    def at(self, path: Path) -> Path:
+        """Where a path of the machine's disk lies here; /tmp and /run of a machine that runs are in its memory."""
+        return self._root / path.relative_to("/")
+
+    def write(self, path: Path, text: str) -> None:
+        self.at(path).parent.mkdir(parents=True, exist_ok=True)
+        self.at(path).write_text(text)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.cut_off()
+        subprocess.run(["umount", str(self._root)], check=True)
+
+    def switch_on(self) -> None:
+        """Boot, until the machine takes commands."""
+        with (self._folder / "console").open("ab") as console:
+            self._container = subprocess.Popen(
+                [
+                    "systemd-nspawn", "--quiet", "--boot", "--private-network", "--register=no", "--keep-unit",
+                    "--console=pipe", f"--machine=velatura-{os.getpid()}", f"--directory={self._root}",
+                ],
+                stdin=subprocess.DEVNULL, stdout=console, stderr=console,
+            )  # fmt: skip
+        children = Path(f"/proc/{self._container.pid}/task/{self._container.pid}/children")
+        self.wait_for(lambda: bool(children.read_text().split()))
+        self._init = int(children.read_text().split()[0])
+        self.wait_for(lambda: self.called("systemctl", "is-system-running").stdout.strip() != "")
+
+    def cut_off(self) -> None:
+        """As when the power fails: every process is gone at once, and nothing was told."""
+        if self._container is not None:
+            os.kill(self._init, signal.SIGKILL)
+            self._container.wait()
+            self._container = None
+
+    def called(self, *words: str | Path, user: str | None = None) -> subprocess.CompletedProcess[str]:
+        """Run a program on the machine, as root if no other ``user`` is named."""
+        there = ["nsenter", f"--target={self._init}", "--mount", "--uts", "--ipc", "--net", "--pid"]
+        identity = [] if user is None else ["runuser", "-u", user, "--"]
+        return subprocess.run(
+            [*there, "env", "-i", _PATH, "LANG=C.UTF-8", *identity, *map(str, words)],
+            capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+
+    def call(self, *words: str | Path, user: str | None = None) -> str:
+        """As ``called``, for what has to work; what it printed."""
+        done = self.called(*words, user=user)
+        assert done.returncode == 0, f"{' '.join(map(str, words))}: {done.stdout[-2000:]} {done.stderr[-2000:]}"
+        return done.stdout
+
+    def velatura(self, command: str, *words: str | Path) -> dict[str, Any]:
+        """A command about the kiosk's stage, by the services' user."""
+        told = self.call("velatura", command, STAGE, *words, "--json", user="velatura")
+        return dict(json.loads(told.splitlines()[-1])["result"])
+
+    def read(self, path: Path) -> bytes:
+        """A file of the machine that runs."""
+        return Path(f"/proc/{self._init}/root", path.relative_to("/")).read_bytes()
+
+    def screen(self) -> npt.NDArray[np.uint8] | None:
+        """What the X server shows, (rows, columns, 3) RGB; None while there is none."""
+        done = self.called("env", "XAUTHORITY=/run/velatura-x11/cookie", "python3", "/opt/photograph.py")
+        if done.returncode:
+            return None
+        width, height = map(int, done.stdout.split())
+        data = np.frombuffer(self.read(Path("/tmp/screen")), np.uint8)
+        return data.reshape(height, width, 4)[:, :, 2::-1]
+
+    def restarts(self, unit: str) -> int:
+        return int(self.call("systemctl", "show", "--value", "--property=NRestarts", unit))
+
+    def fetched(self, url: str) -> str:
+        """A page of the machine, asked for by a program outside it that is in its network."""
+        asking = [sys.executable, "-c", _FETCH, url]
+        done = subprocess.run(
+            ["nsenter", f"--target={self._init}", "--net", *asking], capture_output=True, text=True, check=True
+        )
+        return done.stdout
+
+    def wait_for(self, so: Callable[[], object], *, within_s: float = LONGEST_S) -> float:
+        """Wait until it is so; the seconds that it took. What the services said is shown if it never is."""
+        began_s = time.monotonic()
+        while not so():
+            if time.monotonic() > began_s + within_s:
+                told = self.called("journalctl", "--boot", "--no-pager", "--lines=60").stdout
+                raise AssertionError(f"it did not happen within {within_s:g} s\n{told}")
+            time.sleep(0.2)
+        return time.monotonic() - began_s

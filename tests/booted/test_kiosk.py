@@ -1,0 +1,167 @@
+"""A kiosk from a bare Debian to the picture, and back again after what happens to it: services, X server and disk are
+real; the devices are emulated on pseudo-terminals and TCP.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.booted.kiosk import SERVICES, Kiosk, built_wheel, installed, prepared_stage
+from tests.booted.machine import ADDRESS, STAGE
+from tests.booted.trees import SUITES
+from tests.campaigns.power_cuts import cut, kept, lost
+
+PICTURE_S = 60.0
+"""From the boot of a bare Debian with the package to a picture."""
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built_wheel(tmp_path_factory.mktemp("build"))
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return prepared_stage(tmp_path_factory.mktemp("demo"))
+
+
+@pytest.fixture(scope="module", params=SUITES)
+def bare(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kiosk]:
+    """Installed, without a stage; the projectors show the way to the panel."""
+    with installed(request.param, wheel, tmp_path_factory.mktemp(request.param)) as kiosk:
+        assert kiosk.machine.wait_for(lambda: kiosk.read_code() != "") < PICTURE_S
+        yield kiosk
+
+
+@pytest.fixture(scope="module")
+def playing(bare: Kiosk, stage: Path) -> Kiosk:
+    """With a stage that plays."""
+    bare.put_stage(stage)
+    return bare
+
+
+def test_without_a_stage_the_projectors_show_the_way_to_the_panel(bare: Kiosk) -> None:
+    address = bare.read_code()
+    assert address == f"https://{ADDRESS}:8377/"
+    assert 'name="password"' in bare.machine.fetched(f"{address}login")
+
+
+def test_the_set_up_page_can_ask_which_projectors_there_are(bare: Kiosk) -> None:
+    machine = bare.machine
+    process = machine.call("systemctl", "show", "--value", "--property=MainPID", "velatura-controller").strip()
+    settings = machine.read(Path(f"/proc/{process}/environ")).decode().split("\0")
+    display = [one for one in settings if one.startswith(("DISPLAY=", "XAUTHORITY="))]
+    inside = ["nsenter", f"--target={process}", "--mount", "runuser", "-u", "velatura", "--"]
+    assert "DUMMY0 connected" in machine.call(*inside, "env", *display, "xrandr")
+
+
+def test_the_first_password_is_told_once_and_not_in_the_journal(bare: Kiosk) -> None:
+    program = (
+        "import sys; from pathlib import Path; from controller.kiosk.store.accounts import stage_accounts;"
+        "sys.exit(stage_accounts(Path(sys.argv[1])).verify('technician', sys.argv[2]) is None)"
+    )
+    bare.machine.call("/opt/velatura/bin/python", "-c", program, STAGE, bare.password, user="velatura")
+    assert bare.password not in bare.machine.call("journalctl", "--no-pager")
+    assert bare.machine.called("test", "-e", "/run/velatura/first-login").returncode == 1
+
+
+def test_a_dry_run_tells_what_is_done(bare: Kiosk) -> None:
+    done = [line for line in bare.told.splitlines() if line.startswith(("write", "useradd", "usermod", "make"))]
+    later = ("/etc/X11/xorg.conf.d/20-velatura-outputs.conf", "/var/lib/velatura/player.options")
+    assert [line for line in done if not line.endswith(later)] == [
+        line for line in bare.dry.splitlines() if line.startswith(("write", "useradd", "usermod", "make"))
+    ]
+
+
+def test_installing_again_changes_nothing(bare: Kiosk) -> None:
+    before = [bare.machine.call("systemctl", "show", "--property=MainPID", *SERVICES)]
+    again = bare.machine.call("velatura", "kiosk", "install")
+    assert not re.search("write|restart|useradd|usermod|openssl|apt-get", again)
+    assert [bare.machine.call("systemctl", "show", "--property=MainPID", *SERVICES)] == before
+
+
+def test_user_and_root_reach_the_running_kiosk(playing: Kiosk) -> None:
+    assert playing.machine.velatura("status")["playing"] == "1"
+    assert "playing" in playing.machine.call("velatura", "status", STAGE)
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_a_killed_service_is_back_with_the_picture_and_nothing_restarts_in_a_loop(playing: Kiosk, service: str) -> None:
+    machine, before = playing.machine, {name: playing.machine.restarts(name) for name in SERVICES}
+    machine.call("systemctl", "kill", "--signal=KILL", service)
+    machine.wait_for(lambda: machine.restarts(service) > before[service])
+    machine.wait_for(playing.shows)
+    machine.wait_for(lambda: playing.state == "playing")
+    after = {name: machine.restarts(name) - before[name] for name in SERVICES}
+    followers = {"velatura-x11": 1} if service == "velatura-x11" else {}
+    assert after[service] == 1
+    assert sum(after.values()) <= 1 + followers.get(service, 0), after
+
+
+def test_after_a_restart_of_all_units_the_picture_is_back(playing: Kiosk) -> None:
+    playing.machine.call("systemctl", "restart", "velatura.target")
+    playing.machine.wait_for(playing.shows)
+    playing.machine.wait_for(lambda: playing.state == "playing")
+
+
+def test_the_picture_stays_when_the_controller_restarts(playing: Kiosk) -> None:
+    machine = playing.machine
+    player = machine.call("systemctl", "show", "--property=MainPID", "velatura-player")
+    machine.call("systemctl", "kill", "--signal=KILL", "velatura-controller")
+    assert playing.shows()
+    machine.wait_for(playing.answers)
+    assert playing.shows()
+    assert machine.call("systemctl", "show", "--property=MainPID", "velatura-player") == player
+
+
+def test_a_backup_is_restored_on_this_debians_python(playing: Kiosk) -> None:
+    machine = playing.machine
+    restarts = machine.restarts("velatura-controller")
+    machine.velatura("backup")
+    (backup,) = machine.at(STAGE / "kiosk" / "archives").glob("backup-*")
+    machine.call("velatura", "restore", STAGE, STAGE / "kiosk" / "archives" / backup.name, user="velatura")
+    machine.wait_for(playing.answers)
+    machine.wait_for(playing.shows)
+    assert machine.restarts("velatura-controller") == restarts, "it begins anew without an end"
+
+
+def test_after_a_power_cut_the_picture_is_back_by_itself_and_nothing_is_lost(playing: Kiosk) -> None:
+    before = kept(playing)
+    assert cut(playing, after_s=2.5) < PICTURE_S
+    playing.machine.wait_for(lambda: playing.state == "playing")
+    assert lost(playing, before) == []
+    assert {playing.machine.restarts(name) for name in SERVICES} == {0}
+
+
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+def test_a_calibration_uses_the_same_player_and_what_it_made_plays(playing: Kiosk) -> None:
+    machine = playing.machine
+    described = machine.at(STAGE / "stage.toml")
+    text = re.sub(r'(driver = "player"\n)', r'\1frames = "run/outputs.frame"\n', described.read_text())
+    first, _, _ = text.partition("\n[[appearances]]")
+    (machine.at(STAGE) / "new.toml").write_text(f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n')
+    machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
+    machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
+    machine.wait_for(playing.answers)
+    player = machine.call("systemctl", "show", "--property=MainPID", "velatura-player")
+    machine.call("velatura", "recalibrate", STAGE, user="velatura")
+    machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
+    machine.wait_for(lambda: machine.velatura("status")["playing"] == "board")
+    assert machine.call("systemctl", "show", "--property=MainPID", "velatura-player") == player
+    assert machine.restarts("velatura-controller") == 0
+
+
+def test_uninstalling_leaves_the_stage_and_nothing_that_starts(playing: Kiosk) -> None:
+    machine = playing.machine
+    machine.call("velatura", "kiosk", "uninstall")
+    left = machine.call("find", "/etc", "/run", "-name", "*velatura*", "-not", "-path", "/etc/velatura*")
+    assert [line for line in left.splitlines() if "/run/systemd" not in line] == []
+    assert machine.at(STAGE / "stage.toml").exists()
+    running = machine.call("sh", "-c", "cat /proc/[0-9]*/cmdline | tr '\\0' ' '")
+    assert "emulate" in running
+    assert not re.search("serve|controller.play|Xorg :0", running)

@@ -1,0 +1,155 @@
+"""The installation below another root: what it writes, what it refuses, that it changes nothing when it is repeated.
+The real one is in tests/booted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.kiosk_places import RUNTIME
+from controller.kiosk.install import steps
+from controller.kiosk.install.system import System
+from controller.play.__main__ import _parser
+from tests.controller.kiosk.install.test_outputs import LEFT
+
+PREFIX = Path("/opt/velatura")
+
+
+class Recorded(System):
+    """A computer whose files lie in a folder, and whose programs are only noted. ``answers`` by a program's name."""
+
+    def __init__(self, root: Path, answers: Mapping[str, str], *, dry: bool = False) -> None:
+        self.told: list[str] = []
+        super().__init__(self.told.append, dry=dry, root=root)
+        self.answers, self.ran = answers, list[str]()
+
+    def look(self, *words: str, more: Mapping[str, str] | None = None) -> str | None:
+        return self.answers.get(words[0])
+
+    def run(self, *words: str, may_fail: bool = False) -> None:
+        self.ran.append(" ".join(words))
+        if words[0] == "openssl":
+            self.write(Path(words[words.index("-keyout") + 1]), "a key")
+        if words[0] == "systemd-tmpfiles":
+            self.folder(RUNTIME)
+
+
+@pytest.fixture
+def debian(tmp_path: Path) -> Path:
+    (tmp_path / "etc").mkdir()
+    (tmp_path / "etc/os-release").write_text('NAME="Debian GNU/Linux"\nVERSION_ID="12"\nID=debian\n')
+    return tmp_path
+
+
+INSTALLED = "".join(f"{name} installed\n" for name in steps.PACKAGES)
+FRESH = {"xrandr": LEFT, "hostname": "vase\n", "systemctl": ""}
+THERE = {**FRESH, "dpkg-query": INSTALLED, "getent": "velatura", "id": " ".join(("velatura", *steps.GROUPS))}
+
+
+def installed(root: Path, answers: Mapping[str, str], *, again: bool = False, dry: bool = False) -> Recorded:
+    system = Recorded(root, answers, dry=dry)
+    steps.install(system, outputs_again=again, say=system.told.append, prefix=PREFIX)
+    return system
+
+
+def test_it_makes_user_packages_units_and_the_outputs_that_are_there(debian: Path) -> None:
+    ran = installed(debian, FRESH).ran
+    assert any(line.startswith("useradd --system") for line in ran)
+    (packages,) = (line for line in ran if line.startswith("apt-get install"))
+    assert set(steps.PACKAGES) <= set(packages.split())
+    assert "systemctl enable --quiet velatura.target" in ran
+    assert '"1400x1050_59.98"' in (debian / "etc/X11/xorg.conf.d/20-velatura-outputs.conf").read_text()
+    assert "--name vase.local" in (debian / "etc/velatura/controller.env").read_text()
+    options = (debian / "var/lib/velatura/player.options").read_text().split("\n")[:-1]
+    read = _parser().parse_args(["--socket", "/run/velatura/player.sock", "--resume", *options])
+    assert (read.outputs, read.windows, read.trusted) == ("HDMI-1:1400x1050", True, [])
+
+
+def test_once_more_it_changes_nothing(debian: Path) -> None:
+    installed(debian, FRESH)
+    before = {path: path.read_bytes() for path in debian.rglob("*") if path.is_file()}
+    again = installed(debian, THERE)
+    assert {path: path.read_bytes() for path in debian.rglob("*") if path.is_file()} == before
+    assert [line for line in again.ran if not line.startswith(("systemctl enable", "systemctl start", "ln "))] == []
+
+
+def test_a_dry_run_writes_nothing_and_tells_all_of_it(debian: Path) -> None:
+    before = sorted(debian.rglob("*"))
+    system = installed(debian, FRESH, dry=True)
+    assert sorted(debian.rglob("*")) == before
+    assert {"write /etc/systemd/system/velatura-player.service", "make folder /etc/velatura"} <= set(system.told)
+
+
+def test_a_projector_that_is_off_later_stays_in_the_settings_until_somebody_asks(debian: Path) -> None:
+    installed(debian, FRESH)
+    written = debian / "etc/X11/xorg.conf.d/20-velatura-outputs.conf"
+    other = {**THERE, "xrandr": LEFT.replace("HDMI-1", "DP-7")}
+    installed(debian, other)
+    assert "HDMI-1" in written.read_text()
+    installed(debian, other, again=True)
+    assert "DP-7" in written.read_text()
+    assert "DP-7:1400x1050" in (debian / "var/lib/velatura/player.options").read_text()
+
+
+def test_without_projectors_it_says_so_and_the_player_starts_all_the_same(debian: Path) -> None:
+    system = installed(debian, {**FRESH, "xrandr": ""})
+    assert any("--outputs" in line for line in system.told)
+    assert not (debian / "etc/X11/xorg.conf.d/20-velatura-outputs.conf").exists()
+    assert "projector:1024x768" in (debian / "var/lib/velatura/player.options").read_text()
+
+
+def test_the_options_of_a_stage_are_left_alone(debian: Path) -> None:
+    installed(debian, FRESH)
+    (debian / "var/lib/velatura/stage/stage.toml").write_text("[stage]")
+    (debian / "var/lib/velatura/player.options").write_text("mine")
+    installed(debian, THERE, again=True)
+    assert (debian / "var/lib/velatura/player.options").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("release", "active", "prefix", "code"),
+    [
+        ("ID=ubuntu\nVERSION_ID=24.04\n", "", PREFIX, "kiosk-system-unknown"),
+        ("ID=debian\nVERSION_ID=11\n", "", PREFIX, "kiosk-system-unknown"),
+        ("ID=debian\n", "", PREFIX, "kiosk-system-unknown"),
+        ("", "", PREFIX, "kiosk-system-unknown"),
+        ("ID=debian\nVERSION_ID=13\n", "active\n", PREFIX, "kiosk-has-desktop"),
+        ("ID=debian\nVERSION_ID=13\n", "", Path("/home/somebody/venv"), "kiosk-place-hidden"),
+    ],
+)
+def test_a_computer_on_which_it_would_not_work_is_refused(
+    debian: Path, release: str, active: str, prefix: Path, code: str
+) -> None:
+    (debian / "etc/os-release").write_text(release)
+    system = Recorded(debian, {**FRESH, "systemctl": active})
+    with pytest.raises(VelaturaError) as caught:
+        steps.install(system, outputs_again=False, say=system.told.append, prefix=prefix)
+    assert isinstance(caught.value, UsageError)
+    assert (caught.value.code, system.ran) == (code, [])
+
+
+def test_uninstalling_takes_everything_back_but_the_stage(debian: Path) -> None:
+    before = sorted(path for path in debian.rglob("*") if path.is_file())
+    installed(debian, FRESH)
+    (debian / "var/lib/velatura/stage/stage.toml").write_text("[stage]")
+    system = Recorded(debian, THERE)
+    steps.uninstall(system, purge=False, prefix=PREFIX)
+    left = {path for path in debian.rglob("*") if path.is_file()} - set(before)
+    assert {path.relative_to(debian).parts[:2] for path in left} == {("etc", "velatura"), ("var", "lib")}
+    steps.uninstall(system, purge=True, prefix=PREFIX)
+    assert sorted(path for path in debian.rglob("*") if path.is_file()) == before
+    assert "userdel velatura" in system.ran
+
+
+def test_a_program_that_fails_ends_it_with_what_it_said(debian: Path) -> None:
+    system = System(lambda line: None, root=debian)
+    with pytest.raises(WorkError, match="no such luck") as caught:
+        system.run("sh", "-c", "echo no such luck; exit 3")
+    assert caught.value.code == "kiosk-step-failed"
+    with pytest.raises(WorkError, match="no such program"):
+        system.run("velatura-is-no-such-program")
+    system.run("false", may_fail=True)
