@@ -38,6 +38,8 @@ class StepKind(enum.StrEnum):
     BASE = "base"
     TARGET = "target"
     APPEARANCE = "appearance"
+    REFINE = "refine"
+    REFINED = "refined"
     PUBLISH = "publish"
     PHOTOGRAPH = "photograph"
     TRADITIONAL = "traditional"
