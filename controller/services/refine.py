@@ -18,6 +18,7 @@ from controller.run.runner import Step
 from controller.stage.check import Checked
 from controller.stage.session import StageSession
 from controller.steps.appearance.refining import RefineOptions, refine_steps, sentence
+from hal.deadline import Cancelled
 from hal.errors import DeviceError
 
 REFINE: Final = "refine"
@@ -28,8 +29,8 @@ REFINE: Final = "refine"
 class Refinement:
     """At most so many ``photographs`` of each result; 0: the frames as they were solved.
 
-    ``asked``: by a person, now. Else what has been refined already stays as it is, and a stage without its devices
-    keeps the frames as they were solved, with a warning.
+    ``asked``: by a person, now. Else what has been refined already stays as it is, and a stage whose devices can't be
+    opened, or whose room is bright, keeps the frames as they were solved, with a warning.
     """
 
     photographs: int
@@ -68,14 +69,20 @@ def refine(
     tables = checked.stage.tables
     options = RefineOptions(refinement.photographs, tables.solve.smoothness, tables.capture.longest_exposure_s)
 
+    opened = False
+
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
+        nonlocal opened
+        opened = True
         return [*refine_steps(rig, calibrated, left, options), *dark_after(rig.darkness, rig.display)]
 
     try:
         if left:
             session.run(checked, steps, name=REFINE, reporter=reporter, cancel=cancel, dark=True)
     except DeviceError as error:
-        if refinement.asked:
+        # What fails once lamps may be lit has to be seen by a person.
+        before_light = not opened or error.code == "room-not-dark"
+        if refinement.asked or not before_light or isinstance(error, Cancelled):
             raise
         reporter.say(
             f"The appearances were not refined: {error.what} {error.remedy} Then run the same command again, or set "

@@ -20,7 +20,8 @@ from controller.run.runner import Step
 from controller.services.refine import Refinement, refine, refinement_of
 from controller.stage.check import Checked, check_stage
 from controller.stage.session import MakeSteps, StageSession
-from hal.errors import DeviceGone
+from hal.deadline import Cancelled
+from hal.errors import DeviceError, DeviceGone, DeviceRefused
 from tests.controller.rig.rig_model import ModelRig
 from tests.controller.services.test_calibrate import write
 from tests.controller.steps.appearance.test_publishing import OUTPUTS, solve
@@ -31,10 +32,11 @@ GONE = DeviceGone("camera-gone", what="The camera is gone.", remedy="Plug it in.
 
 @dataclass
 class Session(StageSession):
-    """Notes the steps that it was asked to run; ``error`` instead of running them."""
+    """Notes the steps that it was asked to run; ``error`` instead of them, or before the devices are ``opened``."""
 
     stage: Path
     error: Exception | None = None
+    opened: bool = True
     asked: list[tuple[str, list[str]]] = field(default_factory=list)
 
     def locked(self) -> contextlib.AbstractContextManager[None]:
@@ -45,6 +47,8 @@ class Session(StageSession):
         dark: bool = False, plays: bool = False, before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
     ) -> Path:  # fmt: skip
         assert dark, "room light would be taken for an error"
+        if self.error is not None and not self.opened:
+            raise self.error
         steps = make_steps(ModelRig(self.stage).rig, self.stage)
         self.asked.append((name, [str(step.id) for step in steps]))
         if self.error is not None:
@@ -66,8 +70,10 @@ class Stage:
     run: Path
     told: Told = field(default_factory=Told)
 
-    def refine(self, refinement: Refinement, error: Exception | None = None) -> tuple[Session, Mapping[str, Any]]:
-        session = Session(self.folder, error)
+    def refine(
+        self, refinement: Refinement, error: Exception | None = None, opened: bool = True
+    ) -> tuple[Session, Mapping[str, Any]]:
+        session = Session(self.folder, error, opened)
         calibrated = Calibrated(self.run, tuple(OUTPUTS))
         result = refine(
             session, check_stage(self.folder), calibrated, TITLES, refinement,
@@ -128,11 +134,31 @@ def test_none_drops_what_was_refined_and_lights_nothing(stage: Stage) -> None:
     assert read_refining(stage.run, "gold") is None
 
 
-def test_without_devices_the_solved_frames_stay_unless_asked(stage: Stage) -> None:
-    with pytest.raises(DeviceGone):
-        stage.refine(Refinement(1), GONE)
+@pytest.mark.parametrize(
+    ("error", "opened"), [(GONE, False), (DeviceRefused("room-not-dark", what="It is bright.", remedy="Wait."), True)]
+)
+def test_where_no_lamp_can_be_lit_the_solved_frames_stay_unless_asked(
+    stage: Stage, error: DeviceError, opened: bool
+) -> None:
+    with pytest.raises(type(error)):
+        stage.refine(Refinement(1), error, opened)
     assert stage.told.said == []
-    assert stage.refine(Refinement(1, asked=False), GONE)[1] == {"refined": ""}
+    assert stage.refine(Refinement(1, asked=False), error, opened)[1] == {"refined": ""}
     ((level, text),) = stage.told.said
     assert level is Level.WARNING
-    assert text.startswith("The appearances were not refined: The camera is gone. Plug it in. Then ")
+    assert text.startswith(f"The appearances were not refined: {error.what} {error.remedy} Then ")
+
+
+@pytest.mark.parametrize(
+    ("error", "opened"),
+    [
+        (GONE, True),
+        (DeviceError("lamp-still-lit", what="It is lit.", remedy="Switch it off."), True),
+        (Cancelled(), False),
+    ],
+)
+def test_what_fails_once_lamps_may_be_lit_and_a_stop_are_never_hidden(
+    stage: Stage, error: DeviceError, opened: bool
+) -> None:
+    with pytest.raises(type(error)):
+        stage.refine(Refinement(1, asked=False), error, opened)
