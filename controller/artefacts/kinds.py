@@ -40,6 +40,7 @@ class StepKind(enum.StrEnum):
     APPEARANCE = "appearance"
     REFINE = "refine"
     REFINED = "refined"
+    CAUSES = "causes"
     PUBLISH = "publish"
     PHOTOGRAPH = "photograph"
     TRADITIONAL = "traditional"

@@ -14,7 +14,7 @@ import numpy as np
 
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.names import json_path, npz_path, read_json, stem, write_json
-from controller.core.arrays import ByteImage, FloatImage, Mask, load_arrays, save_arrays
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask, load_arrays, save_arrays
 from controller.core.errors import WorkError
 from controller.core.storage import sha256_of
 
@@ -205,6 +205,7 @@ class Refining:
     ``best``: those photographed with the least error, and ``error`` (camera rows, columns) that error, CIEDE2000, NaN
     where not compared; None before the first photograph that counted
     ``photographs``: one row of figures for each; ``ended``: why there are no more, "" while there may be
+    ``equations``: what they say of common causes (``solve.common_causes``), added; None before the first that counted
     """
 
     frames: dict[str, FloatImage]
@@ -212,20 +213,29 @@ class Refining:
     error: FloatImage | None
     photographs: tuple[dict[str, Any], ...] = ()
     ended: str = ""
+    equations: Float64 | None = None
 
     def write(self, run: Path, name: str, number: int) -> list[Path]:
         arrays = _named("frame", self.frames)
         if self.best is not None and self.error is not None:
             arrays |= {**_named("best", self.best), "error": self.error}
+        if self.equations is not None:
+            arrays["equations"] = self.equations
         told = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
         save_arrays(told.with_suffix(".npz"), arrays)
         return [told.with_suffix(".npz"), write_json(told, {"photographs": self.photographs, "ended": self.ended})]
 
     @classmethod
     def read(cls, run: Path, name: str, number: int, projectors: Sequence[str]) -> Self:
-        told = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
-        arrays, figures = load_arrays(told.with_suffix(".npz")), read_json(told)
+        path = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
+        arrays, figures = load_arrays(path.with_suffix(".npz")), read_json(path)
         frames = {projector: arrays[f"frame-{projector}"] for projector in projectors}
         error = arrays.get("error")
         best = None if error is None else {projector: arrays[f"best-{projector}"] for projector in projectors}
-        return cls(frames, best, error, tuple(figures["photographs"]), str(figures["ended"]))
+        told = tuple(figures["photographs"]), str(figures["ended"])
+        return cls(frames, best, error, *told, arrays.get("equations"))
+
+
+def write_causes(run: Path, figures: Mapping[str, Any]) -> Path:
+    """``causes.json``: why photographs of several appearances err alike (docs/how-to/appearances.md)."""
+    return write_json(json_path(run, StepKind.CAUSES), figures)

@@ -17,11 +17,12 @@ from controller.artefacts.camera import inherit_camera
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
 from controller.capture.brackets import merge_brackets
-from controller.core.arrays import ByteImage, FloatImage, Mask
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.rig.rig import Rig
 from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
+from controller.solve.common_causes import equations
 from controller.solve.refine import (
     PhotographedError,
     RefinedStage,
@@ -34,6 +35,7 @@ from controller.solve.refine import (
     trusted_pixels,
 )
 from controller.steps import costs
+from controller.steps.appearance.causes import causes_step
 from controller.steps.appearance.publishing import take_bracket
 from controller.steps.appearance.solving import device_frames
 
@@ -69,6 +71,7 @@ def refine_steps(
     """
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     steps: list[Step] = []
+    last: list[StepId] = []
     for name, title in titles.items() if options.photographs else ():
         before = (after[name],) if after is not None else ()
         inputs = {"calibration": calibrated.folder.name, **options.inputs()}
@@ -87,6 +90,7 @@ def refine_steps(
                 )
             )
             before = (one,)
+        last += before
         steps.append(
             Step(
                 StepId(StepKind.REFINED, item=name),
@@ -97,6 +101,8 @@ def refine_steps(
                 weight=0.2,
             )
         )
+    if len(last) > 1:
+        steps.append(causes_step(calibrated, tuple(titles), options.photographs, after=last))
     return steps
 
 
@@ -141,13 +147,22 @@ class _Round:
         row = {"delta_e00_median": found.median, "delta_e00_p95": found.p95, "delta_e00_mean": found.mean,
                "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
         rows = (*now.photographs, row)
+        said = self._equations(now, photograph, predicted, trusted)
         if now.best is not None and now.error is not None:
             better = gain(now.error, found.map)
             if better.mean <= 0:
-                return Refining(now.best, now.best, now.error, (*rows[:-1], {**row, "kept": False}), WORSE)
+                return Refining(now.best, now.best, now.error, (*rows[:-1], {**row, "kept": False}), WORSE, said)
             if not better.worth_it:
-                return Refining(now.frames, now.frames, found.map, rows, ENOUGH)
-        return self._corrected(Refining(now.frames, now.frames, found.map, rows), photograph, predicted, trusted)
+                return Refining(now.frames, now.frames, found.map, rows, ENOUGH, said)
+        judged = Refining(now.frames, now.frames, found.map, rows, equations=said)
+        return self._corrected(judged, photograph, predicted, trusted)
+
+    def _equations(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Float64:
+        """What this photograph and those before it say of common causes."""
+        frames = [now.frames[projector] for projector in self.calibrated.projectors]
+        error = np.where(trusted[..., None], photograph.radiance - predicted, 0).astype(np.float32)
+        said = equations(self.calibrated.transport, frames, error, self._stage, trusted)
+        return said if now.equations is None else said + now.equations
 
     def _corrected(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Refining:
         """With frames of a corrected target, if the transport says that these are worth it."""

@@ -113,7 +113,7 @@ def test_each_photograph_is_a_step_and_the_better_frames_are_the_last(stage: Sta
     ((name, steps),) = session.asked
     assert name == "refine"
     assert steps == ["refine-1-gold", "refine-2-gold", "refined-gold",
-                     "refine-1-marble", "refine-2-marble", "refined-marble"]  # fmt: skip
+                     "refine-1-marble", "refine-2-marble", "refined-marble", "causes"]  # fmt: skip
 
 
 def test_what_is_refined_already_is_refined_again_only_when_asked(stage: Stage) -> None:
@@ -121,8 +121,8 @@ def test_what_is_refined_already_is_refined_again_only_when_asked(stage: Stage) 
     session, result = stage.refine(Refinement(1, asked=False))
     assert session.asked[0][1] == ["refine-1-marble", "refined-marble"]
     assert result["refined"] == "Refined gold: 1.50 to 0.50 (CIEDE2000 median) with 1 photograph."
-    assert len(stage.refine(Refinement(1))[0].asked[0][1]) == 4
-    assert len(stage.refine(Refinement(2, asked=False))[0].asked[0][1]) == 6
+    assert len(stage.refine(Refinement(1))[0].asked[0][1]) == 5
+    assert len(stage.refine(Refinement(2, asked=False))[0].asked[0][1]) == 7
     stage.refined("marble", 1)
     assert stage.refine(Refinement(1, asked=False))[0].asked == [], "no lamp is lit for nothing"
 

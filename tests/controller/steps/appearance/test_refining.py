@@ -56,7 +56,7 @@ def calibration() -> Calibration:
 def target() -> FloatImage:
     y, x = np.mgrid[0 : CAMERA[0], 0 : CAMERA[1]].astype(np.float32)
     wave = 0.45 + 0.3 * np.sin(x / 9) * np.sin(y / 11)
-    return (EXPOSURE * wave[..., None] * np.array([1.0, 0.9, 0.8])).astype(np.float32)
+    return np.asarray(EXPOSURE * wave[..., None] * np.array([1.0, 0.9, 0.8]), np.float32)
 
 
 def indirect(light: FloatImage) -> FloatImage:
