@@ -80,7 +80,7 @@ def equations(
     at = np.zeros(trusted.shape, np.bool_)
     at[::STEP_PX, ::STEP_PX] = trusted[::STEP_PX, ::STEP_PX]
     parts = [transport.forward_part(n, frame) for n, frame in enumerate(frames)]
-    total = np.sum(parts, axis=0, dtype=np.float32)
+    total = np.asarray(np.sum(parts, axis=0), np.float32)
     scale = np.maximum(total, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
     object_light, object_white = (image[transport.object_mask].mean(axis=0) for image in (total, stage.white))
     surface = stage.white / np.maximum(object_white, 1e-12)

@@ -119,7 +119,7 @@ def with_errors(seed: int) -> Calibration:
             covariance_px2=at.covariance_px2 * np.float32(rng.uniform(0.8, 1.5)),
         )
         shade = cv2.GaussianBlur(rng.normal(0, 1, CAMERA).astype(np.float32), (0, 0), 12)
-        shade *= float(rng.uniform(0, 0.08) / shade.std())
+        shade = shade * float(rng.uniform(0, 0.08) / shade.std())
         parts.append(replace(part, metapixels=moved, white=part.white * (1 + shade[..., None])))
     return replace(calibration, projectors=tuple(parts))
 
