@@ -171,18 +171,24 @@ def appearance(
     scheduler: Annotated[
         str | None, typer.Option(help="Solve on a Dask cluster: tcp://host:8786 or tls://host:8786.")
     ] = None,
+    refine: Annotated[
+        int | None,
+        typer.Option(help="Photographs that correct each result (default: from stage.toml).", min=0, max=9),
+    ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
-    """Solve appearances with the latest calibration and publish them in a signed bundle."""
+    """Solve appearances with the latest calibration, refine them by photographs, and publish a signed bundle."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.services.calibrate import make_appearances
+        from controller.services.refine import refinement_of
         from controller.stage.session import OwnSession
 
         return make_appearances(
             session=OwnSession(stage), names=tuple(names or ()), scenes=tuple(blender or ()),
-            accept_grade=accept_grade, base=base, scheduler=scheduler, quick=quick, reporter=reporter, cancel=cancel,
+            accept_grade=accept_grade, base=base, scheduler=scheduler, quick=quick,
+            refinement=refinement_of(stage, refine, quick=quick), reporter=reporter, cancel=cancel,
         )  # fmt: skip
 
     work(do, as_json=as_json)

@@ -32,7 +32,7 @@ class Compared:
 
     ``delta_e00_median``, ``delta_e00_p95``: CIEDE2000; ``rmse`` of the target's white; ``sharpness_lambda`` 0 to 1
     (paper 6, eq. 9), all over the reachable pixels of the object; ``reachable_share`` of its pixels, if it is known;
-    ``window_px`` the side of the resolution map's windows, camera pixels
+    ``window_px`` the side of the resolution map's windows, camera pixels; ``refined`` what refining it achieved
     """
 
     run: str
@@ -46,6 +46,7 @@ class Compared:
     sharpness_lambda: float
     reachable_share: float | None
     window_px: int
+    refined: Any = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.names import json_path, npz_path, read_json, write_json
-from controller.core.arrays import ByteImage, FloatImage, Mask, load_arrays, save_arrays
+from controller.artefacts.names import json_path, npz_path, read_json, stem, write_json
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask, load_arrays, save_arrays
 from controller.core.errors import WorkError
+from controller.core.storage import sha256_of
 
 if TYPE_CHECKING:
     from controller.solve.bounded.solver import Solution
@@ -103,10 +104,9 @@ class Solved:
         return float(str(self.figures["exposure"]))
 
     def write(self, run: Path, name: str) -> list[Path]:
-        frames = {f"device-{projector}": frame for projector, frame in self.frames.items()}
-        linear = {f"linear-{projector}": frame for projector, frame in self.linear.items()}
+        frames = {**_named("device", self.frames), **_named("linear", self.linear)}
         arrays = npz_path(run, StepKind.APPEARANCE, name)
-        save_arrays(arrays, {**frames, **linear, "target": self.target, "reachable": self.reachable})
+        save_arrays(arrays, {**frames, "target": self.target, "reachable": self.reachable})
         return [arrays, write_json(json_path(run, StepKind.APPEARANCE, name), self.figures)]
 
 
@@ -116,18 +116,64 @@ def is_solved(run: Path, name: str) -> bool:
 
 
 def solved_figures_path(run: Path, name: str) -> Path:
-    """The file whose bytes identify a solve of an appearance."""
-    return json_path(run, StepKind.APPEARANCE, name)
+    """The file whose bytes identify the frames of an appearance: the refined ones, if there are any."""
+    return json_path(run, StepKind.REFINED if _is_refined(run, name) else StepKind.APPEARANCE, name)
+
+
+def solving_digest(run: Path, name: str) -> str:
+    """What identifies the solving of an appearance, whatever refined it. Raises FileNotFoundError."""
+    return sha256_of(json_path(run, StepKind.APPEARANCE, name))
 
 
 def remove_solved(run: Path, name: str) -> None:
     """Remove an appearance from a run."""
     for path in (json_path(run, StepKind.APPEARANCE, name), npz_path(run, StepKind.APPEARANCE, name)):
         path.unlink(missing_ok=True)
+    remove_refined(run, name)
+
+
+def write_refined(
+    run: Path, name: str, frames: Mapping[str, ByteImage], linear: Mapping[str, FloatImage], figures: Mapping[str, Any]
+) -> list[Path]:
+    """``refined-NAME.npz`` and ``.json``: frames that replace those of the present solving, and how they were found."""
+    arrays = npz_path(run, StepKind.REFINED, name)
+    parts = {**_named("device", frames), **_named("linear", linear)}
+    save_arrays(arrays, parts)
+    told = {"of": solving_digest(run, name), "refined": dict(figures)}
+    return [arrays, write_json(json_path(run, StepKind.REFINED, name), told)]
+
+
+def remove_refined(run: Path, name: str) -> None:
+    """Forget the refined frames of an appearance: those that were solved count again."""
+    for path in (json_path(run, StepKind.REFINED, name), npz_path(run, StepKind.REFINED, name)):
+        path.unlink(missing_ok=True)
+
+
+def read_refining(run: Path, name: str) -> Any:
+    """The figures of the refined frames (docs/reference/report.md); None where frames are as they were solved."""
+    return read_json(json_path(run, StepKind.REFINED, name))["refined"] if _is_refined(run, name) else None
+
+
+def _is_refined(run: Path, name: str) -> bool:
+    """An appearance that was solved again since has its new frames."""
+    path = json_path(run, StepKind.REFINED, name)
+    try:
+        return (
+            bool(read_json(path)["of"] == solving_digest(run, name)) and npz_path(run, StepKind.REFINED, name).exists()
+        )
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _named(prefix: str, frames: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{prefix}-{projector}": frame for projector, frame in frames.items()}
 
 
 def read_solved(run: Path, name: str, projectors: Sequence[str]) -> Solved:
-    """Raises WorkError("appearance-not-solved") if there is none of that name."""
+    """An appearance with its present frames: those that were refined, where there are.
+
+    Raises WorkError("appearance-not-solved") if there is none of that name.
+    """
     if not is_solved(run, name):
         raise WorkError(
             "appearance-not-solved",
@@ -138,10 +184,58 @@ def read_solved(run: Path, name: str, projectors: Sequence[str]) -> Solved:
     figures: Mapping[str, object] = read_json(json_path(run, StepKind.APPEARANCE, name))
     # Runs from before journal format 2 have the frames by the projectors' names only.
     prefix = "device-" if all(f"device-{projector}" in arrays for projector in projectors) else ""
+    target, reachable = arrays["target"], arrays["reachable"]
+    if (refining := read_refining(run, name)) is not None:
+        arrays, prefix = load_arrays(npz_path(run, StepKind.REFINED, name)), "device-"
+        figures = {**figures, "refined": refining}
     return Solved(
         frames={projector: arrays[f"{prefix}{projector}"] for projector in projectors},
         linear={projector: arrays[f"linear-{projector}"] for projector in projectors},
-        target=arrays["target"],
-        reachable=arrays["reachable"],
+        target=target,
+        reachable=reachable,
         figures=dict(figures),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Refining:
+    """``refine.NNN-NAME.npz`` and ``.json``: how far an appearance is after so many photographs of its results.
+
+    ``frames``: to be photographed next, or shown; linear light by projector name
+    ``best``: those photographed with the least error, and ``error`` (camera rows, columns) that error, CIEDE2000, NaN
+    where not compared; None before the first photograph that counted
+    ``photographs``: one row of figures for each; ``ended``: why there are no more, "" while there may be
+    ``equations``: what they say of common causes (``solve.common_causes``), added; None before the first that counted
+    """
+
+    frames: dict[str, FloatImage]
+    best: dict[str, FloatImage] | None
+    error: FloatImage | None
+    photographs: tuple[dict[str, Any], ...] = ()
+    ended: str = ""
+    equations: Float64 | None = None
+
+    def write(self, run: Path, name: str, number: int) -> list[Path]:
+        arrays = _named("frame", self.frames)
+        if self.best is not None and self.error is not None:
+            arrays |= {**_named("best", self.best), "error": self.error}
+        if self.equations is not None:
+            arrays["equations"] = self.equations
+        told = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
+        save_arrays(told.with_suffix(".npz"), arrays)
+        return [told.with_suffix(".npz"), write_json(told, {"photographs": self.photographs, "ended": self.ended})]
+
+    @classmethod
+    def read(cls, run: Path, name: str, number: int, projectors: Sequence[str]) -> Self:
+        path = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
+        arrays, figures = load_arrays(path.with_suffix(".npz")), read_json(path)
+        frames = {projector: arrays[f"frame-{projector}"] for projector in projectors}
+        error = arrays.get("error")
+        best = None if error is None else {projector: arrays[f"best-{projector}"] for projector in projectors}
+        told = tuple(figures["photographs"]), str(figures["ended"])
+        return cls(frames, best, error, *told, arrays.get("equations"))
+
+
+def write_causes(run: Path, figures: Mapping[str, Any]) -> Path:
+    """``causes.json``: why photographs of several appearances err alike (docs/how-to/appearances.md)."""
+    return write_json(json_path(run, StepKind.CAUSES), figures)

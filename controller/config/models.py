@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
@@ -155,6 +155,10 @@ class CalibrationTable(ConfigTable):
     )
 
 
+REFINE: Final = 1
+"""Photographs by which each appearance is corrected, unless stage.toml says otherwise."""
+
+
 class SolveTable(ConfigTable):
     exposure_share: float = Field(
         default=0.9, gt=0, le=1, description="the share of the reachable light that targets may use, above 0, at most 1"
@@ -181,6 +185,13 @@ class SolveTable(ConfigTable):
         le=1,
         description="how much a target is adapted to the available light to keep its local contrast, from 0 (too "
         "bright parts are clipped) to 1",
+    )
+    refine: int = Field(
+        default=REFINE,
+        ge=0,
+        le=9,
+        description="how many photographs of each result are taken to correct it, 0 to 9; with 0 the projectors stay "
+        "off while appearances are made",
     )
 
 

@@ -33,6 +33,7 @@ from controller.steps.appearance.publishing import (
     playback_step,
     publish_step,
 )
+from controller.steps.appearance.refining import RefineOptions, refine_steps
 from controller.steps.appearance.requests import wishes_of
 from controller.steps.appearance.solving import SolveOptions, device_frames, solve_steps
 from controller.steps.calibrate.grade import gate_step
@@ -68,7 +69,7 @@ def demo(
 
 
 def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
-    """Calibrate, solve, publish, photograph, compare with one projector, swap."""
+    """Calibrate, solve, refine, publish, photograph, compare with one projector, swap."""
     stage = checked.stage
     calibrated = Calibrated(run, checked.names)
     wishes = wishes_of(stage, calibrated)
@@ -77,11 +78,14 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
     after = [StepId(StepKind.GEOMETRY), *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS)]
     longest_s = stage.tables.capture.longest_exposure_s
+    refining = RefineOptions(table.refine, table.smoothness, longest_s)
+    solvings = {name: StepId(StepKind.APPEARANCE, item=name) for name in names}
     return [
         *calibrating(rig, run, checked=checked, calibrated=calibrated),
         gate_step(worst_grade(checked), accepted=False),
         marker("solving", "Solving", enter=Event.SOLVE),
         *solve_steps(calibrated, wishes, options, after, costs.scale(p.size_px for p in rig.projectors)),
+        *refine_steps(rig, calibrated, {wish.name: wish.title for wish in wishes}, refining, after=solvings),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
         publish_step(

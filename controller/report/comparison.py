@@ -20,7 +20,7 @@ from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.report import plots
-from controller.report.page import Goal, Page, PageTable, PictureRow, ReportPicture, write_report
+from controller.report.page import Goal, Page, PageTable, PictureRow, ReportPicture, refined_row, write_report
 from controller.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
 from controller.run.journal import Journal
 from controller.run.runner import Context, Step
@@ -157,6 +157,7 @@ def _row(run: Path, one: Compared) -> PictureRow:
     known = [(label, form.format(value(one))) for label, value, form in _FIGURES]
     if one.reachable_share is not None:
         known.append(("within reach", f"{100 * one.reachable_share:.1f} % of the object"))
+    known.extend(refined_row(one.refined))
     known.append(("photographed", time.strftime(MOMENT, time.localtime(one.photographed_unix_s))))
     pictures = []
     for kind, caption, note in _SHOWN:

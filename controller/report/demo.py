@@ -21,7 +21,7 @@ from controller.artefacts.solved import Solved, is_solved, read_base_figures, re
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
-from controller.report.page import Goal, Page, PictureRow, ReportPicture, write_report
+from controller.report.page import Goal, Page, PictureRow, ReportPicture, refined_row, write_report
 from controller.report.pictures import Crop, crop_around, error_picture, fitted, to_screen
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
@@ -154,6 +154,7 @@ def _appearance_figures(appearance: AppearanceComparison) -> dict[str, Any]:
             "sharpness_lambda": appearance.theirs.sharpness_lambda,
         },
         "times_better": appearance.times_better,
+        "refined": appearance.solved.figures.get("refined"),
     }
 
 
@@ -213,6 +214,7 @@ def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration
                 "solved",
                 f"{appearance.solved.figures['mode']}, {float(str(appearance.solved.figures['seconds'])):.2f} s",
             ),
+            *refined_row(appearance.solved.figures.get("refined")),
         ),
         pictures=(
             ReportPicture("Before", before, "all projectors at white"),

@@ -69,6 +69,16 @@ class Page:
     tables: tuple[PageTable, ...] = ()
 
 
+def refined_row(figures: Any) -> tuple[tuple[str, str], ...]:
+    """What refining an appearance achieved, as a row of its figures; none where it was not refined."""
+    if figures is None or figures["before"] is None:
+        return ()
+    expected = " (expected)" if figures["expected"] else ""
+    count = len(figures["photographs"])
+    text = f"{figures['before']:.2f} to {figures['after']:.2f}{expected}, {count} photograph{'s' * (count != 1)}"
+    return (("refined", text),)
+
+
 def render(page: Page) -> str:
     """The page as one self-contained HTML file; every text is escaped, since device names are hostile input."""
     source = resources.files("controller.report").joinpath("report.html").read_text("utf-8")

@@ -21,6 +21,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Level, Reporter
 from controller.run.runner import Runner, Step
 from controller.run.state_machine import Event
+from controller.services.refine import Refinement, refine
 from controller.stage.calibrations import (
     finished_calibration,
     finished_calibrations,
@@ -115,15 +116,17 @@ def make_appearances(
     base: str | None = None,
     scheduler: str | None = None,
     quick: bool = False,
+    refinement: Refinement | None = None,
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml with the latest calibration, and install them as the stage's bundle.
 
     ``scenes``: Blender scenes to render besides ``names``, or only these if no names are given.
     ``accept_grade``: publish with any calibration grade. ``base``: base image that replaces stage.toml's.
     ``scheduler``: a Dask cluster that solves the appearances. ``quick``: a preview by base times scale only;
-    the next run without it solves them as stage.toml says.
+    the next run without it solves them as stage.toml says. ``refinement``: how photographs then correct them; None
+    keeps refined frames.
 
-    Uses no device: the projectors may be off, or playing.
+    Without a refinement it uses no device: the projectors may be off, or playing.
     Raises what ``usable_calibration``, ``wishes_of``, ``answering_on`` and the steps raise.
     """
     chosen = None if base is None else base_choice(base)
@@ -152,11 +155,19 @@ def make_appearances(
                 *([] if is_graded(run) else [verify_step(calibrated, (), scale)]),
                 gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
                 *solve_steps(calibrated, wishes, options, (), scale, answering=answering),
-                publish_step(folder, outputs, [wish.name for wish in wishes],
-                             stage=checked.stage.tables.stage.name, calibration=run.name, key=signing_key(checked)),
-            ]  # fmt: skip
-            Runner(steps, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
-    return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(wish.name for wish in wishes)}
+            ]
+            names = [wish.name for wish in wishes]
+            publish = publish_step(folder, outputs, names, stage=checked.stage.tables.stage.name, calibration=run.name,
+                                   key=signing_key(checked))  # fmt: skip
+            whole = [*steps, publish] if refinement is None else steps
+            Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
+    refined: Mapping[str, Any] = {}
+    if refinement is not None:
+        titles = {wish.name: wish.title for wish in wishes}
+        refined = refine(session, checked, calibrated, titles, refinement, reporter=reporter, cancel=cancel)
+        with session.locked(), Journal(run) as journal:
+            Runner([publish], journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
+    return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(names), **refined}
 
 
 def signing_key(checked: Checked) -> Path | None:

@@ -271,7 +271,7 @@ def strikes(stage: Path) -> dict[str, int]:
 
 def run_of(stage: Path) -> Path:
     """The one calibration, or demo, of the stage."""
-    (run,) = (path for path in (stage / "runs").iterdir() if not path.name.endswith("-play"))
+    (run,) = (path for path in (stage / "runs").iterdir() if not path.name.endswith(("-play", "-refine")))
     return run
 
 

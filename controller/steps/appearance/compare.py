@@ -91,6 +91,7 @@ def _compare(
         sharpness_lambda=found.sharpness_lambda,
         reachable_share=_number(solved.figures.get("reachable_share")),
         window_px=size_px,
+        refined=solved.figures.get("refined"),
     )
     return write_compared(context.folder, one, ComparedImages(picture, found.error_map.astype(np.float16), local))
 

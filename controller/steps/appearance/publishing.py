@@ -65,20 +65,28 @@ Outputs = Mapping[str, tuple[str, tuple[int, int]]]
 
 
 def publish_step(
-    stage_folder: Path, outputs: Outputs, names: Sequence[str], *, stage: str, calibration: str, key: Path | None
+    stage_folder: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    *,
+    stage: str,
+    calibration: str,
+    key: Path | None,
+    after: Sequence[StepId] = (),
 ) -> Step:
     """Write, sign and install the bundle of these appearances; the artefacts are the bundle and its figures.
 
     The bundle also holds other appearances solved on the calibration: see ``kept_names``. Publishing is cheap, and the
     content depends on more than its own steps, so every run repeats it; unchanged content gives the same bytes.
 
-    ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle.
+    ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle; ``after``: the steps
+    of this run that make the frames
     """
     return Step(
         StepId(StepKind.PUBLISH),
         partial(_publish, stage_folder, dict(outputs), tuple(names), (stage, calibration), key),
         inputs={"names": " ".join(names), "key": "" if key is None else sha256_of(key)},
-        after=tuple(StepId(StepKind.APPEARANCE, item=name) for name in names),
+        after=tuple(after),
         title="Publishing the signed bundle",
         weight=1,
         always=True,
@@ -283,16 +291,24 @@ def take_hdr(
     of: Mapping[str, str],
 ) -> tuple[list[Taken], FloatImage]:  # fmt: skip
     """As ``photograph_hdr``: the photographs, and their combination, NaN where it is too bright for all."""
-    exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
-    with kept_if_lit(rig, context) as row:
-        for number, exposure_s in enumerate(exposures_s):
-            identity = ShotId(kind, f"{name}-{number}")
-            row.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
-    taken = row.taken
+    taken = take_bracket(rig, context, kind, name, white, longest_s, shown_at_s=shown_at_s, of=of)
     merged = merge_brackets(
         [photograph.read().measured() for photograph in taken], [photograph.exposure_s for photograph in taken]
     ).radiance
     return taken, merged
+
+
+def take_bracket(
+    rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
+    of: Mapping[str, str], first_again: bool = False,
+) -> list[Taken]:  # fmt: skip
+    """The photographs of ``photograph_hdr``; ``first_again``: the first exposure is taken at the end once more."""
+    exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
+    with kept_if_lit(rig, context) as row:
+        for number, exposure_s in enumerate([*exposures_s, *exposures_s[: int(first_again)]]):
+            identity = ShotId(kind, f"{name}-{number}")
+            row.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
+    return row.taken
 
 
 def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:

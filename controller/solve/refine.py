@@ -1,0 +1,242 @@
+"""An appearance corrected by a photograph of it: which light to aim at, and whether that is worth it.
+
+The photograph less what the transport predicts of the same frames is the model's error there. The target less that
+error is what the next solve aims at: where the model is right, nothing changes, and what is out of reach does not add
+up from photograph to photograph. Arrays in, arrays out (docs/decisions/0044).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.solve.bounded.solver import solve_bounded
+from controller.solve.bounded.weights import appearance_weights
+from controller.solve.drive_levels import DriveLevels
+from controller.solve.feasibility import feasibility, target_radiance
+from controller.solve.metrics import colour_difference
+from controller.transport import LightTransport
+
+SCALES_PX: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Standard deviations of the filter's bands; the finest band is what the first leaves."""
+NOISE_FACTOR: Final = 2.0
+"""Of the noise's variance that is taken from a band's energy: the energy of few samples may be large by chance."""
+SAMPLES_A_SITE: Final = 4.0
+"""Camera pixels to each red or blue sample: the noise of means falls by so much less than with the pixels' number."""
+LIMIT: Final = 2.0
+"""A target's light is never corrected by more than this factor, and ``FLOOR`` of white."""
+FLOOR: Final = 0.1
+LEAST_OUTLIER: Final = 0.15
+"""Of the light and ``FLOOR`` of white: an error below it is never an outlier."""
+OUTLIER_SPREADS: Final = 6.0
+OUTLIER_PX: Final = 9
+"""Side of the smallest area of outliers: edges of shadows are thinner, hands are not."""
+MARGIN_PX: Final = 12
+"""Around what was rejected, where a penumbra may be."""
+CHANGED: Final = 0.04
+"""Of the light and ``FLOOR`` of white: lamps flicker by less between two photographs."""
+MOST_REJECTED: Final = 0.3
+DARKEST: Final = 0.5
+BRIGHTEST: Final = 2.0
+EDGE_PX: Final = 2.0
+"""The correction ends smoothly over about twice this beyond the pixels in reach."""
+LEAST_GAIN: Final = 0.02
+"""CIEDE2000: what two photographs of the same frames differ by, as a mean over the pixels."""
+CORRELATED_PX: Final = 16.0
+"""Camera pixels whose errors count as one when the uncertainty of a mean is estimated."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResultPhotograph:
+    """What a photograph of a result says.
+
+    ``radiance`` (rows, columns, 3) float32, NaN where not measured; ``sigma`` its standard deviation by the noise model
+    ``first``, ``last``: two exposures alike, taken before and after the others, in the same unit
+    """
+
+    radiance: FloatImage
+    sigma: FloatImage
+    first: FloatImage
+    last: FloatImage
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedStage:
+    """What corrections need of a stage, (rows, columns, 3): the ``black`` image, and ``white`` of all projectors."""
+
+    black: FloatImage
+    white: FloatImage
+
+
+def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, mask: Mask) -> Mask:
+    """The pixels of ``mask`` on which the photograph shows the result and nothing else, such as a hand or its shadow.
+
+    Left out is what was not measured, what changed while the photograph was taken, and areas whose error has nothing to
+    do with that of the others.
+    """
+    measured = mask & np.isfinite(photograph.radiance).all(axis=2)
+    if not measured.any():
+        return measured
+    scale = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
+    error = smoothed(photograph.radiance - predicted, measured, EDGE_PX) / scale
+    inside = error[measured]
+    middle = np.median(inside, axis=0)
+    spread = 1.4826 * np.median(np.abs(inside - middle), axis=0)
+    limit = np.maximum(LEAST_OUTLIER, OUTLIER_SPREADS * spread)
+    strange = measured & (np.abs(error - middle) > limit).any(axis=2)
+    both = measured & np.isfinite(photograph.first).all(axis=2) & np.isfinite(photograph.last).all(axis=2)
+    moved = smoothed(np.abs(smoothed(photograph.last - photograph.first, both, EDGE_PX)), both, EDGE_PX)
+    noise = 4 * np.sqrt(2 * noise_variance(photograph.sigma, both, EDGE_PX))
+    strange |= both & (moved > CHANGED * scale + noise).any(axis=2)
+    core = cv2.morphologyEx(strange.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OUTLIER_PX, OUTLIER_PX), np.uint8))
+    side = 2 * MARGIN_PX + 1
+    around = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0
+    return np.asarray(measured & ~around)
+
+
+def refusal(
+    photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, mask: Mask, trusted: Mask
+) -> str | None:
+    """Why a photograph says nothing about the result, for people; None where it does."""
+    measured = mask & np.isfinite(photograph.radiance).all(axis=2)
+    wanted = float((predicted - stage.black)[measured].sum(dtype=np.float64))
+    seen = float((photograph.radiance - stage.black)[measured].sum(dtype=np.float64))
+    if not measured.any() or seen < DARKEST * wanted:
+        return "it is too dark"
+    if seen > BRIGHTEST * wanted:
+        return "it is too bright"
+    if trusted.sum() < (1 - MOST_REJECTED) * mask.sum():
+        return "something moved or stood in the picture"
+    return None
+
+
+def smoothed(image: FloatImage, mask: Mask, sigma_px: float) -> FloatImage:
+    """Gaussian means over the pixels of ``mask`` alone, (rows, columns, 3); 0 where none is near."""
+    weight = mask.astype(np.float32)
+    total = cv2.GaussianBlur(np.where(mask[..., None], image, 0).astype(np.float32), (0, 0), sigma_px)
+    near = cv2.GaussianBlur(weight, (0, 0), sigma_px)[..., None]
+    return np.asarray(np.divide(total, near, out=np.zeros_like(total), where=near > 1e-4), np.float32)
+
+
+def noise_variance(sigma: FloatImage, mask: Mask, scale_px: float) -> FloatImage:
+    """Variance of a photograph's noise in means over a Gaussian of ``scale_px``, 0 for single pixels."""
+    variance = np.where(np.isfinite(sigma), sigma, 0) ** 2
+    if scale_px <= 0:
+        return np.asarray(variance, np.float32)
+    return smoothed(variance, mask, scale_px) * np.float32(min(1.0, SAMPLES_A_SITE / (4 * np.pi * scale_px**2)))
+
+
+def without_noise(error: FloatImage, sigma: FloatImage, mask: Mask) -> FloatImage:
+    """``error`` (rows, columns, 3) without what noise can explain; defined around ``mask``, too.
+
+    In bands from wide to fine; of each, what its local energy has above the noise's (a Wiener filter in each band), so
+    that a clear error keeps its edges, and nothing is made of noise.
+    """
+    means = [np.where(mask[..., None], error, 0), *(smoothed(error, mask, scale) for scale in SCALES_PX)]
+    scales = (0.0, *SCALES_PX)
+    found = _shrunk(means[-1], sigma, mask, scales[-1], 2 * scales[-1])
+    for finer in reversed(range(len(SCALES_PX))):
+        band = means[finer] - means[finer + 1]
+        if finer == 0:
+            band[~mask] = 0
+        found += _shrunk(band, sigma, mask, scales[finer], 2 * scales[finer + 1])
+    return found
+
+
+def _shrunk(band: FloatImage, sigma: FloatImage, mask: Mask, scale_px: float, window_px: float) -> FloatImage:
+    energy = smoothed(band**2, mask, window_px)
+    noise = NOISE_FACTOR * noise_variance(sigma, mask, scale_px)
+    share = np.maximum(energy - noise, 0) / np.maximum(energy, np.finfo(np.float32).tiny)
+    return np.asarray(share * band, np.float32)
+
+
+def corrected_target(
+    target: FloatImage, photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, trusted: Mask
+) -> FloatImage:
+    """What to aim at, so that the photograph becomes ``target`` on the ``trusted`` pixels; elsewhere ``target``.
+
+    ``target``, ``predicted`` (rows, columns, 3): radiance, the latter as the transport makes it of the frames that were
+    photographed, with the black image
+    """
+    error = np.where(trusted[..., None], photograph.radiance - predicted, 0).astype(np.float32)
+    found = without_noise(error, photograph.sigma, trusted)
+    light = np.maximum(target - stage.black, 0)
+    room = FLOOR * stage.white
+    found = np.clip(found, -(LIMIT - 1) * light - room, (1 - 1 / LIMIT) * light + room)
+    near = cv2.GaussianBlur(trusted.astype(np.float32), (0, 0), EDGE_PX)
+    found *= np.where(trusted, 1, np.clip(2 * near, 0, 1))[..., None].astype(np.float32)
+    return np.asarray(target - found, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class PhotographedError:
+    """CIEDE2000 on the pixels compared: its ``median``, 95th percentile and ``mean``; ``map`` is NaN elsewhere."""
+
+    median: float
+    p95: float
+    mean: float
+    map: FloatImage
+
+
+def photographed_error(
+    radiance: FloatImage, target: FloatImage, camera_to_xyz: Float64, white: float, mask: Mask
+) -> PhotographedError:
+    """The error of a photograph, or of a predicted one, on ``mask``, which has to hold a pixel."""
+    found = colour_difference(np.nan_to_num(radiance), target, camera_to_xyz, white, mask)
+    inside = found[mask]
+    error = np.where(mask, found, np.nan).astype(np.float32)
+    median, p95 = np.percentile(inside, (50, 95))
+    return PhotographedError(float(median), float(p95), float(inside.mean(dtype=np.float64)), error)
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """By how much the mean CIEDE2000 fell, and from which change on that says anything."""
+
+    mean: float
+    noise: float
+
+    @property
+    def worth_it(self) -> bool:
+        return self.mean > self.noise
+
+
+def gain(before: FloatImage, after: FloatImage) -> Gain:
+    """Between two error maps, NaN where not compared; on the pixels of both."""
+    both = np.isfinite(before) & np.isfinite(after)
+    if not both.any():
+        return Gain(0.0, LEAST_GAIN)
+    change = (before[both] - after[both]).astype(np.float64)
+    uncertain = 2 * float(change.std()) / max(change.size / CORRELATED_PX, 1.0) ** 0.5
+    return Gain(float(change.mean()), max(LEAST_GAIN, uncertain))
+
+
+def solve_again(
+    transport: LightTransport,
+    target: FloatImage,
+    aimed: FloatImage,
+    black: FloatImage,
+    start: Sequence[FloatImage],
+    *,
+    exposure: float,
+    smoothness: float,
+    drive: DriveLevels | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> tuple[FloatImage, ...]:
+    """Frames for ``aimed`` from the present ones, ``start``, in full, with the weights of the appearance ``target``.
+
+    Raises as ``solve_bounded``.
+    """
+    wanted = target_radiance(target, black, 1.0)
+    possible = feasibility(transport, target, black, drive=drive)
+    weights = appearance_weights(wanted, possible.reachable, exposure)
+    radiance = target_radiance(aimed, black, 1.0)
+    solution = solve_bounded(
+        transport, radiance, black, smoothness=smoothness, weights=weights, start=start, progress=progress
+    )
+    return solution.frames

@@ -1,0 +1,265 @@
+"""The steps that photograph solved frames, correct them by the photograph, and keep the better ones."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.camera import inherit_camera
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
+from controller.capture.brackets import merge_brackets
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.rig.rig import Rig
+from controller.run.progress import Level
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.solve.common_causes import equations
+from controller.solve.refine import (
+    PhotographedError,
+    RefinedStage,
+    ResultPhotograph,
+    corrected_target,
+    gain,
+    photographed_error,
+    refusal,
+    solve_again,
+    trusted_pixels,
+)
+from controller.steps import costs
+from controller.steps.appearance.causes import causes_step
+from controller.steps.appearance.publishing import take_bracket
+from controller.steps.appearance.solving import device_frames
+
+WORSE: Final = "the last correction was no better"
+ENOUGH: Final = "the rest is noise"
+
+
+@dataclass(frozen=True, slots=True)
+class RefineOptions:
+    """``photographs``: at most so many of results, 0 to 9; ``smoothness`` of eq. 3; ``longest_exposure_s``."""
+
+    photographs: int
+    smoothness: float
+    longest_exposure_s: float
+
+    def inputs(self) -> dict[str, str]:
+        """What a correction depends on, as the journal compares it."""
+        return {"smoothness": repr(self.smoothness), "longest_exposure_s": repr(self.longest_exposure_s)}
+
+
+def refine_steps(
+    rig: Rig,
+    calibrated: Calibrated,
+    titles: Mapping[str, str],
+    options: RefineOptions,
+    *,
+    after: Mapping[str, StepId] | None = None,
+) -> list[Step]:
+    """The steps for these appearances, title by name, that are solved on ``calibrated``; none for 0 photographs.
+
+    ``after``: the step of the same run that solves each; None where they were solved before. Then what was photographed
+    on another day is not continued.
+    """
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    steps: list[Step] = []
+    last: list[StepId] = []
+    for name, title in titles.items() if options.photographs else ():
+        before = (after[name],) if after is not None else ()
+        inputs = {"calibration": calibrated.folder.name, **options.inputs()}
+        if after is None:
+            inputs |= {"day": time.strftime("%Y-%m-%d"), "solved": solving_digest(calibrated.folder, name)}
+        for number in range(1, options.photographs + 1):
+            one = StepId(StepKind.REFINE, item=f"{number}-{name}")
+            steps.append(
+                Step(
+                    one,
+                    partial(_refine, rig, calibrated, name, number, options),
+                    inputs=inputs,
+                    after=before,
+                    title=f"Refining {title}, photograph {number}",
+                    weight=3 * costs.shot_s(scale) + costs.APPEARANCE_S * scale,
+                )
+            )
+            before = (one,)
+        last += before
+        steps.append(
+            Step(
+                StepId(StepKind.REFINED, item=name),
+                partial(_keep, calibrated, name, options.photographs),
+                inputs=inputs,
+                after=before,
+                title=f"Keeping the better frames of {title}",
+                weight=0.2,
+            )
+        )
+    if len(last) > 1:
+        steps.append(causes_step(calibrated, tuple(titles), options.photographs, after=last))
+    return steps
+
+
+def _refine(
+    rig: Rig, calibrated: Calibrated, name: str, number: int, options: RefineOptions, context: Context
+) -> Sequence[Path]:
+    solved = read_solved(calibrated.folder, name, calibrated.projectors)
+    before = _before(context.folder, solved, calibrated, name, number)
+    if not before.ended:
+        before = _Round(rig, calibrated, solved, name, options, context).after(before, number)
+    return before.write(context.folder, name, number)
+
+
+def _before(folder: Path, solved: Solved, calibrated: Calibrated, name: str, number: int) -> Refining:
+    if number == 1:
+        return Refining(solved.linear, None, None)
+    return Refining.read(folder, name, number - 1, calibrated.projectors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """One photograph of an appearance, and what follows from it."""
+
+    rig: Rig
+    calibrated: Calibrated
+    solved: Solved
+    name: str
+    options: RefineOptions
+    context: Context
+
+    def after(self, now: Refining, number: int) -> Refining:
+        """Photograph ``now.frames``; judge them, and correct them."""
+        photograph = self._photographed(now.frames, number)
+        predicted = self._predicted(now.frames)
+        mask = self.solved.reachable & self.calibrated.calibration.object_mask
+        trusted = trusted_pixels(photograph, predicted, self._stage, mask)
+        refused = refusal(photograph, predicted, self._stage, mask, trusted)
+        if refused is not None:
+            self.context.reporter.say(f"A photograph of {self.name} was not used: {refused}.", Level.WARNING)
+            return replace(now, photographs=(*now.photographs, {"refused": refused}))
+        found = self._error(photograph.radiance, trusted)
+        row = {"delta_e00_median": found.median, "delta_e00_p95": found.p95, "delta_e00_mean": found.mean,
+               "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
+        rows = (*now.photographs, row)
+        said = self._equations(now, photograph, predicted, trusted)
+        if now.best is not None and now.error is not None:
+            better = gain(now.error, found.map)
+            if better.mean <= 0:
+                return Refining(now.best, now.best, now.error, (*rows[:-1], {**row, "kept": False}), WORSE, said)
+            if not better.worth_it:
+                return Refining(now.frames, now.frames, found.map, rows, ENOUGH, said)
+        judged = Refining(now.frames, now.frames, found.map, rows, equations=said)
+        return self._corrected(judged, photograph, predicted, trusted)
+
+    def _equations(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Float64:
+        """What this photograph and those before it say of common causes."""
+        frames = [now.frames[projector] for projector in self.calibrated.projectors]
+        error = np.where(trusted[..., None], photograph.radiance - predicted, 0).astype(np.float32)
+        said = equations(self.calibrated.transport, frames, error, self._stage, trusted)
+        return said if now.equations is None else said + now.equations
+
+    def _corrected(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Refining:
+        """With frames of a corrected target, if the transport says that these are worth it."""
+        self.context.advance(0.4, "solving again")
+        transport, black = self.calibrated.transport, self.calibrated.calibration.black
+        aimed = corrected_target(self.solved.target, photograph, predicted, self._stage, trusted)
+        frames = solve_again(
+            transport,
+            self.solved.target,
+            aimed,
+            black,
+            [now.frames[projector] for projector in self.calibrated.projectors],
+            exposure=self.solved.exposure,
+            smoothness=self.options.smoothness,
+            drive=self.calibrated.drive,
+            progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
+        )
+        new = dict(zip(self.calibrated.projectors, frames, strict=True))
+        expected = self._error(photograph.radiance + self._predicted(new) - predicted, trusted)
+        assert now.error is not None
+        if not gain(now.error, expected.map).worth_it:
+            return replace(now, ended=ENOUGH)
+        row = {**now.photographs[-1], "expected_median": expected.median}
+        return replace(now, frames=new, photographs=(*now.photographs[:-1], row))
+
+    @property
+    def _stage(self) -> RefinedStage:
+        calibration = self.calibrated.calibration
+        white = np.sum([part.white for part in calibration.projectors], axis=0, dtype=np.float32)
+        return RefinedStage(calibration.black, np.maximum(white, 0))
+
+    def _error(self, radiance: FloatImage, mask: Mask) -> PhotographedError:
+        matrix = self.calibrated.calibration.camera_to_xyz
+        return photographed_error(radiance, self.solved.target, matrix, self.solved.exposure, mask)
+
+    def _predicted(self, frames: Mapping[str, FloatImage]) -> FloatImage:
+        light = self.calibrated.transport.forward([frames[projector] for projector in self.calibrated.projectors])
+        return np.asarray(light + self.calibrated.calibration.black, np.float32)
+
+    def _photographed(self, frames: Mapping[str, FloatImage], number: int) -> ResultPhotograph:
+        if self.context.folder != self.calibrated.folder:
+            inherit_camera(self.calibrated.folder, self.context.folder)
+        shown = device_frames(
+            self.calibrated.calibration, [frames[projector] for projector in self.calibrated.projectors]
+        )
+        presented_s = self.rig.acquirer.show(self.rig.on_outputs(shown), deadline=self.context.deadline)
+        taken = take_bracket(
+            self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", self.solved.exposure,
+            self.options.longest_exposure_s, shown_at_s=presented_s, of={"frames": _digest(shown)}, first_again=True,
+        )  # fmt: skip
+        exposures_s = [one.exposure_s for one in taken]
+        images = [one.read().measured() for one in taken]
+        noise = taken[0].profile.noise if taken[0].profile is not None else None
+        merged = merge_brackets(images, exposures_s, noise=noise)
+        first, last = (images[n] / np.float32(exposures_s[n]) for n in (0, -1))
+        return ResultPhotograph(merged.radiance, merged.sigma, first, last)
+
+
+def _digest(frames: Mapping[str, ByteImage]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(frames):
+        digest.update(np.ascontiguousarray(frames[name]).tobytes())
+    return digest.hexdigest()
+
+
+def _keep(calibrated: Calibrated, name: str, photographs: int, context: Context) -> Sequence[Path]:
+    found = Refining.read(context.folder, name, photographs, calibrated.projectors)
+    figures = _figures(found, photographs)
+    linear = [found.frames[projector] for projector in calibrated.projectors]
+    frames = device_frames(calibrated.calibration, linear)
+    context.reporter.say(sentence(name, figures), Level.INFO if figures["before"] is not None else Level.WARNING)
+    return write_refined(calibrated.folder, name, frames, found.frames, figures)
+
+
+def _figures(found: Refining, asked: int) -> dict[str, Any]:
+    """What is reported: ``before`` and ``after``, medians of CIEDE2000; the latter is ``expected`` or photographed."""
+    counted = [row for row in found.photographs if "refused" not in row]
+    kept = [row for row in counted if row.get("kept", True)]
+    before = kept[0]["delta_e00_median"] if kept else None
+    last = kept[-1] if kept else {}
+    expected = "expected_median" in last and not found.ended
+    after = last.get("expected_median" if expected else "delta_e00_median")
+    return {"asked": asked, "before": before, "after": after, "expected": expected, "ended": found.ended,
+            "photographs": list(found.photographs)}  # fmt: skip
+
+
+def sentence(name: str, figures: Mapping[str, Any]) -> str:
+    """What was achieved, in one line."""
+    count = len(figures["photographs"])
+    photographs = f"{count} photograph{'s' * (count != 1)}"
+    if figures["before"] is None:
+        return f"{name} was not refined: no photograph could be used ({photographs})."
+    if len(figures["photographs"]) == 1 and figures["ended"]:
+        return f"{name} needed no refinement: {figures['before']:.2f} (CIEDE2000 median), {photographs}."
+    before, after = f"{figures['before']:.2f}", f"{figures['after']:.2f}"
+    expected = "an expected " if figures["expected"] else ""
+    return f"Refined {name}: {before} to {expected}{after} (CIEDE2000 median) with {photographs}."
+
+
+__all__ = ["RefineOptions", "refine_steps", "sentence"]

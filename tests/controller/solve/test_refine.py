@@ -1,0 +1,241 @@
+"""Corrections by photographs: they find the model's errors, nothing else, and never make a result worse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+
+from controller.calibrate.values import Calibration
+from controller.core.arrays import FloatImage, Mask
+from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.solve.refine import (
+    EDGE_PX,
+    LEAST_GAIN,
+    MARGIN_PX,
+    RefinedStage,
+    ResultPhotograph,
+    corrected_target,
+    gain,
+    photographed_error,
+    refusal,
+    smoothed,
+    solve_again,
+    trusted_pixels,
+    without_noise,
+)
+from controller.transport import LightTransport, build_transport
+from tests.controller.solve.conftest import plane_calibration
+
+CAMERA = (90, 120)
+EXPOSURE = 0.35
+Spoil = Callable[[FloatImage], FloatImage]
+
+
+def as_it_is(light: FloatImage) -> FloatImage:
+    return light
+
+
+@dataclass
+class Result:
+    """Frames on a stage whose true light, ``light`` of the true transport, is not what its calibration says."""
+
+    calibration: Calibration
+    true: LightTransport
+    light: Spoil
+    noise: float = 0.001
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.transport = build_transport(self.calibration)
+        self.stage = RefinedStage(
+            self.calibration.black, np.sum([part.white for part in self.calibration.projectors], axis=0)
+        )
+        rows, columns = CAMERA
+        y, x = np.mgrid[0:rows, 0:columns].astype(np.float32)
+        wave = 0.45 + 0.3 * np.sin(x / 9) * np.sin(y / 11)
+        self.target = (EXPOSURE * wave[..., None] * np.array([1.0, 0.9, 0.8])).astype(np.float32)
+        self.mask: Mask = np.zeros(CAMERA, np.bool_)
+        self.mask[6:-6, 6:-6] = True
+        self.frames = solve_bounded(self.transport, self.target, self.calibration.black).frames
+
+    def seen(self, frames: tuple[FloatImage, ...]) -> FloatImage:
+        return np.asarray(self.light(self.true.forward(frames)) + self.calibration.black, np.float32)
+
+    def photograph(self, frames: tuple[FloatImage, ...], spoil: Spoil = as_it_is) -> ResultPhotograph:
+        self.seed += 1
+        rng = np.random.default_rng(self.seed)
+        light = spoil(self.seen(frames))
+        first, last, merged = (light + rng.normal(0, self.noise, light.shape).astype(np.float32) for _ in range(3))
+        return ResultPhotograph(merged, np.full_like(merged, self.noise), first, last)
+
+    def predicted(self, frames: tuple[FloatImage, ...]) -> FloatImage:
+        return np.asarray(self.transport.forward(frames) + self.calibration.black, np.float32)
+
+    def corrected(self, frames: tuple[FloatImage, ...], photograph: ResultPhotograph) -> tuple[FloatImage, ...]:
+        """As the steps do it: the new frames, if they are expected to be worth it."""
+        predicted = self.predicted(frames)
+        trusted = trusted_pixels(photograph, predicted, self.stage, self.mask)
+        assert refusal(photograph, predicted, self.stage, self.mask, trusted) is None
+        aimed = corrected_target(self.target, photograph, predicted, self.stage, trusted)
+        new = solve_again(
+            self.transport, self.target, aimed, self.calibration.black, frames, exposure=EXPOSURE, smoothness=SMOOTHNESS
+        )
+        expected = photograph.radiance + self.predicted(new) - predicted
+        change = gain(self.error(photograph.radiance, trusted), self.error(expected, trusted))
+        return new if change.worth_it else frames
+
+    def error(self, radiance: FloatImage, mask: Mask | None = None) -> FloatImage:
+        mask = self.mask if mask is None else mask
+        return photographed_error(radiance, self.target, self.calibration.camera_to_xyz, EXPOSURE, mask).map
+
+    def mean_error(self, frames: tuple[FloatImage, ...]) -> float:
+        return float(np.nanmean(self.error(self.seen(frames))))
+
+
+def result(seed: int = 1, light: Spoil = as_it_is, *, true: Calibration | None = None, noise: float = 0.001) -> Result:
+    calibration = plane_calibration(seed, projector=(30, 40), camera=CAMERA, spill=0.03)
+    return Result(calibration, build_transport(true or calibration), light, noise=noise)
+
+
+def indirect(share: float) -> Spoil:
+    return lambda light: light + np.float32(share) * light.mean(axis=(0, 1))
+
+
+def with_errors(seed: int) -> Calibration:
+    """The same stage with random errors of its calibration: places, widths, brightness and response."""
+    rng = np.random.default_rng(seed)
+    calibration = plane_calibration(seed, projector=(30, 40), camera=CAMERA, spill=0.03)
+    parts = []
+    for part in calibration.projectors:
+        at = part.metapixels
+        shift = rng.normal(0, 0.3, 2).astype(np.float32)
+        moved = replace(
+            at,
+            centre_px=at.centre_px + shift,
+            covariance_px2=at.covariance_px2 * np.float32(rng.uniform(0.8, 1.5)),
+        )
+        shade = cv2.GaussianBlur(rng.normal(0, 1, CAMERA).astype(np.float32), (0, 0), 12)
+        shade = shade * float(rng.uniform(0, 0.08) / shade.std())
+        parts.append(replace(part, metapixels=moved, white=part.white * (1 + shade[..., None])))
+    return replace(calibration, projectors=tuple(parts))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_correction_is_never_worse_whatever_is_wrong_with_the_model(seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    found = result(
+        seed, indirect(rng.uniform(0, 0.15)), true=with_errors(seed), noise=float(10 ** rng.uniform(-4, -1.7))
+    )
+    once = found.corrected(found.frames, found.photograph(found.frames))
+    twice = found.corrected(once, found.photograph(once))
+    before, after, last = map(found.mean_error, (found.frames, once, twice))
+    assert after <= before + LEAST_GAIN
+    assert last <= after + LEAST_GAIN
+
+
+@pytest.mark.parametrize("noise", [0.0003, 0.003, 0.02])
+def test_where_the_model_is_right_noise_is_not_taken_for_an_error(noise: float) -> None:
+    found = result(noise=noise)
+    after = found.corrected(found.frames, found.photograph(found.frames))
+    assert found.mean_error(after) <= found.mean_error(found.frames) + LEAST_GAIN
+
+
+def test_even_indirect_light_goes_with_one_photograph() -> None:
+    found = result(light=indirect(0.05))
+    disturbed, undisturbed = found.mean_error(found.frames), result().mean_error(found.frames)
+    after = found.mean_error(found.corrected(found.frames, found.photograph(found.frames)))
+    assert disturbed > undisturbed + 0.5
+    assert after < undisturbed + 0.1 * (disturbed - undisturbed)
+
+
+def hand(light: FloatImage) -> FloatImage:
+    """Skin in the light of the projectors, over a part of the object."""
+    spoiled = light.copy()
+    spoiled[36:54, 45:65] = 0.8 * EXPOSURE * np.array([0.5, 0.3, 0.22], np.float32)
+    return spoiled
+
+
+def shadow(light: FloatImage) -> FloatImage:
+    """Of a hand before one of the projectors."""
+    spoiled = light.copy()
+    spoiled[36:54, 45:65] *= 0.6
+    return spoiled
+
+
+@pytest.mark.parametrize("spoil", [hand, shadow])
+def test_a_hand_in_the_photograph_is_left_out_and_the_rest_is_corrected(spoil: Spoil) -> None:
+    found = result(light=indirect(0.05))
+    photograph = found.photograph(found.frames, spoil)
+    predicted = found.predicted(found.frames)
+    trusted = trusted_pixels(photograph, predicted, found.stage, found.mask)
+    assert not trusted[36:54, 45:65].any()
+    assert trusted[found.mask].mean() > 0.6
+    aimed = corrected_target(found.target, photograph, predicted, found.stage, trusted)
+    assert np.array_equal(aimed[38:52, 47:63], found.target[38:52, 47:63])
+    after = found.corrected(found.frames, photograph)
+    here = np.zeros(CAMERA, np.bool_)
+    here[36:54, 45:65] = True
+    before_error, after_error = (found.error(found.seen(frames)) for frames in (found.frames, after))
+    assert np.nanmean(after_error) < 0.75 * np.nanmean(before_error)
+    assert np.nanmean(after_error[here]) <= np.nanmean(before_error[here]) + LEAST_GAIN
+
+
+def test_what_changes_while_the_photograph_is_taken_is_left_out() -> None:
+    found = result()
+    photograph = found.photograph(found.frames)
+    last = photograph.last.copy()
+    last[36:54, 45:65] *= 0.9
+    trusted = trusted_pixels(replace(photograph, last=last), found.predicted(found.frames), found.stage, found.mask)
+    assert not trusted[36:54, 45:65].any()
+    far = found.mask.copy()
+    far[36 - 2 * MARGIN_PX : 54 + 2 * MARGIN_PX, 45 - 2 * MARGIN_PX : 65 + 2 * MARGIN_PX] = False
+    assert trusted[far].all()
+
+
+@pytest.mark.parametrize(
+    ("factor", "why"), [(0.0, "it is too dark"), (0.3, "it is too dark"), (3.0, "it is too bright"), (1.0, None)]
+)
+def test_photographs_that_show_something_else_are_refused(factor: float, why: str | None) -> None:
+    found = result()
+    photograph = found.photograph(found.frames, lambda light: np.asarray(light * factor, np.float32))
+    predicted = found.predicted(found.frames)
+    trusted = trusted_pixels(photograph, predicted, found.stage, found.mask)
+    assert refusal(photograph, predicted, found.stage, found.mask, trusted) == why
+
+
+def test_a_photograph_that_measured_nothing_is_refused() -> None:
+    found = result()
+    photograph = replace(found.photograph(found.frames), radiance=np.full((*CAMERA, 3), np.nan, np.float32))
+    trusted = trusted_pixels(photograph, found.target, found.stage, found.mask)
+    assert not trusted.any()
+    assert refusal(photograph, found.target, found.stage, found.mask, trusted) == "it is too dark"
+
+
+def test_nothing_is_corrected_beyond_the_border_of_what_is_trusted() -> None:
+    found = result(light=indirect(0.1))
+    trusted = np.zeros(CAMERA, np.bool_)
+    trusted[20:70, 20:70] = True
+    photograph = found.photograph(found.frames)
+    aimed = corrected_target(found.target, photograph, found.predicted(found.frames), found.stage, trusted)
+    change = np.abs(aimed - found.target).max(axis=2)
+    outside = cv2.dilate(trusted.astype(np.uint8), np.ones((3, 3)), iterations=int(4 * EDGE_PX)) == 0
+    assert change[trusted].min() > 0.002
+    assert change[outside].max() == 0
+    across = change[45, 60:85]
+    assert np.abs(np.diff(across)).max() < 0.5 * across.max(), "it ends smoothly"
+
+
+def test_the_filter_drops_noise_and_keeps_an_edge_better_than_one_gaussian() -> None:
+    rng = np.random.default_rng(3)
+    mask, sigma = np.ones(CAMERA, np.bool_), np.full((*CAMERA, 3), 0.01, np.float32)
+    noise = rng.normal(0, 0.01, (*CAMERA, 3)).astype(np.float32)
+    assert np.sqrt((without_noise(noise, sigma, mask) ** 2).mean()) < 0.001
+    step = np.zeros((*CAMERA, 3), np.float32)
+    step[:, 60:] = 0.1
+    kept, blurred = without_noise(step + noise, sigma, mask), smoothed(step + noise, mask, 2.0)
+    assert np.abs(kept - step).mean() < np.abs(blurred - step).mean()
+    assert (kept[:, 61] - kept[:, 58]).mean() > (blurred[:, 61] - blurred[:, 58]).mean()

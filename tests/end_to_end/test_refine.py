@@ -1,0 +1,62 @@
+"""A stage whose light is no longer as calibrated: its appearances are corrected by photographs, and nothing is lost."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from controller.stage.bench import BenchProcess, bench_of
+from hal.values import Power
+from tests.end_to_end.conftest import FinishedDemo
+from tests.end_to_end.kiosk import copied
+from tests.end_to_end.program import Command, powers, shots, velatura, wrong_code
+
+pytestmark = pytest.mark.timeout(600)
+NAME = "gloss"
+INDIRECT = {"what": "ambient", "indirect": 0.05}
+AFTER = 0.48
+"""Of the error before: even indirect light of 5 %, one photograph."""
+
+
+def photographed(stage: Path) -> float:
+    outcome = velatura("photograph", stage, NAME)
+    assert outcome.code == 0, outcome.records[-1]
+    (row,) = outcome.records[-1]["result"]["appearances"]
+    return float(row["delta_e00_median"])
+
+
+def test_indirect_light_goes_with_one_photograph_and_a_kill_costs_none(
+    finished_demo: FinishedDemo, tmp_path: Path
+) -> None:
+    stage = copied(finished_demo.stage, tmp_path / "stage")
+    bench_of(stage).disturb(stage, [INDIRECT])
+    assert velatura("appearance", stage, NAME, "--refine", "0").code == 0
+    with BenchProcess(stage, cancel=threading.Event()):
+        before = photographed(stage)
+        with Command("appearance", stage, NAME, "--refine", "1") as killed:
+            killed.wait_for("Refining", fraction=0.4)
+            killed.kill()
+        (run,) = (stage / "runs").glob("*-refine")
+        taken = shots(run)
+        assert len(taken) == 3
+        outcome = velatura("appearance", stage, NAME, "--refine", "1")
+        assert outcome.code == 0, outcome.records[-1]
+        assert shots(run) == taken, "the killed run's photographs are used"
+        assert outcome.records[-1]["result"]["refined"].startswith(f"Refined {NAME}: ")
+        assert photographed(stage) < AFTER * before
+        assert set(powers(stage).values()) <= {Power.OFF, Power.COOLING}
+
+
+def test_a_stage_without_its_devices_keeps_what_was_solved_unless_asked(
+    finished_demo: FinishedDemo, tmp_path: Path
+) -> None:
+    stage = copied(finished_demo.stage, tmp_path / "stage")
+    assert velatura("appearance", stage, NAME, "--refine", "0").code == 0
+    outcome = velatura("appearance", stage, NAME)
+    assert outcome.code == 0, outcome.records[-1]
+    said = [record["message"]["text"] for record in outcome.records if "message" in record]
+    assert [text for text in said if text.startswith("The appearances were not refined: ")]
+    assert velatura("appearance", stage, NAME, "--refine", "1").code == 3
+    wrong_code(velatura("appearance", stage, NAME, "--refine", "10"))
