@@ -12,12 +12,15 @@ import pytest
 
 from tests.booted.kiosk import SERVICES, Kiosk, built_wheel, installed, prepared_stage
 from tests.booted.machine import ADDRESS, STAGE
-from tests.booted.trees import SUITES
+from tests.booted.trees import SUITES, obstacle
 from tests.campaigns.power_cuts import cut, kept, lost
 
 PICTURE_S = 60.0
 """From the boot of a bare Debian with the package to a picture."""
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+OBSTACLE = obstacle()
+pytestmark = [
+    pytest.mark.slow, pytest.mark.timeout(1500), pytest.mark.skipif(OBSTACLE is not None, reason=str(OBSTACLE))
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
