@@ -118,7 +118,10 @@ class LampTruth:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorTruth:
-    """A projector; ``port`` and ``profile`` are relative to the stage folder."""
+    """A projector; ``port`` and ``profile`` are relative to the stage folder.
+
+    ``board``: the family whose control board it has (``projectors.boards.BOARDS``)
+    """
 
     name: str
     output: str
@@ -129,6 +132,7 @@ class ProjectorTruth:
     focus: Focus
     light: LightTruth
     lamp: LampTruth
+    board: str = "optoma-later"
 
 
 @dataclass(frozen=True, slots=True)
