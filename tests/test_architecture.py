@@ -61,6 +61,27 @@ def test_what_a_package_names_exists(folder: Path) -> None:
                 )
 
 
+def equations(text: str) -> set[int]:
+    """The numbers of the equations that a text names: "eq. 3", "eqs 2 and 3", "eqs 4-6"."""
+    found: set[int] = set()
+    for first, last in re.findall(r"\beqs?\.? (\d)(?:(?: and | to |-)(\d))?", text):
+        found |= set(range(int(first), int(last or first) + 1))
+    return found
+
+
+def test_each_equation_is_named_in_the_files_that_the_page_lists_for_it() -> None:
+    table = PAGE.partition("## Equations and code")[2].partition("\n## ")[0]
+    rows = [line.split("|")[1::2] for line in table.splitlines() if re.match(r"\| \d", line)]
+    listed = [
+        ({int(number) for number in numbers.split(",")}, re.findall(r"`([^`]+)`", code)) for numbers, code in rows
+    ]
+    assert sorted(number for numbers, _ in listed for number in numbers) == list(range(1, 10))
+    for numbers, files in listed:
+        assert files
+        for file in files:
+            assert numbers & equations((ROOT / file).read_text("utf-8")), f"{file} names none of {numbers}"
+
+
 def test_no_folder_has_too_many_modules_but_those_that_the_page_excuses() -> None:
     excused = PAGE.partition("A folder has at most 15 modules.")[2].partition("\n## ")[0]
     names = re.findall(r"^- `([\w/]+)`: \S", excused, re.MULTILINE)

@@ -179,6 +179,13 @@ def read_exposure(photograph: Path) -> float:
     return float(read_json(_note(photograph))["exposure_s"])
 
 
+def delete_photograph(photograph: Path) -> None:
+    """Delete a photograph with its note, and what else the camera wrote for it; harmless if they are gone."""
+    for file in list(photograph.parent.glob("*")):
+        if file.stem == photograph.stem:
+            file.unlink(missing_ok=True)
+
+
 def _note(photograph: Path) -> Path:
     return photograph.with_suffix(NOTE_SUFFIX)
 

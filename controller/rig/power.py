@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from controller.rig.lamp_faults import fatal_faults, faulty
+from controller.rig.lamp_faults import AGAIN, fatal_faults, faulty
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import Clock, SystemClock
 from hal.deadline import Cancelled, Deadline, in_seconds
@@ -84,7 +84,7 @@ def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance,
                 raise DeviceRefused(
                     "lamp-went-off",
                     what=f"The lamp of projector {guard.name} went off while it was warming up.",
-                    remedy="Let it cool for some minutes and start again. If it goes off again, replace the lamp.",
+                    remedy=f"Let it cool for some minutes. If it goes off again, replace the lamp. {AGAIN}",
                 )
         left_s = max((guard.stable_left_s() for guard in guards), default=0.0)
         if left_s <= 0:
@@ -153,7 +153,7 @@ def cool_all(
 def _check(guard: LampGuard, deadline: Deadline) -> None:
     status = guard.status(deadline=deadline.within(guard.answer_s))
     if status.power is Power.FAULT or fatal_faults(status):
-        raise faulty(guard.name, status)
+        raise faulty(guard.name, status, then=AGAIN)
 
 
 def _strike(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock, tell: Tell) -> None:
@@ -195,25 +195,30 @@ def _is_on(guard: LampGuard, deadline: Deadline) -> bool:
     except (DeviceTimeout, DeviceBusy, ProtocolError):
         return False
     if status.power is Power.FAULT or fatal_faults(status):
-        raise faulty(guard.name, status)
+        raise faulty(guard.name, status, then=AGAIN)
     return status.power is Power.ON
 
 
 def _switch_off(guard: LampGuard, deadline: Deadline, clock: Clock) -> None:
     """Send the off command until the lamp is off or cooling; a warming projector may refuse for a while.
 
-    One that was never seen lit is asked once: a silent projector must not delay the end of a failed run.
+    One that was never seen lit is asked once: a silent projector must not delay the end of a failed run. One that
+    reports a fault after the command is dark, and may report it for ever.
     """
     last: Exception | None = None
+    answered = False
     while True:
         try:
             guard.switch_off(deadline=deadline.within(guard.switch_s))
-            if guard.status(deadline=deadline.within(guard.answer_s)).power in (Power.OFF, Power.COOLING):
+            power = guard.status(deadline=deadline.within(guard.answer_s)).power
+            if power in (Power.OFF, Power.COOLING) or (power is Power.FAULT and not guard.may_be_lit):
                 return
+            answered, last = True, None
         except Cancelled:
             raise
         except Exception as error:  # noqa: BLE001 - in every case the lamp must go off; reported at the time limit
-            last = error
+            # If it answered before, only the time limit cut this answer off: it is still on.
+            last = None if answered and deadline.passed else error
         if deadline.passed or (last is not None and not guard.may_be_lit):
             raise last or DeviceTimeout(
                 "lamp-not-off",

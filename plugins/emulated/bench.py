@@ -38,6 +38,7 @@ from plugins.emulated.optics.staging import (
 from plugins.emulated.optics.stands import SETTINGS, Stands, read_room, read_stands
 from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World, object_of
+from plugins.emulated.projectors.boards import USUAL, baud_of, board_named
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
 from plugins.emulated.projectors.quick_profile import quick_profile
@@ -72,13 +73,12 @@ class EmulatedBench:
             kept = ObjectTruth("mesh", OBJECT_FILE, seed)
         shape = stage_object if stage_object is not None else object_of(stage, kept)
         truth = arranged(random_truth(size, seed, shape, kept, _free_ports(), self._stands), self._room, shape)
-        profile = quick_profile(LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s), stable_s=FAST_LAMP.stable_s)
         with _explained(stage):
             for folder in (FOLDER, "run"):
                 (stage / folder).mkdir(parents=True, exist_ok=True)
             if stage_object is not None:
                 stage_object.save(stage / OBJECT_FILE)
-            (stage / FAST_PROFILE).write_text(profile, encoding="utf-8")
+            _write_fast_profile(stage, USUAL)
             write_truth(stage, truth)
             (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
         return device_tables(truth, shape)
@@ -169,10 +169,11 @@ def _start(
         script = stage / truth.scenario
     scenario = read_scenario(script) if script is not None else None
     check_mains(truth.mains, truth.projectors, usb)
-    timings = [
-        LampTiming(one.warm_up_s, one.cool_down_s, one.drift, one.drift_s) for one in (p.lamp for p in truth.projectors)
-    ]
-    lamps = [EmulatedLamp(timing) for timing in timings]
+    for family in {projector.board for projector in truth.projectors}:
+        board_named(family)
+        with _explained(stage):
+            _write_fast_profile(stage, family)
+    lamps = [EmulatedLamp(_timing(projector.lamp)) for projector in truth.projectors]
 
     def progress(share: float) -> None:
         if stopped.is_set():
@@ -186,7 +187,13 @@ def _start(
     boot_s = boot_times(truth.mains)
     wires = {}
     for projector, lamp in zip(truth.projectors, lamps, strict=True):
-        wire = EmulatedSerialProjector(stage / projector.port, lamp, boot_s=boot_s.get(projector.name, 0.0))
+        wire = EmulatedSerialProjector(
+            stage / projector.port,
+            lamp,
+            baud=baud_of(projector.board),
+            board=board_named(projector.board)(lamp),
+            boot_s=boot_s.get(projector.name, 0.0),
+        )
         wires[projector.name] = wire
         if scenario is not None:
             wire.scenario = ScenarioPlayer(scenario, device=projector.name, faults=wire.faults, lamp=lamp, plug=wire)
@@ -209,6 +216,14 @@ def _start(
 
 def _timing(lamp: LampTruth) -> LampTiming:
     return LampTiming(lamp.warm_up_s, lamp.cool_down_s, lamp.drift, lamp.drift_s)
+
+
+def _write_fast_profile(stage: Path, family: str) -> None:
+    """Write the profile with the times of emulated lamps, unless the stage has it: somebody may have changed it."""
+    path = stage / (FAST_PROFILE if family == USUAL else f"{FOLDER}/{family}-fast.toml")
+    if not path.exists():
+        times = LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s)
+        path.write_text(quick_profile(times, base=family, stable_s=FAST_LAMP.stable_s), encoding="utf-8")
 
 
 def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:

@@ -17,7 +17,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,17 +25,15 @@ from hal.errors import DeviceError
 from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.values import Power
+from plugins.emulated.projectors.boards import BOARDS
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
-from plugins.emulated.projectors.optoma import OptomaBoard
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.quick_profile import quick_profile
-from plugins.emulated.projectors.serial import Board, EmulatedSerialProjector
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.emulated.scenario import ScenarioPlayer, parse_scenario
 from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.serial import open_serial_projector
-from tests.plugins.projectors.boards import BOARDS as OTHERS
 
-BOARDS: dict[str, Callable[[EmulatedLamp], Board]] = {"optoma-later": OptomaBoard, **OTHERS}
 FAMILIES = (*BOARDS, "pjlink")
 DEADLINE_S = 0.6
 GRACE_S = 0.3

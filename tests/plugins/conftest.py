@@ -14,6 +14,7 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
+from plugins.emulated.projectors.boards import BOARDS, USUAL
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.quick_profile import quick_profile
@@ -21,7 +22,6 @@ from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.pjlink import PjLinkProjector, open_pjlink_projector
 from plugins.projectors.profile_files import load_profile
 from plugins.projectors.serial import SerialProjector, open_serial_projector
-from tests.plugins.projectors.boards import BOARDS
 from tests.plugins.projectors.pjlink_advance import NOTICE, pjlink_advance_python
 from tests.waiting import wait_for
 
@@ -107,7 +107,10 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
         profile = kwargs.pop("profile", "optoma-later")
         edit = kwargs.pop("edit", lambda text: text)
         name = kwargs.pop("name", "left")
-        if (board := kwargs.pop("board", BOARDS.get(profile))) is not None:
+        board = kwargs.pop("board", None) or BOARDS.get(profile)
+        if board is None:
+            raise LookupError(f"no emulated board for {profile}: add it to plugins/emulated/projectors/boards.py")
+        if board is not BOARDS[USUAL]:  # the emulator makes that one itself, with its number and quirks
             kwargs["board"] = board(lamp)
         (tmp_path / f"{name}.toml").write_text(edit(quick_profile(timing, base=profile)))
         table_read = load_profile(f"{name}.toml", tmp_path).serial

@@ -17,6 +17,7 @@ from controller.artefacts.photographs import (
     Taken,
     capture_name,
     captures_folder,
+    delete_photograph,
     read_exposure,
     write_exposure,
 )
@@ -101,7 +102,7 @@ class Row:
         except DeviceError:
             for photograph in self.taken[self._sure :]:
                 if photograph.fresh:
-                    photograph.path.unlink(missing_ok=True)
+                    delete_photograph(photograph.path)
             del self.taken[self._sure :]
             raise
         self._sure, self._looked_at_s = len(self.taken), time.monotonic()

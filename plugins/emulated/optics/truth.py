@@ -153,7 +153,10 @@ class Panels:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorTruth:
-    """A projector; ``port`` and ``profile`` are relative to the stage folder."""
+    """A projector; ``port`` and ``profile`` are relative to the stage folder.
+
+    ``board``: the family whose control board it has (``projectors.boards.BOARDS``)
+    """
 
     name: str
     output: str
@@ -165,6 +168,7 @@ class ProjectorTruth:
     light: LightTruth
     lamp: LampTruth
     panels: Panels = Panels()
+    board: str = "optoma-later"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from hal.deadline import Deadline, in_seconds
 from hal.driver_calls import Caller
 from hal.errors import DeviceGone, DeviceRefused, DeviceTimeout
 from hal.values import Power, ProjectorStatus
-from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World, refusal, soon
+from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World, soon
 
 
 @dataclass
@@ -94,9 +94,10 @@ def test_a_lamp_that_goes_out_during_warm_up_is_named() -> None:
     room = Room()
     light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
     room.lamps[1].go_dark()
-    assert (
-        refusal(lambda: steady(room.guards, deadline=soon(), advance=room.advance, clock=room.world)) == "lamp-went-off"
-    )
+    with pytest.raises(DeviceRefused) as refused:
+        steady(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
+    assert refused.value.code == "lamp-went-off"
+    assert "start the same command or job again: it continues" in refused.value.remedy
 
 
 def test_a_lamp_that_never_lights_ends_at_the_deadline() -> None:
@@ -115,6 +116,29 @@ def test_power_down_reaches_every_projector_though_one_fails() -> None:
     assert [failure.projector for failure in failures] == ["left"]
     assert isinstance(failures[0].error, DeviceGone)
     assert [lamp.lit_at_s for lamp in room.lamps[1:]] == [None, None]
+
+
+def test_a_failed_lamp_is_off_though_its_projector_reports_the_fault_for_ever() -> None:
+    room = Room()
+    light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
+    room.lamps[0].reports = ProjectorStatus(Power.FAULT, ("lamp-failed",))
+    asked_s = room.world.time_s
+    assert power_down(room.guards, clock=room.world) == ()
+    assert room.world.time_s == asked_s, "nobody waits for it"
+
+
+def test_a_projector_that_stays_on_is_told_so_and_not_called_silent() -> None:
+    class Stubborn(Lamp):
+        def status(self, *, deadline: Deadline) -> ProjectorStatus:
+            deadline.check("projector-no-answer", what="It did not answer.", remedy="Check its cable.")
+            return ProjectorStatus(Power.ON)
+
+    world = World()
+    guard = LampGuard("left", Stubborn(world), Shelf(), clock=world)
+    guard.status(deadline=soon())
+    (failure,) = power_down([guard], within_s=0.1)
+    assert isinstance(failure.error, DeviceTimeout)
+    assert failure.error.code == "lamp-not-off"
 
 
 def test_power_down_asks_again_until_it_is_heard() -> None:

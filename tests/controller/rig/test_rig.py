@@ -31,6 +31,7 @@ def test_a_lamp_that_went_off_is_named(tmp_path: Path) -> None:
     with pytest.raises(DeviceRefused, match="right went off") as refused:
         stage.rig.check_light(deadline=soon())
     assert refused.value.code == "lamp-went-off"
+    assert "start the same command or job again: it continues" in refused.value.remedy
 
 
 def test_a_lamp_that_went_off_and_was_struck_again_is_not_steady_yet(tmp_path: Path) -> None:
@@ -47,8 +48,9 @@ def test_a_lamp_that_went_off_and_was_struck_again_is_not_steady_yet(tmp_path: P
 def test_a_fault_is_told_as_the_projector_calls_it(tmp_path: Path) -> None:
     stage = ModelRig(tmp_path)
     stage.lamps["left"].reports = ProjectorStatus(Power.FAULT, ("lamp-failed",))
-    with pytest.raises(DeviceRefused, match="lamp-failed"):
+    with pytest.raises(DeviceRefused, match="lamp-failed") as refused:
         stage.rig.check_light(deadline=soon())
+    assert "start the same command or job again: it continues" in refused.value.remedy
 
 
 def test_a_projector_that_is_gone_is_not_taken_for_lit(tmp_path: Path) -> None:

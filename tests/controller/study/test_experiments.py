@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from controller.calibrate.values import PhaseMap
 from controller.capture.dots import dot_patterns
-from controller.study.catalogue import EXPERIMENTS
+from controller.study.catalogue import EXPERIMENTS, SCENES
 from controller.study.experiments import ablation, earlier, live
 from controller.study.experiments.earlier import feathered
 from controller.study.experiments.residual import PAPER, ResidualResult, _criteria, residual
 from controller.study.experiments.sharpness import local_sharpness
 from controller.study.lab.measuring import Quality, Variant, unbounded_inverse
 from controller.study.lab.photographing import dots_as_shares
-from controller.study.values import column
+from controller.study.output.words import description
+from controller.study.values import Experiment, column
 from tests.controller.study.array_stage import ArrayLight, array_subject
 
 
@@ -78,8 +83,25 @@ def test_dots_become_the_shares_that_made_them() -> None:
     assert np.abs(middle - np.where(expected > 0.01, expected, 0)).max() < 0.01
 
 
-def test_every_experiment_says_what_it_does_not_show() -> None:
-    assert all(one.shows.endswith(".") and one.paper and one.title for one in EXPERIMENTS)
+@pytest.mark.parametrize("one", EXPERIMENTS, ids=lambda one: one.name)
+def test_every_experiment_says_what_it_shows_and_explains_it_in_a_paragraph(one: Experiment) -> None:
+    assert one.paper
+    assert one.title
+    assert one.shows.endswith(".")
+    text = description(one.name) or getattr(import_module(one.run.__module__), "TEXT", "")
+    assert len(text.split()) >= 40, f"{one.name} has no text in output/words.py and no TEXT in its module"
+
+
+def test_the_example_of_the_guide_runs_on_a_stage() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "study" / "adding.md").read_text("utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(compile(code, "adding.md", "exec"), names)
+    experiment = names["NOISE"]
+    result = experiment.run(array_subject())
+    assert experiment.scene in SCENES
+    assert result.criteria[0].holds
+    assert f"{column(result.tables[0], 'CIEDE2000')[0]:.2f}" == result.criteria[0].reached
 
 
 def test_sharpness_is_measured_for_one_and_for_all_naive_and_full(monkeypatch: pytest.MonkeyPatch) -> None:

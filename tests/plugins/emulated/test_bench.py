@@ -19,11 +19,17 @@ import pytest
 import rawpy
 import serial
 
+from hal.deadline import in_seconds
 from hal.errors import DeviceError
+from hal.registry import OpenContext
+from hal.values import Power
 from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.cameras.shot import ShotSettings
+from plugins.emulated.optics.stands import Stands
 from plugins.emulated.optics.truth import BenchTruth, MainsTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World
+from plugins.emulated.projectors.boards import BOARDS, USUAL
+from plugins.projectors.serial import open_serial_projector
 
 SERVE = """
 import sys
@@ -96,6 +102,43 @@ def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(
             process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=20) == 0
     assert not any(tty.is_symlink() for tty in ttys)
+
+
+def test_every_family_with_power_codes_can_be_emulated(
+    tmp_path: Path, shrink: Callable[[BenchTruth], BenchTruth]
+) -> None:
+    families = sorted(set(BOARDS) - {USUAL, "optoma-ep910"})
+    EmulatedBench(Stands(len(families))).prepare(tmp_path / "stage", size="small", object_file=None, seed=11)
+    truth = shrink(read_truth(tmp_path / "stage"))
+    others = [
+        dataclasses.replace(projector, board=family)
+        for projector, family in zip(truth.projectors, families, strict=True)
+    ]
+    write_truth(tmp_path / "stage", dataclasses.replace(truth, projectors=tuple(others)))
+    with served(tmp_path / "stage") as process:
+        try:
+            assert not [record for record in until_ready(process) if "error" in record]
+            for projector in others:
+                settings = {"profile": f"bench/{projector.board}-fast.toml", "port": projector.port}
+                driver = open_serial_projector(settings, OpenContext(tmp_path / "stage"), in_seconds(20))
+                driver.switch_on(deadline=in_seconds(60))
+                assert driver.status(deadline=in_seconds(20)).power in (Power.WARMING, Power.ON), projector.board
+                driver.close()
+        finally:
+            process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=20) == 0
+
+
+def test_a_family_without_a_board_is_refused_with_those_there_are(prepared: Path) -> None:
+    truth = read_truth(prepared)
+    odd = dataclasses.replace(truth.projectors[0], board="pjlink")
+    write_truth(prepared, dataclasses.replace(truth, projectors=(odd, *truth.projectors[1:])))
+    process = served(prepared)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 3
+    error = json.loads(out.splitlines()[-1])["error"]
+    assert error["code"] == "board-unknown"
+    assert "benq" in error["remedy"]
 
 
 def test_a_port_in_use_is_told_in_a_sentence_before_anything_is_served(prepared: Path) -> None:

@@ -270,3 +270,8 @@ def test_a_sanyo_whose_lamp_failed_cools_and_then_reports_a_fault(open_serial: A
     pair.emulator.lamp.fail()
     wait_for_power(pair.driver, Power.FAULT)
     assert pair.driver.status(deadline=in_seconds(SOON)).faults == ("error-standby",)
+
+
+def test_a_family_without_an_emulated_board_is_not_taken_for_an_optoma(open_serial: Any) -> None:
+    with pytest.raises(LookupError, match="no emulated board for pjlink: add it to"):
+        open_serial(profile="pjlink")

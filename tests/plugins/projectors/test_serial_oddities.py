@@ -14,11 +14,10 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power, ProjectorStatus
 from plugins.emulated.projectors.board_sanyo import SanyoBoard
+from plugins.emulated.projectors.boards import BOARDS
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.projectors.odd_board import OddBoard
-from plugins.emulated.projectors.optoma import OptomaBoard
 from tests.plugins.conftest import each, wait_for_power
-from tests.plugins.projectors.boards import BOARDS
 
 SOON = 30.0
 LAMP_QUESTION = {
@@ -45,7 +44,7 @@ def impatient(text: str) -> str:
 
 
 def odd(profile: str, answers: Mapping[bytes, bytes | None]) -> Callable[[EmulatedLamp], OddBoard]:
-    usual = BOARDS.get(profile, OptomaBoard)
+    usual = BOARDS[profile]
     return lambda lamp: OddBoard(usual(lamp), answers)
 
 

@@ -96,6 +96,8 @@ def test_photographs_without_a_lamps_light_are_forgotten_but_earlier_ones_are_ke
     with pytest.raises(DeviceRefused, match="went off"):
         take_all(stage.rig, context, plan(), into=PhotographSet("greys"))
     assert not (context.folder / "greys.json").exists()
+    left = [path for path in context.folder.rglob("*") if "grey-1" in path.name or "grey-2" in path.name]
+    assert left == [], "also no note of a photograph that is gone"
     light_again(stage)
     take_all(stage.rig, context, plan(), into=PhotographSet("greys"))
     assert stage.camera.taken == ["grey-0", "grey-1", "grey-2", "grey-1", "grey-2"]
