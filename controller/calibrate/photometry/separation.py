@@ -122,8 +122,7 @@ def _measured(
     for prefix in prefixes:
         steps = plan.sinusoids(prefix)
         images = [coloured(captures, step.name, black.shape[:2]) - black for step in steps]
-        for image, gain in zip(images, _gains(images, white), strict=True):
-            image *= np.float32(gain)
+        images = [image * np.float32(gain) for image, gain in zip(images, _gains(images, white), strict=True)]
         weights = [np.float32(2 / len(steps)) * np.exp(-1j * step.phase_rad) for step in steps]
         along, across = (sum(float(part(w)) * i for w, i in zip(weights, images, strict=True)) for part in (_re, _im))
         residual = np.nan_to_num(sum(images) - np.float32(len(steps) / 2) * white)
