@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.optimize import nnls
 
-from controller.calibrate.values import Calibration
+from controller.calibrate.values import Calibration, ProjectorCalibration
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.indirect import IndirectLight, down, up
 
@@ -52,6 +53,17 @@ def fit_indirect(
     whole = np.sum(indirect, axis=0)
     scale = np.divide(whole, falling, out=np.zeros_like(whole), where=falling > faint)
     return IndirectLight(factors, scale.astype(np.float32), lit, grid, side)
+
+
+def beside(part: ProjectorCalibration, shown: FloatImage, lit: Mask) -> FloatImage:
+    """Direct light (rows, columns, 3) of a projector's frame where the transport knows none: on table and walls."""
+    if part.phase_map is None:
+        light = np.broadcast_to(shown.mean(axis=(0, 1)), part.white.shape)
+    else:
+        at = np.nan_to_num(part.phase_map.projector_px, nan=-1e4)
+        light = cv2.remap(shown, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    mixed = part.white * (light @ part.radiometry.mixing.T.astype(np.float32))
+    return np.where(lit[..., None], np.float32(0), mixed).astype(np.float32)
 
 
 def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:

@@ -21,6 +21,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.calibration import read_black
 from controller.artefacts.camera import Exposures
 from controller.artefacts.drift import read_drift
+from controller.artefacts.indirect import Indirect
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.modes import mode_of
 from controller.artefacts.photographs import DRIFT, white_again_of
@@ -132,6 +133,8 @@ def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
         return Way.CORRECT  # black has been photographed anew
     if kind == StepKind.LIGHT:
         return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
+    if kind == StepKind.INDIRECT:
+        return Way.CORRECT if one.dimmed else Way.KEEP
     return Way.CORRECT if kind == StepKind.PIXELS and one.moved else Way.KEEP
 
 
@@ -163,6 +166,10 @@ def _correct(rig: Rig, last: Calibrated, step: StepId, kept: list[Path], context
         return [*kept, *_photograph_white(rig, projector, context)]
     if step.kind == StepKind.PIXELS:
         _shift_pixels(context.folder, name, one)
+    elif step.kind == StepKind.INDIRECT:
+        found = Indirect.read(context.folder, name)
+        mixing = update_radiometry(found.radiometry, one.gain).mixing
+        dataclasses.replace(found, mixing=mixing).write(context.folder, name)
     else:
         _correct_light(context.folder, name, one)
     return kept
