@@ -146,7 +146,10 @@ def _weights(
     seen = np.stack([down(image, grid, side) for image in indirect])
     whole = seen.sum(axis=0)
     light = whole + np.sum(direct, axis=0)
-    falling = np.stack([[term @ one for term in terms] for one in direct])
+    shape = indirect[0].shape
+    falling = np.stack(
+        [[down(up(term @ one, grid, side, shape), grid, side) for term in terms] for one in direct]
+    )  # fmt: skip
     found = np.full(len(terms), 1 / len(terms))
     use = (whole > 0) & (light > 1e-3 * light.max(initial=0))
     if len(direct) < 2 or not use.any():

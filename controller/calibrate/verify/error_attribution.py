@@ -86,10 +86,10 @@ COLOURS: Final[dict[ErrorCause, tuple[int, int, int]]] = {
     ErrorCause.DARK: (86, 180, 233),
     ErrorCause.GRAZING: (0, 158, 115),
     ErrorCause.DEFOCUS: (204, 121, 167),
-    ErrorCause.INDIRECT: (0, 114, 178),
+    ErrorCause.INDIRECT: (146, 73, 0),
     ErrorCause.UNEXPLAINED: (255, 255, 255),
 }
-"""Okabe and Ito's palette, which people with any colour vision tell apart."""
+"""Okabe and Ito's palette and a brown, which people with any colour vision tell apart."""
 
 
 @dataclass(frozen=True, slots=True)
