@@ -71,7 +71,7 @@ def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int
 
     A block without a shape receives what its nearest neighbour with one does, and sends nothing.
     """
-    known = (np.isfinite(points_m) & np.isfinite(normals)).all(axis=2)
+    known: Mask = np.asarray((np.isfinite(points_m) & np.isfinite(normals)).all(axis=2))
     share = down(known[..., None].astype(np.float32), grid, side)[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
         point, normal = (

@@ -167,7 +167,8 @@ def _smoothed(share: FloatImage, sigma: FloatImage, known: Mask, position_px: Fl
     """Mean over neighbours on the same surface in like light, by their certainty."""
     start = np.stack([cv2.medianBlur(np.ascontiguousarray(share[..., c]), 3) for c in range(3)], axis=2)
     out = share.copy()
-    _mean_of_like(share, start, sigma, known, np.nan_to_num(position_px, nan=-1e6), out)
+    position = np.where(np.isfinite(position_px), position_px, np.float32(-1e6)).astype(np.float32)
+    _mean_of_like(share, np.asarray(start, np.float32), sigma, known, position, out)
     return out
 
 
