@@ -15,7 +15,7 @@ from controller.solve.appearance import Base, prepare_base
 from controller.solve.drive_levels import DriveLevels
 from controller.transport import LightTransport, build_transport
 from controller.transport.indirect import IndirectLight
-from controller.transport.indirect_fit import fit_indirect
+from controller.transport.indirect_fit import beside, fit_indirect
 
 
 class Calibrated:
@@ -62,6 +62,14 @@ class Calibrated:
             self._indirect = fit_indirect(self.calibration, self.transport.object_mask, points_m, normals)
             self._indirect_known = True
         return self._indirect
+
+    def indirect_of(self, n: int, frame: FloatImage) -> FloatImage | None:
+        """What other surfaces throw back of projector ``n``'s linear frame, on table and walls, too; None without G."""
+        if self.indirect is None:
+            return None
+        direct = self.transport.forward_part(n, frame)
+        room = beside(self.calibration.projectors[n], frame, self.transport.object_mask)
+        return self.indirect.forward(direct + room)
 
     def seen(self, frames: Sequence[FloatImage]) -> FloatImage:
         """What the camera sees of linear frames (rows, columns, 3), one a projector, without the black image."""

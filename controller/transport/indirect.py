@@ -96,17 +96,17 @@ def up(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, .
     """(rows, columns, 3): values of blocks, interpolated between their middles."""
     down_, across = _between(shape[0], grid[0], side), _between(shape[1], grid[1], side)
     values = blocks.reshape(*grid, -1)
-    return np.stack([down_ @ values[..., c] @ across.T for c in range(values.shape[2])], axis=2)
+    return np.stack([down_ @ values[..., c] @ across.T for c in range(values.shape[2])], axis=2).astype(np.float32)
 
 
 def up_adjoint(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
     """The transpose of ``up``: (blocks, 3)."""
     down_, across = _between(image.shape[0], grid[0], side), _between(image.shape[1], grid[1], side)
     parts = [down_.T @ image[..., c] @ across for c in range(image.shape[2])]
-    return np.stack(parts, axis=2).reshape(grid[0] * grid[1], -1)
+    return np.asarray(np.stack(parts, axis=2).reshape(grid[0] * grid[1], -1), np.float32)
 
 
 def _between(pixels: int, blocks: int, side: int) -> FloatImage:
     """(pixels, blocks): linear interpolation, constant beyond the outermost middles."""
     at = np.clip((np.arange(pixels) - (side - 1) / 2) / side, 0, blocks - 1)
-    return np.maximum(1 - np.abs(at[:, None] - np.arange(blocks)), 0).astype(np.float32)
+    return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(blocks)), 0), np.float32)

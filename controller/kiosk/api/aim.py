@@ -185,7 +185,7 @@ def feasibility_map(stage: Path, target: Path) -> Path:
     import cv2
 
     from controller.artefacts.calibrated import Calibrated
-    from controller.solve.feasibility import choose_exposure, feasibility
+    from controller.solve.request import SolveOptions, aim_at
     from controller.solve.targets.files import load_target
 
     checked = check_stage(stage)
@@ -200,8 +200,9 @@ def feasibility_map(stage: Path, target: Path) -> Path:
         if whole != target:
             whole.write_bytes(fitted(target.read_bytes(), size_px))
         asked = load_target(whole, size_px)
-    exposure = choose_exposure(transport, asked.image, black, share=checked.stage.tables.solve.exposure_share)
-    found = feasibility(transport, np.float32(exposure) * asked.image, black)
+    options = SolveOptions(checked.stage.tables.solve.exposure_share, checked.stage.tables.solve.smoothness)
+    aim = aim_at(transport, black, asked.image, options, drive=calibrated.drive, indirect=calibrated.indirect)
+    found = aim.possible
     worst = np.maximum(found.too_bright, found.too_dark).max(axis=2)
     grey = np.where(calibrated.calibration.object_mask & asked.mask, np.clip(worst, 0, 1), 0)
     path.parent.mkdir(parents=True, exist_ok=True)

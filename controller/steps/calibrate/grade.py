@@ -20,10 +20,9 @@ from controller.artefacts.grade import (
     write_accepted,
     write_grade,
 )
-from controller.artefacts.indirect import IndirectFigures
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.photographs import PATTERN, VERIFICATION, Taken, codes_of
-from controller.artefacts.projectors import Light
+from controller.artefacts.projectors import IndirectFigures, Light
 from controller.bundle.export import png
 from controller.calibrate.values import ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
@@ -40,7 +39,6 @@ from controller.steps import costs
 from controller.steps.appearance.solving import random_pattern
 from controller.steps.calibrate.drift import shown_frames
 from controller.steps.capture.photographs import Planned, take_all
-from controller.transport.indirect_fit import beside
 
 WORSE = 1.25
 """A calibration this many times worse than the one before it is told of, though it passes the gate."""
@@ -98,9 +96,7 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         rows, columns = part.metapixels.valid.shape
         pattern = random_pattern((columns, rows))
         shown = _shown(context.folder, part, pattern, (columns, rows))
-        light, indirect = transport.forward_part(n, shown), None
-        if calibrated.indirect is not None:
-            indirect = calibrated.indirect.forward(light + beside(part, shown, transport.object_mask))
+        light, indirect = transport.forward_part(n, shown), calibrated.indirect_of(n, shown)
         taken = _taken(context.folder, part.name, pattern)
         seen = taken.per_second()
         expected = light + calibration.black if indirect is None else light + indirect + calibration.black

@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 
 from controller.artefacts.calibration import read_captures
-from controller.artefacts.indirect import Indirect, IndirectFigures
 from controller.artefacts.kinds import StepKind, of_projectors
 from controller.artefacts.photographs import Developed
-from controller.artefacts.projectors import Light, Pixels
+from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.photometry.separation import indirect_figures, indirect_share, shown_contrast

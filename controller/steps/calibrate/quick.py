@@ -21,11 +21,10 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.calibration import read_black
 from controller.artefacts.camera import Exposures
 from controller.artefacts.drift import read_drift
-from controller.artefacts.indirect import Indirect
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.modes import mode_of
 from controller.artefacts.photographs import DRIFT, white_again_of
-from controller.artefacts.projectors import Light, Pixels
+from controller.artefacts.projectors import Indirect, Light, Pixels
 from controller.calibrate.verify.drift import Drift, ProjectorDrift
 from controller.calibrate.verify.drift_report import advice, sentences
 from controller.calibrate.verify.homography_update import update_positions, update_radiometry

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.artefacts.indirect import Indirect, IndirectFigures, read_indirect
+from controller.artefacts.projectors import Indirect, IndirectFigures, read_indirect
 
 NAMES = ("left", "right")
 
