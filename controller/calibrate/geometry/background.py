@@ -25,6 +25,8 @@ BEHIND: Final = 0.01
 """Share of the points that may lie behind a plane, as points that are wrong do."""
 LEAST: Final = 0.03
 """Share of the points that a plane holds."""
+LEAST_OBJECT: Final = 0.1
+"""Share of the points that are not the room's; with fewer, the flat surfaces are themselves the object."""
 BORDER: Final = 0.02
 """Width of the picture's border, as a share of its height."""
 AT_BORDER: Final = 0.03
@@ -35,9 +37,9 @@ def room_pixels(points_m: FloatImage) -> Mask:
     """Pixels (rows, columns) that see flat surfaces of the room; ``points_m``: as ``Geometry``, NaN where unknown.
 
     A pixel without a point counts as its nearest neighbour with one. None is the room's where no plane reaches the
-    picture's border.
+    picture's border, or where hardly anything else is seen.
     """
-    known = np.isfinite(points_m).all(axis=2)
+    known = np.asarray(np.isfinite(points_m).all(axis=2), dtype=np.bool_)
     room = np.zeros(known.shape, dtype=np.bool_)
     border, rng = _border(known.shape), np.random.default_rng(0)
     if np.mean(known[border]) < AT_BORDER:
@@ -53,8 +55,8 @@ def room_pixels(points_m: FloatImage) -> Mask:
         if np.mean(near[border]) < AT_BORDER:
             break
         room |= near
-    if not room.any():
-        return room
+    if not room.any() or np.count_nonzero(known & ~room) < LEAST_OBJECT * np.count_nonzero(known):
+        return np.zeros_like(room)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     whole: Mask = median_filter(room[tuple(nearest)], size=5)
     return whole
@@ -68,7 +70,7 @@ def _plane(
     if not len(row):
         return None
     some = points_m[left][rng.integers(0, len(row), POINTS)].astype(np.float64)
-    best, most = None, LEAST * np.count_nonzero(np.isfinite(points_m[..., 0])) / len(row) * POINTS
+    best, most = None, LEAST * float(np.count_nonzero(np.isfinite(points_m[..., 0]))) / len(row) * POINTS
     apart = round(APART * left.shape[0])
     for start in rng.integers(0, len(row), TRIALS):
         beside = rng.integers(-apart, apart + 1, (2, 3))
@@ -84,7 +86,7 @@ def _plane(
             if len(inliers) < 0.5 * most:
                 break
             plane = _through(inliers)
-        count = np.count_nonzero(np.abs(some @ plane[:3] + plane[3]) < thick)
+        count = float(np.count_nonzero(np.abs(some @ plane[:3] + plane[3]) < thick))
         if count > most and np.mean(everything @ plane[:3] + plane[3] < -thick) < BEHIND:
             best, most = plane, count
     return best

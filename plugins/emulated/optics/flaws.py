@@ -5,6 +5,7 @@ What differs from pixel to pixel and from shot to shot is drawn from the stage's
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -59,7 +60,7 @@ def flickering(lamp: LampTruth, exposure_s: float, rng: np.random.Generator) -> 
     """Factor on a lamp's mean light during one exposure."""
     if not lamp.flicker:
         return 1.0
-    return max(0.0, 1.0 + lamp.flicker / np.sqrt(1.0 + exposure_s / FLICKER_S) * float(rng.standard_normal()))
+    return max(0.0, 1.0 + lamp.flicker / math.sqrt(1.0 + exposure_s / FLICKER_S) * float(rng.standard_normal()))
 
 
 def veiled(image: npt.NDArray[np.float32], share: float) -> npt.NDArray[np.float32]:

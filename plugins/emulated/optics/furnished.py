@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from hal.errors import DeviceError
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.shapes import Floats, Rgb
 from plugins.emulated.optics.truth import SurfaceTruth
+
+LEAST_M2: Final = 1e-8
 
 
 class Scene(Protocol):
@@ -58,14 +61,24 @@ class Furnished:
 
 
 def furnished(thing: StageObject, surfaces: tuple[SurfaceTruth, ...]) -> Scene:
-    """The scene of an object; the object itself where there is no surface."""
+    """The scene of an object; the object itself where there is no surface.
+
+    Raises DeviceError ``surface-no-area``.
+    """
     if not surfaces:
         return thing
     corners = np.array([_corners(surface) for surface in surfaces])
     first = len(thing.vertices) + 4 * np.arange(len(surfaces))[:, None, None]
     faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    area = np.linalg.norm(flat, axis=1, keepdims=True)
+    if area.min() < LEAST_M2:
+        raise DeviceError(
+            "surface-no-area",
+            what=f"The surface {surfaces[int(area.argmin())].name!r} in bench.toml has no area.",
+            remedy="Give across_m and along_m a length, in different directions.",
+        )
+    flat /= area
     normals = np.broadcast_to(flat[:, None, None, :], (len(surfaces), 2, 3, 3)).reshape(-1, 3, 3)
     return Furnished(
         thing=thing,

@@ -215,8 +215,8 @@ def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
     for part in (truth.camera.pose, truth.camera.lens, *projectors):
         digest.update(dump(part).encode())
     digest.update(f"{truth.subsamples} {truth.object.gloss} {truth.object.gloss_exponent}".encode())
-    for part in scene.fingerprint():
-        digest.update(np.ascontiguousarray(part).tobytes())
+    for array in scene.fingerprint():
+        digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 

@@ -68,7 +68,7 @@ def _read(path: Path, key: str) -> Transfer | None:
 
 def _write(path: Path, key: str, transfer: Transfer) -> None:
     matrices = {f"arrive{n}": one for n, one in enumerate(transfer.arrive)} | {"blend": transfer.blend}
-    parts = {
+    parts: dict[str, Any] = {
         f"{name}_{part}": getattr(matrix, part)
         for name, matrix in matrices.items()
         for part in ("data", "indices", "indptr", "shape")
@@ -77,7 +77,7 @@ def _write(path: Path, key: str, transfer: Transfer) -> None:
     temporary = path.with_name(path.name + ".part")
     try:
         with temporary.open("wb") as file:
-            counts = {"key": np.array(key), "projectors": np.array(len(transfer.arrive))}
+            counts: dict[str, Any] = {"key": np.array(key), "projectors": np.array(len(transfer.arrive))}
             np.savez(file, **counts, back=transfer.back, cells=transfer.cells, **parts)
         temporary.replace(path)
     finally:

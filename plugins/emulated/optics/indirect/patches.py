@@ -24,6 +24,8 @@ OBJECT_SHARE: Final = 0.7
 """Of the patches, where there are surfaces, too."""
 FINEST: Final = 0.25
 """Longest edge of a face, in sizes of a patch."""
+FACES_COUNTED: Final = 60_000
+"""Of so many faces the groups are counted, to find the size of a patch."""
 CLEAR_M: Final = 2e-5
 """Rays start so far above the surface."""
 
@@ -119,26 +121,42 @@ def _sorted(corners: Floats, group: Integers, albedo: Floats, body: Integers, si
 def _groups(scene: Scene, faces: Integers, wanted: int) -> tuple[Floats, Integers, Floats, float]:
     """Corners of the (cut) faces, their groups, their albedo, and the size of a group."""
     size = np.sqrt(_area(scene, faces) / wanted)
-    vertices = scene.vertices.astype(np.float64)
-    cut, pieces, source = trimesh.remesh.subdivide_to_size(
-        vertices, scene.faces[faces], FINEST * size, max_iter=20, return_index=True
-    )
-    corners = cut[pieces]
+    corners, source = _cut(scene, faces, FINEST * size)
     normals, areas = _normals(corners)
     corners, normals, source = corners[areas > 0.0], normals[areas > 0.0], source[areas > 0.0]
     middle = corners.mean(axis=1)
-    whole = vertices[scene.faces[faces[source]]]
-    weights = trimesh.triangles.points_to_barycentric(whole, middle, method="cross")
-    albedo = scene.albedo(middle, faces[source].astype(np.int32), weights.astype(np.float32))
+    whole = scene.vertices[scene.faces[source]].astype(np.float64)
+    to_weights: Any = trimesh.triangles.points_to_barycentric
+    weights = to_weights(whole, middle, method="cross")
+    albedo = scene.albedo(middle, source.astype(np.int32), weights.astype(np.float32))
     axis = np.abs(normals).argmax(axis=1)
     side = 2 * axis + (normals[np.arange(len(axis)), axis] > 0.0)
+    place = middle - middle.min(axis=0)
+
+    def keys(size: float, step: int = 1) -> Integers:
+        cells = np.floor(place[::step] / size + 1e-6).astype(np.int64)
+        return np.asarray(cells @ (6, 6 * 4096, 6 * 4096**2) + side[::step])
+
     low, high = 0.5 * size, 4.0 * size
     for _ in range(10):
         size = np.sqrt(low * high)
-        cells = np.concatenate([np.floor((middle - middle.min(axis=0)) / size + 1e-6), side[:, None]], axis=1)
-        keys, group = np.unique(cells.astype(np.int64) @ (1, 4096, 4096**2, 4096**3), return_inverse=True)
-        low, high = (size, high) if len(keys) > wanted else (low, size)
+        many = len(np.unique(keys(size, max(1, len(place) // FACES_COUNTED)))) > wanted
+        low, high = (size, high) if many else (low, size)
+    group = np.unique(keys(size), return_inverse=True)[1]
     return corners, group.reshape(-1), albedo.astype(np.float64), float(size)
+
+
+def _cut(scene: Scene, faces: Integers, longest: float) -> tuple[Floats, Integers]:
+    """Corners (F, 3, 3) of faces without longer edges, and the face of the scene that each is of."""
+    whole = scene.vertices[scene.faces[faces]].astype(np.float64)
+    large = np.linalg.norm(whole - np.roll(whole, 1, axis=1), axis=2).max(axis=1) > longest
+    if not large.any():
+        return whole, faces
+    subdivide: Any = trimesh.remesh.subdivide_to_size
+    vertices, pieces, source = subdivide(
+        scene.vertices.astype(np.float64), scene.faces[faces[large]], longest, max_iter=20, return_index=True
+    )
+    return np.concatenate([whole[~large], vertices[pieces]]), np.concatenate([faces[~large], faces[large][source]])
 
 
 def _normals(corners: Floats) -> tuple[Floats, Floats]:

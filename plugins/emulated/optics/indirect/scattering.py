@@ -6,7 +6,7 @@ They are counted from rays that leave each patch as diffuse light does, so no se
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +44,7 @@ def _form_factors(patches: Patches, rng: np.random.Generator, progress: Progress
     whole = np.concatenate([[0.0], np.cumsum(patches.areas)])
     numbers = qmc.Sobol(5, seed=rng).random(RAYS)
     count = 2 * patches.count
-    rows = []
+    rows: list[Any] = []
     for first in range(0, count, PATCHES_AT_ONCE):
         sides = np.arange(first, min(first + PATCHES_AT_ONCE, count))
         drawn = (numbers[None] + rng.random((len(sides), 1, 5))) % 1.0
@@ -65,7 +65,7 @@ def _form_factors(patches: Patches, rng: np.random.Generator, progress: Progress
     # Both ways between two patches carry the same, so each is counted twice: areas times factors are symmetric.
     area = np.repeat(np.add.reduceat(patches.areas, patches.starts[:-1]), 2)
     both = sparse.diags(area) @ found
-    return (sparse.diags(0.5 / area) @ (both + both.T)).tocsr()
+    return sparse.csr_matrix(sparse.diags(0.5 / area) @ (both + both.T))
 
 
 def _leaving(patches: Patches, face: Integers, side: Floats, drawn: Floats) -> tuple[Floats, Floats]:

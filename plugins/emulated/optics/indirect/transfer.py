@@ -92,8 +92,8 @@ def _arriving(projector: ProjectorTruth, patches: Patches) -> sparse.csr_matrix:
     area = np.add.reduceat(patches.areas, patches.starts[:-1])
     total = sparse.csr_matrix((2 * patches.count, len(pixel)))
     for n in range(parts * parts):
-        x = pixel % width + (n % parts + 0.5) / parts - 0.5
-        y = pixel // width + (n // parts + 0.5) / parts - 0.5
+        x = np.asarray(pixel % width + (n % parts + 0.5) / parts - 0.5, np.float64)
+        y = np.asarray(pixel // width + (n // parts + 0.5) / parts - 0.5, np.float64)
         rays = directions(projector.pose, lens, x, y)
         found = patches.hit(np.broadcast_to(np.asarray(projector.pose.position_m), rays.shape), rays).patch
         corner = ((x - 0.5 * (width - 1)) / (0.5 * width)) ** 2 + ((y - 0.5 * (height - 1)) / (0.5 * height)) ** 2
@@ -141,7 +141,8 @@ def _hit_by_pixels(camera: CameraTruth, patches: Patches, row: Integers, column:
     seen = Hits(np.full(len(row), -1), np.zeros((len(row), 3)), np.zeros((len(row), 3)))
     for dx, dy in ((0.0, 0.0), (-0.4, -0.4), (0.4, 0.4), (-0.4, 0.4), (0.4, -0.4)):
         missed = np.flatnonzero(seen.patch < 0)
-        rays = directions(camera.pose, camera.lens, column[missed] + dx, row[missed] + dy)
+        x, y = np.asarray(column[missed] + dx, np.float64), np.asarray(row[missed] + dy, np.float64)
+        rays = directions(camera.pose, camera.lens, x, y)
         found = patches.hit(np.broadcast_to(eye, rays.shape), rays)
         for part, of_all in ((found.patch, seen.patch), (found.points, seen.points), (found.normals, seen.normals)):
             of_all[missed] = part
@@ -170,9 +171,8 @@ def _blended(patches: Patches, kept: Integers, seen: Hits) -> sparse.csr_matrix:
         turn = TURN * patches.size_m[group[near[0]]]
         tree = cKDTree(np.concatenate([patches.centres[group[near]], turn * facing[near]], axis=1))
         places = np.concatenate([seen.points[mine], turn * seen.normals[mine]], axis=1)
-        away, found = (
-            part.reshape(len(mine), -1) for part in tree.query(places, k=min(NEAREST, len(near)), workers=-1)
-        )
+        nearest = tree.query(places, k=np.arange(1, min(NEAREST, len(near)) + 1), workers=-1)
+        away, found = np.asarray(nearest[0], np.float64), np.asarray(nearest[1], np.int64)
         reach = 1.001 * away[:, -1:]
         weight = (1.0 - (away / reach) ** 2) ** 2
         weight /= weight.sum(axis=1, keepdims=True)

@@ -60,3 +60,8 @@ def test_an_object_before_nothing_is_left_whole_even_a_flat_one(alone: Floats) -
 
 def test_round_things_that_fill_the_picture_are_no_room() -> None:
     assert not room_pixels(points(ball((0.0, 0.0, 1.5), 1.2))).any()
+
+
+def test_a_wall_alone_is_the_object() -> None:
+    assert not room_pixels(points(WALL)).any()
+    assert not room_pixels(points(WALL, ball((0.0, 0.0, 1.4), 0.1))).any()

@@ -143,6 +143,26 @@ def test_panels_shift_and_magnify_the_picture_of_their_colour(truth: BenchTruth,
     np.testing.assert_allclose(picture(with_projector(truth, panels=panels), other), picture(truth, other), atol=1e-5)
 
 
+def test_rough_gloss_is_a_wide_highlight_on_top_of_the_paint(truth: BenchTruth) -> None:
+    """Blinn and Phong's, normalised: g (n + 8) / 8 cos^n of the angle between normal and half vector."""
+    gloss, exponent = 0.06, 12.0
+    glossy = dataclasses.replace(truth, object=dataclasses.replace(truth.object, gloss=gloss, gloss_exponent=exponent))
+    white = blank(truth, 255)
+    plain, more = picture(truth, white), picture(glossy, white)
+    lit = plain.min(axis=2) > 0.5 * plain.max()
+    y, x = np.nonzero(lit)
+    camera = truth.camera
+    # The screen is flat and faces both devices, which stand on one line.
+    flat = (np.stack((x, y), axis=1) - camera.lens.centre_px) / camera.lens.focal_px
+    radius = 1.2 * np.linalg.norm(flat, axis=1)
+    towards = [np.stack((-radius, np.full(len(radius), away)), axis=1) for away in (1.0, 1.2)]
+    half = sum(part / np.linalg.norm(part, axis=1, keepdims=True) for part in towards)
+    cosine = half[:, 1] / np.linalg.norm(half, axis=1)
+    wanted = gloss * (exponent + 8.0) / 8.0 * cosine**exponent
+    # Of paint with albedo 0.5, as the lens' small distortion moves pixels by less than one.
+    np.testing.assert_allclose(0.5 * (more[lit] / plain[lit] - 1.0).mean(axis=1), wanted, rtol=0.02)
+
+
 class Lamp:
     def light_level(self) -> float:
         return 1.0

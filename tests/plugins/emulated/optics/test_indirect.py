@@ -12,6 +12,7 @@ import trimesh
 
 from hal.errors import DeviceError
 from plugins.emulated.bench import EmulatedBench
+from plugins.emulated.optics.furnished import furnished
 from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.indirect.scattering import scattering_of
 from plugins.emulated.optics.indirect.transfer import Transfer, transfer_of
@@ -50,8 +51,12 @@ def ideal(truth: BenchTruth) -> BenchTruth:
     return dataclasses.replace(truth, engine="radiosity", ambient=(0.0, 0.0, 0.0), camera=camera)
 
 
-def test_an_integrating_sphere_has_even_light_by_its_formula(tiny_truth: BenchTruth) -> None:
-    truth, thing = dataclasses.replace(ideal(tiny_truth), patches=600), sphere()
+def test_an_integrating_sphere_has_even_light_by_its_formula(
+    tiny_truth: BenchTruth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Many rays from few patches, so that chance counts for less than the tolerance.
+    monkeypatch.setattr("plugins.emulated.optics.indirect.scattering.RAYS", 4096)
+    truth, thing = dataclasses.replace(ideal(tiny_truth), patches=200), sphere()
     samples = cast(truth, thing, lambda share: None)
     transfer = transfer_of(truth, scattering_of(thing, truth.patches, 1), samples.pixels)
     arrived, power = np.zeros((transfer.back.shape[2], 3), np.float32), np.zeros(3)
@@ -119,7 +124,7 @@ def test_a_transfer_is_kept_for_the_very_stage(
     again = transfer_in(Indirect(vase_and_bust, folder), roomy, vase_and_bust, shares)
     assert shares == [1.0]
     np.testing.assert_array_equal(first.back, again.back)
-    assert (first.blend != again.blend).nnz == 0
+    assert abs(first.blend - again.blend).max() == 0.0
     wall = dataclasses.replace(roomy.surfaces[1], albedo=(0.1, 0.1, 0.1))
     darker = dataclasses.replace(roomy, surfaces=(roomy.surfaces[0], wall))
     assert transfer_in(indirect, darker, vase_and_bust, []).back.mean() < first.back.mean()
@@ -144,7 +149,7 @@ def test_rooms_differ_in_what_bench_toml_says_and_dark_says_nothing(tmp_path: Pa
     assert (room.engine, room.projectors[0].lamp.flicker) == ("radiosity", 0.01)
     assert all(p.panels.aligned for p in room.projectors)
     assert hard.camera.sensor.shutter_spread > 0.0
-    assert all(not p.panels.aligned and p.light.white_segment > 0.0 for p in hard.projectors)
+    assert all(not p.panels.aligned and p.light.glare > 0.0 for p in hard.projectors)
     same = [(p.pose, p.lens, p.focus) for p in dark.projectors]
     assert all([(p.pose, p.lens, p.focus) for p in other.projectors] == same for other in (room, hard))
 
@@ -154,3 +159,5 @@ def test_a_surface_of_no_use_is_refused() -> None:
     assert load(dump(good), SurfaceTruth, file="bench.toml") == good
     with pytest.raises(DeviceError, match=r"between 0 and 0\.95"):
         load(dump(good).replace("[0.5, 0.5, 0.5]", "[1.0, 0.5, 0.5]"), SurfaceTruth, file="bench.toml")
+    with pytest.raises(DeviceError, match=r"'wall' in bench\.toml has no area"):
+        furnished(sphere(), (dataclasses.replace(good, along_m=good.across_m),))

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from plugins.emulated.optics.indirect.scattering import scattering_of
 from plugins.emulated.optics.indirect.transfer import transfer_of
@@ -59,13 +60,16 @@ def bowl() -> StageObject:
 def two_objects() -> StageObject:
     """A ball beside a box, a finger's width apart."""
     ball, box = trimesh.creation.icosphere(4, 0.085), trimesh.creation.box((0.15, 0.2, 0.15))
-    box.apply_transform(trimesh.transformations.rotation_matrix(0.5, (0, 1, 0)))
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec((0.0, 0.5, 0.0)).as_matrix()
+    box.apply_transform(turn)
     box.unmerge_vertices()
     ball.apply_translation((-0.09, 0.02, 0.0))
     box.apply_translation((0.11, 0.0, 0.03))
     colours = np.repeat([(0.8, 0.7, 0.3), (0.3, 0.5, 0.8)], [len(ball.vertices), len(box.vertices)], axis=0)
-    both = trimesh.util.concatenate([ball, box])
-    return object_of_mesh(trimesh.Trimesh(both.vertices, both.faces, process=False), colours)
+    vertices = np.concatenate([ball.vertices, box.vertices])
+    faces = np.concatenate([ball.faces, box.faces + len(ball.vertices)])
+    return object_of_mesh(trimesh.Trimesh(vertices, faces, process=False), colours)
 
 
 def stage_of(stage_object: StageObject) -> BenchTruth:
