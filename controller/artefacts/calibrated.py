@@ -7,12 +7,15 @@ from pathlib import Path
 
 from controller.artefacts.calibration import read_calibration
 from controller.artefacts.depth_edges import edged
-from controller.artefacts.geometry import camera_px
+from controller.artefacts.geometry import camera_px, has_geometry, read_geometry
 from controller.artefacts.solved import SolvedBase
 from controller.calibrate.values import Calibration
+from controller.core.arrays import FloatImage
 from controller.solve.appearance import Base, prepare_base
 from controller.solve.drive_levels import DriveLevels
 from controller.transport import LightTransport, build_transport
+from controller.transport.indirect import IndirectLight
+from controller.transport.indirect_fit import beside, fit_indirect
 
 
 class Calibrated:
@@ -23,6 +26,8 @@ class Calibrated:
         self.projectors = tuple(projectors)
         self._calibration: Calibration | None = None
         self._transport: LightTransport | None = None
+        self._indirect: IndirectLight | None = None
+        self._indirect_known = False
         self._base: Base | None = None
         self._drive: DriveLevels | None = None
 
@@ -47,6 +52,29 @@ class Calibrated:
         if self._transport is None:
             self._transport = edged(build_transport(self.calibration), self.folder, self.projectors)
         return self._transport
+
+    @property
+    def indirect(self) -> IndirectLight | None:
+        """Light by way of other surfaces; None where the run measured none that counts."""
+        if not self._indirect_known:
+            geometry = read_geometry(self.folder) if has_geometry(self.folder) else None
+            points_m, normals = (None, None) if geometry is None else (geometry.points_m, geometry.normals)
+            self._indirect = fit_indirect(self.calibration, self.transport.object_mask, points_m, normals)
+            self._indirect_known = True
+        return self._indirect
+
+    def indirect_of(self, n: int, frame: FloatImage) -> FloatImage | None:
+        """What other surfaces throw back of projector ``n``'s linear frame, on table and walls, too; None without G."""
+        if self.indirect is None:
+            return None
+        direct = self.transport.forward_part(n, frame)
+        room = beside(self.calibration.projectors[n], frame, self.transport.object_mask)
+        return self.indirect.forward(direct + room)
+
+    def seen(self, frames: Sequence[FloatImage]) -> FloatImage:
+        """What the camera sees of linear frames (rows, columns, 3), one a projector, without the black image."""
+        direct = self.transport.forward(frames)
+        return direct if self.indirect is None else direct + self.indirect.forward(direct)
 
     @property
     def base(self) -> Base:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from controller.artefacts.geometry import known_points_m, read_geometry_figures
 from controller.artefacts.modes import mode_of, read_metapixels
 from controller.artefacts.photographs import BLACK, Taken, codes_of, light_of
-from controller.artefacts.projectors import Light, Pixels
+from controller.artefacts.projectors import Light, Pixels, read_indirect
 from controller.calibrate.geometry.background import room_pixels
 from controller.calibrate.values import (
     Calibration,
@@ -56,14 +56,15 @@ def projectors_of(folder: Path) -> list[str]:
 def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     """The calibration of the finished run in ``folder``."""
     parts = []
-    for name in projectors:
+    found = read_indirect(folder, projectors)
+    for number, name in enumerate(projectors):
         light = Light.read(folder, name)
         phase_map, mosaic = read_phase_map(folder, name)
-        parts.append(
-            ProjectorCalibration(
-                name, read_metapixels(folder, name), light.radiometry, np.nan_to_num(light.white), phase_map
-            )
-        )
+        white, indirect, radiometry = np.nan_to_num(light.white), None, light.radiometry
+        if found is not None:
+            indirect, radiometry = found[number].share * white, found[number].radiometry
+            white = white - indirect
+        parts.append(ProjectorCalibration(name, read_metapixels(folder, name), radiometry, white, phase_map, indirect))
     black = np.nan_to_num(light.black)
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)

@@ -21,6 +21,7 @@ class StepKind(enum.StrEnum):
     RADIOMETRY = "radiometry"
     CODES = "codes"
     PIXELS = "pixels"
+    INDIRECT = "indirect"
     GEOMETRY = "geometry"
     DOTS = "dots"
     METAPIXELS = "metapixels"
@@ -50,8 +51,8 @@ class StepKind(enum.StrEnum):
 
 
 OF_PROJECTORS: Final = (
-    StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.DOTS, StepKind.METAPIXELS,
-    StepKind.STUDY_DOTS, StepKind.EDGE_DOTS, StepKind.EDGES,
+    StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.INDIRECT, StepKind.DOTS,
+    StepKind.METAPIXELS, StepKind.STUDY_DOTS, StepKind.EDGE_DOTS, StepKind.EDGES,
 )  # fmt: skip
 """Kinds of which there is one step for each projector."""
 

@@ -78,6 +78,8 @@ class ProjectorCalibration:
     ``white`` (camera rows, columns, 3) float32: HDR image of this projector alone at white, less the black image;
     linear camera units, >= 0, 0 where the projector does not reach
     ``phase_map``: None where metapixels are all that is known
+    ``indirect`` like ``white``: what reached the camera by way of other surfaces, and is not in ``white``; None where
+    there is none to speak of
     """
 
     name: str
@@ -85,6 +87,7 @@ class ProjectorCalibration:
     radiometry: Radiometry
     white: FloatImage
     phase_map: PhaseMap | None = None
+    indirect: FloatImage | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ from controller.solve.drive_levels import DriveLevels
 from controller.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.solve.targets.values import Target
 from controller.transport import LightTransport
+from controller.transport.indirect import IndirectLight
 
 Value = TypeVar("Value")
 _RUNNING: Final = threading.Lock()
@@ -34,13 +35,14 @@ _CODE: Final = ("controller/core/arrays.py", "hal/runtime/jit.py", "controller/s
 class StageData:
     """Data for all appearances of a stage; a worker gets it once.
 
-    ``image``: the base image C_b, ``solution`` its frames; ``black``: K
+    ``image``: the base image C_b, ``solution`` its frames; ``black``: K; ``indirect``: G, where there is one
     """
 
     transport: LightTransport
     image: FloatImage
     solution: Solution
     black: FloatImage
+    indirect: IndirectLight | None = None
 
     def digest(self) -> str:
         """A hash of the contents, so that equal stages are sent only once."""
@@ -49,6 +51,8 @@ class StageData:
             _update(hashed, name, array)
         for number, array in enumerate((self.image, *self.solution.frames, self.black)):
             _update(hashed, str(number), array)
+        for name, array in sorted(({} if self.indirect is None else self.indirect.arrays()).items()):
+            _update(hashed, f"indirect {name}", array)
         return hashed.hexdigest()
 
 
@@ -94,7 +98,9 @@ def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions)
             base = prepare_base(stage.transport, stage.image, stage.black, stage.solution)
             _kept[key] = base, DriveLevels(stage.transport)
         base, drive = _kept[key]
-        return solve_appearance(stage.transport, base, stage.black, asked, options, drive=drive)
+        return solve_appearance(
+            stage.transport, base, stage.black, asked, options, drive=drive, indirect=stage.indirect
+        )
 
     return _told(work)
 

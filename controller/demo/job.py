@@ -76,7 +76,10 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     names = [wish.name for wish in wishes]
     table = stage.tables.solve
     options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
-    after = [StepId(StepKind.GEOMETRY), *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS)]
+    after = [
+        StepId(StepKind.GEOMETRY),
+        *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.INDIRECT),
+    ]
     longest_s = stage.tables.capture.longest_exposure_s
     refining = RefineOptions(table.refine, table.smoothness, longest_s)
     solvings = {name: StepId(StepKind.APPEARANCE, item=name) for name in names}

@@ -115,7 +115,10 @@ def _steps(
     longest_s = checked.stage.tables.capture.longest_exposure_s
     calibrated = Calibrated(run, checked.names)
     steps = list(calibrating(rig, run, checked=checked, calibrated=calibrated))
-    after = [StepId(StepKind.GEOMETRY), *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS)]
+    after = [
+        StepId(StepKind.GEOMETRY),
+        *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.INDIRECT),
+    ]
     if any(experiment.dots for experiment in experiments):
         steps += dot_steps(rig, longest_exposure_s=longest_s)
     scale = costs.scale(projector.size_px for projector in rig.projectors)

@@ -7,7 +7,7 @@ camera's colours, M p, so that projectors of different primaries are scaled alik
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -191,11 +191,14 @@ def make_appearance(
     mode: Mode = "auto",
     smoothness: float = SMOOTHNESS,
     weights: FloatImage | None = None,
+    start: Sequence[FloatImage] | None = None,
     tolerance: float = TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Appearance:
     """Frames for a target radiance: by base and scale, by a full solve, or depending on the target.
+
+    ``start``: frames of a similar target, for a full solve.
 
     A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 25).
     """
@@ -209,6 +212,7 @@ def make_appearance(
         black,
         smoothness=smoothness,
         weights=weights,
+        start=start,
         tolerance=tolerance,
         progress=progress,
         cancelled=cancelled,

@@ -7,8 +7,9 @@ machine, and gives the same.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from controller.core.arrays import FloatImage, Mask
 from controller.solve.adapt import adapt_gently
 from controller.solve.appearance import (
     FINE_DETAIL,
+    Appearance,
     Base,
     BaseChoice,
     Mode,
@@ -23,11 +25,13 @@ from controller.solve.appearance import (
     make_appearance,
     solve_base,
 )
+from controller.solve.bounded.solver import check_target
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
-from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
+from controller.solve.feasibility import Feasibility, choose_exposure, feasibility, target_radiance
 from controller.solve.targets.values import Target
 from controller.transport import LightTransport
+from controller.transport.indirect import IndirectLight
 
 ADVICE_FULL_SOLVE = (
     'The target has finer detail than one projector can scale. To keep it, use mode "full" or base "high-pass".'
@@ -84,42 +88,26 @@ def solve_appearance(
     options: SolveOptions,
     *,
     drive: DriveLevels | None = None,
+    indirect: IndirectLight | None = None,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> AppearanceResult:
     """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
 
+    ``indirect``: light by way of other surfaces, of which the frames then leave room in the target.
+
     Raises what ``choose_exposure`` and ``solve_bounded`` raise.
     """
     drive = DriveLevels(transport) if drive is None else drive
-    picture = requested.image
-    exposure = choose_exposure(transport, picture, black, share=options.share, drive=drive)
-    wanted = np.float32(exposure) * picture
-    possible = feasibility(transport, wanted, black, drive=drive)
-    figures: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
-    if options.adapt > 0:
-        adapted, cut_off, kept = adapt_gently(transport, wanted, black, white=exposure, most=options.adapt, drive=drive)
-        wanted, possible = adapted.target, adapted.after
-        figures |= {"contrast_kept_cut_off": cut_off, "contrast_kept": kept, "adapted_share": possible.share}
-    target = target_radiance(wanted, black, 1.0)
+    aim = aim_at(transport, black, requested.image, options, drive=drive, indirect=indirect)
     began_s = time.perf_counter()
-    if options.base == "high-pass":
-        image = high_pass_base(transport, base.image, target, black)
-        base = solve_base(
-            transport, image, black, smoothness=options.smoothness, progress=progress, cancelled=cancelled
-        )
-    made = make_appearance(
-        transport,
-        base,
-        target,
-        black,
-        mode=options.mode,
-        smoothness=options.smoothness,
-        weights=appearance_weights(target, possible.reachable, exposure),
-        progress=progress,
-        cancelled=cancelled,
-    )
-    figures |= {
+    solve = partial(_solved, transport, base, black, options, aim, progress=progress, cancelled=cancelled)
+    made = solve(aim.direct)
+    if indirect is not None:
+        # what can't be reached throws back other light than was wanted of it
+        light = indirect.forward(transport.forward(made.frames))
+        made = solve(target_radiance(aim.wanted - light, black, 1.0), start=made.frames)
+    figures = aim.figures | {
         "mode": made.mode,
         "seconds": time.perf_counter() - began_s,
         "fine_detail": made.fine_detail,
@@ -127,4 +115,105 @@ def solve_appearance(
         "iterations": 0 if made.solution is None else made.solution.iterations,
         "kkt": None if made.solution is None else made.solution.kkt,
     }
-    return AppearanceResult(made.frames, wanted, possible.reachable & requested.mask, figures)
+    return AppearanceResult(made.frames, aim.wanted, aim.possible.reachable & requested.mask, figures)
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """What a solve aims at, (rows, columns, 3) radiance.
+
+    ``wanted``: the whole picture; ``direct``: what the projectors are to make of it by their direct light, with the
+    black image; ``possible``: how that lies in what they can make; ``figures``: see ``AppearanceResult``
+    """
+
+    wanted: FloatImage
+    direct: FloatImage
+    possible: Feasibility
+    exposure: float
+    figures: dict[str, float | int | str | None]
+
+
+def aim_at(
+    transport: LightTransport,
+    black: FloatImage,
+    picture: FloatImage,
+    options: SolveOptions,
+    *,
+    drive: DriveLevels,
+    indirect: IndirectLight | None = None,
+) -> Aim:
+    """Expose a picture, see what of it is in reach, and adapt it if asked.
+
+    With ``indirect`` light all of this is asked of the direct light that the picture leaves to be made. A pixel is too
+    dark, too, where more indirect light falls than is wanted. Raises what ``choose_exposure`` raises.
+    """
+    if indirect is None:
+        exposure = choose_exposure(transport, picture, black, share=options.share, drive=drive)
+        wanted = needed = np.float32(exposure) * picture
+    else:
+        reach = transport.reach()
+        exposure = indirect_exposure(transport, picture, black, indirect, share=options.share, drive=drive)
+        wanted = np.float32(exposure) * picture
+        needed = black + indirect.direct_target(wanted - black, reach=reach)
+    possible = feasibility(transport, needed, black, drive=drive)
+    figures: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
+    if options.adapt > 0:
+        adapted, cut_off, kept = adapt_gently(transport, needed, black, white=exposure, most=options.adapt, drive=drive)
+        wanted = needed = adapted.target
+        possible = adapted.after
+        if indirect is not None:
+            wanted = wanted + indirect.forward(np.clip(needed - black, 0, reach))
+        figures |= {"contrast_kept_cut_off": cut_off, "contrast_kept": kept, "adapted_share": possible.share}
+    return Aim(wanted, target_radiance(needed, black, 1.0), possible, exposure, figures)
+
+
+def indirect_exposure(
+    transport: LightTransport,
+    picture: FloatImage,
+    black: FloatImage,
+    indirect: IndirectLight,
+    *,
+    share: float,
+    drive: DriveLevels,
+) -> float:
+    """As ``choose_exposure``, where a part of the picture's light comes by way of other surfaces.
+
+    As direct light is linear in the picture while none of it is out of reach, both are taken apart once.
+    """
+    check_target(transport, picture)
+    exposure = choose_exposure(transport, picture, black, share=share, drive=drive)
+    direct = indirect.direct_target(np.float32(exposure) * picture) / np.float32(exposure)
+    needed = np.where(transport.object_mask[..., None], np.maximum(direct, 0), picture).astype(np.float32)
+    return choose_exposure(transport, needed, black, share=share, drive=drive)
+
+
+def _solved(
+    transport: LightTransport,
+    base: Base,
+    black: FloatImage,
+    options: SolveOptions,
+    aim: Aim,
+    target: FloatImage,
+    *,
+    start: Sequence[FloatImage] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Appearance:
+    """Frames for a target radiance, in direct light."""
+    if options.base == "high-pass":
+        image = high_pass_base(transport, base.image, target, black)
+        base = solve_base(
+            transport, image, black, smoothness=options.smoothness, progress=progress, cancelled=cancelled
+        )
+    return make_appearance(
+        transport,
+        base,
+        target,
+        black,
+        mode=options.mode,
+        smoothness=options.smoothness,
+        weights=appearance_weights(target_radiance(aim.wanted, black, 1.0), aim.possible.reachable, aim.exposure),
+        start=start,
+        progress=progress,
+        cancelled=cancelled,
+    )

@@ -12,6 +12,7 @@ from typing import Final
 RADIOMETRY_S: Final = 0.7
 """This and the following at size small; times ``scale`` elsewhere."""
 PIXELS_S: Final = 0.8
+INDIRECT_S: Final = 4.0
 VERIFY_S: Final = 1.0
 BASE_S: Final = 3.0
 APPEARANCE_S: Final = 4.0

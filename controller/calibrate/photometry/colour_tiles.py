@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.gray_code import decode_cells
+from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternKind, PatternPlan, cells_of_frame, tile_levels
 from controller.core.arrays import Float64, FloatImage, Mask
 
@@ -38,13 +39,34 @@ class TileMeasurements:
     pixels: int
 
 
-def measure_tiles(captures: Captures, plan: PatternPlan, black: FloatImage, white: FloatImage) -> TileMeasurements:
+@dataclass(frozen=True, slots=True)
+class KnownIndirect:
+    """What is known already of indirect light: that of white, (rows, columns, 3), and the projector's radiometry."""
+
+    white: FloatImage
+    radiometry: Radiometry
+
+    def of(self, levels: npt.NDArray[np.uint8]) -> FloatImage:
+        """Indirect light of a picture of device values (..., 3): that of white, times the picture's mean light."""
+        light = [self.radiometry.response[c][levels[..., c]].mean() for c in range(3)]
+        return np.asarray(self.white * (self.radiometry.mixing @ np.array(light)).astype(np.float32), np.float32)
+
+
+def measure_tiles(
+    captures: Captures,
+    plan: PatternPlan,
+    black: FloatImage,
+    white: FloatImage,
+    *,
+    indirect: KnownIndirect | None = None,
+) -> TileMeasurements:
     """Find the tiles by the Gray code and measure each.
 
     Parameters
     ----------
     captures : needs ``gray-*`` and ``mosaic-*``
     black, white : (rows, columns, 3) linear light of black, and of white above black; NaN where not known
+    indirect : is taken away from tiles and white
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
@@ -58,6 +80,8 @@ def measure_tiles(captures: Captures, plan: PatternPlan, black: FloatImage, whit
     seen = (axes[0].weak == 0) & (axes[1].weak == 0) & framed
     # At a border of cells: of two tiles, or of two cells of one tile. Their neighbours tell which.
     between = axes[0].sure & axes[1].sure & framed & ~seen
+    if indirect is not None:
+        white = white - indirect.white
     inside = _interior(np.where(seen, tile, -1).astype(np.int32), between, _lit(white))
     number = -(-across // side) * -(-down // side)
     which = tile[inside]
@@ -67,12 +91,15 @@ def measure_tiles(captures: Captures, plan: PatternPlan, black: FloatImage, whit
     used = np.flatnonzero((count >= FEWEST_PIXELS) & np.all(total > 0, axis=1))
     levels, ratios, weights = [], [], []
     for pattern in tiles_patterns:
+        shown = tile_levels(pattern, plan.size_px)
         light = coloured(captures, pattern.name, black.shape[:2])[inside] - black[inside]
+        if indirect is not None:
+            light -= indirect.of(shown)[inside]
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = (_sums(light, which, number) / total)[used]
             variance = NOISE * (np.maximum(ratio, 0) + ratio**2 + 0.02) * full / total[used] + SYSTEMATIC**2
         measured = np.isfinite(ratio).all(axis=1)
-        levels.append(_levels_of(tile_levels(pattern, plan.size_px), side)[used][measured])
+        levels.append(_levels_of(shown, side)[used][measured])
         ratios.append(ratio[measured])
         weights.append(1 / variance[measured])
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.calibrate.correspondence.captures import Captures, coloured
-from controller.calibrate.photometry.colour_tiles import TileMeasurements, measure_tiles
+from controller.calibrate.photometry.colour_tiles import KnownIndirect, TileMeasurements, measure_tiles
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternPlan
 from controller.core.arrays import Float64
@@ -51,12 +51,15 @@ class RadiometryReport:
     additivity: float
 
 
-def measure_radiometry(captures: Captures, plan: PatternPlan) -> tuple[Radiometry, RadiometryReport]:
+def measure_radiometry(
+    captures: Captures, plan: PatternPlan, *, indirect: KnownIndirect | None = None
+) -> tuple[Radiometry, RadiometryReport]:
     """Response and mixing of one projector.
 
     Parameters
     ----------
     captures : linear RGB photographs in one unit: ``black white``, ``gray-*`` and ``mosaic-*``; NaN where saturated
+    indirect : what is known of it by an earlier measurement; the response is then fitted to direct light alone
 
     Returns
     -------
@@ -70,7 +73,8 @@ def measure_radiometry(captures: Captures, plan: PatternPlan) -> tuple[Radiometr
     CalibrationError("colours-alike")  the primaries can't be separated
     """
     black = coloured(captures, "black")
-    tiles = measure_tiles(captures, plan, black, coloured(captures, "white", black.shape[:2]) - black)
+    white = coloured(captures, "white", black.shape[:2]) - black
+    tiles = measure_tiles(captures, plan, black, white, indirect=indirect)
     if tiles.ratio.shape[0] < FEWEST_TILES:
         raise CalibrationError(
             "projector-dark",

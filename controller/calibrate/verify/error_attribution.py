@@ -28,12 +28,14 @@ BLURRED_PX = 1.2
 """Standard deviation in projector pixels."""
 EXPLAINED = 0.5
 """A shift, or a change of brightness, is the reason where it explains this share of the squared error."""
+INDIRECT_SHARE = 0.15
+"""More indirect light than this share of what is seen, and an error no larger than it, is taken for the reason."""
 UNDECODED_SHARE = 0.02
 """Of the brightest white: light without shares beyond it is missed."""
 
 
 class ErrorCause(enum.IntEnum):
-    """Codes of the label map; the first that holds is taken, in this order."""
+    """Codes of the label map; the first that holds is taken, in this order, INDIRECT before UNEXPLAINED."""
 
     FINE = 0
     SATURATED = 1
@@ -45,6 +47,7 @@ class ErrorCause(enum.IntEnum):
     GRAZING = 7
     DEFOCUS = 8
     UNEXPLAINED = 9
+    INDIRECT = 10
 
 
 WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
@@ -65,6 +68,10 @@ WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
     ErrorCause.GRAZING: ("grazing light", "the light falls at a grazing angle",
                      "turn the object, or move a projector towards that side"),
     ErrorCause.DEFOCUS: ("out of focus", "the projector is out of focus there", "focus the projector on this depth"),
+    ErrorCause.INDIRECT: (
+        "indirect light", "much of the light comes by way of other surfaces, and varies more than the model of it",
+        "darken what stands around the object, or use targets that are less dark there",
+    ),
     ErrorCause.UNEXPLAINED: ("unexplained", "no simple reason was found",
                          "glossy or translucent surfaces and reflections between surfaces can cause this"),
 }  # fmt: skip
@@ -79,9 +86,10 @@ COLOURS: Final[dict[ErrorCause, tuple[int, int, int]]] = {
     ErrorCause.DARK: (86, 180, 233),
     ErrorCause.GRAZING: (0, 158, 115),
     ErrorCause.DEFOCUS: (204, 121, 167),
+    ErrorCause.INDIRECT: (146, 73, 0),
     ErrorCause.UNEXPLAINED: (255, 255, 255),
 }
-"""Okabe and Ito's palette, which people with any colour vision tell apart."""
+"""Okabe and Ito's palette and a brown, which people with any colour vision tell apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +105,14 @@ class ErrorAttribution:
 
 
 def attribute_error(
-    light: TransportModel, calibration: Calibration, n: int, shown: FloatImage, seen: FloatImage, *, exposure_s: float
+    light: TransportModel,
+    calibration: Calibration,
+    n: int,
+    shown: FloatImage,
+    seen: FloatImage,
+    *,
+    exposure_s: float,
+    indirect: FloatImage | None = None,
 ) -> ErrorAttribution:
     """Find the reason at every camera pixel.
 
@@ -107,10 +122,13 @@ def attribute_error(
     shown : (rows, columns, 3) what projector ``n`` alone showed, linear light
     seen : (rows, columns, 3) its photograph, full scales per second, NaN where saturated
     exposure_s : of that photograph, from which its noise follows
+    indirect : (rows, columns, 3) what else is expected of what was shown, by way of other surfaces
     """
     part = calibration.projectors[n]
     lit: Mask = np.asarray(light.lit[n], np.bool_)
     predicted = light.forward_part(n, shown)
+    if indirect is not None:
+        predicted = predicted + indirect
     measured: Mask = np.asarray(np.isfinite(seen).all(axis=2), np.bool_)
     light_seen = np.where(measured[:, :, None], seen - calibration.black, predicted).astype(np.float32)
     error = light_seen - predicted
@@ -127,6 +145,10 @@ def attribute_error(
     sigma = _noise(np.maximum(seen, 0), exposure_s)
     x, y, spread = _places(light, n, shown.shape)
     # From the last to the first: what is written later stands before.
+    if indirect is not None:
+        near_indirect = _near(np.where(lit, np.sum(indirect * indirect, axis=2), 0))
+        much = near_indirect > INDIRECT_SHARE**2 * near_power
+        label(ErrorCause.INDIRECT, much & (near_error < near_indirect), bad)
     label(ErrorCause.DEFOCUS, spread > BLURRED_PX, bad)
     label(ErrorCause.GRAZING, _stretch(x, y) > STRETCHED, bad)
     label(ErrorCause.DARK, _near(np.where(lit, np.nan_to_num(sigma) ** 2, 0)) > 0.5 * near_error, bad)

@@ -183,7 +183,7 @@ def feasibility_map(stage: Path, target: Path) -> Path:
     import cv2
 
     from controller.artefacts.calibrated import Calibrated
-    from controller.solve.feasibility import choose_exposure, feasibility
+    from controller.solve.request import SolveOptions, aim_at
     from controller.solve.targets.files import load_target
 
     checked = check_stage(stage)
@@ -198,9 +198,9 @@ def feasibility_map(stage: Path, target: Path) -> Path:
         if whole != target:
             whole.write_bytes(fitted(target.read_bytes(), size_px))
         wanted = load_target(whole, size_px)
-    exposure = choose_exposure(transport, wanted.image, black, share=checked.stage.tables.solve.exposure_share)
-    reach = feasibility(transport, np.float32(exposure) * wanted.image, black)
-    worst = np.maximum(reach.too_bright, reach.too_dark).max(axis=2)
+    options = SolveOptions(checked.stage.tables.solve.exposure_share, checked.stage.tables.solve.smoothness)
+    aim = aim_at(transport, black, wanted.image, options, drive=calibrated.drive, indirect=calibrated.indirect)
+    worst = np.maximum(aim.possible.too_bright, aim.possible.too_dark).max(axis=2)
     grey = np.where(calibrated.calibration.object_mask & wanted.mask, np.clip(worst, 0, 1), 0)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Atomically: another caller may request the same map at the same time.

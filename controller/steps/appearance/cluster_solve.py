@@ -37,7 +37,8 @@ class Spreading:
 
     def _opened(self) -> SpreadAppearances:
         base, calibration = self._calibrated.base, self._calibrated.calibration
-        stage = StageData(self._calibrated.transport, base.image, base.solution, calibration.black)
+        indirect = self._calibrated.indirect
+        stage = StageData(self._calibrated.transport, base.image, base.solution, calibration.black, indirect)
         self._spread = SpreadAppearances(self._cluster, stage)
         return self._spread
 

@@ -159,7 +159,7 @@ class _Round:
 
     def _equations(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Float64:
         """What this photograph and those before it say of common causes."""
-        frames = [now.frames[projector] for projector in self.calibrated.projectors]
+        frames = self._in_order(now.frames)
         error = np.where(trusted[..., None], photograph.radiance - predicted, 0).astype(np.float32)
         said = equations(self.calibrated.transport, frames, error, self._stage, trusted)
         return said if now.equations is None else said + now.equations
@@ -169,12 +169,13 @@ class _Round:
         self.context.advance(0.4, "solving again")
         transport, black = self.calibrated.transport, self.calibrated.calibration.black
         aimed = corrected_target(self.solved.target, photograph, predicted, self._stage, trusted)
+        indirect = predicted - black - transport.forward(self._in_order(now.frames))
         frames = solve_again(
             transport,
-            self.solved.target,
-            aimed,
+            self.solved.target - indirect,
+            aimed - indirect,
             black,
-            [now.frames[projector] for projector in self.calibrated.projectors],
+            self._in_order(now.frames),
             exposure=self.solved.exposure,
             smoothness=self.options.smoothness,
             drive=self.calibrated.drive,
@@ -192,6 +193,8 @@ class _Round:
     def _stage(self) -> RefinedStage:
         calibration = self.calibrated.calibration
         white = np.sum([part.white for part in calibration.projectors], axis=0, dtype=np.float32)
+        indirect = [part.indirect for part in calibration.projectors if part.indirect is not None]
+        white = white + np.sum(indirect, axis=0, dtype=np.float32)
         return RefinedStage(calibration.black, np.maximum(white, 0))
 
     def _error(self, radiance: FloatImage, mask: Mask) -> PhotographedError:
@@ -199,8 +202,11 @@ class _Round:
         return photographed_error(radiance, self.solved.target, matrix, self.solved.exposure, mask)
 
     def _predicted(self, frames: Mapping[str, FloatImage]) -> FloatImage:
-        light = self.calibrated.transport.forward([frames[projector] for projector in self.calibrated.projectors])
+        light = self.calibrated.seen(self._in_order(frames))
         return np.asarray(light + self.calibrated.calibration.black, np.float32)
+
+    def _in_order(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
+        return [frames[projector] for projector in self.calibrated.projectors]
 
     def _photographed(self, frames: Mapping[str, FloatImage], number: int) -> ResultPhotograph:
         if self.context.folder != self.calibrated.folder:

@@ -143,6 +143,7 @@ def _answer_here(calibrated: Calibrated, wish: Wish, options: SolveOptions, cont
         wish.target(),
         options,
         drive=calibrated.drive,
+        indirect=calibrated.indirect,
         progress=_watched(context),
     )
 

@@ -113,7 +113,7 @@ def terms_step(rig: Rig) -> Step:
     return Step(
         StepId(StepKind.EDGE_TERMS),
         partial(_compare, names),
-        after=of_projectors(names, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.EDGES),
+        after=of_projectors(names, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.INDIRECT, StepKind.EDGES),
         title="Correcting the light transport at depth edges",
         weight=3 * costs.scale(projector.size_px for projector in rig.projectors),
     )

@@ -99,13 +99,17 @@ def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     taken = TAKEN.read(context.folder)
     alone = TAKEN.by_projector(context.folder)
     together = {photograph.name: photograph for photograph in taken if photograph.projector is None}
-    seen = DriftPhotographs(
-        black=together["black"].per_second(),
-        white=together["white"].per_second(),
-        patterns={part.name: alone[part.name].per_second() for part in calibration.projectors},
-    )
+    frames = linear_frames(calibrated, PATTERN)
+    patterns, white = {}, together["white"].per_second()
+    for n, (part, shown) in enumerate(zip(calibration.projectors, frames, strict=True)):
+        patterns[part.name] = alone[part.name].per_second()
+        # the transport predicts direct light, so that is what is compared
+        if part.indirect is not None and (indirect := calibrated.indirect_of(n, shown)) is not None:
+            patterns[part.name] = patterns[part.name] - indirect
+            white = white - part.indirect
+    seen = DriftPhotographs(black=together["black"].per_second(), white=white, patterns=patterns)
     context.advance(0.2)
-    drift = find_drift(calibrated.transport, calibration, linear_frames(calibrated, PATTERN), seen)
+    drift = find_drift(calibrated.transport, calibration, frames, seen)
     return [write_drift(context.folder, drift, calibration=calibrated.folder.name, photographs=len(taken))]
 
 

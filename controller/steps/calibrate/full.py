@@ -25,6 +25,7 @@ from controller.rig.rig import Rig, RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
+from controller.steps.calibrate.indirect import indirect_step
 from controller.steps.capture.camera import camera_step
 from controller.steps.capture.patterns import capture_steps, code_step
 
@@ -38,6 +39,7 @@ def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float
         steps.append(_radiometry_step(projector))
         steps.append(code_step(rig, projector))
         steps.append(_pixels_step(projector))
+        steps.append(indirect_step(projector))
     steps.append(
         Step(
             StepId(StepKind.GEOMETRY),

@@ -22,16 +22,19 @@ from controller.artefacts.grade import (
 )
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.photographs import PATTERN, VERIFICATION, Taken, codes_of
+from controller.artefacts.projectors import IndirectFigures, Light
 from controller.bundle.export import png
+from controller.calibrate.values import ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
 from controller.calibrate.verify.grade import Verification, verify
-from controller.capture.patterns import Pattern, frame
-from controller.core.arrays import ByteImage
+from controller.capture.patterns import Pattern, device_frame, frame
+from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig
 from controller.run.progress import Level, Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
+from controller.solve.scaling.dither import to_light
 from controller.steps import costs
 from controller.steps.appearance.solving import random_pattern
 from controller.steps.calibrate.drift import shown_frames
@@ -92,16 +95,32 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         context.advance(n / len(calibration.projectors), part.name)
         rows, columns = part.metapixels.valid.shape
         pattern = random_pattern((columns, rows))
-        shown = frame(pattern, (columns, rows))
-        light = transport.forward_part(n, shown)
+        shown = _shown(context.folder, part, pattern, (columns, rows))
+        light, indirect = transport.forward_part(n, shown), calibrated.indirect_of(n, shown)
         taken = _taken(context.folder, part.name, pattern)
         seen = taken.per_second()
-        found = verify(light + calibration.black, seen, calibration.black, transport.lit[n])
-        why = attribute_error(transport, calibration, n, shown, seen, exposure_s=taken.exposure_s)
-        figures[part.name] = _figures(found, why)
+        expected = light + calibration.black if indirect is None else light + indirect + calibration.black
+        found = verify(expected, seen, calibration.black, transport.lit[n])
+        why = attribute_error(
+            transport, calibration, n, shown, seen, exposure_s=taken.exposure_s, indirect=indirect
+        )  # fmt: skip
+        figures[part.name] = _figures(found, why) | _indirect_figures(context.folder, part.name)
         maps[part.name] = ErrorMaps(found.error_map, why.labels)
         pictures.append(attribution_picture(why, calibration, part.name))
     return write_grade(context.folder, figures, maps, png(np.concatenate(pictures, axis=0)))
+
+
+def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
+    """The light of the pattern: its device values may have been chosen by a response that was corrected since."""
+    meant = frame(pattern, size_px)
+    if part.indirect is None or VERIFICATION.index(folder).exists():
+        return meant
+    return to_light(device_frame(pattern, size_px, Light.read(folder, part.name).response), part.radiometry)
+
+
+def _indirect_figures(folder: Path, projector: str) -> dict[str, object]:
+    figures = IndirectFigures.read(folder, projector)
+    return {} if figures is None else {"indirect": {"median": figures.median, "p95": figures.p95}}
 
 
 def _figures(found: Verification, why: ErrorAttribution) -> dict[str, object]:

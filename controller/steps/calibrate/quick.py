@@ -24,7 +24,7 @@ from controller.artefacts.drift import read_drift
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.modes import mode_of
 from controller.artefacts.photographs import DRIFT, white_again_of
-from controller.artefacts.projectors import Light, Pixels
+from controller.artefacts.projectors import Indirect, Light, Pixels
 from controller.calibrate.verify.drift import Drift, ProjectorDrift
 from controller.calibrate.verify.drift_report import advice, sentences
 from controller.calibrate.verify.homography_update import update_positions, update_radiometry
@@ -132,6 +132,8 @@ def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
         return Way.CORRECT  # black has been photographed again
     if kind == StepKind.LIGHT:
         return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
+    if kind == StepKind.INDIRECT:
+        return Way.CORRECT if one.dimmed else Way.KEEP
     return Way.CORRECT if kind == StepKind.PIXELS and one.moved else Way.KEEP
 
 
@@ -163,6 +165,10 @@ def _correct(rig: Rig, last: Calibrated, step: StepId, kept: list[Path], context
         return [*kept, *_photograph_white(rig, projector, context)]
     if step.kind == StepKind.PIXELS:
         _shift_pixels(context.folder, name, one)
+    elif step.kind == StepKind.INDIRECT:
+        found = Indirect.read(context.folder, name)
+        mixing = update_radiometry(found.radiometry, one.gain).mixing
+        dataclasses.replace(found, mixing=mixing).write(context.folder, name)
     else:
         _correct_light(context.folder, name, one)
     return kept

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hypothesis import given, settings
 
-from controller.artefacts.kinds import OF_PROJECTORS
+from controller.artefacts.kinds import OF_PROJECTORS, StepKind
 from controller.run.journal import Journal
 from controller.run.journal_migration import OLD_SHOT, step_id_of
 from controller.run.runner import Context, Runner, Step
@@ -101,7 +101,7 @@ def test_a_run_of_the_older_version_goes_on_with_the_right_steps(names: list[str
 
 @given(projectors)
 def test_the_name_of_a_step_had_one_meaning(names: list[str]) -> None:
-    for kind in OF_PROJECTORS:
+    for kind in set(OF_PROJECTORS) - {StepKind.INDIRECT}:  # which is younger than the format
         for name in names:
             assert step_id_of(f"{kind}-{name}") == StepId(kind, name)
     assert step_id_of("dark-before") == StepId("dark-before")

@@ -88,5 +88,22 @@ def test_a_good_prediction_blames_nothing_and_the_picture_stays_grey() -> None:
     assert np.ptp(picture[:ROWS].astype(int), axis=2).max() == 0
 
 
+def test_indirect_light_is_the_reason_where_there_is_much_of_it() -> None:
+    light, calibration = stage()
+    seen = light.forward_part(0, SHOWN)
+    back = np.zeros_like(seen)
+    back[PATCH] = 0.5 * seen[PATCH].mean()
+    ripple = np.sin(np.arange(ROWS) / 2)[:, None, None] * np.cos(np.arange(COLUMNS) / 2)[None, :, None]
+    found = attribute_error(
+        light, calibration, 0, SHOWN, (seen + back * (1 + 0.5 * ripple)).astype(np.float32), exposure_s=0.005,
+        indirect=back,
+    )  # fmt: skip
+    inside = found.labels[PATCH]
+    assert np.mean(inside[inside > 0] == ErrorCause.INDIRECT) > 0.5
+    assert "indirect light" in [row["reason"] for row in ranked(found)]
+    exact = attribute_error(light, calibration, 0, SHOWN, seen + back, exposure_s=0.005, indirect=back)
+    assert not exact.labels.any()
+
+
 def test_colours_differ_for_every_reason() -> None:
     assert len(set(COLOURS.values())) == len(COLOURS) == len(ErrorCause) - 1

@@ -1,0 +1,216 @@
+"""Direct and indirect light of a projector's white, from the sinusoids that are shown anyway (Nayar et al. 2006).
+
+Light that arrives by way of other surfaces is a mean over much of the projector's picture, so a sinusoid does not
+modulate it. What contrast the coarse sinusoid lacks is therefore indirect light, apart from what blur takes; the fine
+sinusoids, which lose the same share by indirect light but far more by blur, tell how much that is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numba
+import numpy as np
+
+from controller.calibrate.correspondence.captures import Captures, coloured
+from controller.calibrate.correspondence.decode import FINE_TO_COARSE
+from controller.calibrate.values import Radiometry
+from controller.capture.patterns import PHASE_STEPS, PatternPlan
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.jit import compiled
+
+COARSE: Final = ("phase-x", "phase-y")
+FINE: Final = ("blur-x", "blur-y")
+FAINTEST: Final = 1e-3
+"""Of the 99th percentile of white: below it nothing is said from the pixel itself."""
+LEAST_FINE_CONTRAST: Final = 0.03
+NOISE_WINDOW: Final = (7, 7)
+FLOOR: Final = 0.004
+"""Standard deviation of a pixel's share besides noise."""
+RADIUS_PX: Final = 4
+LIKE_SIGMAS: Final = 3.0
+"""Neighbours whose shares differ by more than so many standard deviations see other light."""
+STEEPEST_PX: Final = 4.0
+"""Change of the projector's pixel from a camera pixel to the next; more is another surface."""
+WORST_SIGMA: Final = 0.25
+FILL_PX: Final = (3.0, 9.0, 27.0, 81.0)
+LEAST_LIT_SHARE: Final = 0.004
+SOME_PIXELS: Final = 200_000
+"""So many stand for all where a few numbers are fitted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sinusoids:
+    """``contrast`` (rows, columns, 3): of both axes, of white; ``sigma`` like it: its standard deviation by noise."""
+
+    contrast: FloatImage
+    sigma: FloatImage
+
+
+def indirect_share(
+    captures: Captures,
+    plan: PatternPlan,
+    white: FloatImage,
+    position_px: FloatImage,
+    *,
+    linearity: Float64 | None = None,
+) -> FloatImage:
+    """The share (rows, columns, 3) of a projector's white that is indirect, 0 to 1.
+
+    Parameters
+    ----------
+    captures : linear photographs in one unit; needs ``black``, ``phase-*``, ``blur-x-*`` and ``blur-y-*``
+    white : (rows, columns, 3) less the black image, NaN where not known
+    position_px : (rows, columns, 2) where the camera pixels look in the projector's image, NaN where not known
+    linearity : (3,) contrast that sinusoids truly had, see ``shown_contrast``; 1 if omitted
+
+    Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
+    """
+    black = coloured(captures, "black", white.shape[:2])
+    coarse = _measured(captures, plan, COARSE, black, white)
+    fine = _measured(captures, plan, FINE, black, white)
+    full = np.ones(3) if linearity is None else linearity
+    with np.errstate(invalid="ignore", divide="ignore"):
+        s = coarse.contrast / full.astype(np.float32)
+        f = np.clip(fine.contrast.mean(axis=2, keepdims=True) / np.float32(full.mean()), LEAST_FINE_CONTRAST, 1.0)
+        f = np.where(np.isfinite(f), f, np.float32(1.0))
+        share = 1 - np.exp((np.log(np.maximum(s, 1e-6)) - FINE_TO_COARSE * np.log(f)) / (1 - FINE_TO_COARSE))
+    sigma = np.hypot(coarse.sigma, FLOOR).astype(np.float32)
+    known = np.isfinite(share).all(axis=2) & (sigma.max(axis=2) < WORST_SIGMA)
+    known &= (white > FAINTEST * _bright(white)).all(axis=2)
+    smooth = _smoothed(np.where(known[..., None], share, 0).astype(np.float32), sigma, known, position_px)
+    return np.clip(_filled(smooth, known), 0, 1).astype(np.float32)
+
+
+def shown_contrast(radiometry: Radiometry, encoded_with: Float64) -> Float64:
+    """(3,) contrast per camera channel of a sinusoid that was encoded by one response and shown by another.
+
+    ``radiometry``: the projector as it is; ``encoded_with`` (3, 256): the response by which device values were chosen
+    """
+    angle = 2 * np.pi * np.arange(720) / 720
+    asked = 0.5 + 0.5 * np.cos(angle)
+    levels = np.arange(256.0)
+    light = np.stack(
+        [
+            np.interp(np.interp(asked, used, levels), levels, true)
+            for used, true in zip(encoded_with, radiometry.response, strict=True)
+        ]
+    )
+    seen = radiometry.mixing @ light
+    return np.asarray(2 * (seen * np.cos(angle)).mean(axis=1) / seen.mean(axis=1), np.float64)
+
+
+def indirect_figures(share: FloatImage, white: FloatImage) -> tuple[float, float]:
+    """Median and 95th percentile of the share over the camera pixels that the projector lights directly."""
+    light = np.nan_to_num(white)
+    direct = light * (1 - share)
+    lit = direct.min(axis=2) > LEAST_LIT_SHARE * float(np.percentile(direct, 99.9))
+    if not lit.any():
+        return 0.0, 0.0
+    values = (share * light).sum(axis=2)[lit] / light.sum(axis=2)[lit]
+    return float(np.median(values)), float(np.percentile(values, 95))
+
+
+def _measured(
+    captures: Captures, plan: PatternPlan, prefixes: tuple[str, ...], black: FloatImage, white: FloatImage
+) -> Sinusoids:
+    """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise."""
+    product = np.ones_like(white)
+    noise = np.zeros_like(white)
+    for prefix in prefixes:
+        steps = plan.sinusoids(prefix)
+        images = [coloured(captures, step.name, black.shape[:2]) - black for step in steps]
+        images = [image * np.float32(gain) for image, gain in zip(images, _gains(images, white), strict=True)]
+        weights = [np.float32(2 / len(steps)) * np.exp(-1j * step.phase_rad) for step in steps]
+        along, across = (sum(float(part(w)) * i for w, i in zip(weights, images, strict=True)) for part in (_re, _im))
+        residual = np.nan_to_num(sum(images) - np.float32(len(steps) / 2) * white)
+        variance = cv2.boxFilter(residual * residual, -1, NOISE_WINDOW) / np.float32(len(steps))
+        product *= np.maximum(along * along + across * across - np.float32(4 / PHASE_STEPS) * variance, 0)
+        noise += variance / np.float32(len(prefixes))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        contrast = 2 * product**0.25 / white
+        sigma = 2 * np.sqrt(np.float32(2 / PHASE_STEPS / len(prefixes)) * noise) / white
+    return Sinusoids(np.asarray(contrast, np.float32), np.asarray(sigma, np.float32))
+
+
+def _re(value: complex) -> float:
+    return value.real
+
+
+def _im(value: complex) -> float:
+    return value.imag
+
+
+def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
+    """How much brighter the lamp was at white than at each step: the steps must add up to half the white each."""
+    use = np.isfinite(white).all(axis=2) & (white > FAINTEST * 10 * _bright(white)).all(axis=2)
+    for image in images:
+        use &= np.isfinite(image).all(axis=2)
+    at = np.flatnonzero(use)
+    if at.size < 10 * len(images):
+        return np.ones(len(images))
+    at = at[:: max(1, at.size // SOME_PIXELS)]
+    wanted = white.reshape(-1, 3)[at].astype(np.float64)
+    equations = np.stack([(i.reshape(-1, 3)[at] / wanted).ravel() for i in images], axis=1)
+    return np.asarray(np.linalg.lstsq(equations, np.full(equations.shape[0], len(images) / 2), rcond=None)[0])
+
+
+def _bright(white: FloatImage) -> FloatImage:
+    finite = white[np.isfinite(white).all(axis=2)]
+    some = finite[:: max(1, len(finite) // SOME_PIXELS)] if len(finite) else np.zeros((1, 3), np.float32)
+    return np.asarray(np.percentile(some, 99, axis=0), np.float32)
+
+
+def _smoothed(share: FloatImage, sigma: FloatImage, known: Mask, position_px: FloatImage) -> FloatImage:
+    """Mean over neighbours on the same surface in like light, by their certainty."""
+    start = np.stack([cv2.medianBlur(np.ascontiguousarray(share[..., c]), 3) for c in range(3)], axis=2)
+    out = share.copy()
+    position = np.where(np.isfinite(position_px), position_px, np.float32(-1e6)).astype(np.float32)
+    _mean_of_like(share, np.asarray(start, np.float32), sigma, known, position, out)
+    return out
+
+
+@compiled(parallel=True)
+def _mean_of_like(
+    share: FloatImage, start: FloatImage, sigma: FloatImage, known: Mask, position: FloatImage, out: FloatImage
+) -> None:
+    rows, columns = known.shape
+    for row in numba.prange(rows):
+        for column in range(columns):
+            if not known[row, column]:
+                continue
+            for c in range(3):
+                total, weight = 0.0, 0.0
+                centre, own = start[row, column, c], sigma[row, column, c]
+                for r in range(max(row - RADIUS_PX, 0), min(row + RADIUS_PX + 1, rows)):
+                    for k in range(max(column - RADIUS_PX, 0), min(column + RADIUS_PX + 1, columns)):
+                        if not known[r, k]:
+                            continue
+                        away = max(abs(r - row), abs(k - column))
+                        if abs(position[r, k, 0] - position[row, column, 0]) > STEEPEST_PX * away + 1:
+                            continue
+                        if abs(position[r, k, 1] - position[row, column, 1]) > STEEPEST_PX * away + 1:
+                            continue
+                        other = sigma[r, k, c]
+                        if abs(start[r, k, c] - centre) > LIKE_SIGMAS * np.sqrt(own * own + other * other):
+                            continue
+                        w = 1 / (other * other)
+                        total += w * share[r, k, c]
+                        weight += w
+                if weight > 0:
+                    out[row, column, c] = total / weight
+
+
+def _filled(share: FloatImage, known: Mask) -> FloatImage:
+    """Shares where nothing is known, from what is around; 0 where nothing is near."""
+    out, left = np.where(known[..., None], share, np.float32(0)), ~known
+    have = known.astype(np.float32)
+    for sigma in FILL_PX:
+        weight = cv2.GaussianBlur(have, (0, 0), sigma)
+        around = cv2.GaussianBlur(np.where(known[..., None], share, np.float32(0)), (0, 0), sigma)
+        now = left & (weight > 0.02)
+        out[now] = around[now] / weight[now][:, None]
+        left &= ~now
+    return np.asarray(out, np.float32)

@@ -1,0 +1,58 @@
+"""The step that tells direct from indirect light, and measures the response once more in direct light alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from controller.artefacts.calibration import read_captures
+from controller.artefacts.kinds import StepKind, of_projectors
+from controller.artefacts.photographs import Developed
+from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
+from controller.calibrate.photometry.colour_tiles import KnownIndirect
+from controller.calibrate.photometry.radiometry import measure_radiometry
+from controller.calibrate.photometry.separation import indirect_figures, indirect_share, shown_contrast
+from controller.capture.patterns import plan_patterns
+from controller.rig.rig import RigProjector
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.steps import costs
+
+PASSES: Final = 2
+"""The share follows from the response by which sinusoids were shown, the response from the share."""
+TOLD_AT: Final = 64
+"""Device value at which the change of the response is told."""
+
+
+def indirect_step(projector: RigProjector) -> Step:
+    """After the projector's pixels are known."""
+    return Step(
+        StepId(StepKind.INDIRECT, projector.name),
+        lambda context: _separate(projector, context),
+        after=(StepId(StepKind.BLACK), *of_projectors([projector.name], StepKind.RADIOMETRY, StepKind.PIXELS)),
+        title=f"Telling direct from indirect light of {projector.name}",
+        weight=costs.INDIRECT_S * costs.scale([projector.size_px]),
+    )
+
+
+def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
+    folder, name, plan = context.folder, projector.name, plan_patterns(projector.size_px)
+    light, pixels = Light.read(folder, name), Pixels.read(folder, name)
+    captures = Developed(read_captures(folder, name), {"black": light.black, "white": light.white + light.black})
+    radiometry = light.radiometry
+    for number in range(PASSES):
+        context.advance(number / PASSES)
+        contrast = shown_contrast(radiometry, light.response)
+        share = indirect_share(captures, plan, light.white, pixels.projector_px, linearity=contrast)
+        radiometry, _ = measure_radiometry(captures, plan, indirect=KnownIndirect(share * light.white, radiometry))
+    median, p95 = indirect_figures(share, light.white)
+    change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
+    figures = IndirectFigures(median, p95, tuple(float(value) for value in change))
+    found = Indirect(share, radiometry.response, radiometry.mixing)
+    return [found.write(folder, name), figures.write(folder, name)]
+
+
+__all__ = ["indirect_step"]

@@ -1,0 +1,112 @@
+"""Light that arrives by way of other surfaces, G: camera image = K + (I + G) L p, with L the local transport.
+
+After its first bounce light does not remember which projector it came from. So G acts on the direct camera image
+d = L p: (G d)(x) = S(x) up(F down(d))(x). Blocks of camera pixels give each other light by F; S is what a camera pixel
+makes of the light that falls on it, and holds the paint (docs/decisions/0045).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import FloatImage, Mask
+
+ROUNDS: Final = 30
+CONVERGED: Final = 1e-5
+"""Relative change of the direct light, at which it is known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IndirectLight:
+    """G of a stage.
+
+    ``factors`` (blocks, blocks) float32: light that falls on a block (row) from the mean light of another (column)
+    ``scale`` (rows, columns, 3) float32: S, 0 where the camera sees no indirect light
+    ``lit`` (rows, columns) bool: camera pixels whose direct light the transport knows
+    ``grid``: (rows, columns) of the blocks; ``side``: camera pixels along a block
+    """
+
+    factors: FloatImage
+    scale: FloatImage
+    lit: Mask
+    grid: tuple[int, int]
+    side: int
+
+    def forward(self, direct: FloatImage) -> FloatImage:
+        """G d: (rows, columns, 3) indirect light of a direct camera image of that shape."""
+        return self.scale * self.falling(direct)
+
+    def falling(self, direct: FloatImage) -> FloatImage:
+        """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""
+        blocks = self.factors @ down(direct, self.grid, self.side)
+        return up(blocks, self.grid, self.side, self.lit.shape)
+
+    def adjoint(self, image: FloatImage) -> FloatImage:
+        """G' r of a camera image (rows, columns, 3)."""
+        blocks = self.factors.T @ up_adjoint(self.scale * image, self.grid, self.side)
+        return down_adjoint(blocks, self.grid, self.side, self.lit.shape)
+
+    def direct_target(self, total: FloatImage, *, reach: FloatImage | None = None) -> FloatImage:
+        """The direct light d on lit pixels with d + G d = ``total`` (rows, columns, 3) there; 0 elsewhere.
+
+        It is negative where more indirect light falls than is wanted. No light is less than none, nor more than
+        ``reach``, so that G takes no more than that of it.
+        """
+        lit = self.lit[..., None]
+        wanted = np.where(lit, total, 0).astype(np.float32)
+        direct = wanted
+        size = max(float(np.abs(wanted).max(initial=0)), 1e-30)
+        for _ in range(ROUNDS):
+            after = np.where(lit, wanted - self.forward(shown(direct, reach)), 0)
+            change = float(np.abs(after - direct).max(initial=0))
+            direct = after.astype(np.float32, copy=False)
+            if change < CONVERGED * size:
+                break
+        return direct
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All that the products depend on, by name."""
+        shape = np.array([*self.grid, self.side])
+        return {"factors": self.factors, "scale": self.scale, "lit": self.lit, "grid": shape}
+
+
+def shown(direct: FloatImage, reach: FloatImage | None = None) -> FloatImage:
+    """What can be shown of a direct image: no less than none, and no more than ``reach``."""
+    return np.maximum(direct, 0) if reach is None else np.clip(direct, 0, reach)
+
+
+def down(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
+    """(blocks, 3): mean of each block of ``side`` x ``side`` pixels; what lies beyond the picture is 0."""
+    first = np.add.reduceat(image, np.arange(0, image.shape[0], side), axis=0)
+    sums = np.add.reduceat(first, np.arange(0, image.shape[1], side), axis=1)
+    return np.asarray(sums.reshape(grid[0] * grid[1], -1) / np.float32(side * side), np.float32)
+
+
+def down_adjoint(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> FloatImage:
+    """The transpose of ``down``: (rows, columns, 3)."""
+    whole = np.repeat(np.repeat(blocks.reshape(*grid, -1), side, axis=0), side, axis=1)
+    return np.asarray(whole[: shape[0], : shape[1]] / np.float32(side * side), np.float32)
+
+
+def up(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> FloatImage:
+    """(rows, columns, 3): values of blocks, interpolated between their middles."""
+    down_, across = _between(shape[0], grid[0], side), _between(shape[1], grid[1], side)
+    values = blocks.reshape(*grid, -1)
+    return np.stack([down_ @ values[..., c] @ across.T for c in range(values.shape[2])], axis=2).astype(np.float32)
+
+
+def up_adjoint(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
+    """The transpose of ``up``: (blocks, 3)."""
+    down_, across = _between(image.shape[0], grid[0], side), _between(image.shape[1], grid[1], side)
+    parts = [down_.T @ image[..., c] @ across for c in range(image.shape[2])]
+    return np.asarray(np.stack(parts, axis=2).reshape(grid[0] * grid[1], -1), np.float32)
+
+
+def _between(pixels: int, blocks: int, side: int) -> FloatImage:
+    """(pixels, blocks): linear interpolation, constant beyond the outermost middles."""
+    at = np.clip((np.arange(pixels) - (side - 1) / 2) / side, 0, blocks - 1)
+    return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(blocks)), 0), np.float32)

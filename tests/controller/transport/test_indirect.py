@@ -1,0 +1,165 @@
+"""Light by way of other surfaces: the operator against dense matrices, and its fit against stages that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.transport.indirect import IndirectLight
+from controller.transport.indirect_fit import beside, fit_indirect, form_factors
+from tests.controller.solve.conftest import plane_calibration
+
+SHAPE = (22, 27)
+
+
+def some(seed: int, *, side: int = 5, strength: float = 0.4) -> IndirectLight:
+    rng = np.random.default_rng(seed)
+    grid = -(-SHAPE[0] // side), -(-SHAPE[1] // side)
+    blocks = grid[0] * grid[1]
+    factors = rng.random((blocks, blocks)).astype(np.float32)
+    factors /= factors.sum(axis=1, keepdims=True)
+    scale = (strength * rng.random((*SHAPE, 3))).astype(np.float32)
+    lit: Mask = rng.random(SHAPE) < 0.9
+    return IndirectLight(factors, scale, lit, grid, side)
+
+
+def dense(light: IndirectLight, channel: int) -> Float64:
+    """Column by column."""
+    columns = []
+    for at in range(light.lit.size):
+        one = np.zeros((*SHAPE, 3), np.float32)
+        one.reshape(-1, 3)[at, channel] = 1
+        columns.append(light.forward(one)[..., channel].ravel())
+    return np.stack(columns, axis=1).astype(np.float64)
+
+
+def picture(seed: int) -> FloatImage:
+    return np.random.default_rng(seed).random((*SHAPE, 3)).astype(np.float32)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.integers(1, 9))
+def test_adjoint_is_the_transpose(seed: int, side: int) -> None:
+    light, d, r = some(seed, side=side), picture(seed + 1), picture(seed + 2)
+    forward, back = np.vdot(light.forward(d).astype(np.float64), r), np.vdot(d, light.adjoint(r).astype(np.float64))
+    assert forward == pytest.approx(back, rel=1e-5)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 1000), st.floats(-3, 3))
+def test_linear_and_never_negative(seed: int, factor: float) -> None:
+    light, a, b = some(seed), picture(seed + 1), picture(seed + 2)
+    both = light.forward((a + np.float32(factor) * b).astype(np.float32))
+    np.testing.assert_allclose(both, light.forward(a) + np.float32(factor) * light.forward(b), atol=1e-5)
+    assert (light.forward(a) >= 0).all()
+
+
+def test_as_its_matrix_and_its_inverse() -> None:
+    light = replace(some(1), lit=np.ones(SHAPE, np.bool_))
+    matrix, d = dense(light, 1), picture(5)
+    np.testing.assert_allclose(light.forward(d)[..., 1].ravel(), matrix @ d[..., 1].ravel(), atol=1e-5)
+    total = (d + light.forward(d)).astype(np.float32)
+    solved = np.linalg.solve(np.eye(len(matrix)) + matrix, total[..., 1].ravel())
+    np.testing.assert_allclose(light.direct_target(total)[..., 1].ravel(), solved, atol=1e-4)
+    np.testing.assert_allclose(light.direct_target(total), d, atol=1e-4)
+
+
+def test_light_is_one_number_for_even_light() -> None:
+    light = some(2)
+    np.testing.assert_allclose(light.falling(np.ones((*SHAPE, 3), np.float32))[:20, :25], 1, atol=0.35)
+
+
+def test_more_than_is_wanted_is_less_than_nothing() -> None:
+    light = replace(some(3, strength=1.0), lit=np.ones(SHAPE, np.bool_))
+    total = np.ones((*SHAPE, 3), np.float32)
+    total[:11] = 0.0
+    direct = light.direct_target(total)
+    assert (direct[:11] <= 0).all()
+    assert direct[:11].min() < -0.05
+    np.testing.assert_allclose(direct + light.forward(np.maximum(direct, 0)), total, atol=1e-4)
+
+
+def test_out_of_reach_throws_nothing_back() -> None:
+    light = replace(some(4, strength=0.8), lit=np.ones(SHAPE, np.bool_))
+    total, reach = np.full((*SHAPE, 3), 2.0, np.float32), np.full((*SHAPE, 3), 0.5, np.float32)
+    limited, unlimited = light.direct_target(total, reach=reach), light.direct_target(total)
+    np.testing.assert_allclose(limited + light.forward(np.clip(limited, 0, reach)), total, atol=1e-4)
+    assert limited.mean() > unlimited.mean()
+
+
+def corner(shape: tuple[int, int] = (60, 80)) -> tuple[FloatImage, FloatImage]:
+    """Points and normals of two planes that meet at a right angle, open towards the camera."""
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
+    ray = np.stack([(x - shape[1] / 2) / 80, (y - shape[0] / 2) / 80, np.ones(shape)], axis=2)
+    left = x < shape[1] / 2
+    normal = np.where(left[..., None], [np.sqrt(0.5), 0, -np.sqrt(0.5)], [-np.sqrt(0.5), 0, -np.sqrt(0.5)])
+    at = np.array([0, 0, 2.0])
+    depth = np.sum(normal * at, axis=2) / np.sum(normal * ray, axis=2)
+    return (ray * depth[..., None]).astype(np.float32), normal.astype(np.float32)
+
+
+def test_form_factors_add_up_to_the_part_of_the_view_that_is_taken() -> None:
+    points, normals = corner()
+    factors = form_factors(points, normals, (12, 16), 5)
+    grid = factors.sum(axis=1).reshape(12, 16)
+    assert (factors >= 0).all()
+    np.testing.assert_array_equal(factors.reshape(12, 16, 12, 16)[:, 2, :, :8], 0)  # a plane gives itself nothing
+    # beside the edge nearly half of the half-space is the other plane
+    assert 0.3 < grid[6, 7] < 0.55
+    assert grid[6, 7] > 2 * grid[6, 1]
+
+
+def fitted(kernel: FloatImage, *, projectors: int = 3) -> tuple[IndirectLight, list[FloatImage], list[FloatImage]]:
+    """The fit for a stage whose blocks give each other light by ``kernel``; its direct and indirect whites."""
+    stage = plane_calibration(projectors=projectors)
+    truth = IndirectLight(kernel, np.full((60, 80, 3), 0.3, np.float32), stage.object_mask, (12, 16), 5)
+    parts = []
+    for n, part in enumerate(stage.projectors):
+        white = part.white.copy()
+        white[:, : 20 * n] = 0
+        white[:, 60 - 15 * n :] *= 0.3
+        parts.append(replace(part, white=white, indirect=truth.forward(white)))
+    points, normals = corner()
+    found = fit_indirect(replace(stage, projectors=tuple(parts)), stage.object_mask, points, normals)
+    assert found is not None
+    return found, [part.white for part in parts], [truth.forward(part.white) for part in parts]
+
+
+def test_indirect_light_of_all_whites_is_as_measured() -> None:
+    found, direct, indirect = fitted(form_factors(*corner(), (12, 16), 5))
+    both = found.forward(np.sum(direct, axis=0)), np.sum(indirect, axis=0)
+    np.testing.assert_allclose(*both, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("even", [0.0, 1.0])
+def test_each_projectors_is_told_by_the_terms_that_fit(even: float) -> None:
+    shape = form_factors(*corner(), (12, 16), 5)
+    kernel = (even / 192 * np.ones_like(shape) + (1 - even) * shape).astype(np.float32)
+    found, direct, indirect = fitted(kernel)
+    for one, wanted in zip(direct, indirect, strict=True):
+        error = found.forward(one) - wanted
+        assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(wanted**2))
+
+
+def test_without_shape_or_measurement() -> None:
+    stage = plane_calibration()
+    assert fit_indirect(stage, stage.object_mask, None, None) is None
+    parts = tuple(replace(part, indirect=0.1 * part.white) for part in stage.projectors)
+    found = fit_indirect(replace(stage, projectors=parts), stage.object_mask, None, None)
+    assert found is not None
+    whole = np.sum([part.white for part in parts], axis=0)
+    np.testing.assert_allclose(found.forward(whole), 0.1 * whole, rtol=1e-3, atol=1e-5)
+
+
+def test_light_beside_the_object_is_that_of_the_frame() -> None:
+    stage = plane_calibration()
+    lit = np.zeros((60, 80), np.bool_)
+    lit[:30] = True
+    found = beside(stage.projectors[0], np.full((20, 26, 3), 0.5, np.float32), lit)
+    np.testing.assert_array_equal(found[:30], 0)
+    np.testing.assert_allclose(found[30:], 0.5 * stage.projectors[0].white[30:], rtol=1e-5)
