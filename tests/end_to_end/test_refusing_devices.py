@@ -13,7 +13,7 @@ import pytest
 
 from hal.values import Power
 from tests.end_to_end.kiosk import with_ports_of_its_own
-from tests.end_to_end.program import REPOSITORY, Bench, Command, lamps, powers, velatura, wrong_code
+from tests.end_to_end.program import LONGEST_S, REPOSITORY, Bench, Command, lamps, powers, velatura, wrong_code
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -68,7 +68,8 @@ def test_a_reader_or_a_terminal_that_goes_away_leaves_no_lamp_lit(served: tuple[
     while b"Photographing black" not in told and working.poll() is None:
         told += os.read(ours, 4096)
     os.close(ours)
-    assert working.wait(60) in (1, 130)
+    # A calibration whose reader is gone continues to its end, which takes as long as the machine needs.
+    assert working.wait(LONGEST_S) in (1, 130)
     assert lamps(stage) == {"left": False, "right": False, "above": False}
     assert set(powers(stage).values()) <= {Power.OFF, Power.COOLING}
     assert b"Traceback" not in told

@@ -162,7 +162,7 @@ def test_a_file_that_the_description_names_and_the_folder_lacks_is_refused(tmp_p
 
 
 def test_no_captures_and_a_dark_projector_are_refused() -> None:
-    with pytest.raises(api.VelaturaError, match="no captures"):
+    with pytest.raises(api.VelaturaError, match="No captures were given"):
         api.calibrate({})
     dark = {name: np.zeros_like(image) for name, image in photographed(SCENE).items()}
     with pytest.raises(api.VelaturaError) as error:

@@ -40,7 +40,7 @@ def test_an_experiment_without_a_stage_is_done_and_gets_its_page(
 def test_unknown_names_and_sizes_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no experiment called fig99"):
         run(tmp_path / "out", "fig99")
-    with pytest.raises(UsageError, match="no size 'huge'"):
+    with pytest.raises(UsageError, match="The size 'huge' is unknown"):
         run(tmp_path / "out", "residual", size="huge")
     assert not (tmp_path / "out").exists()
 

@@ -363,7 +363,9 @@ def test_hours_that_are_sent_while_the_service_is_made_anew_are_refused_and_not_
     kiosk, cancel, refused = StageKiosk(vase(tmp_path)), threading.Event(), list[str]()
 
     @contextlib.contextmanager
-    def serving(stage: Path, cancel: threading.Event, *, leave_lit: bool) -> Iterator[Service]:
+    def serving(
+        stage: Path, cancel: threading.Event, *, leave_lit: bool, alive: Callable[[], None]
+    ) -> Iterator[Service]:
         log = EventLog(stage / EventLog.FILE, durable=False)
         service = Service(check_stage(stage), log)  # it has read the hours
         if refused:
