@@ -77,3 +77,7 @@ def test_a_new_owner_takes_the_place_of_a_dead_one(tmp_path: Path) -> None:
     link = PtyLink(tmp_path / "tty", "/dev/pts/99993")
     assert leads_to_its_owner(tmp_path / "tty")
     link.remove()
+
+
+def test_a_name_that_no_file_can_have_is_left_to_the_opening(tmp_path: Path) -> None:
+    assert leads_to_its_owner(tmp_path / ("p" * 4000))
