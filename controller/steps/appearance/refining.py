@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from controller.artefacts.camera import inherit_camera
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
 from controller.capture.brackets import merge_brackets
-from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask
 from controller.rig.rig import Rig
 from controller.run.progress import Level
 from controller.run.runner import Context, Step
@@ -38,6 +37,7 @@ from controller.steps import costs
 from controller.steps.appearance.causes import causes_step
 from controller.steps.appearance.publishing import take_bracket
 from controller.steps.appearance.solving import device_frames
+from controller.steps.capture.photographs import frames_digest
 
 WORSE: Final = "the last correction was no better"
 ENOUGH: Final = "the rest is noise"
@@ -211,13 +211,12 @@ class _Round:
     def _photographed(self, frames: Mapping[str, FloatImage], number: int) -> ResultPhotograph:
         if self.context.folder != self.calibrated.folder:
             inherit_camera(self.calibrated.folder, self.context.folder)
-        shown = device_frames(
-            self.calibrated.calibration, [frames[projector] for projector in self.calibrated.projectors]
-        )
+        shown = device_frames(self.calibrated.calibration, self._in_order(frames))
         presented_s = self.rig.acquirer.show(self.rig.on_outputs(shown), deadline=self.context.deadline)
         taken = take_bracket(
             self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", self.solved.exposure,
-            self.options.longest_exposure_s, shown_at_s=presented_s, of={"frames": _digest(shown)}, first_again=True,
+            self.options.longest_exposure_s, shown_at_s=presented_s, of={"frames": frames_digest(shown)},
+            first_again=True,
         )  # fmt: skip
         exposures_s = [one.exposure_s for one in taken]
         images = [one.read().measured() for one in taken]
@@ -225,13 +224,6 @@ class _Round:
         merged = merge_brackets(images, exposures_s, noise=noise)
         first, last = (images[n] / np.float32(exposures_s[n]) for n in (0, -1))
         return ResultPhotograph(merged.radiance, merged.sigma, first, last)
-
-
-def _digest(frames: Mapping[str, ByteImage]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(frames):
-        digest.update(np.ascontiguousarray(frames[name]).tobytes())
-    return digest.hexdigest()
 
 
 def _keep(calibrated: Calibrated, name: str, photographs: int, context: Context) -> Sequence[Path]:

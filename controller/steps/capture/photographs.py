@@ -145,7 +145,7 @@ def _take(
     rig: Rig, context: Context, planned: Planned, identity: ShotId, before: _Before | None
 ) -> tuple[Taken, _Before | None]:
     frames = rig.on_outputs(planned.frames())
-    settings = {"exposure_s": repr(planned.exposure_s), "frames": _digest(frames)}
+    settings = {"exposure_s": repr(planned.exposure_s), "frames": frames_digest(frames)}
     known = context.journal.shot(identity, settings)
     if known is not None:
         return _taken(identity, known.path, read_exposure(known.path)), None
@@ -224,7 +224,8 @@ def _journalled(
     return replace(_taken(identity, artefact.path, exposure_s), fresh=True)
 
 
-def _digest(frames: Mapping[str, ByteImage]) -> str:
+def frames_digest(frames: Mapping[str, ByteImage]) -> str:
+    """Identifies 8-bit frames by output or projector name, for the journal; hexadecimal."""
     digest = hashlib.sha256()
     for output in sorted(frames):
         digest.update(f"{output} {frames[output].shape} ".encode())

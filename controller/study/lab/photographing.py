@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,12 +20,13 @@ from controller.calibrate.metapixels.from_dots import fit_dots
 from controller.calibrate.metapixels.initial_estimate import initial_metapixels, modelled_correspondence, where_missing
 from controller.calibrate.values import PhaseMap
 from controller.capture.dots import DotPattern, dot_patterns
-from controller.core.arrays import ByteImage, Float64, FloatImage
+from controller.core.arrays import Float64, FloatImage
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.steps.appearance.publishing import take_hdr
 from controller.steps.appearance.solving import device_frames
 from controller.steps.calibrate.dots import capture_step, read_dots
+from controller.steps.capture.photographs import frames_digest
 from controller.study.lab.subject import Dots, Shares
 
 FAINTEST_SHARE = 0.01
@@ -51,7 +51,7 @@ class RigPhotographer:
         presented = self.rig.display.show(self.rig.on_outputs(shown), deadline=self.context.deadline.within(20))
         taken, merged = take_hdr(
             self.rig, self.context, "study", f"{self.name}-{name}", white, self.longest_exposure_s,
-            shown_at_s=presented.at_s, of={"frames": _digest(shown)},
+            shown_at_s=presented.at_s, of={"frames": frames_digest(shown)},
         )  # fmt: skip
         self.used.extend(one.path for one in taken)
         # Too bright for the shortest exposure is at least its full scale; black would be the one wrong answer.
@@ -121,10 +121,3 @@ def dot_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
     return [
         capture_step(rig, projector, DOTS, longest_exposure_s, kind=StepKind.STUDY_DOTS) for projector in rig.projectors
     ]
-
-
-def _digest(frames: Mapping[str, ByteImage]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(frames):
-        digest.update(np.ascontiguousarray(frames[name]).tobytes())
-    return digest.hexdigest()
