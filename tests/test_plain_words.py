@@ -1,6 +1,6 @@
 """Texts that users see are in plain words: no archaic phrase, no sentence that needs a second reading.
 
-Later work adds folders to ``FOLDERS`` and ``PAGES`` until they are ``controller``, ``hal``, ``plugins`` and ``docs``.
+They are the messages, help and templates of the product, the README and every page of the documentation.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import pytest
 ROOT: Final = Path(__file__).parents[1]
 FOLDERS: Final = ("controller", "hal", "plugins")
 """Folders whose messages, help and templates are in plain words."""
-PAGES: Final = ("docs/explanation", "docs/how-to", "docs/reference", "docs/study", "docs/tutorials", "README.md")
-"""Pages, and folders of them, in plain words; docs/decisions keep their wording."""
+PAGES: Final = ("docs", "README.md")
+"""Pages, and folders of them, in plain words."""
 LONGEST: Final = 25
 """Words in a sentence of ``what`` and ``remedy``."""
 
