@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -133,17 +135,26 @@ class Machine:
                 ],
                 stdin=subprocess.DEVNULL, stdout=console, stderr=console,
             )  # fmt: skip
-        children = Path(f"/proc/{self._container.pid}/task/{self._container.pid}/children")
-        self.wait_for(lambda: bool(children.read_text().split()))
-        self._init = int(children.read_text().split()[0])
+        self.wait_for(lambda: self._find_init() != 0)
         self.wait_for(lambda: self.called("systemctl", "is-system-running").stdout.strip() != "")
+
+    def _find_init(self) -> int:
+        """The machine's first process; 0 while there is none. systemd-nspawn has another child before it."""
+        assert self._container is not None
+        children = Path(f"/proc/{self._container.pid}/task/{self._container.pid}/children").read_text().split()
+        for child in children:
+            with contextlib.suppress(OSError):  # it has ended since
+                status = Path(f"/proc/{child}/status").read_text()
+                if re.search(r"^NSpid:\t\d+\t1$", status, re.MULTILINE):
+                    self._init = int(child)
+        return self._init
 
     def cut_off(self) -> None:
         """As when the power fails: every process is gone at once, and nothing was told."""
         if self._container is not None:
-            os.kill(self._init, signal.SIGKILL)
+            os.kill(self._init or self._container.pid, signal.SIGKILL)
             self._container.wait()
-            self._container = None
+            self._container, self._init = None, 0
 
     def called(self, *words: str | Path, user: str | None = None) -> subprocess.CompletedProcess[str]:
         """Run a program on the machine, as root if no other ``user`` is named."""

@@ -6,7 +6,7 @@ import json
 import os
 import pickle
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,14 @@ from hal.runtime.compute import ROOT, digest_of, kernel_folder
 from hal.runtime.kernels import TABLES, encode, main
 
 
-def kernels_of_the_tables(to: Path) -> None:
-    """Make ``to`` a kernel folder with all kernels of the tables, compiled; their machine code is linked, not copied.
+def kernels_of_the_tables(to: Path, copy_file: Callable[[str, str], object] = os.link) -> None:
+    """Make ``to`` a kernel folder with all kernels of the tables, compiled; their machine code is linked by default.
 
     The user's kernel folder may hold more, which other tests compiled: those are left out.
     """
     assert main(["compile"]) == 0
     for source, folder in _folders(kernel_folder()):
-        copy = Path(shutil.copytree(folder, to / folder.name, copy_function=os.link))
+        copy = Path(shutil.copytree(folder, to / folder.name, copy_function=copy_file))
         for index in copy.glob("*.nbi"):
             _keep(index, _calls_in_tables(source, _function(source, index)))
     for stamp in kernel_folder().glob("all-*"):
