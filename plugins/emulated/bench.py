@@ -24,7 +24,7 @@ from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
 from plugins.emulated.optics.bumps import bumps_of, write_bumps
-from plugins.emulated.optics.objects import load_object
+from plugins.emulated.optics.objects import default_object, load_object
 from plugins.emulated.optics.rooms import DARK, arranged
 from plugins.emulated.optics.staging import (
     FAST_LAMP,
@@ -37,7 +37,7 @@ from plugins.emulated.optics.staging import (
 )
 from plugins.emulated.optics.stands import SETTINGS, Stands, read_room, read_stands
 from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
-from plugins.emulated.optics.world import World, object_of
+from plugins.emulated.optics.world import World
 from plugins.emulated.projectors.boards import USUAL, baud_of, board_named
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
@@ -66,18 +66,13 @@ class EmulatedBench:
         ``stage-not-written``.
         """
         size_named(size)
-        kept = ObjectTruth("vase-and-bust", "", seed)
-        stage_object = None
-        if object_file is not None:
-            stage_object = load_object(object_file)
-            kept = ObjectTruth("mesh", OBJECT_FILE, seed)
-        shape = stage_object if stage_object is not None else object_of(stage, kept)
+        shape = default_object() if object_file is None else load_object(object_file)
+        kept = ObjectTruth("vase-and-bust" if object_file is None else "mesh", OBJECT_FILE, seed)
         truth = arranged(random_truth(size, seed, shape, kept, _free_ports(), self._stands), self._room, shape)
         with _explained(stage):
             for folder in (FOLDER, "run"):
                 (stage / folder).mkdir(parents=True, exist_ok=True)
-            if stage_object is not None:
-                stage_object.save(stage / OBJECT_FILE)
+            shape.save(stage / OBJECT_FILE)
             _write_fast_profile(stage, USUAL)
             write_truth(stage, truth)
             (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from hal.errors import DeviceError
 from hal.runtime.files import LARGEST_MESH, require_regular
-from plugins.emulated.optics.shapes import Floats, Rgb, bust, paint_bust, paint_solid, paint_vase, vase
+from plugins.emulated.optics.shapes import Floats, Rgb, bust, dot, length, paint_bust, paint_solid, paint_vase, vase
 
 HEIGHT_M: Final = 0.30
 WIDTH_M: Final = 0.36
@@ -206,7 +206,7 @@ def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArra
     total = np.zeros((int(place.max()) + 1, 3))
     for corner in range(3):
         sides = [_unit(corners[:, (corner + step) % 3] - corners[:, corner]) for step in (1, 2)]
-        angle = np.arccos(np.clip(np.sum(sides[0] * sides[1], axis=1), -1.0, 1.0))
+        angle = np.arccos(np.clip(dot(*sides), -1.0, 1.0))
         for axis in range(3):
             total[:, axis] += np.bincount(place[faces[:, corner]], weights=angle * flat[:, axis], minlength=len(total))
     smooth = _unit(total)[place][faces]
@@ -215,7 +215,7 @@ def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArra
 
 
 def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30))
+    return np.asarray(vectors / np.maximum(length(vectors), 1e-30)[..., None])
 
 
 def _linear(srgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:

@@ -21,6 +21,7 @@ from embreex.mesh_construction import TriangleMesh
 
 from plugins.emulated.optics.furnished import Scene, furnished
 from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.shapes import dot, length
 from plugins.emulated.optics.truth import BenchTruth, Lens, Pose, ProjectorTruth
 from plugins.emulated.tables import dump
 
@@ -103,7 +104,7 @@ def project(pose: Pose, lens: Lens, points: Floats) -> tuple[Floats, Floats]:
     """Pixels (N, 2) and points in the device's frame (N, 3) of world points (N, 3) in metres."""
     local = (points - pose.position_m) @ pose.rotation.T
     flat = local[:, :2] / local[:, 2:]
-    square = np.sum(flat**2, axis=1, keepdims=True)
+    square = dot(flat, flat)[:, None]
     bent = flat * (1.0 + square * (lens.distortion[0] + square * lens.distortion[1]))
     return bent * lens.focal_px + lens.centre_px, local
 
@@ -113,10 +114,10 @@ def directions(pose: Pose, lens: Lens, x: Floats, y: Floats) -> Floats:
     bent = (np.stack((x, y), axis=-1) - lens.centre_px) / lens.focal_px
     flat = bent.copy()
     for _ in range(8):  # converges within 1e-9 for the mild distortion of a photographic lens
-        square = np.sum(flat**2, axis=1, keepdims=True)
+        square = dot(flat, flat)[:, None]
         flat = bent / (1.0 + square * (lens.distortion[0] + square * lens.distortion[1]))
     local = np.concatenate((flat, np.ones((len(flat), 1))), axis=1)
-    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    local /= length(local)[:, None]
     return np.asarray(local @ pose.rotation)
 
 
@@ -135,7 +136,7 @@ def _cast_rows(truth: BenchTruth, things: Scene, scene: Any, first: int, last: i
     weights = np.stack((1.0 - found["u"][hit] - found["v"][hit], found["u"][hit], found["v"][hit]), axis=-1)
     points = np.einsum("nk,nkc->nc", weights.astype(np.float64), things.vertices[things.faces[faces]])
     normals = np.einsum("nk,nkc->nc", weights, things.normals[faces]).astype(np.float64)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals /= np.maximum(length(normals), 1e-12)[:, None]
     normals *= _facing(found["Ng"][hit].astype(np.float64), normals, ray)[:, None]
     lit = [_lit(projector, scene, points, normals) for projector in truth.projectors]
     on_object = faces < things.object_faces
@@ -152,8 +153,8 @@ def _cast_rows(truth: BenchTruth, things: Scene, scene: Any, first: int, last: i
 
 def _facing(geometric: Floats, normals: Floats, ray: Floats) -> Floats:
     """+1 or -1 for each shading normal: a mesh may be inside out, and what the camera sees is the outside."""
-    same_side = np.sum(geometric * normals, axis=1) >= 0.0
-    towards_camera = np.sum(geometric * ray, axis=1) <= 0.0
+    same_side = dot(geometric, normals) >= 0.0
+    towards_camera = dot(geometric, ray) <= 0.0
     return np.where(same_side == towards_camera, 1.0, -1.0)
 
 
@@ -163,13 +164,14 @@ def _lit(
     """Where a projector lights points, how strongly, and how blurred."""
     light, size = projector.light, np.asarray(projector.lens.size_px)
     at, local = project(projector.pose, projector.lens, points)
-    distance = np.linalg.norm(local, axis=1)
+    distance = length(local)
     z = local[:, 2]
     towards = (np.asarray(projector.pose.position_m) - points) / np.maximum(distance, 1e-9)[:, None]
-    cosine = np.sum(normals * towards, axis=1)
+    cosine = dot(normals, towards)
     reach = (z > 0.01) & (cosine > 0.0) & np.all((at > -BEYOND_PX) & (at < size - 1 + BEYOND_PX), axis=1)
     reach[reach] = ~_in_shadow(projector, scene, points[reach], distance[reach])
-    corner = np.sum(((at - 0.5 * (size - 1)) / (0.5 * size)) ** 2, axis=1) / 2.0
+    off_centre = (at - 0.5 * (size - 1)) / (0.5 * size)
+    corner = dot(off_centre, off_centre) / 2.0
     gain = light.brightness * light.reference_m**2 * cosine * distance / np.maximum(z, 0.01) ** 3
     gain *= np.maximum(1.0 - light.vignetting * corner, 0.0)
     focus = projector.focus
@@ -191,9 +193,9 @@ def _highlight(
     if strength <= 0.0:
         return np.zeros(0)
     towards = np.asarray(projector.pose.position_m) - points
-    half = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9) - ray
-    half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
-    cosine = np.clip(np.sum(half * normals, axis=1), 0.0, 1.0)
+    half = towards / np.maximum(length(towards), 1e-9)[:, None] - ray
+    half /= np.maximum(length(half), 1e-9)[:, None]
+    cosine = np.clip(dot(half, normals), 0.0, 1.0)
     return np.asarray(on_object * strength * (exponent + 8.0) / 8.0 * cosine**exponent)
 
 

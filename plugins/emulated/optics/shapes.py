@@ -170,6 +170,19 @@ def _tube(radius: Floats, height: Floats, angle: Floats, axis_x: float) -> Surfa
     return np.concatenate([grid, ends]), faces
 
 
+def dot(a: Floats, b: Floats) -> Floats:
+    """Products (...,) of vectors (..., 2 or 3). Adding up columns is several times as fast as numpy's sum over them."""
+    total = a[..., 0] * b[..., 0]
+    for axis in range(1, a.shape[-1]):
+        total += a[..., axis] * b[..., axis]
+    return np.asarray(total)
+
+
+def length(vectors: Floats) -> Floats:
+    """Lengths (...,) of vectors (..., 2 or 3)."""
+    return np.asarray(np.sqrt(dot(vectors, vectors)))
+
+
 def _crossing(distance: Callable[[Floats], Floats], inside: Floats, outside: Floats) -> Floats:
     """Where ``distance`` changes sign between the two, by bisection."""
     for _ in range(18):

@@ -173,7 +173,9 @@ class ProjectorTruth:
 
 @dataclass(frozen=True, slots=True)
 class ObjectTruth:
-    """``kind`` is ``vase-and-bust`` (``seed`` varies it), or ``mesh`` with ``file`` relative to the stage folder.
+    """``kind`` is ``vase-and-bust`` or ``mesh``; ``file``, relative to the stage folder, has its triangles.
+
+    Without ``file`` the vase and the bust are computed again, which takes seconds.
 
     ``gloss``: strength of its highlights (Blinn and Phong, normalised): light added where the surface mirrors a lens
     into the camera, relative to a perfect white; ``gloss_exponent``: how small they are.

@@ -164,6 +164,6 @@ class World:
 
 def object_of(stage: Path, kept: ObjectTruth) -> StageObject:
     """The object of a prepared stage. Raises DeviceError ``object-unreadable``."""
-    if kept.kind == "mesh":
+    if kept.kind == "mesh" or kept.file:
         return StageObject.read(stage / kept.file)
     return default_object()
