@@ -12,7 +12,7 @@ import pytest
 
 from tests.end_to_end.kernel_copy import compiled_calls, kernels_of_the_tables
 from tests.end_to_end.kiosk import with_ports_of_its_own
-from tests.end_to_end.program import Command, Outcome, asked, lamps, processes_on, run_of, shots, velatura
+from tests.end_to_end.program import Bench, Command, Outcome, asked, lamps, processes_on, run_of, shots, velatura
 from tests.shared import made_once
 
 
@@ -70,10 +70,16 @@ def finish_a_demo(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def prepared_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that ``velatura demo --prepare-only`` wrote; to be copied, not to be touched."""
+    """The folder that ``velatura demo --prepare-only --room dark`` wrote; to be copied, not to be touched.
+
+    Its bench has cast its rays, which takes most of a start. In the dark it is then ready at once: for tests that are
+    not about light.
+    """
 
     def prepare(folder: Path) -> None:
-        assert velatura("demo", "--prepare-only", "--out", folder / "out").code == 0
+        assert velatura("demo", "--prepare-only", "--room", "dark", "--out", folder / "out").code == 0
+        with Bench(folder / "out" / "stage"):
+            pass
 
     folder, _ = made_once(tmp_path_factory, "prepared", prepare)
     return folder / "out"

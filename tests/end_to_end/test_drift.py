@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -21,6 +22,7 @@ from controller.services.calibrate import calibrate, finished_calibration, make_
 from controller.services.recalibrate import check_drift, recalibrate
 from controller.stage.session import OwnSession
 from plugins.emulated.optics.bumps import Bump, write_bumps
+from tests.end_to_end.kiosk import with_ports_of_its_own
 from tests.end_to_end.program import REPOSITORY
 
 LEFT = Bump("projector", "left", shift_px=(1.2, -0.7))
@@ -53,14 +55,9 @@ class Bumpy:
 
 
 @pytest.fixture(scope="module")
-def bumpy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bumpy]:
-    from controller.demo.job import demo
-
-    out = tmp_path_factory.mktemp("bumpy")
-    demo(
-        size="small", object_file=None, out=out, seed=4, prepare_only=True, reporter=Silent(), cancel=threading.Event()
-    )
-    stage = out / "stage"
+def bumpy(prepared_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bumpy]:
+    out = shutil.copytree(prepared_once, tmp_path_factory.mktemp("bumpy") / "out")
+    stage = with_ports_of_its_own(Path(out) / "stage")
     bench = subprocess.Popen(
         [sys.executable, "-m", "controller", "emulate", str(stage), "--json", "--until-input-ends"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY, start_new_session=True,
