@@ -117,7 +117,7 @@ def test_appearances_in_turn_a_damaged_bundle_and_changed_settings(tmp_path: Pat
         moved = text.replace('"left"', '"links"')
         assert "left" in ask(stage, "effect-of-settings", text=moved)
         assert "cools" in ask(stage, "effect-of-settings", text=moved)
-        ask(stage, "save-settings", text=f"{text}\n[safety]\npower_up_s = 900.0\n")
+        ask(stage, "save-settings", text=text.replace("\n[safety]\n", "\n[safety]\nminimum_off_s = 0.5\n"))
         wait_for(lambda: "service-ended" in codes(stage))
         until(stage, playing)
         assert (strikes(stage), all(lamps(stage).values())) == (struck, True)

@@ -18,6 +18,7 @@ from controller.bundle.signing import Trust
 from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import Turn
+from controller.play.control.protocol import MAX_FADE_S, MAX_SECONDS
 
 PREVIEWS: Final = "kiosk/previews"
 WITHOUT: Final = "bundles-without"
@@ -55,7 +56,11 @@ class BundleStore:
         """See ``interfaces.Bundles``."""
         index = self.index(self.bundle())
         hints = () if index is None else index.schedule
-        return tuple((hint.appearance, hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints)
+        # A bundle may say more than the player takes.
+        return tuple(
+            (hint.appearance, min(hint.duration_ms / 1000, MAX_SECONDS), min(hint.fade_ms / 1000, MAX_FADE_S))
+            for hint in hints
+        )
 
     def given_up(self) -> str:
         """The file's name of the bundle that showed no picture, so that the one before plays; empty if none."""

@@ -65,10 +65,11 @@ class Forms:
         async def answer(_: Request, visitor: Visitor, sent: Sent) -> Response:
             assert visitor.session is not None
             values: Values = {}
+            sure = sent.texts.pop("sure", "") == "yes"
             try:
                 values = _values(operation, sent)
                 question = await self._question(operation, values)
-                if question and sent.texts.get("sure") != "yes":
+                if question and not sure:
                     return await self._ask(operation, visitor, sent, question)
                 result = await answers.run(self._panel, operation, values, visitor.name)
             except answers.FAILURES as error:
@@ -92,7 +93,6 @@ class Forms:
 
     async def _ask(self, operation: Operation, visitor: Visitor, sent: Sent, question: str) -> Response:
         facts = {"question": question, "action": f"/do/{operation.name}", "back": LEADS_TO[operation.name]}
-        kept = {name: text for name, text in sent.texts.items() if name != "sure"}
         if operation.upload is not None:
             # A file can't be sent on; its own page has the question beside it.
             assert visitor.session is not None
@@ -100,7 +100,7 @@ class Forms:
                 ("error", "Nothing was done. Tick the box to confirm, and choose the file again.")
             )
             return RedirectResponse(LEADS_TO[operation.name], 303)
-        return await self._pages.show("sure.html", visitor, {**facts, "kept": kept, "here": facts["back"]})
+        return await self._pages.show("sure.html", visitor, {**facts, "kept": sent.texts, "here": facts["back"]})
 
     async def _check(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         text = sent.texts.get("text", "").replace("\r\n", "\n")
