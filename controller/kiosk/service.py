@@ -35,6 +35,7 @@ from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
+from controller.run.signals import Stop
 from controller.run.state_machine import State
 from controller.stage.calibrations import finished_calibrations, stage_trust
 from controller.stage.check import Checked, check_stage
@@ -312,4 +313,4 @@ def serving(
                 ended.set()
                 if loop.is_alive():
                     loop.join(10.0)
-                service.end(leave_lit=leave_lit)
+                service.end(leave_lit=leave_lit or (isinstance(cancel, Stop) and cancel.restarting))

@@ -85,7 +85,7 @@ class Alerts:
         """Send a test on every channel. Raises UsageError("alerts-none"), WorkError("alert-not-sent")."""
         table = self._table()
         if not (wanted := _wanted(table)):
-            raise UsageError("alerts-none", what="stage.toml names nobody to alert.",
+            raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.",
                              remedy="Write mail_to or webhook under [alerts].")  # fmt: skip
         row = EventRow(self._log.number, time.time(), "info", "This is a test: alerts arrive.", "alert-test")
         for send in wanted.values():

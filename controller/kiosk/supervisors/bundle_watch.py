@@ -30,6 +30,6 @@ class BundleWatch:
         made = "" if index is None else time.strftime(" of %Y-%m-%d %H:%M UTC", time.gmtime(index.created_unix_s))
         return Decision(
             "bundle-older-plays",
-            f"The newest bundle showed no picture, so the one before{made} plays.",
+            f"The newest bundle showed no picture, so the previous one{made} plays.",
             "Compute and publish the appearances again.", "warning",
         )  # fmt: skip

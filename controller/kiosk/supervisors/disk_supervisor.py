@@ -126,6 +126,6 @@ class DiskSupervisor:
 def _full(why: str) -> Decision:
     return Decision(
         DISK_FULL,
-        f"The disk of the stage {why}. What plays goes on. No lamp is switched on, because that could not be recorded.",
+        f"The disk of the stage {why}. Playback continues. No lamp is switched on, because that could not be recorded.",
         "Free some space on the disk, and check that it is in order.", "error",
     )  # fmt: skip

@@ -215,7 +215,7 @@ class MemoryKiosk:
         self.save_settings(text)
 
     def test_alerts(self) -> None:
-        raise UsageError("alerts-none", what="stage.toml names nobody to alert.", remedy="Name somebody.")
+        raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.", remedy="Name somebody.")
 
     def effect_of_settings(self, text: str) -> str:
         self.validate_settings(text)

@@ -115,7 +115,7 @@ def test_a_password_goes_only_through_tls_and_only_to_a_server_that_proves_its_n
     (tmp_path / "mail-password").write_text("swordfish\n")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(public, private)
-    login = {"mail_user": "kiosk", "mail_password_file": "mail-password"}
+    login: dict[str, Any] = {"mail_user": "kiosk", "mail_password_file": "mail-password"}
     with MailServer(context) as mail:
         one = Alerting(tmp_path, **MAIL, **login, mail_port=mail.port, certificates=public.name)
         one.alerts.test()
@@ -154,6 +154,6 @@ def test_settings_that_could_send_nothing_or_a_password_in_clear_are_refused(ale
 
 def test_without_anybody_to_tell_a_test_says_so(tmp_path: Path) -> None:
     one = Alerting(tmp_path)
-    with pytest.raises(UsageError, match="names nobody"):
+    with pytest.raises(UsageError, match="names no receiver"):
         one.alerts.test()
     one.log.close()

@@ -74,7 +74,7 @@ def test_a_player_that_dies_soon_after_its_start_on_a_damaged_bundle_comes_back_
         wait_for(lambda: supervisor.view.problem is None and shows(store.bundle()))
         assert time.monotonic() - began_s < 40
         assert watch.warning is not None
-        assert "the one before" in watch.warning.text
+        assert "the previous one" in watch.warning.text
         assert [one.code for one in told].count("bundle-older-plays") == 1
         install(write_noise(tmp_path / "b.vel", key=key, revision=3), slots, trusted=[public])
         watch.step()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from controller.cli.serve_command import PanelAddress, _check_panel
@@ -10,11 +12,17 @@ from controller.kiosk.store.accounts import Role
 from controller.panel.api import PREFIX
 from controller.panel.auth.refusals import EVERY_S, Refusals
 from controller.panel.mqtt.options import BrokerOptions, check_broker
+from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import PASSWORD, Served, csrf, log_in
 
 
+def in_memory(fresh: Served) -> MemoryKiosk:
+    assert isinstance(fresh.kiosk, MemoryKiosk)
+    return fresh.kiosk
+
+
 def told(fresh: Served) -> list[str]:
-    return [what for _, what in fresh.kiosk.recorded]
+    return [what for _, what in in_memory(fresh).recorded]
 
 
 def test_a_bad_client_does_not_lock_out_good_tokens_behind_the_same_address(fresh: Served) -> None:
@@ -86,7 +94,7 @@ def test_closing_and_removing_ask_first(fresh: Served, operation: str, sent: dic
 def test_settings_that_restart_something_and_restoring_ask_first(fresh: Served) -> None:
     with fresh.entered("tina") as tina:
         token, text = csrf(tina.get("/settings").text), fresh.kiosk.settings()
-        fresh.kiosk.effect = "The lamp of left is switched off & on again."
+        in_memory(fresh).effect = "The lamp of left is switched off & on again."
         page = tina.post("/do/save-settings", data={"csrf": token, "text": f"# new\n{text}"})
         assert "The lamp of left is switched off &amp; on again." in page.text
         assert fresh.kiosk.settings() == text
@@ -94,7 +102,7 @@ def test_settings_that_restart_something_and_restoring_ask_first(fresh: Served) 
         sent = {"csrf": token, "text": f"# new\n{text}", "sure": "yes"}
         assert tina.post("/do/save-settings", data=sent).status_code == 303
         assert fresh.kiosk.settings().startswith("# new")
-        fresh.kiosk.effect = ""
+        in_memory(fresh).effect = ""
         assert tina.post("/do/save-settings", data={"csrf": token, "text": text}).status_code == 303
         asked = tina.post("/do/restore", data={"csrf": token}, files={"file": ("b", b"")}, follow_redirects=True)
         assert "Tick the box" in asked.text
@@ -111,11 +119,8 @@ def test_who_tries_many_names_does_not_fill_the_log() -> None:
 
 
 @pytest.mark.parametrize("host", ["broker.example", "10.0.0.9", "::"])
-def test_a_password_for_a_broker_elsewhere_needs_tls(host: str, tmp_path: object) -> None:
-    from pathlib import Path
-
-    folder = Path(str(tmp_path))
-    password = folder / "password"
+def test_a_password_for_a_broker_elsewhere_needs_tls(host: str, tmp_path: Path) -> None:
+    password = tmp_path / "password"
     password.write_text("swordfish\n")
     with pytest.raises(UsageError) as refused:
         check_broker(BrokerOptions(host, password_file=password))
