@@ -30,10 +30,13 @@ PUT_S: Final = 5.0
 FADE_AWAITED_S: Final = 3.0
 NOTICE_TURN_S: Final = 10.0
 """On an object that all projectors light, the text of several at once could not be read."""
-STARTS_WITH_BUNDLE: Final = 4
+AGAIN_S: Final = 60.0
+"""After this time without a picture, a player without the installed bundle is started with it again."""
+STARTS_WITH_BUNDLE: Final = 6
 """Starts in a row without a picture after which the player is started without the installed bundle: it shows black.
 
-One more than after which it goes back to the bundle before by itself (``bundle.fallback``).
+More than after which it goes back to the bundle before by itself (``bundle.fallback``), because a picture may have been
+on the outputs that was not seen here.
 """
 
 
@@ -66,7 +69,7 @@ class PlayerSupervisor:
         self._misses, self._failed = 0, 0
         self._with_bundle, self._starts_without_picture, self._dark = True, 0, True
         self._turns: tuple[Turn, ...] | None = None
-        self._skipped = 0
+        self._skipped = False
         self._start_at_s, self._started_at_s = 0.0, 0.0
         self._identified = False
         self._noticed: tuple[int, tuple[str, ...]] | None = None
@@ -104,7 +107,8 @@ class PlayerSupervisor:
         except WorkError as error:
             self._misses = 0
             problem = Decision(error.code, error.what, error.remedy, "error")
-            if self._dark and self._with_bundle and error.code.startswith("bundle-"):
+            waited = self._with_bundle or self._monotonic() - self._started_at_s > AGAIN_S
+            if self._dark and waited and error.code.startswith("bundle-"):
                 # Only starts are counted, and after three without a picture the player goes back to the bundle before.
                 self._restart(problem)
             else:
@@ -126,7 +130,7 @@ class PlayerSupervisor:
     def _start(self) -> None:
         try:
             failed = self._starts_without_picture
-            self._with_bundle, self._dark = failed < STARTS_WITH_BUNDLE or failed % 10 == 0, True
+            self._with_bundle, self._dark = failed < STARTS_WITH_BUNDLE or failed % 2 == 0, True
             self._process = self._player(self._settings(self._with_bundle))
             if self._closed:
                 # While it was made ready: it would show its picture after the service's end.
@@ -144,7 +148,7 @@ class PlayerSupervisor:
             return
         self._started_at_s, self._misses, self._identified = self._monotonic(), 0, False
         self._noticed, self._hello = None, hello
-        self._turns, self._skipped = None, 0
+        self._turns, self._skipped = None, False
         self._identities = {}
         installed = self._settings(True).bundle
         if hello.get("bundle") and installed is not None:
@@ -185,7 +189,10 @@ class PlayerSupervisor:
         want = self.want
         if name:
             self._dark, self._starts_without_picture = False, 0
-        self._tell_skipped(int(status["skipped"]))
+        if status["skipped"] and name and not self._skipped:
+            # Once, because it comes round again and again.
+            self._skipped = True
+            self._tell(_SKIPPED)
         if self.identifying:
             if not self._identified:
                 self._ask({"op": "identify"}, 3.0)
@@ -213,11 +220,6 @@ class PlayerSupervisor:
         same = shown is not None and shown.bundle == want.bundle and shown.appearance in names
         return running and same and self._turns in (None, want.in_turn)
 
-    def _tell_skipped(self, skipped: int) -> None:
-        if skipped > self._skipped:
-            self._tell(_SKIPPED)
-        self._skipped = skipped
-
     def _warning(self, status: dict[str, Any]) -> Decision | None:
         told = status.get("warning")
         if told is None:
@@ -243,13 +245,15 @@ class PlayerSupervisor:
         if loaded != want.bundle:
             answer = self._ask({"op": "load-bundle", "path": str(want.bundle)}, 5.0)
             self._identities[str(answer["bundle"])] = want.bundle
+            self._skipped = False
         request: dict[str, Any] = {"op": "play", "appearance": want.appearance, "fade_s": want.fade_s}
         if want.in_turn:
             request = {"op": "sequence", "items": [list(turn) for turn in want.in_turn], "repeat": 0}
         # The answer comes when the picture has faded in; until then the status tells what comes.
         slow = want.in_turn[0][2] if want.in_turn else want.fade_s
         with contextlib.suppress(TimeoutError) if slow > FADE_AWAITED_S else contextlib.nullcontext():
-            self._ask(request, PUT_S)
+            if self._ask(request, PUT_S)["ok"]:
+                self._dark, self._starts_without_picture = False, 0
         self._turns = want.in_turn
         what = f"{len(want.in_turn)} appearances in turn" if want.in_turn else want.appearance
         self._tell(Decision("playing", f"The player shows {what}."))
