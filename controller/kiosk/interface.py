@@ -150,10 +150,10 @@ class Kiosk(Protocol):
         """What people will see when this text is saved, in sentences; empty if nothing. Raises as above."""
 
     def save_settings(self, text: str) -> None:
-        """Validate, keep the old text in a copy, write, and apply it: only what differs restarts. Raises as above."""
+        """Validate, keep the old text in a copy, write, and apply it: only what differs restarts. Raises as above.
 
-    def set_up(self, text: str) -> None:
-        """As ``save_settings``, for the first stage.toml; the stage gets a signing key, which the text then trusts."""
+        With the first stage.toml the stage gets a signing key, which the text then trusts.
+        """
 
     def camera_picture(self) -> bytes | None:
         """The camera's last live picture as JPEG, made by the kiosk itself; None if there is none."""

@@ -118,7 +118,7 @@ def test_appearances_in_turn_a_damaged_bundle_and_changed_settings(tmp_path: Pat
         assert "left" in ask(stage, "effect-of-settings", text=moved)
         assert "cools" in ask(stage, "effect-of-settings", text=moved)
         ask(stage, "save-settings", text=text.replace("\n[safety]\n", "\n[safety]\nminimum_off_s = 0.5\n"))
-        wait_for(lambda: "service-ended" in codes(stage))
+        wait_for(lambda: codes(stage).count("service-started") == 2 and codes(stage)[-1] == "playing")
         until(stage, playing)
         assert (strikes(stage), all(lamps(stage).values())) == (struck, True)
         assert any("User " in row["text"] for row in ask(stage, "events") if row["code"] == "done-by")

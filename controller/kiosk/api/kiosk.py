@@ -321,11 +321,8 @@ class StageKiosk(FolderKiosk):
 
     def save_settings(self, text: str) -> None:
         with self._idle():
-            settings.save(self.stage, text)
+            settings.save(self.stage, text if settings.text(self.stage) else settings.with_own_key(self.stage, text))
             self.take_over()
-
-    def set_up(self, text: str) -> None:
-        self.save_settings(settings.with_own_key(self.stage, text))
 
     @property
     def _in_use(self) -> StageTables:

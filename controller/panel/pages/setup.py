@@ -58,7 +58,7 @@ class Setup:
         try:
             devices = await self._panel.ask(lambda: list(self._panel.kiosk.find_devices()))
             text = stage_text(sent.texts.get("name", ""), [device for device in devices if device.key in chosen])
-            await self._panel.ask(lambda: self._panel.kiosk.set_up(text))
+            await self._panel.ask(lambda: self._panel.kiosk.save_settings(text))
         except answers.FAILURES as error:
             return await self._pages.show(
                 "settings.html", visitor, {"text": text, "problem": error, "here": "/settings"}, 422

@@ -211,9 +211,6 @@ class MemoryKiosk:
     def record(self, code: str, what: str, level: EventLevel = "info") -> None:
         self.recorded.append((code, what))
 
-    def set_up(self, text: str) -> None:
-        self.save_settings(text)
-
     def test_alerts(self) -> None:
         raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.", remedy="Name somebody.")
 
