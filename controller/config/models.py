@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 from pydantic import Field
 
 from controller.config.table import ConfigTable, Name, OpenConfigTable, Positive, Seconds, Size
-from controller.config.upkeep import AlertsTable, DiskTable
+from controller.config.upkeep import AlertsTable, BackupTable, DiskTable
 from hal.values import LampRules
 
 __all__ = ["ConfigTable", "Name", "OpenConfigTable", "Positive", "Seconds", "Size"]
@@ -293,4 +293,5 @@ class StageTables(ConfigTable):
         default=(), description="a list of [[appearances]] tables"
     )
     disk: DiskTable = Field(default_factory=DiskTable, description="the table [disk]")
+    backup: BackupTable = Field(default_factory=BackupTable, description="the table [backup]")
     alerts: AlertsTable = Field(default_factory=AlertsTable, description="the table [alerts]")

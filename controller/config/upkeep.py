@@ -1,4 +1,4 @@
-"""The tables of stage.toml on what a kiosk does while nobody looks: its disk, and whom it tells."""
+"""The tables of stage.toml on what a kiosk does while nobody looks: its disk, its backups, and whom it tells."""
 
 from __future__ import annotations
 
@@ -20,6 +20,18 @@ class DiskTable(ConfigTable):
     keep_runs: int = Field(
         default=5, ge=2, le=10_000, description="how many runs of each kind are never removed, 2 to 10000"
     )
+
+
+class BackupTable(ConfigTable):
+    folder: str | None = Field(
+        default=None, min_length=1,
+        description="the folder that gets a backup every night, best on another disk; relative to the stage's folder; "
+        "if omitted: no backup",
+    )  # fmt: skip
+    at: str = Field(
+        default="04:30", pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", description='the local time "HH:MM" of the backup'
+    )
+    keep: int = Field(default=7, ge=1, le=366, description="how many backups stay in the folder, 1 to 366")
 
 
 class AlertsTable(ConfigTable):

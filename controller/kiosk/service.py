@@ -24,6 +24,7 @@ from controller.kiosk.jobs.job_runner import JobRunner
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.nightly_backup import NightlyBackup
 from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.bundle_watch import BundleWatch
@@ -47,6 +48,7 @@ from hal.interfaces import ButtonPanel
 STEP_S: Final = 0.25
 LOOK_S: Final = 1.0
 DISK_S: Final = 5.0
+BACKUP_S: Final = 20.0
 END_WORK_S: Final = 30.0
 AFTER_CRASH_S: Final = 5.0
 
@@ -93,6 +95,10 @@ class Service:
             stage.folder, lambda: self.checked.stage.tables.disk, self.bundles, log,
             busy=lambda: self.jobs.running is not None,
         )  # fmt: skip
+        self.backups = NightlyBackup(
+            stage.folder, lambda: self.checked.stage.tables.backup, lambda: self.schedule.now.time_zone, log,
+            busy=lambda: self.jobs.running is not None,
+        )  # fmt: skip
         self.alerts = Alerts(
             stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log
         )
@@ -115,6 +121,7 @@ class Service:
         self._thread("bundles", self.bundle_watch.step, LOOK_S)
         self._thread("disk", self.disk.step, DISK_S)
         self._thread("alerts", self.alerts.step, LOOK_S)
+        self._thread("backups", self.backups.step, BACKUP_S)
         for projector in self.devices.projectors:
             self._thread(f"projector {projector.name}", projector.step, LOOK_S)
         for supervisor in self.devices.others:

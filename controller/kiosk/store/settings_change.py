@@ -18,7 +18,7 @@ from controller.stage.check import Checked, check_stage
 GOOD: Final = "kiosk/stage.toml.good"
 """A copy of the stage.toml that the kiosk last ran with."""
 _READ_WHEN_NEEDED: Final = frozenset(
-    {"stage", "object", "capture", "calibration", "solve", "appearances", "disk", "alerts"}
+    {"stage", "object", "capture", "calibration", "solve", "appearances", "disk", "backup", "alerts"}
 )
 """Tables that no device and no supervisor depends on."""
 
