@@ -18,6 +18,8 @@ from controller.core.errors import VelaturaError
 from controller.core.storage import write_atomically
 
 MOST_FAILED_STARTS: Final = 3
+MISSING: Final = "missing"
+"""What was given up, where the bundle's file is gone."""
 _LARGEST_BYTES: Final = 4096
 
 
@@ -68,7 +70,7 @@ class CountedStart:
         if failing and earlier is not None and earlier.name not in (name, starts.given_up):
             why = f"The bundle {name} showed no picture in {starts.failed} starts" if name else "The bundle is missing"
             tell(f"{why}; {earlier.name} plays again.")
-            now, starts = earlier, Starts(earlier.name, 0, name or None)
+            now, starts = earlier, Starts(earlier.name, 0, name or MISSING)
         self.file = folder / CURRENT if now is None else now
         self._starts = replace(starts, failed=starts.failed + 1)
         if now is not None:

@@ -25,6 +25,8 @@ _TYPES: Final[Mapping[str, Any]] = {"integer": int, "number": float, "boolean": 
 _COMPLETE: Final = {"appearance": appearance_names, "projector": projector_names, "": None}
 NoWait = Annotated[bool, typer.Option("--no-wait", help="Do not wait for the end of the job.")]
 
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. Scripts are never asked.")]
+
 
 def commands(group: str = "", operations: Sequence[Operation] = OPERATIONS) -> tuple[Callable[..., None], ...]:
     """The commands of one group, "" for those of one word."""
@@ -39,8 +41,10 @@ def commands(group: str = "", operations: Sequence[Operation] = OPERATIONS) -> t
 def command(operation: Operation, name: str) -> Callable[..., None]:
     """A function as typer takes it; its signature and help are the operation's."""
 
-    def run(stage: Path, as_json: bool, no_wait: bool = False, **given: Any) -> None:
+    def run(stage: Path, as_json: bool, no_wait: bool = False, yes: bool = False, **given: Any) -> None:
         arguments = {field.name: _value(field, given.get(field.name)) for field in operation.fields}
+        if operation.asks and not yes and sys.stdin.isatty():
+            typer.confirm(operation.question(arguments), abort=True)
         if operation.effect is Effect.WORKS and not no_wait:
             job(stage, operation.socket_name, arguments, as_json=as_json)
             return
@@ -54,6 +58,8 @@ def command(operation: Operation, name: str) -> Callable[..., None]:
     parameters += [_parameter(field.name, *_typed(field)) for field in operation.fields if not field.secret]
     if operation.effect is Effect.WORKS:
         parameters.append(_parameter("no_wait", NoWait, False))
+    if operation.asks:
+        parameters.append(_parameter("yes", Yes, False))
     parameters.append(_parameter("as_json", Json, False))
     vars(run)["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

@@ -21,9 +21,9 @@ from controller.kiosk.api.control import NAME, ControlServer
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.panel_address import PanelAccess, addresses, keep_first_login
-from controller.kiosk.service import serving
+from controller.kiosk.service import Service, serving
 from controller.kiosk.store.accounts import FOLDER
-from controller.panel.mqtt.options import BrokerOptions
+from controller.panel.mqtt.options import BrokerOptions, check_broker
 from controller.play.control.notify import Notifier
 from controller.run.progress import Level, Reporter
 from hal.errors import DeviceError
@@ -94,7 +94,7 @@ def serve(
                         reporter.say(f"The kiosk {stage.name} is running.")
                         first = False
                         notifier.ready()
-                    _wait(kiosk, cancel)
+                    _wait(kiosk, cancel, over=_Correction(kiosk, service))
                 kiosk.detach()
             except (VelaturaError, DeviceError) as error:
                 if first and not setup:
@@ -112,6 +112,29 @@ def serve(
     return {"served": str(stage)}
 
 
+def _signature(stage: Path) -> tuple[int, int]:
+    """Which changes with stage.toml."""
+    with contextlib.suppress(OSError):
+        found = (stage / FILE).stat()
+        return found.st_mtime_ns, found.st_size
+    return 0, 0
+
+
+class _Correction:
+    """Takes over a stage.toml that was damaged when the service started, once it is in order; always False."""
+
+    def __init__(self, kiosk: StageKiosk, service: Service) -> None:
+        self._kiosk, self._service, self._seen = kiosk, service, _signature(kiosk.stage)
+
+    def __call__(self) -> bool:
+        now = _signature(self._kiosk.stage)
+        if self._service.problem is not None and now != self._seen:
+            self._seen = now
+            with contextlib.suppress(VelaturaError):
+                self._kiosk.take_over()
+        return False
+
+
 def _check_panel(where: PanelAddress) -> None:
     """Before any device is opened. Raises what the panel's start would raise, and UsageError("file-unreadable")."""
     from controller.core.files import require_regular
@@ -125,6 +148,8 @@ def _check_panel(where: PanelAddress) -> None:
         except OSError as error:
             raise UsageError("file-unreadable", what=f"{file} can't be read: {error.strerror}.",
                              remedy="Check the path, or omit the option.") from error  # fmt: skip
+    if where.broker is not None:
+        check_broker(where.broker)
     check_port(where.host, where.port)
 
 

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from controller.config.lines import KeyLines, KeyPath
 from controller.config.models import ConfigTable, OpenConfigTable, StageTables
 from controller.config.problems import Place
+from controller.config.upkeep import AlertsTable
 from controller.core.errors import UsageError
 from controller.core.files import UnfitFile, read_bytes
 from controller.core.text import printable
@@ -37,14 +38,14 @@ class Stage:
         return self.folder / relative
 
 
-def load_stage(path: Path) -> Stage:
-    """Read ``path``: a stage folder or its stage.toml.
+def load_stage(path: Path, *, instead: Path | None = None) -> Stage:
+    """Read ``path``: a stage folder or its stage.toml. ``instead``: the file that is read in the place of stage.toml.
 
     Raises UsageError with code "stage-missing", "stage-unreadable", "stage-syntax", "stage-key-unknown",
     "stage-key-missing", "stage-key-type" or "stage-key-value"; all but the first two name the line.
     """
     file = path / FILE if path.is_dir() else path
-    content, place = read_toml(file)
+    content, place = read_toml(instead or file)
     return Stage(file.parent.resolve(), parse_stage(content, place))
 
 
@@ -230,6 +231,7 @@ def _check_agreement(tables: StageTables) -> None:
     _all_different(tables.appearances, "name")
     _all_different(tables.relays, "name")
     _check_mains(tables)
+    _check_alerts(tables.alerts)
     outputs = [output.name for output in tables.display.outputs]
     if not outputs:
         return  # real windows: only the display itself knows its outputs
@@ -242,6 +244,17 @@ def _check_agreement(tables: StageTables) -> None:
         if projector.output not in outputs:
             problem = "is not an output of the display"
             raise projector.place.wrong_value("output", projector.output, problem, f"one of {listed}")
+
+
+def _check_alerts(alerts: AlertsTable) -> None:
+    """Mail needs a sender and a server, and no password crosses a network without encryption."""
+    if alerts.mail_to:
+        for key in ("mail_from", "mail_host"):
+            if getattr(alerts, key) is None:
+                raise alerts.place.missing(key, str(AlertsTable.model_fields[key].description), written=[])
+    if alerts.mail_user is not None and alerts.mail_security == "none":
+        problem = "would send the password without encryption"
+        raise alerts.place.wrong_value("mail_security", "none", problem, '"starttls" or "tls", or no mail_user')
 
 
 def _check_mains(tables: StageTables) -> None:

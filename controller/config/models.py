@@ -2,57 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+from pydantic import Field
 
-from controller.config.problems import Place, check_keys
+from controller.config.table import ConfigTable, Name, OpenConfigTable, Positive, Seconds, Size
+from controller.config.upkeep import AlertsTable, BackupTable, DiskTable
 from hal.values import LampRules
 
-Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f/\\]+$")]
-Seconds = Annotated[float, Field(ge=0, le=86_400)]
-Positive = Annotated[float, Field(gt=0)]
-Size = Annotated[int, Field(ge=1, le=16_384)]
-
-
-class ConfigTable(BaseModel):
-    """A table of stage.toml; knows where it stands in the file."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
-    _place: Place | None = PrivateAttr(default=None)
-
-    @property
-    def place(self) -> Place:
-        """Where errors about this table's keys point to."""
-        if self._place is None:
-            raise ValueError("this table was not read from a file")
-        return self._place
-
-    def placed(self, place: Place) -> Self:
-        self._place = place
-        return self
-
-
-class OpenConfigTable(ConfigTable):
-    """A table with further keys that only somebody else understands: a driver, or a kind of appearance."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="allow", allow_inf_nan=False)
-
-    def settings(self, allowed: Mapping[str, str], required: tuple[str, ...] = ()) -> dict[str, Any]:
-        """The keys written in this table that the other side understands, Velatura's own among them, checked.
-
-        ``allowed`` maps each key to what it may be. Raises UsageError("stage-key-unknown", "stage-key-missing").
-        """
-        written = {key: _plain(value) for key, value in self.model_dump(exclude_unset=True).items()}
-        own = {key: field.description or "" for key, field in type(self).model_fields.items()}
-        check_keys(self.place, written, {**own, **allowed}, required)
-        return {key: value for key, value in written.items() if key in allowed}
-
-
-def _plain(value: Any) -> Any:
-    """As TOML has it: lists, not tuples."""
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+__all__ = ["ConfigTable", "Name", "OpenConfigTable", "Positive", "Seconds", "Size"]
 
 
 class StageTable(ConfigTable):
@@ -143,11 +101,11 @@ class CaptureTable(ConfigTable):
 
 class CalibrationTable(ConfigTable):
     worst_grade: float = Field(
-        default=8.0,
+        default=4.0,
         gt=0,
         le=1000,
         description="the largest prediction error, in per cent, at which a calibration may be published, above 0, at "
-        "most 1000",
+        "most 1000; the default refuses grade C",
     )
     photograph_at_night: bool = Field(
         default=False,
@@ -334,3 +292,6 @@ class StageTables(ConfigTable):
     appearances: Annotated[tuple[AppearanceTable, ...], Field(strict=False)] = Field(
         default=(), description="a list of [[appearances]] tables"
     )
+    disk: DiskTable = Field(default_factory=DiskTable, description="the table [disk]")
+    backup: BackupTable = Field(default_factory=BackupTable, description="the table [backup]")
+    alerts: AlertsTable = Field(default_factory=AlertsTable, description="the table [alerts]")

@@ -54,6 +54,9 @@ class Kiosk(Protocol):
     def events(self, after: int = 0) -> Sequence[EventRow]:
         """Events with a number above ``after``, oldest first, at most the newest 2,000."""
 
+    def record(self, code: str, what: str, level: EventLevel = "info") -> None:
+        """Add one line to the event log: what a person or a program did here, and who it was."""
+
     def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
         """Call ``callback`` (quick, from any thread) after every change of the snapshot or the event log."""
 
@@ -67,6 +70,9 @@ class Kiosk(Protocol):
         """End the running job at its next safe point. Raises WorkError if none is running."""
 
     def play(self, name: str) -> None: ...
+
+    def rotate(self) -> None:
+        """Show all appearances in turn, as the bundle's playlist says."""
 
     def stop(self) -> None:
         """Close: stop playing and cool the lamps down."""
@@ -122,6 +128,9 @@ class Kiosk(Protocol):
     def doctor(self) -> Sequence[Finding]:
         """Find problems of the machine, the stage and the devices. Seconds."""
 
+    def test_alerts(self) -> None:
+        """Send a test alert to everybody that stage.toml names. Seconds. Raises UsageError, WorkError."""
+
     def backup(self) -> Path:
         """A new file with settings, calibration, appearances; without secrets. Seconds."""
 
@@ -137,8 +146,14 @@ class Kiosk(Protocol):
     def validate_settings(self, text: str) -> None:
         """Raises UsageError naming line, key and what is allowed."""
 
+    def effect_of_settings(self, text: str) -> str:
+        """What people will see when this text is saved, in sentences; empty if nothing. Raises as above."""
+
     def save_settings(self, text: str) -> None:
-        """Validate, keep the old text in a copy, write, and apply it (devices are reopened). Raises as above."""
+        """Validate, keep the old text in a copy, write, and apply it: only what differs restarts. Raises as above.
+
+        With the first stage.toml the stage gets a signing key, which the text then trusts.
+        """
 
     def camera_picture(self) -> bytes | None:
         """The camera's last live picture as JPEG, made by the kiosk itself; None if there is none."""

@@ -22,6 +22,14 @@ _GET_ADDRESS: Final = 0x8915
 """SIOCGIFADDR: an interface's IPv4 address (netdevice(7))."""
 
 
+def is_loopback(host: str) -> bool:
+    """Whether only this computer reaches ``host``."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 def own_addresses() -> tuple[str, ...]:
     """The IPv4 addresses of this computer in its networks, without those that only itself knows."""
     found = []

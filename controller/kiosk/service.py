@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -14,23 +14,29 @@ from typing import Final
 from controller.core import kiosk_places
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
+from controller.kiosk.alerts.alerts import Alerts
 from controller.kiosk.decide.clock import TrustedClock, beginning
-from controller.kiosk.decide.interfaces import BLACK, Condition, Request
+from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Request
 from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobRunner
-from controller.kiosk.store import archive
+from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.nightly_backup import NightlyBackup
 from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
+from controller.kiosk.supervisors.bundle_watch import BundleWatch
 from controller.kiosk.supervisors.devices import Devices
+from controller.kiosk.supervisors.disk_supervisor import DiskSupervisor
 from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.kiosk.supervisors.lamp_history import LampHistory
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
+from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
+from controller.run.signals import Stop
 from controller.run.state_machine import State
 from controller.stage.calibrations import finished_calibrations, stage_trust
 from controller.stage.check import Checked, check_stage
@@ -41,6 +47,8 @@ from hal.interfaces import ButtonPanel
 
 STEP_S: Final = 0.25
 LOOK_S: Final = 1.0
+DISK_S: Final = 5.0
+BACKUP_S: Final = 20.0
 END_WORK_S: Final = 30.0
 AFTER_CRASH_S: Final = 5.0
 
@@ -48,10 +56,15 @@ AFTER_CRASH_S: Final = 5.0
 class Service:
     """One stage that runs by itself. ``changed`` is called after every step that may have changed something, ``alive``
     by the loop as long as it turns.
+
+    ``problem``: why it runs with older settings than those of stage.toml, or None. ``cools``: the projectors whose
+    lamps are switched off at its end; None: all.
     """
 
-    def __init__(self, checked: Checked, log: EventLog) -> None:
+    def __init__(self, checked: Checked, log: EventLog, problem: Decision | None = None) -> None:
         stage = checked.stage
+        self.problem = problem
+        self.cools: tuple[str, ...] | None = None
         self.checked, self.log, self.stage = checked, log, stage.folder
         self.runtime = runtime_folder(stage.folder)
         self.bundles = BundleStore(stage.folder, stage_trust(stage))
@@ -60,7 +73,8 @@ class Service:
         installed = kiosk_places.is_installed(stage.folder)
         self.player = PlayerSupervisor(self.runtime, self._settings, log.tell, attach=attach if installed else None)
         self.alive: Callable[[], None] = lambda: None
-        self.devices = Devices(checked, self.runtime, log.tell)
+        self.bundle_watch = BundleWatch(self.bundles, log.tell)
+        self.devices = Devices(checked, self.runtime, self._tell)
         self.devices.scene = self._scene
         self.lamp_history = LampHistory(stage.folder)
         handlers = JobHandlers(
@@ -77,6 +91,17 @@ class Service:
             without_time=self.schedule.open_without_time,
             limits=Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
         )  # fmt: skip
+        self.disk = DiskSupervisor(
+            stage.folder, lambda: self.checked.stage.tables.disk, self.bundles, log,
+            busy=lambda: self.jobs.running is not None,
+        )  # fmt: skip
+        self.backups = NightlyBackup(
+            stage.folder, lambda: self.checked.stage.tables.backup, lambda: self.schedule.now.time_zone, log,
+            busy=lambda: self.jobs.running is not None,
+        )  # fmt: skip
+        self.alerts = Alerts(
+            stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log
+        )
         self.changed: Callable[[], None] = lambda: None
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -89,8 +114,14 @@ class Service:
         if self.schedule.problem is not None:
             problem = self.schedule.problem
             self.log.tell(Decision(problem.code, problem.what, problem.remedy, "error"))
+        if self.problem is not None:
+            self.log.tell(self.problem)
         self.reconciler.step()
         self._thread("player", self.player.step, STEP_S)
+        self._thread("bundles", self.bundle_watch.step, LOOK_S)
+        self._thread("disk", self.disk.step, DISK_S)
+        self._thread("alerts", self.alerts.step, LOOK_S)
+        self._thread("backups", self.backups.step, BACKUP_S)
         for projector in self.devices.projectors:
             self._thread(f"projector {projector.name}", projector.step, LOOK_S)
         for supervisor in self.devices.others:
@@ -126,11 +157,13 @@ class Service:
     def end(self, *, leave_lit: bool) -> None:
         """Cancel the job, cool the lamps (unless ``leave_lit``, for the next start), and close everything."""
         self.jobs.close(END_WORK_S)
-        if not leave_lit:
-            self.player.want = BLACK
-            for projector in self.devices.projectors:
+        cooled = [one for one in self.devices.projectors if self.cools is None or one.name in self.cools]
+        if cooled and not leave_lit:
+            if self.cools is None:
+                self.player.want = BLACK
+            for projector in cooled:
                 projector.want_lit = False
-            self._wait_until_dark()
+            self._wait_until_dark(cooled)
         self._stop.set()
         for thread in self._threads:
             thread.join(5.0)
@@ -141,6 +174,12 @@ class Service:
         self.devices.close()
         self.log.tell(Decision("service-ended", "The kiosk has stopped."))
 
+    def use(self, checked: Checked) -> None:
+        """Use settings that differ only in what no device depends on (``settings_change``)."""
+        self.checked, self.problem = checked, None
+        self.devices.use(checked)
+        settings_change.keep_good(checked)
+
     def rows(self) -> tuple[DeviceRow, ...]:
         """Every device as the panel shows it."""
         return (*self.devices.rows(), *(() if self.keys is None else (self.keys.row,)))
@@ -149,6 +188,13 @@ class Service:
         self.reconciler.ask(*requests)
 
     # -- inside
+
+    def _tell(self, decision: Decision) -> None:
+        """A device's event. That nothing can be written is told once, not by each device."""
+        if decision.code == DISK_FULL:
+            self.disk.suspect(decision)
+        else:
+            self.log.tell(decision)
 
     def _settings(self, with_bundle: bool) -> PlayerSettings:
         return player_settings(self.checked.stage, self.runtime, plays=with_bundle)
@@ -184,12 +230,12 @@ class Service:
             projector.want_lit for projector in self.devices.projectors
         )
 
-    def _wait_until_dark(self) -> None:
+    def _wait_until_dark(self, projectors: Sequence[ProjectorSupervisor]) -> None:
         until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
-        while any(one.may_light for one in self.devices.projectors) and time.monotonic() < until_s:
+        while any(one.may_light for one in projectors) and time.monotonic() < until_s:
             self.alive()
             time.sleep(0.1)
-        names = [projector.name for projector in self.devices.projectors if projector.view.maybe_lit]
+        names = [projector.name for projector in projectors if projector.view.maybe_lit]
         if names:
             self.log.tell(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
                                    "Switch it off with its remote control.", "error"))  # fmt: skip
@@ -230,6 +276,14 @@ class Service:
             self.reconciler.ask(Request("quick", light=True))
 
 
+def _usable(stage: Path) -> tuple[Checked, Decision | None]:
+    """The stage's settings, or the last good ones and why. Raises what ``check_stage`` raises."""
+    try:
+        return check_stage(stage), None
+    except UsageError as error:
+        return settings_change.last_good(stage, error)
+
+
 @contextlib.contextmanager
 def serving(
     stage: Path, cancel: threading.Event, *, leave_lit: bool = False, alive: Callable[[], None] = lambda: None
@@ -241,7 +295,7 @@ def serving(
     if (stage / archive.RESTORING).exists():
         with stage_lock(stage):
             archive.finish_restore(stage)
-    checked = check_stage(stage)
+    checked, problem = _usable(stage)
     if checked.stage.tables.display.driver != "player":
         raise UsageError(
             "display-plays-no-bundles",
@@ -252,16 +306,18 @@ def serving(
         archive.clear_cut_off(checked.stage.folder)
         log = EventLog(checked.stage.folder / EventLog.FILE)
         with contextlib.closing(log):
-            service = Service(checked, log)
+            service = Service(checked, log, problem)
             service.alive = alive
             ended = threading.Event()
             loop = threading.Thread(target=service.run, args=(ended,), name="reconciler", daemon=True)
             try:
                 service.start()
                 loop.start()
+                if problem is None:
+                    settings_change.keep_good(checked)
                 yield service
             finally:
                 ended.set()
                 if loop.is_alive():
                     loop.join(10.0)
-                service.end(leave_lit=leave_lit)
+                service.end(leave_lit=leave_lit or (isinstance(cancel, Stop) and cancel.restarting))

@@ -54,7 +54,8 @@ class Job:
 
     ``number`` grows with every job; ``left_s`` None until it is known; ``run`` the run's folder name if the job
     makes one; ``outcome`` a sentence when it ended, with ``failed`` if it failed; ``count`` the number of steps it will
-    have, 0 until that is known; ``steps`` those up to the current one
+    have, 0 until that is known; ``waits`` a sentence on what a job waits for that did not start yet;
+    ``why``: why ``left_s`` rose; ``steps`` those up to the current one
     """
 
     number: int
@@ -67,6 +68,8 @@ class Job:
     failed: bool = False
     outcome: str = ""
     count: int = 0
+    waits: str = ""
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +131,12 @@ class Grade:
 class KioskState:
     """Everything that the panel's first page shows, as of one moment.
 
-    ``state`` is a value of ``controller.run.state_machine.State``; ``reason`` one sentence; ``since_unix_s`` when it
-    began. ``warnings``: sentences on problems that belong to no device (light in the room); ``failures``: failed jobs,
-    as in the event log, until an operator confirms them. ``revision`` grows with every change, also over restarts of
-    the service. ``needs_setup`` is True while the stage has no valid stage.toml.
+    ``state`` is a value of ``controller.run.state_machine.State``; ``reason`` one sentence; ``since_unix_s`` when
+    it began. ``warnings``: sentences on problems that belong to no device (light in the room); ``failures``: failed
+    jobs, as in the event log, until an operator confirms them. ``in_turn``: ``playing`` is one of those that are
+    shown in turn. ``disk_free_bytes``: free space on the stage's disk, in steps of 10 MB, 0 until it is known.
+    ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
+    has no valid stage.toml.
     """
 
     revision: int
@@ -150,6 +155,8 @@ class KioskState:
     needs_setup: bool = False
     warnings: tuple[str, ...] = ()
     failures: tuple[EventRow, ...] = ()
+    in_turn: bool = False
+    disk_free_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.operations.fields import Field, parse
-from controller.kiosk.operations.operation import Answer, Operation, Values
+from controller.kiosk.operations.operation import Answer, Effect, Operation, Values
 from controller.panel.context import Panel
 from hal.errors import DeviceError
 
@@ -47,11 +47,17 @@ def failure(error: Failure) -> Response:
     return JSONResponse({"code": error.code, "what": error.what, "remedy": error.remedy}, status_of(error))
 
 
-async def run(panel: Panel, operation: Operation, values: Values) -> Any:
-    """Run an operation in a thread; keys of uploaded targets become their files. Raises what it raises."""
+async def run(panel: Panel, operation: Operation, values: Values, who: str) -> Any:
+    """Run an operation in a thread; keys of uploaded targets become their files. Raises what it raises.
+
+    The event log has ``who`` asked for it, unless it only looks.
+    """
     targets = [field.name for field in operation.fields if field.kind == "target"]
 
     def do() -> Any:
+        if operation.effect is not Effect.LOOKS:
+            # Before, because some of them end the log's service.
+            panel.kiosk.record("done-by", operation.done_by(who, values))
         files = {name: panel.targets.path(values[name]) for name in targets}
         return operation.of(panel.holders[operation.holder], values | files)
 

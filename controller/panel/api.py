@@ -45,7 +45,7 @@ def body_limits(panel: Panel) -> dict[str, int]:
 
 
 def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
-    async def answer(request: Request, _: Visitor) -> Response:
+    async def answer(request: Request, visitor: Visitor) -> Response:
         uploaded = None
         try:
             values = answers.scalar_values(operation, request)
@@ -54,7 +54,9 @@ def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
                 values[operation.upload.name] = uploaded
             elif operation.changes:
                 values |= await answers.json_values(operation, request)
-            return answers.response(operation, await answers.run(panel, operation, values), values)
+            return answers.response(
+                operation, await answers.run(panel, operation, values, f"Token {visitor.name}"), values
+            )
         except answers.FAILURES as error:
             return answers.failure(error)
         finally:
@@ -165,6 +167,9 @@ class KioskFigures(Collector):
             "velatura_job_running", "1 while a job runs", float(now.job is not None and not now.job.ended)
         )
         yield GaugeMetricFamily("velatura_job_done_ratio", "Progress of the job, the mean of its steps", done)
+        yield GaugeMetricFamily(
+            "velatura_disk_free_bytes", "Free space on the stage's disk", float(now.disk_free_bytes)
+        )
         yield GaugeMetricFamily(
             "velatura_open_panels", "Open panels with live updates", float(self._panel.hub.listening)
         )

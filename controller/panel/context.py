@@ -16,6 +16,7 @@ from controller.kiosk.operations.accounts import AccountActions
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.store.accounts import Accounts
+from controller.panel.auth.refusals import Refusals
 from controller.panel.auth.sessions import LoginLimit, Sessions
 from controller.panel.live import Hub
 from controller.panel.mqtt.options import BrokerOptions
@@ -68,7 +69,11 @@ class Panel:
     hashing: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(2))
     costly: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
     working: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(16))
+    refused: Refusals = field(init=False)
     form_key: bytes = field(default_factory=lambda: secrets.token_bytes(32))
+
+    def __post_init__(self) -> None:
+        self.refused = Refusals(self.kiosk.record)
 
     @property
     def holders(self) -> dict[str, Any]:

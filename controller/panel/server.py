@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import ipaddress
 import socket
 import ssl
 import threading
@@ -14,6 +13,7 @@ import uvicorn
 from starlette.applications import Starlette
 
 from controller.core.errors import UsageError, WorkError
+from controller.kiosk.panel_address import is_loopback
 from controller.panel.context import PanelOptions
 
 START_S = 10.0
@@ -75,11 +75,7 @@ class PanelServer:
 
 def check_exposure(options: PanelOptions) -> None:
     """Raises UsageError("panel-open-without-tls"): passwords must not cross a network unencrypted."""
-    try:
-        loopback = ipaddress.ip_address(options.host).is_loopback
-    except ValueError:
-        loopback = options.host == "localhost"
-    if not loopback and not options.tls:
+    if not is_loopback(options.host) and not options.tls:
         raise UsageError(
             "panel-open-without-tls",
             what=f"The panel would be reachable at {options.host} without TLS.",

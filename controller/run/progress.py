@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from controller.run.time_left import TimeLeft, expected
+
 
 class Phase(enum.Enum):
     """State of a step."""
@@ -31,7 +33,7 @@ class Progress:
 
     ``step`` the step's title; ``index`` its number, from 0, of ``count``; ``fraction`` of the whole run by weight and
     ``step_fraction`` of this step, both 0..1; ``elapsed_s`` since the start; ``left_s`` None until it can be estimated;
-    ``note`` the present work inside the step, or empty
+    ``note`` the present work inside the step, or empty; ``why``: why ``left_s`` rose by more than a fifth, or empty
     """
 
     step: str
@@ -43,6 +45,7 @@ class Progress:
     elapsed_s: float
     left_s: float | None
     note: str = ""
+    why: str = ""
 
 
 class Reporter(Protocol):
@@ -71,6 +74,7 @@ class Tracker:
     ----------
     weights : expected relative cost of each step, > 0 (seconds on the reference machine make the best weights)
     clock : seconds on a monotonic clock
+    measured : seconds that each step took in the last runs, where that is known
     """
 
     def __init__(
@@ -79,10 +83,13 @@ class Tracker:
         weights: Sequence[float],
         reporter: Reporter,
         clock: Callable[[], float] = time.monotonic,
+        measured: Sequence[float | None] = (),
     ) -> None:
         if len(titles) != len(weights) or any(not weight > 0 for weight in weights):
             raise ValueError("every step needs a title and a weight above zero")
-        self._titles, self._weights = tuple(titles), tuple(weights)
+        costs, in_seconds = expected(weights, measured or [None] * len(weights))
+        self._titles, self._weights = tuple(titles), tuple(costs)
+        self._time_left = TimeLeft(costs, in_seconds=in_seconds)
         self._reporter, self._clock = reporter, clock
         self._began_s = clock()
         self._passed = 0.0
@@ -121,7 +128,12 @@ class Tracker:
         fraction = min(1.0, (self._passed + running) / total)
         worked_s = self._worked_s + (now_s - self._step_began_s if phase is Phase.RUNNING else 0.0)
         worked = self._worked + running
-        left_s = worked_s / worked * (total - self._passed - running) if worked > 0 else None
+        left_s = self._time_left.now(
+            worked=worked,
+            worked_s=worked_s,
+            left=max(0.0, total - self._passed - running),
+            title=self._titles[self._index],
+        )
         self._reporter.progress(
             Progress(
                 step=self._titles[self._index],
@@ -131,7 +143,8 @@ class Tracker:
                 fraction=fraction,
                 step_fraction=self._step_fraction if phase is Phase.RUNNING else 1.0,
                 elapsed_s=now_s - self._began_s,
-                left_s=None if left_s is None else max(0.0, left_s),
+                left_s=left_s,
                 note=note,
+                why=self._time_left.reason,
             )
         )

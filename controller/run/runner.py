@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from controller.core.errors import VelaturaError, WorkError
+from controller.run.durations import measured
 from controller.run.journal import Artefact, Journal
 from controller.run.progress import Level, Reporter, Silent, Tracker
 from controller.run.state_machine import Event, Machine
@@ -110,7 +111,9 @@ class Runner:
         WorkError("run-too-slow") when the deadline passes, in both cases between two steps or at a step's ``advance``.
         """
         titles = [step.heading for step in self._steps]
-        tracker = Tracker(titles, [step.weight for step in self._steps], self._reporter, self._clock)
+        took_before = measured(self._journal.folder, [step.id for step in self._steps])
+        weights = [step.weight for step in self._steps]
+        tracker = Tracker(titles, weights, self._reporter, self._clock, took_before)
         results: dict[StepId, tuple[Artefact, ...]] = {}
         with self._journal.run(name):
             try:

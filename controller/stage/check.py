@@ -65,12 +65,14 @@ class Checked:
         return tuple(table.name for table in self.stage.tables.projectors)
 
 
-def check_stage(folder: Path, *, drivers: Drivers | None = None) -> Checked:
+def check_stage(folder: Path, *, drivers: Drivers | None = None, instead: Path | None = None) -> Checked:
     """Read stage.toml and check every key, including the drivers' keys; opens no device.
+
+    ``instead``: the file that is read in the place of stage.toml.
 
     Raises UsageError (see ``controller.config.load_stage``) and PluginError("driver-unknown").
     """
-    stage = load_stage(folder)
+    stage = load_stage(folder, instead=instead)
     drivers = drivers or load_drivers(benches=False)
     tables = stage.tables
 

@@ -36,8 +36,9 @@ def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:
     for folder in sorted(runs.glob(f"*-{name}"), reverse=True):
         if (folder / Journal.FILE).exists():
             with Journal(folder) as journal:
-                outcomes = journal.outcomes()
-            if finished or not outcomes or outcomes[-1][1] != "done":
+                # Appearances are made in the folder of their calibration: that one failed does not leave it unfinished.
+                outcomes = [outcome for run, outcome in journal.outcomes() if run == name]
+            if finished or not outcomes or outcomes[-1] != "done":
                 return folder
             break
     stamp = time.strftime("%Y%m%d-%H%M%S")

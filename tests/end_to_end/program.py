@@ -120,8 +120,9 @@ class Command:
         assert any(map(reached, self.records)), f"{what} was not reached: {self.records[-1:]}"
 
     def limit_files_to(self, size: int) -> None:
-        """From now on the process can't make a file larger than that, as on a disk that is nearly full."""
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (size, size))
+        """The process can make no larger file from now on, as on a disk that is nearly full; -1: no limit."""
+        _, hard = resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (size, hard))
 
     def interrupt(self) -> Outcome:
         """Ctrl-C, and what comes of it."""

@@ -38,13 +38,15 @@ def kiosk(finished_demo: FinishedDemo, tmp_path: Path) -> Iterator[StageKiosk]:
     log.close()
 
 
-def ended(kiosk: StageKiosk, job: Job) -> Job:
-    """After its end was taken note of."""
+def ended(kiosk: StageKiosk, job: Job, states: set[str] | None = None) -> Job:
+    """After its end was taken note of. ``states``: what the kiosk said of itself meanwhile."""
     service, done = kiosk.service, threading.Event()
 
     def look() -> bool:
         service.reconciler.step()
         service.changed()
+        if states is not None:
+            states.add(kiosk.snapshot().state)
         known = kiosk.job(job.number)
         if known is not None and known.ended:
             # What follows from it is another test's.
@@ -70,8 +72,11 @@ def test_an_upload_of_another_size_becomes_a_target_and_an_appearance(kiosk: Sta
     assert picture.shape == (CAMERA_PX[1], CAMERA_PX[0], 4)
     assert kiosk.feasibility(target).read_bytes().startswith(b"\x89PNG")
     assert kiosk.feasibility(tmp_path / "phone.png").read_bytes().startswith(b"\x89PNG")
-    job = ended(kiosk, kiosk.compute("phone", tmp_path / "phone.png"))
+    kiosk.stop()
+    states = set[str]()
+    job = ended(kiosk, kiosk.compute("phone", tmp_path / "phone.png"), states)
     assert not job.failed, job.outcome
+    assert "solving" in states, "a closed stage that computes is not only closed"
     assert "phone" in [one.name for one in kiosk.appearances()]
     assert kiosk.snapshot().failures == ()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -66,6 +67,7 @@ def settings(
     stage: StageFolder,
     check: Annotated[Path | None, typer.Option(help="Check this stage.toml only.")] = None,
     save: Annotated[Path | None, typer.Option(help="Check this stage.toml and use it.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask. Scripts are never asked.")] = False,
     as_json: Json = False,
 ) -> None:
     """Print stage.toml, check another one, or replace it."""
@@ -84,6 +86,13 @@ def settings(
         text = read_text(file)
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError("file-unreadable", what=f"{file} can't be read.", remedy="Give a text file.") from error
+    if (
+        save is not None
+        and not yes
+        and sys.stdin.isatty()
+        and (effect := _call(stage, "effect-of-settings", text=text))
+    ):
+        typer.confirm(f"{effect} Save?", abort=True)
     _done(stage, op, said, as_json=as_json, text=text)
 
 

@@ -6,7 +6,9 @@ import base64
 import contextlib
 import json
 import os
+import pwd
 import socket
+import struct
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, is_dataclass
@@ -15,6 +17,7 @@ from typing import Any, Final
 
 from controller.core.errors import UsageError, VelaturaError
 from controller.core.storage import runtime_folder
+from controller.kiosk.operations.dispatch import CALLER
 from hal.errors import DeviceError
 
 NAME: Final = "kiosk.sock"
@@ -68,6 +71,7 @@ class ControlServer:
 
     def _serve(self, channel: socket.socket) -> None:
         try:
+            CALLER.set(_user_of(channel))
             with channel, channel.makefile("rwb") as lines:
                 while line := lines.readline(LONGEST_LINE + 1):
                     lines.write(json.dumps(self._answer(line)).encode() + b"\n")
@@ -98,6 +102,15 @@ class ControlServer:
         except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it answers and continues
             what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
             return _error("crash", what, "Export the diagnostics.")
+
+
+def _user_of(channel: socket.socket) -> str:
+    """The name of the user whose program is at the other end, or the number of one without a name."""
+    _, uid, _ = struct.unpack("3i", channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
 
 
 def _error(code: str, what: str, remedy: str) -> dict[str, Any]:

@@ -62,6 +62,10 @@ class FolderKiosk:
     def validate_settings(self, text: str) -> None:
         settings.validate(text)
 
+    def effect_of_settings(self, text: str) -> str:
+        settings.validate(text)
+        return ""
+
     def save_settings(self, text: str) -> None:
         settings.save(self.stage, text)
 

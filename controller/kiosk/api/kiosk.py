@@ -5,22 +5,25 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from controller.config.models import StageTables
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.api import aim, finding
 from controller.kiosk.api.control import plain
 from controller.kiosk.api.folder import FolderKiosk, appearances_of
 from controller.kiosk.api.snapshot import Snapshots
-from controller.kiosk.decide.interfaces import Request
+from controller.kiosk.decide.interfaces import IN_TURN, Request
 from controller.kiosk.interface import (
     Aiming,
     Appearance,
     Comparison,
+    EventLevel,
     EventRow,
     Finding,
     Fit,
@@ -37,12 +40,16 @@ from controller.kiosk.interface import (
 from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.operations.accounts import AccountActions
 from controller.kiosk.service import Service
-from controller.kiosk.store import archive, runs, settings, targets
+from controller.kiosk.store import archive, runs, settings, settings_change, targets
 from controller.kiosk.store.accounts import Accounts, stage_accounts
+from controller.kiosk.store.event_log import Decision
+from controller.stage.check import check_stage
 
 NOTICE_S: Final = 900.0
 """The longest time for a text on the projectors, so that no lamp burns for it all night."""
 AIMING_S: Final = 900.0
+MOST_UNLOGGED: Final = 200
+"""Lines for the event log of a service that does not run yet."""
 _REVISIONS: Final = 1_000_000_000
 
 
@@ -68,6 +75,7 @@ class StageKiosk(FolderKiosk):
         self._snapshots = Snapshots(stage)
         self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
         self._notice_ends_s = float("inf")
+        self._unlogged: deque[Decision] = deque(maxlen=MOST_UNLOGGED)
 
     def attach(self, service: Service | None, reason: str = "") -> None:
         """Use this service from now on; None with the ``reason`` why there is none."""
@@ -82,6 +90,8 @@ class StageKiosk(FolderKiosk):
                 service.log.keep("starts", str(starts))
                 self._last = replace(self._last, revision=starts * _REVISIONS)
                 service.changed = self._refresh
+                while self._unlogged:
+                    service.log.tell(self._unlogged.popleft())
                 self._show_notice()
         self._notify()
 
@@ -142,6 +152,14 @@ class StageKiosk(FolderKiosk):
 
     def events(self, after: int = 0) -> Sequence[EventRow]:
         return () if self._service is None else self._service.log.after(after)
+
+    def record(self, code: str, what: str, level: EventLevel = "info") -> None:
+        decision = Decision(code, what, "", level)
+        with self._lock:
+            if self._service is not None:
+                self._service.log.tell(decision)
+            else:
+                self._unlogged.append(decision)
 
     def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
         with self._lock:
@@ -204,6 +222,11 @@ class StageKiosk(FolderKiosk):
         service.reconciler.choose(name)
         service.reconciler.open()
 
+    def rotate(self) -> None:
+        service = self.service
+        service.reconciler.choose(IN_TURN)
+        service.reconciler.open()
+
     def stop(self) -> None:
         self.service.reconciler.shut()
 
@@ -240,7 +263,9 @@ class StageKiosk(FolderKiosk):
 
     def remove_appearance(self, name: str) -> None:
         service = self.service
-        if name == self._last.playing or name in [row.appearance for row in service.schedule.now.rows]:
+        if (name == self._last.playing and not self._last.in_turn) or name in [
+            row.appearance for row in service.schedule.now.rows
+        ]:
             raise UsageError("appearance-in-use", what=f"{name} is playing, or it is in the schedule.",
                              remedy="Play another one, and remove it from the schedule.")  # fmt: skip
         with service.reconciler.idle():
@@ -274,18 +299,48 @@ class StageKiosk(FolderKiosk):
     def doctor(self) -> Sequence[Finding]:
         return finding.findings(self.stage, self._service)
 
+    def test_alerts(self) -> None:
+        self.service.alerts.test()
+
     def restore(self, backup: Path) -> None:
         with self._idle():
             archive.restore(self.stage, backup)
+            service = self._service
+            if service is not None:
+                after = check_stage(self.stage).stage.tables
+                service.cools = settings_change.change(self._in_use, after).lamps
             self.reload.set()
 
     def diagnostics(self) -> Path:
         return archive.diagnostics(self.stage, {"state": plain(self._last), "events": plain(self.events())})
 
+    def effect_of_settings(self, text: str) -> str:
+        settings.validate(text)
+        after = settings.tables_of(text)
+        return "" if self._service is None else settings_change.change(self._in_use, after).warning(self.stage)
+
     def save_settings(self, text: str) -> None:
         with self._idle():
-            settings.save(self.stage, text)
+            settings.save(self.stage, text if settings.text(self.stage) else settings.with_own_key(self.stage, text))
+            self.take_over()
+
+    @property
+    def _in_use(self) -> StageTables:
+        return self.service.checked.stage.tables
+
+    def take_over(self) -> None:
+        """Use stage.toml as it is now: at once, or by a restart of what has to be opened again."""
+        service = self._service
+        if service is None:
             self.reload.set()
+            return
+        checked = check_stage(self.stage)
+        found = settings_change.change(self._in_use, checked.stage.tables)
+        if not found.restarts:
+            service.use(checked)
+            return
+        service.cools = found.lamps
+        self.reload.set()
 
     def _idle(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext() if self._service is None else self._service.reconciler.idle()

@@ -6,9 +6,11 @@ import time
 from pathlib import Path
 from typing import Final
 
-from controller.kiosk.interface import BundleIdentity, DeviceRow, Grade, KioskState
+from controller.kiosk.interface import BundleIdentity, DeviceRow, Grade, Job, KioskState
+from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
+from controller.run.state_machine import State
 
 GRADES_EVERY_S: Final = 10.0
 
@@ -23,8 +25,9 @@ class Snapshots:
 
     def of(self, service: Service, revision: int) -> KioskState:
         """The state now; the grades come from the disk and may be some seconds old."""
-        machine, shown = service.reconciler.machine, service.player.view.shown
-        state = machine.state.value
+        shown, wanted = service.player.view.shown, service.player.want
+        job = self._job(service)
+        state, reason = self._state(service, job)
         if self._since[0] != state:
             self._since = (state, time.time())
         at_s, grades = self._grades
@@ -39,11 +42,13 @@ class Snapshots:
             revision=revision,
             stage=service.checked.stage.tables.stage.name,
             state=state,
-            reason=machine.reason,
+            reason=reason,
             since_unix_s=self._since[1],
-            devices=(*service.rows(), self._player_row(service), *self._disk_row(service)),
-            job=service.jobs.job,
+            devices=(*service.rows(), self._player_row(service), service.disk.row),
+            job=job,
             playing=shown.appearance if shown is not None else "",
+            disk_free_bytes=service.disk.free_bytes,
+            in_turn=shown is not None and bool(shown.appearance) and bool(wanted is not None and wanted.in_turn),
             next_event=service.reconciler.plan.next,
             bundle=identity,
             lamps=service.lamps,
@@ -53,17 +58,27 @@ class Snapshots:
             failures=service.log.failures,
         )
 
+    def _job(self, service: Service) -> Job | None:
+        """The job that runs, or waits for its lamps; else the last one."""
+        waiting = service.reconciler.waiting
+        if waiting is None or not waiting.light:
+            return service.jobs.job
+        number = waiting.number or service.jobs.number + 1
+        return Job(number, title_of(waiting), waits="It starts when the lamps are lit and steady.")
+
+    def _state(self, service: Service, job: Job | None) -> tuple[str, str]:
+        """A closed stage that computes is not only closed."""
+        machine, request = service.reconciler.machine, service.jobs.running
+        if machine.state is not State.OFF or request is None or job is None or job.ended:
+            return machine.state.value, machine.reason
+        state = State.PUBLISHING if request.kind == "publish" else State.SOLVING
+        return state.value, f"{job.name}. The stage is closed, and the lamps are off."
+
     def _warnings(self, service: Service) -> tuple[str, ...]:
-        said = service.player.view.warning
-        return service.devices.warnings if said is None else (*service.devices.warnings, said.text)
+        said = (service.problem, service.player.view.warning, service.bundle_watch.warning)
+        return (*service.devices.warnings, *(one.text for one in said if one is not None))
 
     def _player_row(self, service: Service) -> DeviceRow:
         problem = service.player.view.problem
         what, remedy = (None, "") if problem is None else (problem.reason, problem.remedy)
         return DeviceRow("player", "display", "player", (), what, remedy)
-
-    def _disk_row(self, service: Service) -> tuple[DeviceRow, ...]:
-        if service.log.problem is None:
-            return ()
-        remedy = "Free some space on the disk. Playback continues."
-        return (DeviceRow("disk", "disk", "", (), f"The event log can't be written: {service.log.problem}.", remedy),)

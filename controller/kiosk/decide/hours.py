@@ -12,6 +12,7 @@ from typing import Final
 from zoneinfo import ZoneInfo
 
 from controller.core.errors import UsageError
+from controller.kiosk.decide.interfaces import IN_TURN
 from controller.kiosk.interface import Schedule, ScheduleRow
 
 WEEKDAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
@@ -60,9 +61,13 @@ def check_schedule(schedule: Schedule, appearances: Collection[str] | None = Non
         for text in (row.opens, row.closes):
             if text and not _TIME.fullmatch(text):
                 raise _wrong(f"A time of row {number}", text, '"HH:MM", from 00:00 to 23:59')
-        if row.appearance and appearances is not None and row.appearance not in appearances:
+        if row.appearance not in ("", IN_TURN) and appearances is not None and row.appearance not in appearances:
             known = ", ".join(sorted(appearances))
-            allowed = f"one of {known}" if known else "none, because the stage has no appearances yet"
+            allowed = (
+                f"one of {known}, or {IN_TURN} for all in turn"
+                if known
+                else "none, because the stage has no appearances yet"
+            )
             raise _wrong(f"The appearance of row {number}", row.appearance, allowed)
 
 

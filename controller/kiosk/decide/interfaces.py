@@ -6,10 +6,13 @@ import enum
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeAlias
 
 from controller.kiosk.store.event_log import Decision
 from hal.values import Power
+
+DISK_FULL: Final = "disk-full"
+"""The code of the one problem that several devices may have because nothing can be written."""
 
 
 class Condition(enum.Enum):
@@ -59,12 +62,24 @@ class ProjectorPort(Protocol):
     def view(self) -> ProjectorView: ...
 
 
+Turn: TypeAlias = tuple[str, float, float]
+"""An appearance's name, the seconds for which it is shown, and those of them in which it fades in."""
+IN_TURN: Final = "*"
+"""In the place of an appearance's name: all of the bundle, in turn."""
+
+
 @dataclass(frozen=True, slots=True)
 class Showing:
-    """What the player is to show: an appearance of a bundle. ``appearance`` empty: black."""
+    """What the player is to show: an appearance of a bundle. ``appearance`` empty: black.
+
+    ``in_turn``: what is shown in turn without end; ``appearance`` is the first of them then. ``fade_s``: for how long
+    a single one comes in.
+    """
 
     bundle: Path | None
     appearance: str = ""
+    in_turn: tuple[Turn, ...] = ()
+    fade_s: float = field(default=0.0, compare=False)
 
 
 BLACK: Final = Showing(None)
@@ -100,6 +115,9 @@ class Bundles(Protocol):
 
     def names(self) -> Sequence[str]:
         """The appearances of the installed bundle."""
+
+    def playlist(self) -> Sequence[Turn]:
+        """What the installed bundle suggests to show in turn; may be empty."""
 
     def without(self, missing: Collection[str], appearance: str) -> Path | None:
         """The bundle solved without these projectors from the same calibration, or None.

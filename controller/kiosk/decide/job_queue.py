@@ -31,6 +31,10 @@ class JobQueue:
         return self._jobs.running or (self._queue[0] if self._queue else None)
 
     @property
+    def running(self) -> bool:
+        return self._jobs.running is not None
+
+    @property
     def needs_light(self) -> bool:
         """Whether the running or next job needs the lamps."""
         return self.head is not None and self.head.light

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from controller.kiosk.decide.interfaces import IN_TURN
 from controller.kiosk.decide.planner import Plan
 from controller.kiosk.store.event_log import Decision, EventLog
 
@@ -68,13 +69,14 @@ class OperatorOverrides:
 
     def choose(self, appearance: str, plan: Plan) -> None:
         self._choose(appearance)
-        self._log.tell(Decision("asked", f"An operator chose the appearance {appearance}."))
+        what = "all appearances in turn" if appearance == IN_TURN else f"the appearance {appearance}"
+        self._log.tell(Decision("asked", f"An operator chose {what}."))
 
     def appearance(self, plan: Plan, names: Sequence[str]) -> str:
-        """The chosen one if the bundle has it, else the scheduled one, else the first; empty if the bundle has none."""
-        if self._chosen in names:
-            return self._chosen
-        return plan.appearance if plan.appearance in names else names[0] if names else ""
+        """The chosen one if the bundle has it, else the scheduled one, else ``IN_TURN``; empty if there is none."""
+        if not names:
+            return ""
+        return next((name for name in (self._chosen, plan.appearance) if name in (*names, IN_TURN)), IN_TURN)
 
     def _choose(self, appearance: str) -> None:
         self._chosen = appearance

@@ -95,6 +95,12 @@ class Reconciler:
         with self._lock:
             return self._queue.head is not None
 
+    @property
+    def waiting(self) -> Request | None:
+        """The job that starts next, once its lamps are steady; None while one runs."""
+        with self._lock:
+            return None if self._queue.running else self._queue.head
+
     def waits(self, number: int) -> bool:
         """Whether the job of this number waits to start."""
         with self._lock:
@@ -299,7 +305,8 @@ class Reconciler:
 
 
 def _reasons(views: Sequence[ProjectorView]) -> str:
-    return " ".join(view.problem.text for view in views if view.problem is not None)
+    # One reason that all have is said once.
+    return " ".join(dict.fromkeys(view.problem.text for view in views if view.problem is not None))
 
 
 _FAULTY: Final = Decision(

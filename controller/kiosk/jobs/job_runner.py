@@ -53,7 +53,8 @@ class JobReporter:
             self._steps = [JobStep("", 0.0)] * now.count
         done = 1.0 if now.phase is not Phase.RUNNING else now.step_fraction
         self._steps[now.index] = JobStep(now.step, done)
-        self.job = replace(self.job, steps=tuple(self._steps[: now.index + 1]), left_s=now.left_s, count=now.count)
+        self.job = replace(self.job, steps=tuple(self._steps[: now.index + 1]), left_s=now.left_s, count=now.count,
+                           why=now.why)  # fmt: skip
         self._changed()
 
     def say(self, text: str, level: Level = Level.INFO) -> None:

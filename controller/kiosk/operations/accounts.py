@@ -88,9 +88,10 @@ ACCOUNT_OPERATIONS: Final = (
               command="account password", said="The new password is in use."),
     _declared("remove-account", "Remove an account, and end its sessions", Effect.CHANGES, fields=(_NAME,),
               answer=Answer.NOTHING, http=("DELETE", "/accounts/{name}"), command="account remove",
-              said="{name} is removed."),
+              said="{name} is removed.", asks="Remove the account {name}?"),
     _declared("add-token", "Add an API token; it is shown only once", Effect.CHANGES, fields=(_NAME, _ROLE),
               http=("POST", "/tokens"), command="account add-token"),
     _declared("remove-token", "Remove an API token", Effect.CHANGES, fields=(_NAME,), answer=Answer.NOTHING,
-              http=("DELETE", "/tokens/{name}"), command="account remove-token", said="The token {name} is removed."),
+              http=("DELETE", "/tokens/{name}"), command="account remove-token", said="The token {name} is removed.",
+              asks="Remove the token {name}? Its programs are refused."),
 )  # fmt: skip

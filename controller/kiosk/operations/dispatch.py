@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from controller.kiosk.operations.fields import Field, parse
-from controller.kiosk.operations.operation import Operation, Values
+from controller.kiosk.operations.operation import Effect, Operation, Values
 from controller.kiosk.operations.table import JOB, OPERATIONS
 
 LONGEST_PATH: Final = 4096
+CALLER: Final = ContextVar("CALLER", default="unknown")
+"""The name of the user of this computer whose request is answered."""
 AT_SOCKET: Final = (*OPERATIONS, JOB)
 
 
@@ -35,17 +38,20 @@ def socket_table(
 ) -> dict[str, Callable[..., Any]]:
     """The socket's operations by name, as far as ``holders`` has their holder."""
     return {
-        operation.socket_name: _bound(operation, holders[operation.holder])
+        operation.socket_name: _bound(operation, holders[operation.holder], holders.get("kiosk"))
         for operation in operations
         if operation.holder in holders
     }
 
 
-def _bound(operation: Operation, holder: Any) -> Callable[..., Any]:
+def _bound(operation: Operation, holder: Any, kiosk: Any) -> Callable[..., Any]:
     names = [field.name for field in operation.fields]
 
     def ask(*given: Any, **sent: Any) -> Any:
-        return operation.of(holder, local_values(operation, dict(zip(names, given, strict=False)) | sent))
+        values = local_values(operation, dict(zip(names, given, strict=False)) | sent)
+        if operation.effect is not Effect.LOOKS and kiosk is not None:
+            kiosk.record("done-by", operation.done_by(f"User {CALLER.get()}", values))
+        return operation.of(holder, values)
 
     return ask
 

@@ -63,7 +63,8 @@ class Operation:
     ``offline``: ``api.folder.FolderKiosk`` has it, for use without a running kiosk. ``http``: method and path below
     /api/v1; ``at_socket``, ``command``, ``verb``: its name at the socket, on the command line and for building control.
     All names default to ``name``. ``within``: the hand-written command that includes it. ``said``: the sentence shown
-    when it is done, with the values as format fields; ``more``: what the help says after ``about``
+    when it is done, with the values as format fields; ``more``: what the help says after ``about``;
+    ``asks``: the question that a person has to answer with yes before, with the values as format fields
     """
 
     name: str
@@ -84,6 +85,7 @@ class Operation:
     verb: str = ""
     said: str = "Done."
     more: str = ""
+    asks: str = ""
 
     @property
     def method(self) -> str:
@@ -131,6 +133,15 @@ class Operation:
         """Call the holder's method. Raises what it raises."""
         method = getattr(holder, self.call or self.name.replace("-", "_"))
         return self.part(method(**self.take(values)), values)
+
+    def question(self, values: Values) -> str:
+        """``asks``, with the values in it; empty if it does not ask."""
+        return self.asks.format_map(values)
+
+    def done_by(self, who: str, values: Values) -> str:
+        """A line for the event log; it has names, and no other values."""
+        named = ", ".join(str(values[key]) for key in ("name", "projector", "role", "kind") if values.get(key))
+        return f"{who}: {self.about} ({named})." if named else f"{who}: {self.about}."
 
     def sentence(self, values: Values) -> str:
         """``said``, with the values in it."""

@@ -22,6 +22,7 @@ from controller.artefacts.kinds import StepKind
 from controller.artefacts.names import json_path
 from controller.artefacts.published import BUNDLE_FIGURES
 from controller.config import load_stage
+from controller.config.loader import FILE, LARGEST_BYTES
 from controller.core.errors import UsageError, WorkError
 from controller.core.files import require_regular
 from controller.core.storage import sync_folder
@@ -78,6 +79,33 @@ def restore(stage: Path, file: Path) -> None:
         fresh.rename(stage / RESTORING)
         sync_folder(stage)
     finish_restore(stage)
+
+
+def check_backup(file: Path) -> None:
+    """Read a backup to its end, and the settings in it.
+
+    Raises UsageError("not-a-backup") and what ``load_stage`` raises.
+    """
+    try:
+        with tarfile.open(file, "r:gz") as archive, tempfile.TemporaryDirectory() as folder:
+            names = [_read_through(archive, member, Path(folder)) for member in archive]
+            if names[:1] != [MARK]:
+                raise _not_ours()
+            load_stage(Path(folder))
+    except (tarfile.TarError, OSError, EOFError, ValueError) as error:
+        raise _not_ours() from error
+
+
+def _read_through(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> str:
+    """Read one member, and put the settings into ``folder``; returns its name."""
+    if _harmless(member) is None:
+        raise _not_ours()
+    content = archive.extractfile(member) if member.isfile() else None
+    if content is not None and member.name == FILE:
+        (folder / FILE).write_bytes(content.read(LARGEST_BYTES + 1))
+    while content is not None and content.read(1 << 20):
+        pass
+    return member.name
 
 
 def finish_restore(stage: Path) -> bool:

@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Final
 
 from controller.artefacts.names import safe_name
+from controller.bundle.fallback import Starts
 from controller.bundle.format import Index
-from controller.bundle.install import current
+from controller.bundle.install import current, previous
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
 from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
+from controller.kiosk.decide.interfaces import Turn
+from controller.play.control.protocol import MAX_FADE_S, MAX_SECONDS
 
 PREVIEWS: Final = "kiosk/previews"
 WITHOUT: Final = "bundles-without"
@@ -40,9 +43,31 @@ class BundleStore:
         """The installed bundle's file, even if it can't be read: the player then goes back to the previous one."""
         return current(self._stage / "bundles")
 
+    def installed(self) -> Sequence[Path]:
+        """The files of the bundle that plays and of the one before."""
+        folder = self._stage / "bundles"
+        return tuple(path for path in (current(folder), previous(folder)) if path is not None)
+
     def names(self) -> Sequence[str]:
         index = self.index(self.bundle())
         return () if index is None else tuple(entry.name for entry in index.appearances)
+
+    def playlist(self) -> Sequence[Turn]:
+        """See ``interfaces.Bundles``."""
+        index = self.index(self.bundle())
+        hints = () if index is None else index.schedule
+        # A bundle may say more than the player takes.
+        return tuple(
+            (hint.appearance, min(hint.duration_ms / 1000, MAX_SECONDS), min(hint.fade_ms / 1000, MAX_FADE_S))
+            for hint in hints
+        )
+
+    def given_up(self) -> str:
+        """The file's name of the bundle that showed no picture, so that the one before plays; empty if none."""
+        folder = self._stage / "bundles"
+        starts, now = Starts.read(folder), current(folder)
+        fell_back = starts.given_up is not None and now is not None and starts.bundle == now.name != starts.given_up
+        return str(starts.given_up) if fell_back else ""
 
     def check_name(self, name: str | None) -> None:
         """Raises UsageError("appearance-unknown") for a name that the installed bundle does not have."""

@@ -38,7 +38,7 @@ def expired(stage: Path, *, now_s: float) -> list[Path]:
     for runs in kinds.values():
         good = 0
         for run in runs:
-            outcome = _outcome(run)
+            outcome = outcome_of(run)
             old = now_s - (run / Journal.FILE).stat().st_mtime >= KEPT_S
             if good >= KEPT_OF_A_KIND and outcome is not None and old and _has_photographs(run):
                 result.append(run)
@@ -63,7 +63,7 @@ def _has_photographs(run: Path) -> bool:
     return (run / CAPTURES).is_dir() or (run / GOING).is_dir()
 
 
-def _outcome(run: Path) -> str | None:
+def outcome_of(run: Path) -> str | None:
     """The outcome of the last start; None if it is running, was killed, or is unknown."""
     try:
         with Journal(run) as journal:

@@ -11,6 +11,7 @@ from controller.artefacts.solved import remove_solved
 from controller.config.editing import rewrite_stage
 from controller.config.lines import KeyLines
 from controller.config.loader import FILE, LARGEST_BYTES, parse_stage
+from controller.config.models import StageTables
 from controller.config.problems import Place
 from controller.core.errors import UsageError
 from controller.core.files import LARGEST_TEXT, read_bytes
@@ -41,6 +42,11 @@ def validate(content: str) -> None:
     parse_stage(parsed, Place(FILE, KeyLines(content)))
 
 
+def tables_of(content: str) -> StageTables:
+    """The tables of a text that ``validate`` accepts."""
+    return parse_stage(tomllib.loads(content), Place(FILE, KeyLines(content)))
+
+
 def save(stage: Path, content: str) -> None:
     """Validate, also the keys of drivers, keep the old text as ``BEFORE``, and write.
 
@@ -61,6 +67,23 @@ def save(stage: Path, content: str) -> None:
         write_atomically(stage / BEFORE, before.encode())
 
 
+def with_own_key(stage: Path, content: str) -> str:
+    """The text of a first stage.toml, with the stage's signing key as a trusted one; the key is made if there is none.
+
+    Without it the stage would refuse its own bundles. Raises as ``validate``, and what ``make_key`` raises.
+    """
+    from controller.bundle.signing import load_signing_key
+    from controller.services.bundle import make_key
+    from controller.services.calibrate import KEY_FILE
+
+    validate(content)
+    if tables_of(content).bundle.trusted_keys:
+        return content
+    key = stage / KEY_FILE
+    public = bytes(load_signing_key(key).verify_key).hex() if key.exists() else make_key(stage, key.stem)["public"]
+    return f'{content.rstrip()}\n\n[bundle]\ntrusted_keys = ["{public}"]\n'
+
+
 def check_name(name: str) -> None:
     """Raises UsageError("appearance-name")."""
     if not _NAME.fullmatch(name):
@@ -70,7 +93,7 @@ def check_name(name: str) -> None:
 
 def add_picture(stage: Path, name: str, picture: Path) -> None:
     """Add an appearance of kind "picture" to stage.toml, if it has none of this name. Raises as ``rewrite_stage``."""
-    tables = parse_stage(tomllib.loads(text(stage)), Place(FILE, KeyLines(text(stage))))
+    tables = tables_of(text(stage))
     if any(table.name == name for table in tables.appearances):
         return
     entry = {"name": name, "kind": "picture", "file": str(picture.relative_to(stage))}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, cast
 
 from controller.core.text import printable
-from controller.kiosk.decide.interfaces import Condition, ProjectorView
+from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
@@ -52,6 +52,10 @@ class Devices:
         )
         self.sensor = self._sensor()
 
+    def use(self, checked: Checked) -> None:
+        """Use settings in which nothing differs that a device is opened with."""
+        self._checked = checked
+
     @property
     def others(self) -> tuple[DeviceSupervisor, ...]:
         """The supervisors of all devices that are not projectors."""
@@ -78,11 +82,13 @@ class Devices:
             )
             reason = f"No photographs are possible without the camera. {problem.reason}"
             return replace(problem, reason=reason, level="error")
-        missing = [
-            supervisor.name
-            for supervisor in self.projectors
-            if supervisor.view.condition in (Condition.LOST, Condition.BROKEN)
-        ]
+        views = [supervisor.view for supervisor in self.projectors]
+        missing = [view.name for view in views if view.condition in (Condition.LOST, Condition.BROKEN)]
+        full = next(
+            (view.problem for view in views if view.problem is not None and view.problem.code == DISK_FULL), None
+        )
+        if full is not None:
+            return full
         if missing:
             return Decision("projector-missing", f"No photographs are possible without projector {', '.join(missing)}.",
                             "Repair it first. Playback continues without it.", "error")  # fmt: skip
@@ -203,7 +209,10 @@ def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
         values.append(LiveValue("Projector's counter", f"{view.counter_hours:,} h"))
     if view.condition is Condition.LIT and view.stable_left_s > 0:
         values.append(LiveValue("Stable in", f"{view.stable_left_s:.0f} s"))
-    what, remedy = (None, "") if view.problem is None else (view.problem.reason, view.problem.remedy)
+    problem = view.problem
+    # The disk has a row of its own.
+    its_own = problem is not None and problem.code != DISK_FULL
+    what, remedy = (problem.reason, problem.remedy) if problem is not None and its_own else (None, "")
     return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy)
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
-import socket
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,9 +12,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import VelaturaError, WorkError
-from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing
+from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
+from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover
 
@@ -27,10 +26,18 @@ READY_S: Final = 8.0
 HEALTHY_S: Final = 20.0
 """A player that ran for so long is started again at once when it dies."""
 BACK_OFF_S: Final = (0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 15.0, 30.0)
+PUT_S: Final = 5.0
+FADE_AWAITED_S: Final = 3.0
 NOTICE_TURN_S: Final = 10.0
 """On an object that all projectors light, the text of several at once could not be read."""
-STARTS_WITH_BUNDLE: Final = 4
-"""Failed starts in a row after which the player is started without the installed bundle, so that it shows black."""
+AGAIN_S: Final = 60.0
+"""After this time without a picture, a player without the installed bundle is started with it again."""
+STARTS_WITH_BUNDLE: Final = 6
+"""Starts in a row without a picture after which the player is started without the installed bundle: it shows black.
+
+More than after which it goes back to the bundle before by itself (``bundle.fallback``), because a picture may have been
+on the outputs that was not seen here.
+"""
 
 
 class PlayerSupervisor:
@@ -56,12 +63,14 @@ class PlayerSupervisor:
         self.notice: tuple[str, ...] = ()
         self._attach = attach
         self._process: PlayerProcess | AttachedPlayer | None = None
-        self._channel: socket.socket | None = None
+        self._channel = PlayerChannel()
         self._view = PlayerView()
         self._identities: dict[str, Path] = {}
         self._misses, self._failed = 0, 0
+        self._with_bundle, self._starts_without_picture, self._dark = True, 0, True
+        self._turns: tuple[Turn, ...] | None = None
+        self._skipped = False
         self._start_at_s, self._started_at_s = 0.0, 0.0
-        self._numbers = 0
         self._identified = False
         self._noticed: tuple[int, tuple[str, ...]] | None = None
         self._hello: dict[str, Any] = {}
@@ -89,7 +98,7 @@ class PlayerSupervisor:
             if self._misses >= MOST_MISSES:
                 self._restart(Decision("player-hung", "The player did not answer.", "It is started again.", "error"))
         except (OSError, ValueError, KeyError):
-            self._disconnect()
+            self._channel.close()
             self._misses += 1
             if self._misses >= MOST_MISSES + 2:
                 self._restart(
@@ -97,7 +106,13 @@ class PlayerSupervisor:
                 )
         except WorkError as error:
             self._misses = 0
-            self._trouble(Decision(error.code, error.what, error.remedy, "error"))
+            problem = Decision(error.code, error.what, error.remedy, "error")
+            waited = self._with_bundle or self._monotonic() - self._started_at_s > AGAIN_S
+            if self._dark and waited and error.code.startswith("bundle-"):
+                # Only starts are counted, and after three without a picture the player goes back to the bundle before.
+                self._restart(problem)
+            else:
+                self._trouble(problem)
 
     def close(self) -> None:
         """Black, and the player's end, for good. One of somebody else runs on, and shows what is wanted last."""
@@ -106,7 +121,7 @@ class PlayerSupervisor:
             # One that does not answer is its starter's to end.
             with contextlib.suppress(OSError, ValueError, KeyError, VelaturaError):
                 self._ask({"op": "stop"}, 3.0)
-        self._disconnect()
+        self._channel.close()
         if (process := self._process) is not None:
             process.terminate()
 
@@ -114,8 +129,9 @@ class PlayerSupervisor:
 
     def _start(self) -> None:
         try:
-            with_bundle = self._failed < STARTS_WITH_BUNDLE or self._failed % 10 == 0
-            self._process = self._player(self._settings(with_bundle))
+            failed = self._starts_without_picture
+            self._with_bundle, self._dark = failed < STARTS_WITH_BUNDLE or failed % 2 == 0, True
+            self._process = self._player(self._settings(self._with_bundle))
             if self._closed:
                 # While it was made ready: it would show its picture after the service's end.
                 self._process.terminate()
@@ -125,12 +141,14 @@ class PlayerSupervisor:
         except (VelaturaError, OSError) as error:
             self._process = None
             self._failed += 1
+            self._starts_without_picture += 1
             self._start_at_s = self._monotonic() + BACK_OFF_S[min(self._failed, len(BACK_OFF_S) - 1)]
             what, remedy = (error.what, error.remedy) if isinstance(error, VelaturaError) else (str(error), "")
             self._trouble(Decision("player-not-started", what, remedy or "It is tried again.", "error"))
             return
         self._started_at_s, self._misses, self._identified = self._monotonic(), 0, False
         self._noticed, self._hello = None, hello
+        self._turns, self._skipped = None, False
         self._identities = {}
         installed = self._settings(True).bundle
         if hello.get("bundle") and installed is not None:
@@ -147,7 +165,7 @@ class PlayerSupervisor:
     def _restart(self, why: Decision) -> None:
         assert self._process is not None
         self._tell(why)
-        self._disconnect()
+        self._channel.close()
         if self._process.alive:
             # It had its time to answer; SIGTERM would be one more thing that it does not hear.
             os.kill(self._process.pid, signal.SIGKILL)
@@ -155,6 +173,8 @@ class PlayerSupervisor:
         self._process = None
         healthy = self._monotonic() - self._started_at_s >= HEALTHY_S
         self._failed = 0 if healthy else self._failed + 1
+        # One that died after it had shown its picture says nothing about the bundle.
+        self._starts_without_picture += self._dark and self.want != BLACK
         self._start_at_s = self._monotonic() + BACK_OFF_S[min(max(self._failed - 1, 0), len(BACK_OFF_S) - 1)]
         self._view = replace(self._view, shown=None, problem=why, restarts=self._view.restarts + 1)
         if self._monotonic() >= self._start_at_s:
@@ -167,13 +187,21 @@ class PlayerSupervisor:
         name = status["appearance"] if status["showing"] == "appearance" else ""
         shown = Showing(path, str(name)) if name else BLACK if status["showing"] == "black" else None
         want = self.want
+        if name:
+            self._dark, self._starts_without_picture = False, 0
+        if status["skipped"] and name and not self._skipped:
+            # Once, because it comes round again and again.
+            self._skipped = True
+            self._tell(_SKIPPED)
         if self.identifying:
             if not self._identified:
                 self._ask({"op": "identify"}, 3.0)
                 self._identified = True
         elif want == BLACK and self.notice:
             self._tell_all()
-        elif want is not None and (shown != want or self._identified or self._noticed is not None):
+        elif want is not None and (
+            not self._is_shown(want, shown, status) or self._identified or self._noticed is not None
+        ):
             self._identified, self._noticed = False, None
             self._put(want, path)
             shown = want
@@ -182,6 +210,15 @@ class PlayerSupervisor:
         if self._view.problem is not None:
             self._tell(Decision("player-well", "The player shows what it should again."))
         self._view = replace(self._view, shown=shown, problem=None, warning=self._warning(status))
+
+    def _is_shown(self, want: Showing, shown: Showing | None, status: dict[str, Any]) -> bool:
+        running = bool(status["sequence_running"])
+        if not want.in_turn:
+            # What somebody else lets the player show in turn is not ours to end.
+            return shown == want and not (running and self._turns)
+        names = {name for name, _, _ in want.in_turn}
+        same = shown is not None and shown.bundle == want.bundle and shown.appearance in names
+        return running and same and self._turns in (None, want.in_turn)
 
     def _warning(self, status: dict[str, Any]) -> Decision | None:
         told = status.get("warning")
@@ -208,50 +245,31 @@ class PlayerSupervisor:
         if loaded != want.bundle:
             answer = self._ask({"op": "load-bundle", "path": str(want.bundle)}, 5.0)
             self._identities[str(answer["bundle"])] = want.bundle
-        self._ask({"op": "play", "appearance": want.appearance}, 5.0)
-        self._tell(Decision("playing", f"The player shows {want.appearance}."))
+            self._skipped = False
+        request: dict[str, Any] = {"op": "play", "appearance": want.appearance, "fade_s": want.fade_s}
+        if want.in_turn:
+            request = {"op": "sequence", "items": [list(turn) for turn in want.in_turn], "repeat": 0}
+        # The answer comes when the picture has faded in; until then the status tells what comes.
+        slow = want.in_turn[0][2] if want.in_turn else want.fade_s
+        with contextlib.suppress(TimeoutError) if slow > FADE_AWAITED_S else contextlib.nullcontext():
+            if self._ask(request, PUT_S)["ok"]:
+                self._dark, self._starts_without_picture = False, 0
+        self._turns = want.in_turn
+        what = f"{len(want.in_turn)} appearances in turn" if want.in_turn else want.appearance
+        self._tell(Decision("playing", f"The player shows {what}."))
 
     def _trouble(self, problem: Decision) -> None:
         if self._view.problem is None or self._view.problem.code != problem.code:
             self._tell(problem)
         self._view = replace(self._view, problem=problem, shown=None)
 
-    # -- the socket
-
     def _ask(self, request: dict[str, Any], timeout_s: float = ANSWER_S) -> dict[str, Any]:
-        """Raises TimeoutError, OSError, ValueError, and WorkError for what the player refuses."""
-        if self._channel is None:
-            assert self._process is not None
-            self._channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            self._channel.settimeout(timeout_s)
-            self._channel.connect(str(self._process.socket))
-        self._numbers += 1
-        number, until_s = self._numbers, time.monotonic() + timeout_s
-        self._channel.settimeout(timeout_s)
-        self._channel.sendall(json.dumps({"id": number, **request}).encode() + b"\n")
-        waiting = b""
-        while True:
-            self._channel.settimeout(max(0.01, until_s - time.monotonic()))
-            data = self._channel.recv(1 << 16)
-            if not data:
-                raise ConnectionError
-            waiting += data
-            *lines, waiting = waiting.split(b"\n")
-            for line in lines:
-                answer = json.loads(line)
-                # An answer that came too late for an earlier question is passed over.
-                if answer.get("id") == number:
-                    return self._accepted(answer)
+        """Raises as ``PlayerChannel.ask``."""
+        assert self._process is not None
+        return self._channel.ask(self._process.socket, request, timeout_s)
 
-    def _accepted(self, answer: dict[str, Any]) -> dict[str, Any]:
-        if answer["ok"]:
-            return answer
-        error = answer["error"]
-        if error["code"] == "superseded":
-            return answer
-        raise WorkError(str(error["code"]), what=str(error["what"]), remedy=str(error["remedy"]))
 
-    def _disconnect(self) -> None:
-        if self._channel is not None:
-            self._channel.close()
-            self._channel = None
+_SKIPPED: Final = Decision(
+    "appearance-skipped", "An appearance could not be read from the bundle, and was left out.",
+    "Publish the appearances again.", "error",
+)  # fmt: skip

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
+from controller.capture.acquire import DISK_CODES
 from controller.core.errors import VelaturaError
-from controller.kiosk.decide.interfaces import Condition, ProjectorView
+from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
 from controller.kiosk.store.event_log import Decision
 from controller.rig.lamp_faults import fatal_faults, faulty
 from controller.rig.lamp_guard import LampGuard
@@ -250,7 +251,7 @@ class ProjectorSupervisor:
             return self._see(Condition.BROKEN, status, _decision(error))
         except VelaturaError as error:
             # The lamp counter can't be saved, so the lamp was not switched on.
-            return self._see(Condition.BROKEN, status, _decision(error))
+            return self._see(Condition.BROKEN, status, _unrecorded(error))
         self._struck_at_s = now_s
         self._tell(Decision("lamp-struck", f"The lamp of projector {self.name} is being switched on."))
         return self._see(Condition.LIGHTING, status, self._view.problem)
@@ -315,6 +316,14 @@ class ProjectorSupervisor:
 
 def _decision(error: DeviceError | VelaturaError) -> Decision:
     return Decision(error.code, error.what, error.remedy, "error")
+
+
+def _unrecorded(error: VelaturaError) -> Decision:
+    """The same for all projectors, because it is one problem, of the disk."""
+    if error.code not in DISK_CODES:
+        return _decision(error)
+    reason = "No lamp is switched on, because the disk of the stage is full or can't be written to."
+    return Decision(DISK_FULL, reason, "Free some space on the disk, and check that it is in order.", "error")
 
 
 def _unlit(name: str) -> Decision:

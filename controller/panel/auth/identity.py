@@ -74,14 +74,16 @@ async def guarded(panel: Panel, entry: Entry, request: Request) -> Response:  # 
     if entry.way == "public":
         return await entry.endpoint(request, ANONYMOUS)
     address = request.client.host if request.client else ""
-    if entry.way == "token" and (wait_s := panel.by_token.wait_s(address)) > 0:
-        return _too_many(wait_s)
     who = visitor(panel, request, entry.way)
     if who is None:
         if entry.way == "session":
             return RedirectResponse("/login", 303) if _navigates(request) else _denied(401)
         if "authorization" in request.headers:
+            # Only wrong ones wait: others behind the same address (a proxy, a router) have good ones.
+            if (wait_s := panel.by_token.wait_s(address)) > 0:
+                return _too_many(wait_s)
             panel.by_token.failed(address)
+            panel.refused.tell(f"A wrong token from {address} was refused")
         return _api_error(401, "not-known", "The request has no valid token.", "Send 'Authorization: Bearer ...'.")
     # Deny by default: an entry without a role is a mistake in the table, and must not grant access.
     if entry.role is None or who.role < entry.role:

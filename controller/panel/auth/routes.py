@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+from functools import partial
 from typing import Any
 
 import anyio
@@ -10,6 +11,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from controller.core.errors import UsageError
+from controller.core.text import printable
 from controller.kiosk.store.accounts import LONGEST_PASSWORD, Account, Role
 from controller.panel.auth.identity import Entry, Visitor, cookie_name, form_pair, form_token, same_origin
 from controller.panel.auth.sessions import LONGEST_S
@@ -78,7 +80,9 @@ class Entrance:
         panel.by_account.failed(name)
         account = await anyio.to_thread.run_sync(panel.accounts.verify, name, password, limiter=panel.hashing)
         if account is None:
+            panel.refused.tell(f"A log-in as {printable(name)[:32]} from {address} was refused")
             return self._form(_WRONG, 403)
+        panel.kiosk.record("logged-in", f"{account.name} logged in from {address}.")
         panel.by_address.succeeded(address)
         panel.by_account.succeeded(name)
         return self._enter(request, account)
@@ -99,6 +103,7 @@ class Entrance:
         return page
 
     async def _logout(self, _: Request, visitor: Visitor, __: Sent) -> Response:
+        self._panel.kiosk.record("logged-out", f"{visitor.name} logged out.")
         self._panel.sessions.end(visitor.secret)
         page = RedirectResponse("/login", 303)
         page.delete_cookie(cookie_name(self._panel), path="/", secure=self._panel.options.tls, httponly=True)
@@ -114,6 +119,7 @@ class Entrance:
                 raise UsageError("too-many-tries", what="Too many wrong passwords.", remedy="Wait a minute.")
             if await anyio.to_thread.run_sync(panel.accounts.verify, visitor.name, old, limiter=panel.hashing) is None:
                 panel.by_address.failed(address)
+                panel.refused.tell(f"A change of the password of {visitor.name} from {address} was refused")
                 raise UsageError("password-wrong", what="The old password is wrong.", remedy="Type it again.")
             if new != sent.texts.get("again", ""):
                 raise UsageError("password-wrong", what="The two new passwords differ.", remedy="Type them again.")
@@ -122,6 +128,7 @@ class Entrance:
             await anyio.to_thread.run_sync(panel.accounts.set_password, visitor.name, new, limiter=panel.hashing)
         except UsageError as error:
             return await self._redirect(visitor, "/password", "error", f"{error.what} {error.remedy}")
+        panel.kiosk.record("done-by", f"{visitor.name}: Change the own password.")
         panel.sessions.end_all(visitor.name, but=visitor.session)
         page = "/setup" if panel.kiosk.snapshot().needs_setup and visitor.role is Role.TECHNICIAN else "/"
         return await self._redirect(visitor, page, "good", "Your new password is in use.")
@@ -131,18 +138,20 @@ class Entrance:
         visitor.session.notes.append((level, text))
         return RedirectResponse(page, 303)
 
-    async def _apply(self, visitor: Visitor, change: Any, said: str) -> Response:
+    async def _apply(self, visitor: Visitor, change: Any, said: str, about: str) -> Response:
         try:
             await anyio.to_thread.run_sync(change, limiter=self._panel.hashing)
         except UsageError as error:
             return await self._redirect(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
+        self._panel.kiosk.record("done-by", f"{visitor.name}: {about}.")
         return await self._redirect(visitor, "/accounts", "good", said)
 
     async def _add(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name, password, role = (sent.texts.get(key, "") for key in ("name", "password", "role"))
         return await self._apply(
-            visitor, lambda: self._panel.accounts.add(name, Role.named(role), password), "The account is added."
-        )
+            visitor, lambda: self._panel.accounts.add(name, Role.named(role), password), "The account is added.",
+            f"Add the account {name} ({role})",
+        )  # fmt: skip
 
     async def _role(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name, role = sent.texts.get("name", ""), sent.texts.get("role", "")
@@ -152,16 +161,18 @@ class Entrance:
             if name != visitor.name:
                 self._panel.sessions.end_all(name)
 
-        return await self._apply(visitor, change, "The role is changed.")
+        return await self._apply(visitor, change, "The role is changed.", f"Make {name} a {role}")
 
     async def _remove(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name = sent.texts.get("name", "")
+        if sent.texts.get("sure") != "yes":
+            return await self._ask(visitor, "/accounts/remove", f"Remove the account {name}?", name)
 
         def change() -> None:
             self._panel.accounts.remove(name)
             self._panel.sessions.end_all(name)
 
-        return await self._apply(visitor, change, "The account is removed.")
+        return await self._apply(visitor, change, "The account is removed.", f"Remove the account {name}")
 
     async def _add_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         accounts = self._panel.accounts
@@ -169,9 +180,21 @@ class Entrance:
             shown = accounts.add_token(sent.texts.get("name", ""), Role.named(sent.texts.get("role", "")))
         except UsageError as error:
             return await self._redirect(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
+        self._panel.kiosk.record(
+            "done-by", f"{visitor.name}: Add the token {sent.texts['name']} ({sent.texts['role']})."
+        )
         facts = {"accounts": accounts.all(), "tokens": accounts.tokens(), "shown": shown, "here": "/accounts"}
         return await self._pages.show("accounts.html", visitor, facts)
 
     async def _remove_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name = sent.texts.get("name", "")
-        return await self._apply(visitor, lambda: self._panel.accounts.remove_token(name), "The token is removed.")
+        if sent.texts.get("sure") != "yes":
+            return await self._ask(
+                visitor, "/tokens/remove", f"Remove the token {name}? Its programs are refused.", name
+            )
+        change = partial(self._panel.accounts.remove_token, name)
+        return await self._apply(visitor, change, "The token is removed.", f"Remove the token {name}")
+
+    async def _ask(self, visitor: Visitor, action: str, question: str, name: str) -> Response:
+        facts = {"question": question, "action": action, "back": "/accounts", "kept": {"name": name}}
+        return await self._pages.show("sure.html", visitor, {**facts, "here": "/accounts"})

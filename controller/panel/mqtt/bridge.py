@@ -169,7 +169,13 @@ class BuildingControl:
         operation = self._verbs.get(word)
         if operation is None:
             return None
-        return lambda: operation.of(self._kiosk, _values(operation, payload[:LONGEST_PAYLOAD]))
+
+        def do() -> None:
+            values = _values(operation, payload[:LONGEST_PAYLOAD])
+            self._kiosk.record("done-by", operation.done_by("Building control", values))
+            operation.of(self._kiosk, values)
+
+        return do
 
 
 def _values(operation: Operation, payload: bytes) -> Values:

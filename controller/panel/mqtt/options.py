@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from controller.core.errors import UsageError
+from controller.kiosk.panel_address import is_loopback
+
 
 @dataclass(frozen=True, slots=True)
 class BrokerOptions:
@@ -19,3 +22,14 @@ class BrokerOptions:
     username: str | None = None
     password_file: Path | None = None
     certificates: Path | None = None
+
+
+def check_broker(options: BrokerOptions) -> None:
+    """Raises UsageError("mqtt-password-without-tls"): passwords must not cross a network unencrypted."""
+    if options.password_file is None or options.certificates is not None or is_loopback(options.host):
+        return
+    raise UsageError(
+        "mqtt-password-without-tls",
+        what=f"The password for the MQTT broker {options.host} would be sent without TLS.",
+        remedy="Set --mqtt-certificates, or use a broker on this computer.",
+    )

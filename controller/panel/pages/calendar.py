@@ -46,6 +46,8 @@ def _day(schedule: Schedule, day: date) -> CalendarDay:
     bars = [(0, end - 1440, row.appearance) for row in before for _, end in [_minutes(row)] if end > 1440]
     bars += [(start, min(end, 1440) - start, row.appearance) for row in rows for start, end in [_minutes(row)]]
     text = ", ".join(f"{row.opens} to {row.closes}" for row in rows)
+    if not schedule.rows:
+        return CalendarDay(day, "open all day", ((0, 1440, ""),), special=False)
     return CalendarDay(day, text or "closed", tuple(bars), special)
 
 

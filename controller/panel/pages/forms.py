@@ -24,8 +24,8 @@ from controller.panel.pages.routes import Pages
 MOST_FIELDS = 2000
 LEADS_TO: Final = {
     **dict.fromkeys(("recalibrate", "cancel", "start", "stop", "identify", "compute", "compare", "seen"), "/"),
-    **dict.fromkeys(("play", "remove-appearance"), "/appearances"),
-    **dict.fromkeys(("backup", "restore", "diagnostics"), "/care"),
+    **dict.fromkeys(("play", "rotate", "remove-appearance"), "/appearances"),
+    **dict.fromkeys(("backup", "restore", "diagnostics", "test-alerts"), "/care"),
     "upload-target": "/appearances/new/{target}",
     "set-schedule": "/schedule",
     "test-shots": "/aiming",
@@ -65,9 +65,13 @@ class Forms:
         async def answer(_: Request, visitor: Visitor, sent: Sent) -> Response:
             assert visitor.session is not None
             values: Values = {}
+            sure = sent.texts.pop("sure", "") == "yes"
             try:
                 values = _values(operation, sent)
-                result = await answers.run(self._panel, operation, values)
+                question = await self._question(operation, values)
+                if question and not sure:
+                    return await self._ask(operation, visitor, sent, question)
+                result = await answers.run(self._panel, operation, values, visitor.name)
             except answers.FAILURES as error:
                 if operation.name == "save-settings":
                     return await self._settings(visitor, sent, error)
@@ -80,6 +84,24 @@ class Forms:
 
         return answer
 
+    async def _question(self, operation: Operation, values: Values) -> str:
+        """What a person has to agree to first, or nothing."""
+        if operation.name == "save-settings":
+            effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_settings(values["text"]))
+            return f"Save these settings now? {effect}" if effect else ""
+        return operation.question(values)
+
+    async def _ask(self, operation: Operation, visitor: Visitor, sent: Sent, question: str) -> Response:
+        facts = {"question": question, "action": f"/do/{operation.name}", "back": LEADS_TO[operation.name]}
+        if operation.upload is not None:
+            # A file can't be sent on; its own page has the question beside it.
+            assert visitor.session is not None
+            visitor.session.notes.append(
+                ("error", "Nothing was done. Tick the box to confirm, and choose the file again.")
+            )
+            return RedirectResponse(LEADS_TO[operation.name], 303)
+        return await self._pages.show("sure.html", visitor, {**facts, "kept": sent.texts, "here": facts["back"]})
+
     async def _check(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         text = sent.texts.get("text", "").replace("\r\n", "\n")
         try:
@@ -87,7 +109,9 @@ class Forms:
         except answers.FAILURES as error:
             return await self._settings(visitor, sent, error)
         assert visitor.session is not None
-        visitor.session.notes.append(("good", "These settings are valid. They are not saved yet."))
+        effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_settings(text))
+        if effect:
+            visitor.session.notes.append(("warn", f"When you save them: {effect}"))
         return await self._settings(visitor, sent, None)
 
     async def _settings(self, visitor: Visitor, sent: Sent, error: answers.Failure | None) -> Response:

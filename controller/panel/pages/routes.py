@@ -61,7 +61,7 @@ class Pages:
                 "/settings",
                 Role.TECHNICIAN,
                 "settings.html",
-                lambda _: {"text": self._panel.kiosk.settings(), "problem": None},
+                self._settings,
             ),
             ("/care", Role.TECHNICIAN, "care.html", lambda _: {}),
             ("/accounts", Role.TECHNICIAN, "accounts.html", self._accounts),
@@ -106,11 +106,13 @@ class Pages:
         return answer
 
     def _picture(self, operation: Operation) -> Callable[[Request, Visitor], Awaitable[Response]]:
-        async def answer(request: Request, _: Visitor) -> Response:
+        async def answer(request: Request, visitor: Visitor) -> Response:
             try:
                 # The query is ignored: pages add a number to it to reload a picture.
                 values = parse(operation.fields, request.path_params, strings=True)
-                return answers.response(operation, await answers.run(self._panel, operation, values), values)
+                return answers.response(
+                    operation, await answers.run(self._panel, operation, values, visitor.name), values
+                )
             except answers.FAILURES as error:
                 return answers.failure(error)
 
@@ -123,6 +125,16 @@ class Pages:
         return StreamingResponse(
             self._panel.hub.stream(alive), media_type="text/event-stream", headers={"x-accel-buffering": "no"}
         )
+
+    def _settings(self, _: Request) -> dict[str, Any]:
+        kiosk, problem = self._panel.kiosk, None
+        text = kiosk.settings()
+        try:
+            if text:
+                kiosk.validate_settings(text)
+        except answers.FAILURES as error:
+            problem = error
+        return {"text": text, "problem": problem}
 
     def _now(self, _: Request) -> dict[str, Any]:
         return {"picture": self._panel.kiosk.camera_picture() is not None}

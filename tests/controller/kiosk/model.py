@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from controller.kiosk.decide.clock import TrustedClock, beginning
-from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing
+from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing, Turn
 from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -120,12 +120,16 @@ class ModelJobs:
 class ModelStock:
     installed: Path | None = BUNDLE
     beside: dict[frozenset[str], Path] = field(default_factory=dict)
+    turns: tuple[Turn, ...] = ()
 
     def bundle(self) -> Path | None:
         return self.installed
 
     def names(self) -> Sequence[str]:
         return ("shine", "marble")
+
+    def playlist(self) -> Sequence[Turn]:
+        return self.turns
 
     def without(self, missing: Collection[str], appearance: str) -> Path | None:
         return self.beside.get(frozenset(missing))

@@ -23,6 +23,7 @@ from controller.kiosk.interface import (
     BundleIdentity,
     Comparison,
     DeviceRow,
+    EventLevel,
     EventRow,
     Finding,
     Fit,
@@ -82,6 +83,8 @@ class MemoryKiosk:
         self._schedule = Schedule("Europe/Vienna", (ScheduleRow("mon", "10:00", "18:00", names[0]),), "03:00")
         self._toml = toml
         self.asked: list[tuple[str, object]] = []
+        self.recorded: list[tuple[str, str]] = []
+        self.effect = ""
         self._appearances = {name: Appearance(name, BORN, 1.2, name == names[0], self._drawn(name)) for name in names}
         self._results: dict[str, Results] = {}
         self._comparisons: dict[str, Comparison] = {}
@@ -201,6 +204,19 @@ class MemoryKiosk:
         self._known(name)
         self._appearances = {key: replace(one, playing=key == name) for key, one in self._appearances.items()}
         self.change(playing=name, state="playing", reason="Playing as asked.")
+
+    def rotate(self) -> None:
+        self.change(in_turn=True, state="playing", reason="Playing as asked.")
+
+    def record(self, code: str, what: str, level: EventLevel = "info") -> None:
+        self.recorded.append((code, what))
+
+    def test_alerts(self) -> None:
+        raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.", remedy="Name somebody.")
+
+    def effect_of_settings(self, text: str) -> str:
+        self.validate_settings(text)
+        return self.effect
 
     def _known(self, name: str) -> Appearance:
         if name not in self._appearances:

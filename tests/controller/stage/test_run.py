@@ -347,3 +347,13 @@ def test_the_same_step_is_not_done_twice_when_a_run_goes_on(models: Models) -> N
         OwnSession(checked.stage.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
     OwnSession(checked.stage.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
     assert done == ["first", "second", "second"]
+
+
+def test_a_finished_run_stays_finished_when_other_work_in_its_folder_fails(models: Models) -> None:
+    folder = models.folder / "runs" / "20260101-020000-calibrate"
+    with Journal(folder) as journal:
+        with journal.run("calibrate"):
+            pass
+        with pytest.raises(RuntimeError), journal.run("appearance"):
+            raise RuntimeError
+    assert unfinished_run(models.folder, "calibrate") != folder

@@ -188,7 +188,10 @@ def test_a_log_in_begins_a_new_session_and_its_cookie_is_closed(fresh: Served) -
 def test_a_removed_account_and_a_changed_password_end_their_sessions(fresh: Served) -> None:
     with fresh.entered("tina") as tina, fresh.entered("otto") as otto, fresh.entered("vera") as vera:
         token = csrf(tina.get("/accounts").text)
-        tina.post("/accounts/remove", data={"csrf": token, "name": "otto"})
+        asked = tina.post("/accounts/remove", data={"csrf": token, "name": "otto"})
+        assert "Remove the account otto?" in asked.text
+        assert otto.get("/").status_code == 200
+        tina.post("/accounts/remove", data={"csrf": token, "name": "otto", "sure": "yes"})
         assert otto.get("/").status_code == 303
         with fresh.entered("vera") as elsewhere:
             sent = {"old": PASSWORD, "new": "another long one", "again": "another long one"}

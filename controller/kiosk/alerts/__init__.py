@@ -1,0 +1,1 @@
+"""Alerts: events of the kiosk, sent by mail and to a webhook. `alerts` decides what is sent when; start there."""

@@ -1,0 +1,101 @@
+"""Sends what happened to those who are not there: gathers events, tries again, and never holds anything else up."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from controller.config.upkeep import AlertsTable
+from controller.core.errors import UsageError, WorkError
+from controller.kiosk.alerts import channels
+from controller.kiosk.interface import EventRow
+from controller.kiosk.store.event_log import Decision, EventLog
+
+GATHER_S: Final = 5.0
+"""From the first event to the message, because a fault seldom comes as one event."""
+PAUSE_S: Final = 60.0
+"""Between two messages of a channel, so that a device that fails every second fills no mailbox."""
+AGAIN_S: Final = (30.0, 60.0, 300.0, 900.0)
+MOST_EVENTS: Final = 50
+"""In one message: the newest."""
+_OWN: Final = "alert-not-sent"
+_LEVELS: Final = {"warning": ("warning", "error"), "error": ("error",)}
+
+Send = Callable[[Path, str, AlertsTable, Sequence[EventRow]], None]
+
+
+class Channel:
+    """One way out. What was sent is kept in the log's file, so that a restart neither repeats nor loses an alert."""
+
+    def __init__(self, name: str, send: Send, log: EventLog, monotonic: Callable[[], float]) -> None:
+        self._name, self._send, self._log, self._monotonic = f"alerted-{name}", send, log, monotonic
+        self._due_s: float | None = None
+        self._next_s, self._failed = 0.0, 0
+        if log.value(self._name) is None:
+            self._sent(log.number)
+
+    def step(self, stage: Path, name: str, table: AlertsTable) -> None:
+        """Send what is due. Tells the log of the first failure in a row."""
+        now_s = self._monotonic()
+        rows = [row for row in self._log.after(int(self._log.value(self._name) or 0)) if _worth(row, table)]
+        if not rows:
+            self._due_s = None
+            return
+        self._due_s = now_s + GATHER_S if self._due_s is None else self._due_s
+        if now_s < max(self._due_s, self._next_s):
+            return
+        try:
+            self._send(stage, name, table, rows[-MOST_EVENTS:])
+        except WorkError as error:
+            if not self._failed:
+                self._log.tell(Decision(error.code, error.what, error.remedy, "warning"))
+            self._next_s = self._monotonic() + AGAIN_S[min(self._failed, len(AGAIN_S) - 1)]
+            self._failed += 1
+            return
+        if self._failed:
+            self._log.tell(Decision("alert-sent", "Alerts are sent again."))
+        self._failed, self._due_s = 0, None
+        self._next_s = self._monotonic() + PAUSE_S
+        self._sent(rows[-1].number)
+
+    def _sent(self, number: int) -> None:
+        self._log.keep(self._name, str(number))
+
+
+class Alerts:
+    """``table`` and ``name``: the settings and the stage's name now. One thread calls ``step`` about once a second."""
+
+    def __init__(
+        self, stage: Path, name: Callable[[], str], table: Callable[[], AlertsTable], log: EventLog, *,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        self._stage, self._name, self._table, self._log, self._monotonic = stage, name, table, log, monotonic
+        self._channels: dict[str, Channel] = {}
+
+    def step(self) -> None:
+        table = self._table()
+        for kind, send in _wanted(table).items():
+            if kind not in self._channels:
+                self._channels[kind] = Channel(kind, send, self._log, self._monotonic)
+            self._channels[kind].step(self._stage, self._name(), table)
+
+    def test(self) -> None:
+        """Send a test on every channel. Raises UsageError("alerts-none"), WorkError("alert-not-sent")."""
+        table = self._table()
+        if not (wanted := _wanted(table)):
+            raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.",
+                             remedy="Write mail_to or webhook under [alerts].")  # fmt: skip
+        row = EventRow(self._log.number, time.time(), "info", "This is a test: alerts arrive.", "alert-test")
+        for send in wanted.values():
+            send(self._stage, self._name(), table, (row,))
+
+
+def _wanted(table: AlertsTable) -> dict[str, Send]:
+    mail = {"mail": channels.mail} if table.mail_to else {}
+    return {**mail, **({"webhook": channels.webhook} if table.webhook is not None else {})}
+
+
+def _worth(row: EventRow, table: AlertsTable) -> bool:
+    return row.level in _LEVELS[table.least] and row.code != _OWN

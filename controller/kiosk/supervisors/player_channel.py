@@ -1,0 +1,60 @@
+"""Questions to the player over its socket, each with a time in which it has to answer."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+from controller.core.errors import WorkError
+
+
+class PlayerChannel:
+    """One connection, opened at the first question and again after ``close``."""
+
+    def __init__(self) -> None:
+        self._socket: socket.socket | None = None
+        self._numbers = 0
+
+    def ask(self, path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
+        """The answer of the player that serves ``path``.
+
+        Raises TimeoutError, OSError, ValueError, and WorkError for what the player refuses.
+        """
+        if self._socket is None:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            self._socket.settimeout(timeout_s)
+            self._socket.connect(str(path))
+        self._numbers += 1
+        number, until_s = self._numbers, time.monotonic() + timeout_s
+        self._socket.settimeout(timeout_s)
+        self._socket.sendall(json.dumps({"id": number, **request}).encode() + b"\n")
+        waiting = b""
+        while True:
+            self._socket.settimeout(max(0.01, until_s - time.monotonic()))
+            data = self._socket.recv(1 << 16)
+            if not data:
+                raise ConnectionError
+            waiting += data
+            *lines, waiting = waiting.split(b"\n")
+            for line in lines:
+                answer = json.loads(line)
+                # An answer that came too late for an earlier question is passed over.
+                if answer.get("id") == number:
+                    return _accepted(answer)
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def _accepted(answer: dict[str, Any]) -> dict[str, Any]:
+    if answer["ok"]:
+        return answer
+    error = answer["error"]
+    if error["code"] == "superseded":
+        return answer
+    raise WorkError(str(error["code"]), what=str(error["what"]), remedy=str(error["remedy"]))

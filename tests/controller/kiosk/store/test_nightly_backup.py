@@ -1,0 +1,107 @@
+"""A backup every night: made once, read back, restored on another folder; and what is said where that fails."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from controller.config.upkeep import BackupTable
+from controller.core.errors import UsageError, VelaturaError
+from controller.kiosk.store import archive
+from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.store.nightly_backup import AGAIN_S, NightlyBackup, copied
+from tests.controller.kiosk.vase import TEXT, vase
+
+NIGHT_S = datetime(2026, 5, 4, 4, 31, tzinfo=UTC).timestamp()
+DAY_S = 86_400.0
+
+
+class Nights:
+    """A stage, a folder for backups, and a clock that is set by hand."""
+
+    def __init__(self, folder: Path, keep: int = 2) -> None:
+        self.stage, self.to = vase(folder / "stage"), folder / "stick"
+        self.table = BackupTable(folder=str(self.to), keep=keep)
+        self.log = EventLog(self.stage / EventLog.FILE, durable=False)
+        self.now_s, self.busy = NIGHT_S, False
+        self.backup = NightlyBackup(
+            self.stage, lambda: self.table, lambda: "UTC", self.log, busy=lambda: self.busy, wall=lambda: self.now_s
+        )
+
+    def at(self, seconds: float) -> list[str]:
+        """What lies in the folder after a step at so many seconds after the first night."""
+        self.now_s = NIGHT_S + seconds
+        self.backup.step()
+        return sorted(path.name for path in self.to.iterdir()) if self.to.exists() else []
+
+    @property
+    def codes(self) -> list[str]:
+        return [row.code for row in self.log.after(0)]
+
+
+def test_one_backup_a_night_the_oldest_go_and_another_machine_restores_it(tmp_path: Path) -> None:
+    nights = Nights(tmp_path)
+    nights.to.mkdir()
+    (nights.to / "holiday.tar.gz").write_bytes(b"somebody else's")
+    assert nights.at(-120) == ["holiday.tar.gz"], "not before its time"
+    nights.busy = True
+    assert nights.at(0) == ["holiday.tar.gz"], "not while a job writes what would be copied"
+    nights.busy = False
+    assert nights.at(60) == ["holiday.tar.gz", "velatura-20260504.tar.gz"]
+    made = (nights.to / "velatura-20260504.tar.gz").stat().st_ino
+    nights.at(600)
+    assert (nights.to / "velatura-20260504.tar.gz").stat().st_ino == made
+    assert nights.codes == ["backup-same-disk"], "a folder on the stage's own disk is a half of a backup, which is said"
+    nights.at(DAY_S)
+    assert nights.at(2 * DAY_S) == ["holiday.tar.gz", "velatura-20260505.tar.gz", "velatura-20260506.tar.gz"]
+    assert not list((nights.stage / archive.FOLDER).iterdir()), "the kiosk's own disk does not fill"
+    blank = tmp_path / "blank"
+    blank.mkdir()
+    archive.restore(blank, nights.to / "velatura-20260506.tar.gz")
+    assert (blank / "stage.toml").read_text() == TEXT
+    assert not (blank / "keys").exists()
+    nights.log.close()
+
+
+def test_a_missing_disk_is_a_failure_that_stays_in_sight_until_somebody_has_seen_it(
+    tmp_path: Path,
+) -> None:
+    nights = Nights(tmp_path)
+    nights.at(0)
+    nights.at(60)
+    (failure,) = nights.log.failures
+    assert (failure.code, failure.level) == ("backup-failed", "error")
+    assert "does not exist" in failure.text
+    nights.to.mkdir()
+    assert nights.at(120) == [], "not all the time"
+    assert nights.at(60 + AGAIN_S) == ["velatura-20260504.tar.gz"]
+    nights.log.close()
+
+
+@pytest.mark.parametrize("how", ["cut", "a flipped bit", "no settings"])
+def test_what_does_not_read_back_as_a_backup_gets_no_name(tmp_path: Path, how: str) -> None:
+    stage = vase(tmp_path / "stage")
+    if how == "no settings":
+        (stage / "stage.toml").unlink()
+    source = archive.backup(stage)
+    data = bytearray(source.read_bytes())
+    if how == "cut":
+        del data[len(data) * 2 // 3 :]
+    elif how == "a flipped bit":
+        data[len(data) // 2] ^= 16
+    source.write_bytes(data)
+    target = tmp_path / "velatura-20260504.tar.gz"
+    target.write_bytes(b"the one of before")
+    with pytest.raises(VelaturaError):
+        copied(source, target)
+    assert target.read_bytes() == b"the one of before"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["stage", target.name]
+
+
+def test_a_sound_backup_passes_and_others_do_not(tmp_path: Path) -> None:
+    archive.check_backup(archive.backup(vase(tmp_path / "stage")))
+    (tmp_path / "b.tar.gz").write_bytes(b"nothing")
+    with pytest.raises(UsageError, match="not a backup"):
+        archive.check_backup(tmp_path / "b.tar.gz")
