@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from hal.annotations import mismatch
 from hal.deadline import Deadline
-from hal.driver_calls import Caller
+from hal.driver_calls import Caller, closed_quietly
 from hal.errors import PluginError
 from hal.escapes import toml_value
 
@@ -214,11 +214,13 @@ def open_device(
     """Check ``settings``, then open the device. ``name``: its name in the stage, for messages.
 
     Later calls of the device are checked, too (see ``hal.driver_calls``). Raises PluginError for the
-    settings, the driver's own DeviceError, and DriverFault("driver-fault") for other errors or wrong results.
+    settings, the driver's own DeviceError, DriverFault("driver-fault") for other errors or wrong results, and
+    DriverFault("driver-stuck") where it does not return; what it opens later is closed.
     """
     check_settings(driver, settings)
     caller = _caller(driver, name)
-    return caller.device(driver.kind, caller.call("open", driver.open, Any, settings, context, deadline))
+    made = caller.call("open", driver.open, Any, settings, context, deadline, late=closed_quietly)
+    return caller.device(driver.kind, made)
 
 
 def _caller(driver: Driver, name: str) -> Caller:

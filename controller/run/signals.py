@@ -9,18 +9,20 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
+from hal.deadline import Stop
+
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextlib.contextmanager
-def cancelled_by_signals() -> Iterator[threading.Event]:
-    """An event that the first SIGINT, SIGTERM or SIGHUP sets; further ones have no effect.
+def cancelled_by_signals() -> Iterator[Stop]:
+    """An event that the first SIGINT, SIGTERM or SIGHUP sets; the second makes it urgent.
 
     Put it into the run's ``Deadline`` and keep the context open while the lamps are cooled, so that a second
-    Ctrl-C can't skip that. On leaving, the previous handlers are restored. Outside the main thread, where Python
-    handles no signals, it is an ordinary event.
+    Ctrl-C can't skip that: it only stops waiting for a driver that hangs. On leaving, the previous handlers are
+    restored. Outside the main thread, where Python handles no signals, it is an ordinary event.
     """
-    cancel = threading.Event()
+    cancel = Stop()
     if threading.current_thread() is not threading.main_thread():
         yield cancel
         return
@@ -50,7 +52,7 @@ def _noticed(number: int, frame: FrameType | None) -> None:
     """Replaces the handler that raises KeyboardInterrupt; the byte on the socket does the work."""
 
 
-def _watch(ours: socket.socket, cancel: threading.Event) -> None:
+def _watch(ours: socket.socket, cancel: Stop) -> None:
     while numbers := ours.recv(64):
-        if any(number in STOPPING for number in numbers):
-            cancel.set()
+        for _ in (number for number in numbers if number in STOPPING):
+            cancel.again()

@@ -18,7 +18,21 @@ from hal.errors import DeviceRefused, DeviceTimeout
 from hal.interfaces import Camera
 from hal.values import CameraCapabilities, CapturedFile, ExposureSettings, FileKind
 
-_RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".crw", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef"}
+_RAW_SUFFIXES = {
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".crw",
+    ".nef",
+    ".arw",
+    ".raf",
+    ".orf",
+    ".rw2",
+    ".pef",
+    ".exr",
+    ".tif",
+    ".tiff",
+}
 
 
 class CameraConformance(DeviceConformance):
@@ -81,6 +95,11 @@ class CameraConformance(DeviceConformance):
         self.check_files(files, tmp_path / "shot.of-the-day")
         assert sorted(file.path for file in files) == sorted(tmp_path.iterdir()), "no other files may be in the folder"
         assert all(file.path.stat().st_ino in synced for file in files), "every file is fsynced"
+
+    def test_a_folder_that_does_not_exist_is_made(self, camera: Camera, tmp_path: Path) -> None:
+        self.configure_short(camera)
+        destination = tmp_path / "captures" / "left" / "shot"
+        self.check_files(camera.capture(destination, deadline=self.soon()), destination)
 
     def test_the_kind_of_file_follows_the_setting(self, camera: Camera, tmp_path: Path) -> None:
         can = camera.capabilities
