@@ -52,7 +52,9 @@ class CameraFaults:
     many reports of a new picture never come; ``wrong_lengths``: that many data phases announce more than they send;
     ``garbage``: that many answers are noise; ``slow_s``: before every answer; ``card_full``; ``silent``: no answers;
     ``autofocus_fails``: that many presses find no focus; ``target_flips``: that many times the body changes by itself
-    from the computer to its card before an exposure, and says nothing.
+    from the computer to its card before an exposure, and says nothing; ``unconfirmed``: properties whose changes an EOS
+    never reports; ``space_refused``: an EOS refuses to hear of the computer's free space, and exposes all the same;
+    ``late_events_s``: how long after the first connection the event port of PTP/IP opens.
     """
 
     busy: int = 0
@@ -67,6 +69,9 @@ class CameraFaults:
     silent: bool = False
     autofocus_fails: int = 0
     target_flips: int = 0
+    unconfirmed: frozenset[int] = frozenset()
+    space_refused: bool = False
+    late_events_s: float = 0.0
 
     def take(self, name: str) -> bool:
         """Use up one of a count; False when none is left."""

@@ -132,7 +132,8 @@ class EmulatedPtpCamera:
         if self._ports[1] and self._ports[1] == self._ports[0]:
             self._ports = (port, port)
         else:
-            self._ports = (port, self._listen(self._ports[1]).getsockname()[1])
+            late = self.faults.late_events_s > 0
+            self._ports = (port, self._listen(self._ports[1], late=late).getsockname()[1])
         self._body.stopped.clear()
         for listener in self._listeners:
             threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
@@ -162,12 +163,14 @@ class EmulatedPtpCamera:
     ) -> None:
         self.stop()
 
-    def _listen(self, port: int) -> socket.socket:
+    def _listen(self, port: int, *, late: bool = False) -> socket.socket:
+        """``late``: the port is taken, but refuses connections until ``_open_late``."""
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((self._host, port))
-            listener.listen()
+            if not late:
+                listener.listen()
         except OSError as error:
             listener.close()
             self.stop()
@@ -179,7 +182,15 @@ class EmulatedPtpCamera:
         self._listeners.append(listener)
         return listener
 
+    def _open_late(self) -> None:
+        if not self._body.stopped.wait(self.faults.late_events_s):
+            with contextlib.suppress(OSError, IndexError):
+                self._listeners[1].listen()
+
     def _accept(self, listener: socket.socket) -> None:
+        while not listener.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+            if self._body.stopped.wait(0.01):
+                return
         while True:
             try:
                 connection, _ = listener.accept()
@@ -203,6 +214,8 @@ class EmulatedPtpCamera:
         if not self._take_over(connection):
             send(connection, INIT_FAIL, struct.pack("<I", 2))
             return
+        if self.faults.late_events_s > 0:
+            threading.Thread(target=self._open_late, daemon=True).start()
         try:
             guid = uuid.uuid5(uuid.NAMESPACE_OID, self._body.names.serial).bytes
             name = (self._body.names.model + "\0").encode("utf-16-le")
