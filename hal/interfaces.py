@@ -228,3 +228,6 @@ class Bench(Protocol):
 
         ``scenario``: a script of faults of its devices.
         """
+
+    def replay(self, tape: Path, *, json_lines: bool) -> int:
+        """Serve the devices of a tape (``hal.tape``) until SIGINT/SIGTERM, as ``serve``."""

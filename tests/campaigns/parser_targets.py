@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 import tempfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from controller.bundle import format as bundle_format
 from controller.bundle.index import parse_index
@@ -25,6 +28,7 @@ from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp import values as ptp
 from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
 from hal.errors import ProtocolError
+from hal.tape.reading import parse_tape
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 
 FOLDER = Path(__file__).parents[2] / "firmware_configs" / "projectors"
@@ -51,6 +55,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "serial-answers": Target(_serial, _answers()),
         "pjlink-answers": Target(_pjlink, tuple(bytes([n]) + answer for n, answer in enumerate(_PJLINK))),
         "pjlink-udp": Target(pjlink_udp.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
+        "tape": Target(_tape, _TAPES),
         "hid-reports": Target(_hid, _REPORTS),
         "bundle-index": Target(_index, (json.dumps(_INDEX).encode(),), (BundleError,)),
         "bundle-header": Target(_header, (bytes(128), bundle_format.MAGIC + bytes(120)), (BundleError,)),
@@ -145,6 +150,16 @@ _REPORTS = (
     b"\x03\0BITFT\0\0\x03",
     b"\x01" + bytes([1, 3, 0, 16, 0, 0, 0]),
     b"\x02" + hid_light.SensorSettings().pack(),
+)
+
+
+def _tape(data: bytes) -> None:
+    parse_tape(data.decode("latin-1"))
+
+
+_TAPES: Final = (
+    b"velatura tape 1\n0.1 + 1 serial a\n0.2 > 1 on\\r\n0.3 < 1 OK\n",
+    b"velatura tape 1\n0.1 + 1 ptp a\n0.2 { 1 " + base64.b64encode(zlib.compress(bytes(300))) + b"\n",
 )
 
 

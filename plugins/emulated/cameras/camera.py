@@ -60,6 +60,7 @@ class EmulatedPtpCamera:
     card_bytes : size of the memory card
     raw : False for a camera that makes JPEG files only
     faults : knobs that may be turned while it runs
+    body : another body than the flavour's, for example of a tape
     """
 
     def __init__(
@@ -75,10 +76,11 @@ class EmulatedPtpCamera:
         card_bytes: int = 4 << 30,
         raw: bool = True,
         faults: CameraFaults | None = None,
+        body: EmulatedBody | None = None,
     ) -> None:
         self.faults = faults or CameraFaults()
-        self.names = names or NAMES[flavour]
-        self._body: EmulatedBody = BODIES[flavour](
+        self.names = names or (NAMES[flavour] if body is None else body.names)
+        self._body: EmulatedBody = body or BODIES[flavour](
             expose,
             names=self.names,
             time_scale=time_scale,
