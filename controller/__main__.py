@@ -40,9 +40,9 @@ from controller.cli.commands.keys import keys
 from controller.cli.commands.live import live
 from controller.cli.commands.photograph import photograph
 from controller.cli.commands.plan import plan
-from controller.cli.commands.record import record
 from controller.cli.commands.report import report
 from controller.cli.commands.study import study
+from controller.cli.record_command import record
 from controller.cli.running import Json, StageFolder, group, projector_names, work
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.files import file_error

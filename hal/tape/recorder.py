@@ -9,7 +9,7 @@ import threading
 import time
 import zlib
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 from hal.escapes import escaped
 from hal.transcript import Transcript, Way
@@ -36,7 +36,7 @@ class Tape:
         self._lock = threading.Lock()
         self._tracks = 0
         self._written = 0
-        self._file = path.open("w", encoding="ascii", buffering=1)
+        self._file: TextIO | None = path.open("w", encoding="ascii", buffering=1)
         self._write(HEADER)
 
     def track(self, kind: str, address: str, *, secrets: tuple[bytes, ...] = ()) -> TapeTrack:

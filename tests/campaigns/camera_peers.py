@@ -36,7 +36,7 @@ from plugins.gphoto2.camera import open_camera
 
 __all__ = ["FLAVOURS", "SIZE", "Flavour", "Peer", "Way", "network_peer", "usb_peer"]
 
-FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old")
+FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old", "nikon", "sony")
 SIZE: Final = 150_000
 _TIME_SCALE: Final = 0.01
 _PATIENCE_S: Final = 60.0

@@ -24,6 +24,8 @@ from hal.codecs.projectors.profiles import parse_profile
 from hal.codecs.projectors.serial_protocol import parse_hours, parse_line
 from hal.codecs.ptp import eos as ptp_eos
 from hal.codecs.ptp import ip as ptp_ip
+from hal.codecs.ptp import nikon as ptp_nikon
+from hal.codecs.ptp import sony as ptp_sony
 from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp import values as ptp
 from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
@@ -52,6 +54,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "ptp-datasets": Target(_ptp_dataset, _datasets()),
         "ptp-ip": Target(_ptp_ip, _packets()),
         "eos-records": Target(_eos, _records()),
+        "nikon": Target(_nikon, (b"\x02\0\x02\x40\1\0\0\0\x0d\x40\0\0\0\0", bytes(384) + b"\xff\xd8\xff\xe0")),
+        "sony": Target(ptp_sony.parse_properties, _SONY),
         "serial-answers": Target(_serial, _answers()),
         "pjlink-answers": Target(_pjlink, tuple(bytes([n]) + answer for n, answer in enumerate(_PJLINK))),
         "pjlink-udp": Target(pjlink_udp.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
@@ -150,6 +154,24 @@ _REPORTS = (
     b"\x03\0BITFT\0\0\x03",
     b"\x01" + bytes([1, 3, 0, 16, 0, 0, 0]),
     b"\x02" + hid_light.SensorSettings().pack(),
+)
+
+
+def _nikon(data: bytes) -> None:
+    """Every parser gets all the bytes."""
+    refused = None
+    for parse in (ptp_nikon.parse_events, ptp_nikon.parse_codes, ptp_nikon.parse_view):
+        try:
+            parse(data)
+        except ProtocolError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
+_SONY: Final = (
+    struct.pack("<II", 1, 0) + struct.pack("<HHBBIIBH3I", 0xD20D, 6, 1, 1, 9, 9, 2, 3, 0x1000A, 0x100FA, 0x12C000A),
+    struct.pack("<II", 1, 0) + struct.pack("<HHBBHHBH2HH2H", 0x5007, 4, 1, 1, 9, 9, 2, 2, 400, 560, 2, 400, 560),
 )
 
 

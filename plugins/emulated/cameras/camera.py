@@ -16,7 +16,9 @@ from hal.errors import DeviceError
 from plugins.emulated.cameras.body import JPEG, CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.cameras.eos import EmulatedEosBody, EmulatedOldEosBody
 from plugins.emulated.cameras.generic import EmulatedGenericBody
+from plugins.emulated.cameras.nikon import EmulatedNikonBody
 from plugins.emulated.cameras.shot import Expose
+from plugins.emulated.cameras.sony import EmulatedSonyBody
 from plugins.emulated.cameras.wire import (
     CANCEL,
     EVENT,
@@ -37,12 +39,20 @@ from plugins.emulated.cameras.wire import (
     send_data,
 )
 
-Flavour = Literal["generic", "eos-new", "eos-old"]
-BODIES: Final = {"generic": EmulatedGenericBody, "eos-new": EmulatedEosBody, "eos-old": EmulatedOldEosBody}
+Flavour = Literal["generic", "eos-new", "eos-old", "nikon", "sony"]
+BODIES: Final = {
+    "generic": EmulatedGenericBody,
+    "eos-new": EmulatedEosBody,
+    "eos-old": EmulatedOldEosBody,
+    "nikon": EmulatedNikonBody,
+    "sony": EmulatedSonyBody,
+}
 NAMES: Final = {
     "generic": CameraNames(),
     "eos-new": CameraNames("Canon Inc.", "Canon EOS 1300D", "0320010001", "3-1.1.0"),
     "eos-old": CameraNames("Canon Inc.", "Canon EOS 400D DIGITAL", "0320010002", "3-1.1.1"),
+    "nikon": CameraNames("Nikon Corporation", "D7100", "0003200103", "V1.04"),
+    "sony": CameraNames("Sony Corporation", "ILCE-7M2", "0003200104", "1.0"),
 }
 _TAKEOVER_S: Final = 0.5
 
@@ -53,7 +63,8 @@ class EmulatedPtpCamera:
     Parameters
     ----------
     expose : makes the files of an exposure; called from the camera's shutter thread
-    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D)
+    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D),
+        "nikon" (9207 and 90C7), "sony" (protocol 3)
     command_port, event_port : 0 takes a free one; both the same non-zero number: one port for both, as real ones do
     names : identity; by default one that fits the flavour
     time_scale : real seconds for each second of exposure

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.core.errors import WorkError
 from controller.stage import recording
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
@@ -80,7 +81,7 @@ def test_a_file_that_is_no_tape_is_refused_by_the_bench(tmp_path: Path, capsys: 
 def test_a_tape_that_cannot_be_made_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(recording.VARIABLE, str(tmp_path / "missing" / "a.tape"))
     recording._tape.cache_clear()
-    with pytest.raises(recording.WorkError) as caught:
+    with pytest.raises(WorkError) as caught:
         recording.open_context(tmp_path)
     assert caught.value.code == "tape-not-made"
     assert recording.open_context(tmp_path).tape is None, "the variable is for one process"
