@@ -42,6 +42,7 @@ from controller.cli.commands.photograph import photograph
 from controller.cli.commands.plan import plan
 from controller.cli.commands.report import report
 from controller.cli.commands.study import study
+from controller.cli.record_command import record
 from controller.cli.running import Json, StageFolder, group, projector_names, work
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.files import file_error
@@ -98,7 +99,8 @@ def demo(
 
 
 def emulate(
-    stage: StageFolder,
+    stage: Annotated[Path | None, typer.Argument(metavar="STAGE", help="The stage's folder.")] = None,
+    tape: Annotated[Path | None, typer.Option(help="Replay the devices of a tape (`velatura record`).")] = None,
     scenario: Annotated[
         Path | None, typer.Option(help="A script of faults (see docs/how-to/emulated-devices.md).")
     ] = None,
@@ -107,10 +109,14 @@ def emulate(
     ] = False,
     as_json: Json = False,
 ) -> int:
-    """Run the emulated devices of a stage and print their addresses, until Ctrl-C."""
+    """Run the emulated devices of a stage, or those of a tape, and print their addresses, until Ctrl-C."""
     from controller.stage.bench import bench_of, terminated_when_input_ends
 
-    if not stage.is_dir():
+    if tape is not None:
+        if until_input_ends:
+            terminated_when_input_ends()
+        return bench_of(stage or Path.cwd()).replay(tape, json_lines=as_json)
+    if stage is None or not stage.is_dir():
         raise UsageError(
             "stage-missing",
             what=f"The folder {stage} does not exist.",
@@ -230,6 +236,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     live,
     keys,
     emulate,
+    record,
     export,
     plan,
     report,

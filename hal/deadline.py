@@ -22,6 +22,23 @@ class Cancelled(DeviceError):
         super().__init__("cancelled", what="The work was stopped on request.", remedy="Start it again to continue.")
 
 
+class Stop(threading.Event):
+    """A request to stop the work. ``urgent``: it was made again, so wait for no driver that does not answer.
+
+    ``restarting``: the program is started again at once.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.urgent = False
+        self.restarting = False
+
+    def again(self) -> None:
+        """Ask; the second time it is urgent."""
+        self.urgent = self.is_set()
+        self.set()
+
+
 @dataclass(frozen=True, slots=True)
 class Deadline:
     """The time on the monotonic clock by which a call must end, and an event to end it sooner.

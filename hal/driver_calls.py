@@ -1,7 +1,8 @@
-"""Calls into drivers. Every error of a driver, and every wrong object that it returns, becomes a ``DeviceError``.
+"""Calls into drivers. Every error of a driver, every wrong object that it returns, and every call that does not end
+becomes a ``DeviceError``.
 
-Our drivers use ``hal.errors``. One of another author may raise anything, but must not end the program or block
-other devices: above all, no lamp may stay on because of it.
+Our drivers use ``hal.errors``. One of another author may raise anything or never return, but must not end the program
+or block other devices: above all, no lamp may stay on because of it.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
+import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final, get_type_hints
 
 from hal.annotations import mismatch
+from hal.deadline import Deadline, Stop
 from hal.errors import DeviceError, DriverFault
 from hal.interfaces import (
     BundleDisplay,
@@ -26,7 +29,14 @@ from hal.interfaces import (
     WatchedCamera,
     WatchedProjector,
 )
+from hal.runtime.call_threads import CallThreads, LeftBehind
 
+GRACE_S: Final = 6.0
+"""A call may end so much later than its deadline or cancellation; then it is left behind."""
+_URGENT_S: Final = 0.5
+"""The same after an urgent request to stop (Ctrl-C twice)."""
+_WITHOUT_DEADLINE_S: Final = 4.0
+"""Time for a call without a deadline, such as ``close``, before that."""
 INTERFACES: Final[Mapping[str, tuple[type, ...]]] = {
     "projector": (Projector, WatchedProjector),
     "camera": (Camera, WatchedCamera, LiveViewCamera),
@@ -40,18 +50,35 @@ _LONGEST_TEXT: Final = 200
 
 
 class Caller:
-    """Calls functions of one plugin. ``who`` starts every message, e.g. ``The driver 'acme' of projector left``."""
+    """Calls functions of one plugin. ``who`` starts every message, e.g. ``The driver 'acme' of projector left``.
 
-    def __init__(self, who: str) -> None:
+    ``grace_s``: a call that has not ended so long after its deadline is left behind on its thread.
+    """
+
+    def __init__(self, who: str, *, grace_s: float = GRACE_S) -> None:
         self._who = who
+        self._grace_s = grace_s
+        self._threads = CallThreads(who)
 
-    def call(self, name: str, function: Callable[..., Any], returns: Any, *args: Any, **kwargs: Any) -> Any:
+    def call(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        returns: Any,
+        *args: Any,
+        late: Callable[[Any], object] = lambda _: None,
+        **kwargs: Any,
+    ) -> Any:
         """Call ``function``; its result must fit the annotation ``returns``.
 
-        Raises the driver's own DeviceError unchanged, and DriverFault("driver-fault") for other errors except Ctrl-C.
+        Raises the driver's own DeviceError unchanged, DriverFault("driver-fault") for other errors except Ctrl-C, and
+        DriverFault("driver-stuck") for a call that does not end: it goes on, and ``late`` gets what it may return.
         """
+        patience = _Patience(self._grace_s, *args, *kwargs.values())
         try:
-            value = function(*args, **kwargs)
+            value = self._threads.run(lambda: function(*args, **kwargs), given_up=patience.given_up, late=late)
+        except LeftBehind as left:
+            raise self._stuck(name, left) from None
         except KeyboardInterrupt:
             raise
         except BaseException as error:
@@ -71,12 +98,24 @@ class Caller:
         needed, *optional = INTERFACES[kind]
         if missing := [name for name in _members(needed) if not _has(made, name)]:
             # It may hold a port that is needed again; errors of its close do not matter.
-            with contextlib.suppress(Exception):
-                made.close()  # type: ignore[attr-defined]
+            closed_quietly(made)
             told = f"a {type(made).__name__} without {', '.join(missing)}"
             raise self.fault(f"returned from open: {told}, which is not a {kind.replace('_', ' ')}")
         also = tuple(extra for extra in optional if all(_has(made, name) for name in _members(extra)))
         return _checked_class(needed, *also)(made, self)
+
+    def end(self) -> None:
+        """No call will follow soon."""
+        self._threads.end()
+
+    def _stuck(self, name: str, left: LeftBehind) -> DriverFault:
+        did = "hangs in earlier calls, and gets no further ones" if left.again else f"did not return from {name}"
+        return DriverFault(
+            "driver-stuck",
+            what=f"{self._who} {did}.",
+            remedy="Switch the device off and on, check its cable, then start again. If it happens again, "
+            "report it to the driver's author.",
+        )
 
     def fault(self, did: str) -> DriverFault:
         return DriverFault(
@@ -84,6 +123,31 @@ class Caller:
             what=f"{self._who} {did}.",
             remedy="This is a mistake in the driver: update it, or report it to its author.",
         )
+
+
+class _Patience:
+    """Until when a call is waited for: by the ``Deadline`` among its arguments."""
+
+    def __init__(self, grace_s: float, *arguments: object) -> None:
+        found = next((value for value in arguments if isinstance(value, Deadline)), None)
+        self._deadline = found or Deadline(time.monotonic() + _WITHOUT_DEADLINE_S)
+        self._grace_s = grace_s
+        self._stopped_at_s: float | None = None
+
+    def given_up(self) -> bool:
+        now_s, stop = time.monotonic(), self._deadline.cancel
+        ends_s, grace_s = self._deadline.at_s, self._grace_s
+        if stop is not None and stop.is_set():
+            self._stopped_at_s = self._stopped_at_s or now_s
+            ends_s = min(ends_s, self._stopped_at_s)
+            grace_s = min(grace_s, _URGENT_S) if isinstance(stop, Stop) and stop.urgent else grace_s
+        return now_s > ends_s + grace_s
+
+
+def closed_quietly(made: Any) -> None:
+    """Close what may be a device; its errors do not matter."""
+    with contextlib.suppress(Exception):
+        made.close()
 
 
 class CheckedDevice:
@@ -106,7 +170,14 @@ def _forwarded(name: str, member: Any) -> Any:
     returns = get_type_hints(member.fget if is_property else member)["return"]
 
     def method(self: CheckedDevice, *args: Any, **kwargs: Any) -> Any:
-        return self._caller.call(name, lambda: getattr(self._device, name)(*args, **kwargs), returns)
+        def looked_up(*given: Any, **named: Any) -> Any:
+            return getattr(self._device, name)(*given, **named)
+
+        try:
+            return self._caller.call(name, looked_up, returns, *args, **kwargs)
+        finally:
+            if name == "close":
+                self._caller.end()
 
     def value(self: CheckedDevice) -> Any:
         return self._caller.call(name, lambda: getattr(self._device, name), returns)

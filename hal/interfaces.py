@@ -91,7 +91,7 @@ class Camera(Device, Protocol):
         """Take one picture; return its files, complete and fsynced. Never fires twice.
 
         ``destination`` is a path without suffix; each file gets the camera's suffix (``.dng``, ``.jpg``), written
-        under a temporary name and renamed when whole.
+        under a temporary name and renamed when whole. A folder that does not exist is made.
         """
 
 
@@ -228,3 +228,6 @@ class Bench(Protocol):
 
         ``scenario``: a script of faults of its devices.
         """
+
+    def replay(self, tape: Path, *, json_lines: bool) -> int:
+        """Serve the devices of a tape (``hal.tape``) until SIGINT/SIGTERM, as ``serve``."""

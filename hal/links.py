@@ -134,6 +134,8 @@ class TcpLink(BufferedLink):
     def __init__(self, host: str, port: int, *, deadline: Deadline, transcript: Transcript | None = None) -> None:
         super().__init__(f"{host}:{port}", transcript)
         self._socket = self._connect(host, port, deadline)
+        if transcript is not None:
+            transcript.remark("connected")
 
     def _connect(self, host: str, port: int, deadline: Deadline) -> socket.socket:
         self._check(deadline, "was not reached")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
@@ -11,9 +12,11 @@ from typing import Any, Final
 
 from hal.annotations import mismatch
 from hal.deadline import Deadline
-from hal.driver_calls import Caller
+from hal.driver_calls import Caller, closed_quietly
 from hal.errors import PluginError
 from hal.escapes import toml_value
+from hal.tape.recorder import Tape
+from hal.transcript import Transcript
 
 GROUP = "velatura.devices"
 BENCH = "-bench"
@@ -32,11 +35,26 @@ class OpenContext:
     """The stage's folders for a driver: relative paths in settings start at the stage's folder.
 
     ``transcripts``: folder for byte transcripts, or None to keep none. ``runtime``: short private folder for sockets.
+    ``tape``: records the traffic of all devices, instead of transcripts.
     """
 
     stage: Path
     transcripts: Path | None = None
     runtime: Path | None = None
+    tape: Tape | None = None
+
+    def transcript(self, kind: str, address: str, *, keep: int = 10_000, secret: str = "") -> Transcript | None:
+        """Where a driver records its bytes; None to record none.
+
+        ``kind``: "serial", "tcp", "pjlink", "ptp" or "hid"; ``secret``: a password, which is not recorded.
+        """
+        if self.tape is not None:
+            return self.tape.track(kind, address, secrets=(secret.encode(),) if secret else ())
+        if self.transcripts is None:
+            return None
+        self.transcripts.mkdir(parents=True, exist_ok=True)
+        name = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{kind}-{address}")
+        return Transcript(self.transcripts / f"{name}.txt", keep=keep)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,11 +232,13 @@ def open_device(
     """Check ``settings``, then open the device. ``name``: its name in the stage, for messages.
 
     Later calls of the device are checked, too (see ``hal.driver_calls``). Raises PluginError for the
-    settings, the driver's own DeviceError, and DriverFault("driver-fault") for other errors or wrong results.
+    settings, the driver's own DeviceError, DriverFault("driver-fault") for other errors or wrong results, and
+    DriverFault("driver-stuck") where it does not return; what it opens later is closed.
     """
     check_settings(driver, settings)
     caller = _caller(driver, name)
-    return caller.device(driver.kind, caller.call("open", driver.open, Any, settings, context, deadline))
+    made = caller.call("open", driver.open, Any, settings, context, deadline, late=closed_quietly)
+    return caller.device(driver.kind, made)
 
 
 def _caller(driver: Driver, name: str) -> Caller:

@@ -5,22 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from controller.api.arrays import as_images
-from controller.capture import brackets, raw
+from controller.capture import brackets, linear_files, raw
 from controller.capture.brackets import MergedBracket
 from controller.capture.profile import CameraNoise, CameraProfile
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.errors import WorkError
-from controller.solve.targets.files import read_picture
-
-PLAIN: Final = (".png", ".tif", ".tiff")
-"""Whole numbers without a camera's colour pattern, taken as linear light."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,37 +50,20 @@ def develop(path: Path | str, *, camera: CameraProfile | None = None) -> Develop
     camera : measurements of the camera (black level, clipping, bad pixels, response, noise), for example
         ``read_run(folder).camera``; they take precedence over the values in the file
 
-    Errors: ``photograph-unreadable``, ``raw-not-bayer``, ``jpeg-response-missing``, ``target-unreadable`` (EXR).
+    Errors: ``photograph-unreadable``, ``raw-not-bayer``, ``jpeg-response-missing``.
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix in (".exr", *PLAIN):
-        image, saturated = _exr(path) if suffix == ".exr" else _plain(path)
+    if suffix in (*linear_files.SUFFIXES, ".png"):
+        try:
+            image, saturated = linear_files.read_linear(path, bits=(8, 16))
+        except linear_files.Unreadable as error:
+            raise _unreadable(path, error) from error
         image[saturated] = np.nan
         return Developed(image, saturated, None, None, None)
     photograph = raw.read_photograph(path, profile=camera)
     noise = None if camera is None else camera.noise
     return Developed(photograph.measured(), photograph.saturated, noise, photograph.camera_to_xyz, photograph.colours)
-
-
-def _plain(path: Path) -> tuple[FloatImage, Mask]:
-    """(rows, columns, 3) from 0 to 1, and the mask of the pixels with the largest number."""
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    except (OSError, cv2.error) as error:
-        raise _unreadable(path, error) from error
-    if decoded is None or decoded.dtype not in (np.uint8, np.uint16):
-        raise _unreadable(path, "it is not a picture of 8 or 16 bits")
-    colours = np.repeat(decoded[..., None], 3, axis=2) if decoded.ndim == 2 else decoded[..., 2::-1]
-    full = 255 if decoded.dtype == np.uint8 else 65535
-    return np.asarray(colours / np.float32(full), np.float32), np.any(colours == full, axis=2)
-
-
-def _exr(path: Path) -> tuple[FloatImage, Mask]:
-    """Unchanged linear light; a pixel that is not finite counts as saturated."""
-    image = np.ascontiguousarray(read_picture(path)[..., :3])
-    return image, np.asarray(~np.isfinite(image).all(axis=2))
 
 
 def _unreadable(path: Path, reason: object) -> WorkError:

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from controller.capture.linear_files import is_linear
 from controller.capture.profile import CameraNoise
-from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic
+from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic, read_samples
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import CalibrationError
 
@@ -159,6 +160,9 @@ def thumbprint(path: Path, exposure_s: float) -> Thumbprint:
         # Squared, a JPEG's values are near enough to light for telling whether two pictures are the same.
         light = (read_jpeg_values(path)[::SPARSE, ::SPARSE, 1].astype(np.float32) / 255) ** 2
         return Thumbprint((light / np.float32(exposure_s)).astype(np.float32), 1 / exposure_s)
+    if is_linear(path):
+        sparse = read_samples(path)[0][::SPARSE, ::SPARSE, 1]
+        return Thumbprint((sparse / np.float32(exposure_s)).astype(np.float32), 1 / exposure_s)
     mosaic = read_mosaic(path)
     column = 0 if mosaic.levels.colours[0, 0] == 1 else 1
     sparse = mosaic.samples[0::SPARSE, column::SPARSE].astype(np.float32)

@@ -1,4 +1,6 @@
-"""Photographs as linear light: RAW files of any Bayer camera, and JPEG files where the camera's response is known."""
+"""Photographs as linear light: RAW files of any Bayer camera, EXR and TIFF files that are linear already, and JPEG
+files where the camera's response is known.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from controller.capture import linear_files
 from controller.capture.demosaic import SensorLevels, demosaic, fill_bad
 from controller.capture.profile import CameraProfile
 from controller.core.arrays import Float64, FloatImage, Mask
@@ -40,7 +43,7 @@ class Photograph:
     ``saturated`` (rows, columns) bool: some sample that this pixel is made of was clipped
     ``camera_to_xyz`` (3, 3) linear camera RGB to CIE XYZ as the file states it, None where it does not
     ``colours`` (2, 2) the Bayer pattern it was interpolated from (0 red, 1 green, 2 blue; see ``bayer_kernels``), None
-    for a JPEG, whose interpolation is the camera's secret
+    for a file with three colours for each pixel, whose interpolation is the camera's secret
     """
 
     image: FloatImage
@@ -81,7 +84,8 @@ class RawMosaic:
 
 
 def read_photograph(path: Path, *, response: Float64 | None = None, profile: CameraProfile | None = None) -> Photograph:
-    """Read a RAW file (any kind that LibRaw knows, Bayer sensors), or a JPEG with its ``response`` (3, 256).
+    """Read a RAW file (any kind that LibRaw knows, Bayer sensors), an EXR or a TIFF of 16 bits, or a JPEG with its
+    ``response`` (3, 256).
 
     ``profile`` is what was measured of the camera: its black level, its limits, bad pixels and JPEG response go before
     what the file says.
@@ -102,7 +106,25 @@ def read_photograph(path: Path, *, response: Float64 | None = None, profile: Cam
                 remedy="Set the camera to RAW, or measure its response first.",
             )
         return _read_jpeg(path, response)
+    if linear_files.is_linear(path):
+        return Photograph(*_read_linear(path), None)
     return read_mosaic(path, profile=profile).developed()
+
+
+def read_samples(path: Path) -> tuple[FloatImage, Mask]:
+    """What a RAW, EXR or TIFF file says of light, before any interpolation.
+
+    (rows, columns) float32 of a mosaic or (rows, columns, 3) of three colours, 0 at black and 1 at full scale; and
+    (rows, columns) bool where it was clipped. Raises as ``read_photograph``.
+    """
+    return _read_linear(path) if linear_files.is_linear(path) else read_mosaic(path).linear()
+
+
+def _read_linear(path: Path) -> tuple[FloatImage, Mask]:
+    try:
+        return linear_files.read_linear(path)
+    except linear_files.Unreadable as error:
+        raise _unreadable(path, error) from error
 
 
 def is_jpeg(path: Path) -> bool:

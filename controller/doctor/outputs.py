@@ -17,7 +17,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 
 from controller.capture.acquire import Shot
-from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic
+from controller.capture.raw import is_jpeg, read_jpeg_values, read_samples
 from controller.core.arrays import ByteImage
 from controller.core.storage import exclusive
 from controller.doctor.values import Examination, Finding
@@ -178,5 +178,5 @@ class _Camera:
         if is_jpeg(file.path):
             image = read_jpeg_values(file.path) / np.float32(255)
             return float(image.mean()), float((image >= 1).any(axis=2).mean())
-        linear, clipped = read_mosaic(file.path).linear()
+        linear, clipped = read_samples(file.path)
         return float(linear.mean()), float(clipped.mean())

@@ -10,11 +10,12 @@ from typing import Any, cast
 from controller.doctor.values import Finding, Tried
 from controller.rig.lamp_faults import fatal_faults, faulty
 from controller.stage.check import Checked
+from controller.stage.recording import open_context
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.finding import Problem
 from hal.interfaces import ButtonPanel, Camera, LightSensor, PowerSwitch, Projector, WatchedProjector
-from hal.registry import Driver, OpenContext, open_device
+from hal.registry import Driver, open_device
 from hal.values import Power
 
 OPEN_S = 15.0
@@ -82,7 +83,7 @@ class Trying:
             yield Tried(device.name, device.kind, answer), finding
 
     def _asked(self, device: Device) -> str:
-        context = OpenContext(stage=self._checked.stage.folder)
+        context = open_context(self._checked.stage.folder)
         until = self._deadline.within(OPEN_S)
         opened = open_device(device.driver, device.settings, context, until, name=device.title)
         with contextlib.closing(opened):

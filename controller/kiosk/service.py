@@ -36,13 +36,12 @@ from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
-from controller.run.signals import Stop
 from controller.run.state_machine import State
 from controller.stage.calibrations import finished_calibrations, stage_trust
 from controller.stage.check import Checked, check_stage
 from controller.stage.open import player_settings, technicians_panel
 from controller.stage.run import stage_lock
-from hal.deadline import in_seconds
+from hal.deadline import Stop, in_seconds
 from hal.interfaces import ButtonPanel
 
 STEP_S: Final = 0.25

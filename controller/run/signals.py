@@ -9,24 +9,20 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
+from hal.deadline import Stop
+
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 RESTARTS = signal.SIGUSR1
 """What systemd sends instead of SIGTERM to a service that it starts again at once (``RestartKillSignal=``)."""
 
 
-class Stop(threading.Event):
-    """Set by a signal. ``restarting``: that the program is started again at once."""
-
-    restarting = False
-
-
 @contextlib.contextmanager
 def cancelled_by_signals() -> Iterator[Stop]:
-    """An event that the first signal of ``STOPPING`` sets; further ones have no effect.
+    """An event that the first signal of ``STOPPING`` sets; the second makes it urgent.
 
     Put it into the run's ``Deadline`` and keep the context open while the lamps are cooled, so that a second
-    Ctrl-C can't skip that. On leaving, the previous handlers are restored. Outside the main thread, where Python
-    handles no signals, it is an ordinary event.
+    Ctrl-C can't skip that: it only stops waiting for a driver that hangs. On leaving, the previous handlers are
+    restored. Outside the main thread, where Python handles no signals, it is an ordinary event.
     """
     cancel = Stop()
     if threading.current_thread() is not threading.main_thread():
@@ -62,5 +58,5 @@ def _watch(ours: socket.socket, cancel: Stop) -> None:
     while numbers := ours.recv(64):
         if RESTARTS in numbers and not cancel.is_set():
             cancel.restarting = True
-        if any(number in STOPPING for number in numbers):
-            cancel.set()
+        for _ in (number for number in numbers if number in STOPPING):
+            cancel.again()

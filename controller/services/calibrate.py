@@ -48,7 +48,7 @@ from controller.steps.calibrate.grade import (
     grade_figures,
     verify_step,
 )
-from controller.steps.capture.lens_check import lens_check
+from controller.steps.capture.device_checks import device_checks
 from hal.deadline import in_seconds
 
 KEY_FILE = "keys/stage.key"
@@ -79,7 +79,7 @@ def calibrate(
         reporter=reporter,
         cancel=cancel,
         dark=True,
-        before=lambda rig: lens_check(rig, prior),
+        before=lambda rig: device_checks(rig, prior),
     )
     tell_grade(checked, run, last, reporter, accept_grade=accept_grade)
     return {"run": str(run), **grade_figures(run)}

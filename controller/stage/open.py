@@ -23,6 +23,7 @@ from controller.rig.lamp_ledger import LampFile
 from controller.rig.mains_relays import Circuit, close_circuits
 from controller.rig.rig import Rig, RigProjector
 from controller.stage.check import Checked, mistake_in
+from controller.stage.recording import open_context
 from hal import registry
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, PluginError
@@ -42,7 +43,7 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
     Mains relays are closed first. This function switches no relay or lamp off: ``lit`` does that.
     """
     stage = checked.stage
-    context = OpenContext(stage=stage.folder, runtime=runtime_folder(stage.folder))
+    context = open_context(stage.folder, runtime=runtime_folder(stage.folder))
     with contextlib.ExitStack() as stack:
         darkness = light_sensor(checked, context, stack, deadline)
         circuits = mains_circuits(checked, context, stack, deadline)
@@ -74,7 +75,7 @@ def technicians_panel(checked: Checked, *, deadline: Deadline) -> Iterator[Butto
     if table is None or checked.key_panel is None:
         yield None
         return
-    context = OpenContext(stage=checked.stage.folder)
+    context = open_context(checked.stage.folder)
     panel = cast("ButtonPanel", open_device(table, *checked.key_panel, context, deadline))
     with contextlib.closing(panel):
         yield panel

@@ -14,12 +14,13 @@ are the tests' time limits; increase them for a slow device. Only this part of `
 from hal.conformance.button_panel import ButtonPanelConformance
 from hal.conformance.camera import CameraConformance
 from hal.conformance.device import DeviceConformance
-from hal.conformance.display import DisplayConformance
+from hal.conformance.display import BundleDisplayConformance, DisplayConformance
 from hal.conformance.light_sensor import LightSensorConformance
 from hal.conformance.power_switch import PowerSwitchConformance
 from hal.conformance.projector import ProjectorConformance
 
 __all__ = [
+    "BundleDisplayConformance",
     "ButtonPanelConformance",
     "CameraConformance",
     "DeviceConformance",

@@ -11,6 +11,7 @@ import shlex
 import signal
 import socket
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +21,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from hal.runtime.files import read_text
+from hal.tape.reading import read_tape
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
@@ -44,6 +46,7 @@ from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
 from plugins.emulated.projectors.quick_profile import quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.emulated.scenario import ScenarioPlayer, read_scenario
+from plugins.emulated.tape.serving import serve_tape
 from plugins.emulated.usb.bench import UsbDevices, read_usb
 
 OBJECT_FILE: Final = f"{FOLDER}/object.npz"
@@ -102,6 +105,25 @@ class EmulatedBench:
             out.ready()
             while not stopped.wait(0.5):
                 _follow_bumps(world, out)
+        out.say({"stopped": True}, "All devices are off.")
+        return 0
+
+    def replay(self, tape: Path, *, json_lines: bool) -> int:
+        """See ``hal.interfaces.Bench``."""
+        out = _OutputLines(json_lines)
+        stopped = threading.Event()
+        with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
+            try:
+                folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="velatura-tape-")))
+                count = serve_tape(read_tape(tape), folder, stack, out.served)
+            except DeviceError as error:
+                out.failed(error)
+                return DEVICE_FAILED
+            except _Interrupted:
+                return 0
+            out.say({"devices": count}, f"{count} devices of the tape.")
+            out.ready()
+            stopped.wait()
         out.say({"stopped": True}, "All devices are off.")
         return 0
 

@@ -23,7 +23,6 @@ class Opened:
     def __init__(self, library: Any, camera: Any) -> None:
         self.library = library
         self.camera = camera
-        self.lost = False
         names = {widget: _named(camera, library, group) for widget, group in _GROUPS.items()}
         self.names: dict[str, str] = {kind: name for kind, name in names.items() if name}
 

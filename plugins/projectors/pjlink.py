@@ -250,10 +250,7 @@ def check_pjlink_projector(settings: Mapping[str, Any], context: OpenContext) ->
 def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PjLinkProjector:
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
     host, port, password, profile = _settings(settings, context)
-    transcript = None
-    if context.transcripts is not None:
-        context.transcripts.mkdir(parents=True, exist_ok=True)
-        transcript = Transcript(context.transcripts / f"pjlink-{host.replace(':', '_')}-{port}.txt")
+    transcript = context.transcript("pjlink", f"{host}-{port}", secret=password or "")
     projector = PjLinkProjector(
         lambda until: TcpLink(host, port, deadline=until, transcript=transcript),
         profile,

@@ -284,10 +284,7 @@ def check_serial_projector(settings: Mapping[str, Any], context: OpenContext) ->
 def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
     profile, port, baud, address = read_settings(settings, context)
-    transcript = None
-    if context.transcripts is not None:
-        context.transcripts.mkdir(parents=True, exist_ok=True)
-        transcript = Transcript(context.transcripts / f"serial-{port.name}.txt")
+    transcript = context.transcript("serial", port.name)
     projector = SerialProjector(
         lambda until: SerialLink(port, baud=baud, deadline=until, transcript=transcript),
         profile,

@@ -95,8 +95,9 @@ class Channel:
         sink: Sink | None = None,
         most: int | None = None,
         patience_s: float | None = None,
+        note_busy: bool = True,
     ) -> Reply:
-        """Do an operation once and return the camera's answer."""
+        """Do an operation once and return the camera's answer. ``note_busy``: a busy camera is worth a note."""
         until = deadline.within(self.timing.answer_s if patience_s is None else patience_s)
         began_s = time.monotonic()
         reply = self.link.transact(
@@ -105,7 +106,7 @@ class Channel:
         took_s = time.monotonic() - began_s
         if took_s > self.timing.slow_s and sink is None:
             self.diary.add("camera-slow", f"The camera took {took_s:.1f} s to answer operation 0x{operation:04x}.")
-        if reply.busy:
+        if reply.busy and note_busy:
             self.diary.add("camera-busy", f"The camera was busy when asked for operation 0x{operation:04x}.")
         return reply
 

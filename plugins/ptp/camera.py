@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -13,6 +12,7 @@ from hal.registry import Driver, OpenContext
 from hal.transcript import Transcript
 from plugins.ptp.ip.link import PtpIpLink
 from plugins.ptp.ip.wire import PtpIpAddress
+from plugins.ptp.recording import TRACK, RecordedLink
 from plugins.ptp.still import Connect, PtpCamera
 
 
@@ -32,13 +32,12 @@ def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
     """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
     address, to_card, keep_on_card, both = _settings(settings)  # a wrong address leaves no file
-    transcript = None
-    if context.transcripts is not None:
-        context.transcripts.mkdir(parents=True, exist_ok=True)
-        name = re.sub(r"[^A-Za-z0-9.-]+", "-", _named(address))
-        transcript = Transcript(context.transcripts / f"{name}.txt", keep=1000)
+    transcript = context.transcript(TRACK, _named(address), keep=1000)
+    connect = _way(address, None if context.tape is not None else transcript)
+    if context.tape is not None and transcript is not None:
+        connect = _recorded(connect, transcript)
     return PtpCamera(
-        _way(address, transcript),
+        connect,
         serial=str(settings.get("serial", "")),
         to_card=to_card,
         keep_on_card=keep_on_card,
@@ -59,11 +58,16 @@ def _way(address: str, transcript: Transcript | None) -> Connect:
     return lambda until: PtpIpLink.connect(place, transcript=transcript, deadline=until)
 
 
+def _recorded(connect: Connect, track: Transcript) -> Connect:
+    """Each new link writes on the tape."""
+    return lambda until: RecordedLink(connect(until), track)
+
+
 def _named(address: str) -> str:
     if address.startswith("usb:"):
         return address
     place = PtpIpAddress.parse(address)
-    return f"ptpip-{place.host}-{place.command_port}"
+    return f"{place.host}-{place.command_port}"
 
 
 def _choice(settings: Mapping[str, Any], key: str, *allowed: str) -> str:
@@ -91,13 +95,13 @@ def _wrong_setting(key: str, value: object, allowed: str) -> PluginError:
 DRIVER: Final = Driver(
     kind="camera",
     name="ptp",
-    summary="Still cameras with PTP over USB or the network (PTP/IP): standard ones and Canon EOS.",
+    summary="Still cameras with PTP over USB or the network (PTP/IP): standard ones, Canon EOS, Nikon, Sony.",
     open=open_camera,
     settings={
         "address": "usb:SERIAL, usb:VENDOR:PRODUCT, usb:PORT, usb: for any, or ptpip:HOST:COMMANDPORT[:EVENTPORT]",
         "serial": "serial number that the camera must have (default: any)",
         "target": '"computer" (default) or "card": where a Canon EOS stores its pictures first',
-        "raw_and_jpeg": "true to get a JPEG with each RAW file, if the camera can (default false)",
+        "raw_and_jpeg": "true to get a JPEG with each RAW file, if the camera can (default false; not Sony)",
         "keep_on_card": "true to keep pictures on the card after the transfer (default false)",
     },
     required=("address",),

@@ -12,13 +12,15 @@ from hal.errors import DeviceError, DeviceGone, DeviceTimeout
 class Timing:
     """The driver's time limits, in seconds.
 
-    ``answer_s``: for an ordinary answer; ``busy_s``: with a busy camera; ``margin_s``: for a picture, beyond twice its
-    exposure; ``grace_s``: for an event, before its information is requested; ``come_back_s``: for a lost camera
-    to answer again, ``reconnect_s``: the same during a picture; ``keep_alive_s``: between two signs of life while it
-    works, ``idle_s``: without any call; ``slow_s``: an answer that took longer is noted.
+    ``answer_s``: for an ordinary answer; ``confirm_s``: for the report of a setting; ``busy_s``: with a busy camera;
+    ``margin_s``: for a picture, beyond twice its exposure; ``grace_s``: for an event, before its information is
+    requested; ``come_back_s``: for a lost camera to answer again, ``reconnect_s``: the same during a picture;
+    ``keep_alive_s``: between two signs of life while it works, ``idle_s``: without any call; ``slow_s``: an answer that
+    took longer is noted.
     """
 
     answer_s: float = 15.0
+    confirm_s: float = 5.0
     busy_s: float = 20.0
     margin_s: float = 15.0
     grace_s: float = 1.0

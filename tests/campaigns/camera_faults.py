@@ -38,7 +38,7 @@ from plugins.ptp.link import PtpLink
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
 
-FLAVOURS: Final = ("generic", "eos-new", "eos-old")
+FLAVOURS: Final = ("generic", "eos-new", "eos-old", "nikon", "sony")
 CAMERAS: Final = tuple(f"{bus} {flavour}" for bus in ("network", "usb") for flavour in FLAVOURS)
 SIZE: Final = 40_000
 SLOW_S: Final = 0.06

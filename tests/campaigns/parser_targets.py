@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 import tempfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from controller.bundle import format as bundle_format
 from controller.bundle.index import parse_index
@@ -21,10 +24,13 @@ from hal.codecs.projectors.profiles import parse_profile
 from hal.codecs.projectors.serial_protocol import parse_hours, parse_line
 from hal.codecs.ptp import eos as ptp_eos
 from hal.codecs.ptp import ip as ptp_ip
+from hal.codecs.ptp import nikon as ptp_nikon
+from hal.codecs.ptp import sony as ptp_sony
 from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp import values as ptp
 from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
 from hal.errors import ProtocolError
+from hal.tape.reading import parse_tape
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 
 FOLDER = Path(__file__).parents[2] / "firmware_configs" / "projectors"
@@ -48,9 +54,12 @@ def targets(folder: Path) -> dict[str, Target]:
         "ptp-datasets": Target(_ptp_dataset, _datasets()),
         "ptp-ip": Target(_ptp_ip, _packets()),
         "eos-records": Target(_eos, _records()),
+        "nikon": Target(_nikon, (b"\x02\0\x02\x40\1\0\0\0\x0d\x40\0\0\0\0", bytes(384) + b"\xff\xd8\xff\xe0")),
+        "sony": Target(ptp_sony.parse_properties, _SONY),
         "serial-answers": Target(_serial, _answers()),
         "pjlink-answers": Target(_pjlink, tuple(bytes([n]) + answer for n, answer in enumerate(_PJLINK))),
         "pjlink-udp": Target(pjlink_udp.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
+        "tape": Target(_tape, _TAPES),
         "hid-reports": Target(_hid, _REPORTS),
         "bundle-index": Target(_index, (json.dumps(_INDEX).encode(),), (BundleError,)),
         "bundle-header": Target(_header, (bytes(128), bundle_format.MAGIC + bytes(120)), (BundleError,)),
@@ -145,6 +154,34 @@ _REPORTS = (
     b"\x03\0BITFT\0\0\x03",
     b"\x01" + bytes([1, 3, 0, 16, 0, 0, 0]),
     b"\x02" + hid_light.SensorSettings().pack(),
+)
+
+
+def _nikon(data: bytes) -> None:
+    """Every parser gets all the bytes."""
+    refused = None
+    for parse in (ptp_nikon.parse_events, ptp_nikon.parse_codes, ptp_nikon.parse_view):
+        try:
+            parse(data)
+        except ProtocolError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
+_SONY: Final = (
+    struct.pack("<II", 1, 0) + struct.pack("<HHBBIIBH3I", 0xD20D, 6, 1, 1, 9, 9, 2, 3, 0x1000A, 0x100FA, 0x12C000A),
+    struct.pack("<II", 1, 0) + struct.pack("<HHBBHHBH2HH2H", 0x5007, 4, 1, 1, 9, 9, 2, 2, 400, 560, 2, 400, 560),
+)
+
+
+def _tape(data: bytes) -> None:
+    parse_tape(data.decode("latin-1"))
+
+
+_TAPES: Final = (
+    b"velatura tape 1\n0.1 + 1 serial a\n0.2 > 1 on\\r\n0.3 < 1 OK\n",
+    b"velatura tape 1\n0.1 + 1 ptp a\n0.2 { 1 " + base64.b64encode(zlib.compress(bytes(300))) + b"\n",
 )
 
 

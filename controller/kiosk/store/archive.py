@@ -27,6 +27,7 @@ from controller.core.errors import UsageError, WorkError
 from controller.core.files import require_regular
 from controller.core.storage import sync_folder
 from controller.stage.calibrations import finished_calibrations
+from controller.stage.recording import tapes
 from hal.runtime.caches import kept
 
 FOLDER: Final = "kiosk/archives"
@@ -36,6 +37,7 @@ RESTORING: Final = ".restoring"
 REPLACED: Final = "kiosk/replaced"
 KEPT: Final = 5
 CUT_OFF_S: Final = 3600.0
+LARGEST_TAPE: Final = 64 << 20
 """An unfinished backup without changes for this time is abandoned."""
 MOST_FILES: Final = 100_000
 ROOM_SHARE: Final = 0.9
@@ -151,10 +153,15 @@ def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:
         for database in sorted([*stage.glob("runs/*/journal.sqlite"), *stage.glob("kiosk/events.sqlite")])[-20:]:
             with contextlib.suppress(sqlite3.Error):
                 _add(archive, str(database.relative_to(stage)), _copy_of(database))
-        for text in _texts(stage):
+        for text in [*_texts(stage), *_last_tape(stage)]:
             archive.add(text, str(text.relative_to(stage)))
 
     return _written(path, write)
+
+
+def _last_tape(stage: Path) -> list[Path]:
+    """The newest tape, unless its pictures make it too large for a mail."""
+    return [path for path in tapes(stage)[-1:] if path.stat().st_size <= LARGEST_TAPE]
 
 
 def _texts(stage: Path) -> Iterable[Path]:

@@ -22,10 +22,10 @@ from controller.rig.lamp_ledger import LampFile
 from controller.rig.rig import Rig
 from controller.stage.check import Checked
 from controller.stage.open import light_sensor, mains_circuits, open_device, rig_of
+from controller.stage.recording import open_context
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceGone
 from hal.interfaces import Camera, Device, Display, LightSensor, Projector, WatchedCamera
-from hal.registry import OpenContext
 
 Tell = Callable[[Decision], object]
 
@@ -38,7 +38,7 @@ class Devices:
 
     def __init__(self, checked: Checked, runtime: Path, tell: Tell) -> None:
         self._checked, self._tell = checked, tell
-        self._context = OpenContext(stage=checked.stage.folder, runtime=runtime)
+        self._context = open_context(checked.stage.folder, runtime=runtime)
         self._ledger = LampFile(checked.stage.folder / LampFile.NAME)
         self.mains = self._mains_supervisor()
         self.projectors = tuple(self._projector(number) for number in range(len(checked.projectors)))

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from controller.capture.linear_files import Unreadable, read_exr
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
-from controller.core.files import check_pixels, read_picture_bytes, require_regular
-from controller.core.text import printable
+from controller.core.files import read_picture_bytes
 from controller.solve.targets.values import Target, srgb_to_linear
 
 PHOTOGRAPHS: tuple[str, ...] = ("astronaut", "chelsea", "coffee")
@@ -58,7 +58,12 @@ def check_picture(path: Path, picture: FloatImage, size: tuple[int, int]) -> Non
 
 def read_picture(path: Path) -> FloatImage:
     """(rows, columns, 3 or 4) float32 linear light of an EXR, PNG or JPEG; UsageError("target-unreadable") if not."""
-    return _read_exr(path) if path.suffix.lower() == ".exr" else _read_encoded(path)
+    if path.suffix.lower() != ".exr":
+        return _read_encoded(path)
+    try:
+        return read_exr(path)
+    except Unreadable as error:
+        raise _unreadable(path, str(error)) from error
 
 
 def shipped_photograph(name: Literal["astronaut", "chelsea", "coffee"] = "astronaut") -> FloatImage:
@@ -72,30 +77,6 @@ def shipped_photograph(name: Literal["astronaut", "chelsea", "coffee"] = "astron
             remedy=f"Choose one of {', '.join(PHOTOGRAPHS)}, or give a file.",
         )
     return srgb_to_linear(np.asarray(getattr(skimage.data, name)()))
-
-
-def _read_exr(path: Path) -> FloatImage:
-    """(rows, columns, 3 or 4) float32 from channels R, G, B and A, or Y alone."""
-    import OpenEXR
-
-    try:
-        require_regular(path)
-        with OpenEXR.File(str(path), header_only=True) as file:
-            low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
-            check_pixels(path, (int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)))
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            found = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
-    except OSError as error:
-        raise _unreadable(path, f"it can't be read: {error.strerror or printable(str(error))}") from error
-    except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise _unreadable(path, f"it could not be decoded ({printable(str(error))})") from error
-    names = ["R", "G", "B"] if "R" in found else ["Y", "Y", "Y"]
-    if not set(names) <= set(found):
-        raise _unreadable(path, f"it has the channels {', '.join(sorted(found))}, not R, G and B")
-    planes = [found[name] for name in names + (["A"] if "A" in found else [])]
-    if any(plane.shape != planes[0].shape for plane in planes):
-        raise _unreadable(path, "its channels differ in size")
-    return np.stack(planes, axis=2).astype(np.float32)
 
 
 def _read_encoded(path: Path) -> FloatImage:

@@ -17,6 +17,7 @@ from controller.artefacts.photographs import BLACK, CAMERA_RESPONSE, Taken, ligh
 from controller.capture.acquire import Shot
 from controller.capture.jpeg_response import measure_response, nominal_response
 from controller.capture.latency import LONGEST_S, measure_latency
+from controller.capture.linear_files import is_linear
 from controller.capture.linearity import (
     RawExposure,
     black_offset,
@@ -150,8 +151,12 @@ def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
 def _measure_camera(projectors: Sequence[str], context: Context) -> Sequence[Path]:
     black = BLACK.read(context.folder)
     series = [white_bracket(light_of(name).read(context.folder)) for name in projectors]
-    measure = _of_jpeg if is_jpeg(black[0].path) else _of_raw
-    profile, figures = measure(black, series, context)
+    if is_jpeg(black[0].path):
+        profile, figures = _of_colours("jpeg", black, series)
+    elif is_linear(black[0].path):
+        profile, figures = _of_colours("linear", black, series)
+    else:
+        profile, figures = _of_raw(black, series, context)
     path = write_camera_figures(context.folder, figures)
     return [profile.save(context.folder), path]
 
@@ -205,10 +210,10 @@ def _samples(taken: Taken, profile: CameraProfile) -> FloatImage:
     return linear
 
 
-def _of_jpeg(
-    black: Sequence[Taken], whites: Sequence[Sequence[Taken]], context: Context
+def _of_colours(
+    kind: str, black: Sequence[Taken], whites: Sequence[Sequence[Taken]]
 ) -> tuple[CameraProfile, dict[str, object]]:
-    """Measure only the noise: the response is known, and a JPEG has no black level and no mosaic."""
+    """Measure only the noise: the response is known, and there is no black level and no mosaic."""
     profile = black[0].profile or CameraProfile()
     pairs = []
     for series in whites:
@@ -220,7 +225,7 @@ def _of_jpeg(
     if noise is not None:
         profile = replace(profile, noise=noise.noise)
     figures: dict[str, object] = {
-        "kind": "jpeg",
+        "kind": kind,
         "noise": {"shot": profile.noise.shot, "read": profile.noise.read, "measured": noise is not None},
     }
     return profile, figures

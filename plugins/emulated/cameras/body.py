@@ -52,7 +52,9 @@ class CameraFaults:
     many reports of a new picture never come; ``wrong_lengths``: that many data phases announce more than they send;
     ``garbage``: that many answers are noise; ``slow_s``: before every answer; ``card_full``; ``silent``: no answers;
     ``autofocus_fails``: that many presses find no focus; ``target_flips``: that many times the body changes by itself
-    from the computer to its card before an exposure, and says nothing.
+    from the computer to its card before an exposure, and says nothing; ``unconfirmed``: properties whose changes an EOS
+    never reports; ``space_refused``: an EOS refuses to hear of the computer's free space, and exposes all the same;
+    ``late_events_s``: how long after the first connection the event port of PTP/IP opens.
     """
 
     busy: int = 0
@@ -67,6 +69,9 @@ class CameraFaults:
     silent: bool = False
     autofocus_fails: int = 0
     target_flips: int = 0
+    unconfirmed: frozenset[int] = frozenset()
+    space_refused: bool = False
+    late_events_s: float = 0.0
 
     def take(self, name: str) -> bool:
         """Use up one of a count; False when none is left."""
@@ -89,11 +94,14 @@ class EmulatedBody:
     """Answers operations; families override ``vendor`` and the hooks. All of it under ``self.lock``."""
 
     operations: tuple[int, ...] = ()
+    with_data: tuple[int, ...] = (0x1016, 0x9110)
+    """Operations whose data come from the computer."""
     events: tuple[int, ...] = (0x4002, 0x4003, 0x400A, 0x400D)
     properties: tuple[int, ...] = (0x5001,)
     capture_formats: tuple[int, ...] = (JPEG,)
     vendor_extension = 0
     raw_format = 0x3811
+    raw_ending = "DNG"
     _common = (0x1001, 0x1002, 0x1003, 0x1004, 0x1005, 0x1006, 0x1007, 0x1008, 0x1009, 0x100A, 0x100B, 0x1014, 0x1015)
 
     def __init__(
@@ -227,7 +235,7 @@ class EmulatedBody:
         with self.lock:
             self._picture = self._picture % 9999 + 1
             taken = time.strftime("%Y%m%dT%H%M%S")
-            for format_code, ending, data in ((self.raw_format, "DNG", files.raw), (JPEG, "JPG", files.jpeg)):
+            for format_code, ending, data in ((self.raw_format, self.raw_ending, files.raw), (JPEG, "JPG", files.jpeg)):
                 if data is not None:
                     name = f"IMG_{self._picture:04d}.{ending}"
                     exposed.stored.append(

@@ -16,7 +16,9 @@ from hal.errors import DeviceError
 from plugins.emulated.cameras.body import JPEG, CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.cameras.eos import EmulatedEosBody, EmulatedOldEosBody
 from plugins.emulated.cameras.generic import EmulatedGenericBody
+from plugins.emulated.cameras.nikon import EmulatedNikonBody
 from plugins.emulated.cameras.shot import Expose
+from plugins.emulated.cameras.sony import EmulatedSonyBody
 from plugins.emulated.cameras.wire import (
     CANCEL,
     EVENT,
@@ -37,12 +39,20 @@ from plugins.emulated.cameras.wire import (
     send_data,
 )
 
-Flavour = Literal["generic", "eos-new", "eos-old"]
-BODIES: Final = {"generic": EmulatedGenericBody, "eos-new": EmulatedEosBody, "eos-old": EmulatedOldEosBody}
+Flavour = Literal["generic", "eos-new", "eos-old", "nikon", "sony"]
+BODIES: Final = {
+    "generic": EmulatedGenericBody,
+    "eos-new": EmulatedEosBody,
+    "eos-old": EmulatedOldEosBody,
+    "nikon": EmulatedNikonBody,
+    "sony": EmulatedSonyBody,
+}
 NAMES: Final = {
     "generic": CameraNames(),
     "eos-new": CameraNames("Canon Inc.", "Canon EOS 1300D", "0320010001", "3-1.1.0"),
     "eos-old": CameraNames("Canon Inc.", "Canon EOS 400D DIGITAL", "0320010002", "3-1.1.1"),
+    "nikon": CameraNames("Nikon Corporation", "D7100", "0003200103", "V1.04"),
+    "sony": CameraNames("Sony Corporation", "ILCE-7M2", "0003200104", "1.0"),
 }
 _TAKEOVER_S: Final = 0.5
 
@@ -53,13 +63,15 @@ class EmulatedPtpCamera:
     Parameters
     ----------
     expose : makes the files of an exposure; called from the camera's shutter thread
-    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D)
+    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D),
+        "nikon" (9207 and 90C7), "sony" (protocol 3)
     command_port, event_port : 0 takes a free one; both the same non-zero number: one port for both, as real ones do
     names : identity; by default one that fits the flavour
     time_scale : real seconds for each second of exposure
     card_bytes : size of the memory card
     raw : False for a camera that makes JPEG files only
     faults : knobs that may be turned while it runs
+    body : another body than the flavour's, for example of a tape
     """
 
     def __init__(
@@ -75,10 +87,11 @@ class EmulatedPtpCamera:
         card_bytes: int = 4 << 30,
         raw: bool = True,
         faults: CameraFaults | None = None,
+        body: EmulatedBody | None = None,
     ) -> None:
         self.faults = faults or CameraFaults()
-        self.names = names or NAMES[flavour]
-        self._body: EmulatedBody = BODIES[flavour](
+        self.names = names or (NAMES[flavour] if body is None else body.names)
+        self._body: EmulatedBody = body or BODIES[flavour](
             expose,
             names=self.names,
             time_scale=time_scale,
@@ -132,7 +145,8 @@ class EmulatedPtpCamera:
         if self._ports[1] and self._ports[1] == self._ports[0]:
             self._ports = (port, port)
         else:
-            self._ports = (port, self._listen(self._ports[1]).getsockname()[1])
+            late = self.faults.late_events_s > 0
+            self._ports = (port, self._listen(self._ports[1], late=late).getsockname()[1])
         self._body.stopped.clear()
         for listener in self._listeners:
             threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
@@ -162,12 +176,14 @@ class EmulatedPtpCamera:
     ) -> None:
         self.stop()
 
-    def _listen(self, port: int) -> socket.socket:
+    def _listen(self, port: int, *, late: bool = False) -> socket.socket:
+        """``late``: the port is taken, but refuses connections until ``_open_late``."""
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((self._host, port))
-            listener.listen()
+            if not late:
+                listener.listen()
         except OSError as error:
             listener.close()
             self.stop()
@@ -179,7 +195,15 @@ class EmulatedPtpCamera:
         self._listeners.append(listener)
         return listener
 
+    def _open_late(self) -> None:
+        if not self._body.stopped.wait(self.faults.late_events_s):
+            with contextlib.suppress(OSError, IndexError):
+                self._listeners[1].listen()
+
     def _accept(self, listener: socket.socket) -> None:
+        while not listener.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+            if self._body.stopped.wait(0.01):
+                return
         while True:
             try:
                 connection, _ = listener.accept()
@@ -203,6 +227,8 @@ class EmulatedPtpCamera:
         if not self._take_over(connection):
             send(connection, INIT_FAIL, struct.pack("<I", 2))
             return
+        if self.faults.late_events_s > 0:
+            threading.Thread(target=self._open_late, daemon=True).start()
         try:
             guid = uuid.uuid5(uuid.NAMESPACE_OID, self._body.names.serial).bytes
             name = (self._body.names.model + "\0").encode("utf-16-le")

@@ -71,6 +71,7 @@ class EmulatedEosBody(EmulatedBody):
         self._format: tuple[tuple[int, int, int], ...] = FORMATS[0]
         self._reports: list[bytes] = []
         self._reporting = False
+        self._told: set[int] = set()
         self._pressed = 0
         self._view_at = 0.0
 
@@ -116,6 +117,9 @@ class EmulatedEosBody(EmulatedBody):
                 return self._changes()
             case 0x9117:
                 return PtpOutcome() if self.card.waiting.pop(asked[0], None) else PtpOutcome(NO_SUCH_HANDLE)
+            case 0x911A if self.faults.space_refused:
+                self._values[0xD11B] = 1000
+                return PtpOutcome(GENERAL_ERROR)
             case 0x911A:
                 self._change(0xD11B, 1000)
                 return PtpOutcome()
@@ -232,7 +236,8 @@ class EmulatedEosBody(EmulatedBody):
     def _change(self, code: int, value: int) -> None:
         if self._values[code] != value:
             self._values[code] = value
-            self._report(0xC189, struct.pack("<II", code, value))
+            if code not in self.faults.unconfirmed:
+                self._report(0xC189, struct.pack("<II", code, value))
 
     def _changes(self) -> PtpOutcome:
         records = b"".join(self._reports)
@@ -243,6 +248,9 @@ class EmulatedEosBody(EmulatedBody):
         self._reporting = on
         self._reports.clear()
         for code, value in {**self._values, 0xD111: self._battery_code()}.items():
+            if code in self.faults.unconfirmed and code in self._told:
+                continue
+            self._told.add(code)
             self._report(0xC189, struct.pack("<II", code, value))
         self._report(0xC189, struct.pack("<I", 0xD120) + format_bytes(self._format))
         self._report(0xC189, struct.pack("<I", 0xD1AF) + self.names.serial.encode("ascii", "replace") + b"\0")

@@ -32,9 +32,9 @@ class Setting:
 class EmulatedGenericBody(EmulatedBody):
     """See ``EmulatedBody``. Which files a shot makes follows the format that InitiateCapture names; 0 means a JPEG."""
 
-    operations = (0x100E, 0x1016, 0x101B)
-    properties = (0x5001, 0x5007, 0x500D, 0x500E, 0x500F)
-    capture_formats = (JPEG, DNG)
+    operations: tuple[int, ...] = (0x100E, 0x1016, 0x101B)
+    properties: tuple[int, ...] = (0x5001, 0x5007, 0x500D, 0x500E, 0x500F)
+    capture_formats: tuple[int, ...] = (JPEG, DNG)
 
     settings: dict[int, Setting]
 

@@ -23,15 +23,16 @@ IN, OUT, EVENTS = 0x81, 0x02, 0x83
 _PACKET: Final = 512
 _HEADER: Final = struct.Struct("<IHHI")
 _COMMAND, _DATA, _RESPONSE, _EVENT = 1, 2, 3, 4
-_WITH_DATA: Final = (0x1016, 0x9110)
 _UNKNOWN: Final = 0xFFFF_FFFF
 _LARGEST_OUT: Final = 1 << 20
 _VENDORS: Final = {
     "generic": (0x1209, 0x5645),
     "eos-new": (0x04A9, 0x32B4),
     "eos-old": (0x04A9, 0x3110),
+    "nikon": (0x04B0, 0x0430),
+    "sony": (0x054C, 0x0D18),
 }
-"""USB numbers: of a test vendor, the EOS 1300D and the EOS 400D."""
+"""USB numbers: of a test vendor, the EOS 1300D, the EOS 400D, the D7100 and the ILCE-7RM4."""
 
 
 @dataclass(slots=True)
@@ -183,9 +184,9 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         if kind == _COMMAND:
             parameters = struct.unpack(f"<{len(body) // 4}I", body)
             self._asked = (code, transaction, parameters)
-            if code not in _WITH_DATA:
+            if code not in self.body.with_data:
                 self._put(b"")
-        elif kind == _DATA and self._asked and self._asked[0] in _WITH_DATA and self._asked[1] == transaction:
+        elif kind == _DATA and self._asked and self._asked[0] in self.body.with_data and self._asked[1] == transaction:
             self._put(body)
         else:
             raise Stall

@@ -12,6 +12,7 @@ from typing import Final
 from hal.codecs.ptp.eos import Destination, EosProperty, aperture_of, exposure_of, iso_of
 from hal.codecs.ptp.values import Answer, Operation
 from hal.deadline import Deadline
+from hal.errors import DeviceRefused
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
 from plugins.ptp.body import Channel, nearest, no_such_file, still_waiting
 from plugins.ptp.canon.conversation import EosTalk
@@ -47,6 +48,7 @@ class EosBody:
         self._both = both
         self._bulb_s: float | None = None
         self._target_changed = False
+        self._space_refused = False
 
     @property
     def capabilities(self) -> CameraCapabilities:
@@ -221,12 +223,21 @@ class EosBody:
             wanted = now if now != Destination.HOST or not cards else cards[0]
         self._talk.set(EosProperty.CAPTURE_DESTINATION, wanted, deadline, again=again)
         if wanted == Destination.HOST and self._channel.has(Operation.EOS_HOST_CAPACITY):
+            self._tell_space(deadline)
+
+    def _tell_space(self, deadline: Deadline) -> None:
+        """Some bodies refuse it and expose all the same; one that needs it refuses the release, with its reason."""
+        try:
             self._channel.ask(
                 Operation.EOS_HOST_CAPACITY,
                 *_HOST_SPACE,
                 doing="accept this computer's free space",
                 deadline=deadline,
             )
+        except DeviceRefused as error:
+            if not self._space_refused:
+                self._channel.diary.add("camera-space-refused", error.what)
+            self._space_refused = True
 
     def _forget_old_pictures(self, deadline: Deadline) -> None:
         """Drop pictures that belong to an earlier shot."""

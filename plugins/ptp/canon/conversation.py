@@ -13,6 +13,7 @@ from plugins.ptp.body import Channel
 from plugins.ptp.canon.state import EosState
 
 _MOST_DRAINS: Final = 200
+_EXPOSURE: Final = (EosProperty.APERTURE, EosProperty.SHUTTER, EosProperty.ISO)
 
 
 class EosTalk:
@@ -45,7 +46,9 @@ class EosTalk:
     def set(self, code: EosProperty, value: int | ImageFormat, deadline: Deadline, *, again: bool = False) -> int:
         """Set a property and wait until the body reports it (C189); return the reported value.
 
-        ``again``: also if the body has reported this value already.
+        ``again``: also if the body has reported this value already. A body that accepts it and reports nothing is asked
+        to report everything. If that does not tell, a note says so and the accepted value counts, except for exposure
+        settings: DeviceTimeout("camera-not-confirmed"), because photographs would be measured with a wrong value.
         """
         wanted = pack_setting(code, value)[8:]
         if not again and self.state.is_set(code, wanted):
@@ -61,22 +64,38 @@ class EosTalk:
         if again and not self.state.knows(code):
             self.drain(deadline)
             self.state.assume(code, wanted)  # a body that did not change it has nothing to report
-        self._await_value(code, deadline.within(self.channel.timing.answer_s))
-        return self.state.number(code)
-
-    def _await_value(self, code: EosProperty, until: Deadline) -> None:
-        pause_s = 0.001
-        while True:
-            self.drain(until)
-            if self.state.knows(code):
-                return
-            if until.passed:
+        if not self._reported(code, deadline):
+            what = f"The camera took a setting (0x{code:04x}) but did not confirm it."
+            if code in _EXPOSURE or deadline.passed:
                 # The setting is unknown now; a new connection starts with a full report.
                 self.channel.link.close()
                 raise DeviceTimeout(
                     "camera-not-confirmed",
-                    what=f"The camera took a setting (0x{code:04x}) but did not confirm it.",
+                    what=what,
                     remedy="Turn its mode dial to M and leave its menus, then try again.",
                 )
+            self.channel.diary.add("camera-not-confirmed", what)
+            self.state.assume(code, wanted)
+        return self.state.number(code)
+
+    def _reported(self, code: EosProperty, deadline: Deadline) -> bool:
+        """Wait for the report; then have everything reported, and wait again."""
+        if self._await_value(code, deadline.within(self.channel.timing.confirm_s)):
+            return True
+        if deadline.passed:
+            return False
+        self.channel.ask(Operation.EOS_SET_EVENT_MODE, 1, doing="report everything", deadline=deadline)
+        return self._await_value(code, deadline.within(self.channel.timing.confirm_s))
+
+    def _await_value(self, code: EosProperty, until: Deadline) -> bool:
+        pause_s = 0.001
+        while True:
+            try:
+                self.drain(until)
+            except DeviceTimeout:
+                if self.channel.link.broken:
+                    raise
+            if self.state.knows(code) or until.passed:
+                return self.state.knows(code)
             until.sleep(pause_s)
             pause_s = min(0.05, 2 * pause_s)

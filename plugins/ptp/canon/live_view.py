@@ -41,7 +41,8 @@ class EosView:
         until = deadline.within(talk.channel.timing.busy_s)
         while True:
             talk.keep_alive(deadline)
-            reply = talk.channel.once(Operation.EOS_GET_VIEWFINDER, *_WHOLE_FRAME, deadline=deadline)
+            # Every body is busy until its mirror is up: that is no trouble.
+            reply = talk.channel.once(Operation.EOS_GET_VIEWFINDER, *_WHOLE_FRAME, deadline=deadline, note_busy=False)
             if reply.ok:
                 return parse_view(reply.data)
             if not reply.busy:

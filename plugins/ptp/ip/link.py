@@ -15,7 +15,7 @@ from typing import Final, Self
 from hal.codecs.ptp import ip as ptp_ip
 from hal.codecs.ptp.values import broken
 from hal.deadline import SLICE_S, Deadline
-from hal.errors import DeviceBusy, DeviceError, DeviceRefused
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused
 from hal.transcript import Transcript
 from plugins.ptp.ip.wire import PtpIpAddress, Wire, readable, still_time
 from plugins.ptp.link import MOST_IN_MEMORY, LinkEvent, Reply, Sink, camera_lost
@@ -24,6 +24,7 @@ _BLOCK: Final = 1 << 20
 _MOST_EVENTS: Final = 10_000
 _LONGEST_NOTE: Final = 4096
 _MOST_READS: Final = 16
+_EVENTS_S: Final = 5.0
 
 
 class PtpIpLink:
@@ -114,7 +115,7 @@ class PtpIpLink:
         accepted = self._packet(self._command, deadline)
         if not isinstance(accepted, ptp_ip.InitCommandAck):
             raise _unwelcome(accepted)
-        self._events = Wire.connect(address.host, address.event_port, deadline=deadline)
+        self._events = _event_wire(address, accepted.name, deadline)
         self._send(self._events, ptp_ip.pack(ptp_ip.InitEventRequest(accepted.connection)), deadline)
         ready = self._packet(self._events, deadline)
         if not isinstance(ready, ptp_ip.InitEventAck):
@@ -238,6 +239,25 @@ class PtpIpLink:
     def _note(self, data: bytes | bytearray) -> None:
         if self._transcript is not None:
             self._transcript.received(bytes(data[:_LONGEST_NOTE]))
+
+
+def _event_wire(address: PtpIpAddress, name: str, deadline: Deadline) -> Wire:
+    """Some cameras open this port a while after the first connection. Raises DeviceRefused("camera-no-events")."""
+    give_up = deadline.within(_EVENTS_S)
+    while True:
+        try:
+            return Wire.connect(address.host, address.event_port, deadline=deadline)
+        except DeviceGone as error:
+            if not give_up.passed:
+                give_up.sleep(0.1)
+                continue
+            raise DeviceRefused(
+                "camera-no-events",
+                what=f"The camera {name or address.host} accepts this computer, but not on its event port "
+                f"{address.event_port}.",
+                remedy="Give its event port in stage.toml (ptpip:HOST:COMMANDPORT:EVENTPORT). Fujifilm cameras are "
+                "not supported on the network: connect them by USB.",
+            ) from error
 
 
 def _unwelcome(packet: ptp_ip.Packet) -> DeviceError:

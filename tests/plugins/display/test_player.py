@@ -18,7 +18,7 @@ import pytest
 
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
-from hal.conformance import DisplayConformance
+from hal.conformance import BundleDisplayConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.registry import OpenContext
@@ -29,9 +29,7 @@ OUTPUTS = [("P1", 20, 15), ("P2", 21, 16)]
 TABLES = [{"name": name, "width_px": width, "height_px": height} for name, width, height in OUTPUTS]
 
 
-@pytest.fixture
-def player(tmp_path: Path) -> Iterator[PlayerProcess]:
-    bundle = tmp_path / "b.vel"
+def written(bundle: Path) -> None:
     write_bundle(
         bundle,
         stage="s",
@@ -40,6 +38,12 @@ def player(tmp_path: Path) -> Iterator[PlayerProcess]:
         outputs=OUTPUTS,
         appearances=[NewAppearance(str(seed), noise(OUTPUTS, seed)) for seed in range(2)],
     )
+
+
+@pytest.fixture
+def player(tmp_path: Path) -> Iterator[PlayerProcess]:
+    bundle = tmp_path / "b.vel"
+    written(bundle)
     settings = PlayerSettings(OUTPUTS, tmp_path / "out.frame", bundle=bundle, allow_unsigned=True)
     with start_player(tmp_path, settings) as process:
         yield process
@@ -60,14 +64,19 @@ def display(player: PlayerProcess, tmp_path: Path) -> Iterator[PlayerDisplay]:
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Where a player serves that no test ends."""
+    """Where a player serves that no test ends, and a bundle for it."""
     path = tmp_path_factory.mktemp("player")
-    with start_player(path, PlayerSettings(OUTPUTS, path / "out.frame")):
+    written(path / "b.vel")
+    with start_player(path, PlayerSettings(OUTPUTS, path / "out.frame", allow_unsigned=True)):
         yield path
 
 
-class TestPlayerDisplay(DisplayConformance):
+class TestPlayerDisplay(BundleDisplayConformance):
     """The shared suite, every test on the same player."""
+
+    @pytest.fixture
+    def bundle(self, shared: Path) -> tuple[Path, tuple[str, str]]:
+        return shared / "b.vel", ("0", "1")
 
     @pytest.fixture
     def display(self, shared: Path) -> Iterator[PlayerDisplay]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import builtins
 import os
+import signal
 import sys
-import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,13 +15,12 @@ import pytest
 
 from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
-from hal.errors import DeviceError, DeviceRefused, PluginError
+from hal.errors import DeviceError, DeviceGone, DeviceTimeout, PluginError
 from hal.registry import OpenContext
-from hal.values import CameraCapabilities, ExposureSettings
-from plugins.gphoto2 import opened as gphoto2_opened
+from hal.values import ExposureSettings
 from plugins.gphoto2 import settings as words
 from plugins.gphoto2.camera import DRIVER, Gphoto2Camera, open_camera
-from plugins.gphoto2.opened import Opened
+from tests.campaigns.camera_peers import FLAVOURS, Flavour, driver_captures
 from tests.waiting import wait_for
 
 
@@ -32,7 +30,6 @@ def virtual_camera(tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("vcamera")
     picture = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     assert cv2.imwrite(str(folder / "GPH_0001.JPG"), picture)
-    assert "gphoto2" not in sys.modules
     os.environ["VCAMERADIR"] = str(folder)
 
 
@@ -44,7 +41,7 @@ def camera() -> Iterator[Gphoto2Camera]:
 
 
 class TestGphoto2(CameraConformance):
-    pass
+    sees_fsync = False
 
 
 def test_the_picture_is_the_camera_s_own(camera: Gphoto2Camera, tmp_path: Path) -> None:
@@ -62,41 +59,75 @@ def test_the_status_tells_battery_and_card(camera: Gphoto2Camera) -> None:
     assert camera.troubles() == []
 
 
-def test_a_camera_that_could_not_be_opened_leaves_no_thread_behind() -> None:
-    before = threading.active_count()
-    for _ in range(3):
-        with pytest.raises(DeviceError):
-            open_camera({"serial": "of another camera"}, OpenContext(Path()), in_seconds(20))
-    wait_for(lambda: threading.active_count() <= before)
+def test_a_camera_that_could_not_be_opened_leaves_no_process_behind() -> None:
+    with pytest.raises(DeviceError) as caught:
+        open_camera({"serial": "of another camera"}, OpenContext(Path()), in_seconds(20))
+    assert caught.value.code == "camera-other"
+    assert not [child for child in children() if "plugins.gphoto2.worker" in child]
 
 
-def test_a_camera_that_fails_once_it_is_open_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    closed: list[Opened] = []
-    let_go = Gphoto2Camera.let_go
+def children() -> list[str]:
+    """The command lines of this process' children."""
+    mine = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    return [Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ") for child in mine]
 
-    def note(camera: Gphoto2Camera, opened: Opened) -> None:
-        closed.append(opened)
-        let_go(camera, opened)
 
-    def refuse(opened: Opened) -> CameraCapabilities:
-        raise DeviceRefused("camera-refused", what="It will not say.", remedy="Ask it again.")
+def test_a_library_that_crashes_ends_its_process_and_the_call_is_done_again(camera: Gphoto2Camera) -> None:
+    first = crash(camera)
+    assert camera.identity(deadline=in_seconds(20)).model
+    assert camera.process.pid not in (None, first)
+    assert [code for code, _ in camera.troubles()] == ["camera-library-ended"]
 
-    monkeypatch.setattr(Gphoto2Camera, "let_go", note)
-    monkeypatch.setattr(gphoto2_opened, "capabilities", refuse)
-    with pytest.raises(DeviceRefused):
-        open_camera({}, OpenContext(Path()), in_seconds(20))
-    wait_for(lambda: len(closed) == 1)
+
+def test_a_crash_during_a_picture_is_reported_and_nothing_is_taken_twice(camera: Gphoto2Camera, tmp_path: Path) -> None:
+    crash(camera)
+    with pytest.raises(DeviceGone) as caught:
+        camera.capture(tmp_path / "shot", deadline=in_seconds(20))
+    assert caught.value.code == "camera-shot-lost"
+    assert "signal 11" in caught.value.what
+    assert list(tmp_path.iterdir()) == []
+    assert camera.capture(tmp_path / "shot", deadline=in_seconds(20))
+
+
+def crash(camera: Gphoto2Camera) -> int:
+    pid = camera.process.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSEGV)
+    wait_for(lambda: "Z" in Path(f"/proc/{pid}/stat").read_text().split(")")[1])
+    return pid
+
+
+def test_a_library_that_hangs_is_ended_by_the_deadline_and_started_again(camera: Gphoto2Camera) -> None:
+    pid = camera.process.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    began_s = time.monotonic()
+    with pytest.raises(DeviceTimeout):
+        camera.identity(deadline=in_seconds(0.5))
+    assert time.monotonic() - began_s < 5
+    assert not Path(f"/proc/{pid}").exists()
+    assert camera.identity(deadline=in_seconds(20)).model
+
+
+def test_the_way_through_the_process_takes_a_few_milliseconds(camera: Gphoto2Camera, tmp_path: Path) -> None:
+    """At most 10 ms for a capture; the campaign camera_peers prints it for every flavour."""
+    overheads = []
+    for number in range(10):
+        began_s = time.monotonic()
+        camera.capture(tmp_path / str(number), deadline=in_seconds(20))
+        overheads.append(time.monotonic() - began_s - camera.process.took_s)
+    assert sorted(overheads)[len(overheads) // 2] <= 0.010
+
+
+@pytest.mark.parametrize("flavour", FLAVOURS)
+def test_network_cameras_are_opened_set_and_released(flavour: Flavour, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twenty captures of each: tests/campaigns/camera_peers.py."""
+    monkeypatch.delenv("VCAMERADIR")  # with it, the library knows the virtual camera's bus only
+    assert driver_captures(flavour, 2) <= 0.010
 
 
 def test_without_the_wheel_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def missing(name: str, *rest: Any) -> Any:
-        if name == "gphoto2":
-            raise ImportError("No module named 'gphoto2'")
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "gphoto2", None)
     with pytest.raises(PluginError) as caught:
         open_camera({}, OpenContext(Path()), in_seconds(5))
     assert caught.value.code == "gphoto2-missing"

@@ -20,7 +20,7 @@ from plugins.ptp.ip.wire import PtpIpAddress
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
 
-FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old")
+FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old", "nikon", "sony")
 PATIENT = Timing(answer_s=20.0, busy_s=20.0, margin_s=20.0, grace_s=0.1, come_back_s=20.0, reconnect_s=20.0,
                  keep_alive_s=0.05)  # fmt: skip
 """Nothing but ``grace_s`` is waited for in vain where a camera answers, however loaded the machine is."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,16 +14,17 @@ import pytest
 from hal.codecs.ptp.eos import exposure_of
 from hal.codecs.ptp.values import Operation
 from hal.deadline import Cancelled, Deadline, in_seconds
-from hal.errors import DeviceError, DeviceGone, DeviceRefused
+from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
 from hal.interfaces import LiveViewCamera, WatchedCamera
 from hal.values import ExposureSettings
+from plugins.emulated.cameras.body import CameraFaults
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.wire import GENERAL_ERROR
 from plugins.ptp.ip.link import PtpIpLink
 from plugins.ptp.ip.wire import PtpIpAddress, Wire
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
-from tests.plugins.ptp.ptp_rig import FLAVOURS, HASTY, PATIENT, SHORT, Studio, connect, running, when
+from tests.plugins.ptp.ptp_rig import FLAVOURS, HASTY, PATIENT, SHORT, Rig, Studio, connect, running, when
 from tests.waiting import wait_for
 
 BULB_S = 0.7
@@ -211,3 +215,44 @@ def test_mended_faults_are_told_for_the_journal_once(tmp_path: Path) -> None:
         told = [code for code, _ in rig.driver.troubles()]
         assert told == ["camera-busy", "camera-disconnected"]
         assert rig.driver.troubles() == []
+
+
+def test_a_target_that_is_never_confirmed_costs_a_note_and_not_the_camera(tmp_path: Path) -> None:
+    faults = CameraFaults(unconfirmed=frozenset({0xD11C}))
+    with eos(faults) as rig:
+        notes = [code for code, _ in rig.driver.troubles()]
+        assert notes == ["camera-not-confirmed"]
+        assert rig.capture(tmp_path, "shot") == rig.latest()
+
+
+def test_an_exposure_that_is_never_confirmed_is_no_measurement() -> None:
+    with eos(CameraFaults(unconfirmed=frozenset({0xD103}))) as rig, pytest.raises(DeviceTimeout) as caught:
+        rig.driver.configure(replace(SHORT, iso=800), deadline=in_seconds(30))
+    assert caught.value.code == "camera-not-confirmed"
+
+
+def test_a_body_that_refuses_to_hear_of_the_computers_space_is_used_with_a_note(tmp_path: Path) -> None:
+    with eos(CameraFaults(space_refused=True)) as rig:
+        assert rig.capture(tmp_path, "one") == rig.latest()
+        assert rig.capture(tmp_path, "two") == rig.latest()
+        assert [code for code, _ in rig.driver.troubles()] == ["camera-space-refused"]
+
+
+def test_a_body_that_is_not_ready_at_the_start_of_live_view_is_no_trouble() -> None:
+    with running("eos-new") as rig:
+        rig.driver.troubles()
+        assert rig.driver.live_view(deadline=in_seconds(20)).startswith(b"\xff\xd8")
+        assert rig.emulator.body.answered[0x9153] > 1, "it was not ready at first"
+        assert rig.driver.troubles() == []
+
+
+@contextlib.contextmanager
+def eos(faults: CameraFaults) -> Iterator[Rig]:
+    """A driver that is opened on a body with these habits, and waits little for its reports."""
+    studio = Studio()
+    with EmulatedPtpCamera(studio.expose, flavour="eos-new", time_scale=0.0, faults=faults) as emulator:
+        driver = connect(emulator, timing=replace(PATIENT, confirm_s=0.3))
+        try:
+            yield Rig(emulator, studio, driver)
+        finally:
+            driver.close()

@@ -15,6 +15,7 @@ from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.service import Service, serving
 from controller.kiosk.store import archive
 from controller.kiosk.store.archive import FOLDER
+from controller.stage.recording import new_tape
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
 
 OLD, NEW = "20260501-100000-calibrate", "20260601-100000-calibrate"
@@ -157,6 +158,16 @@ def test_diagnostics_hold_facts_and_journals_and_no_secret_and_no_picture(stage:
     assert not [name for name in held if name.endswith(".png") or "keys" in name or "accounts" in name]
     assert b"SECRET" not in contents(file)
     assert b'"state": "playing"' in contents(file)
+
+
+def test_diagnostics_hold_the_newest_tape_unless_it_is_too_large(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number, name in enumerate(("old", "new")):
+        new_tape(stage, name).write_text(f"velatura tape 1\n{'x' * 100}")
+        os.utime(stage / "tapes" / f"{name}.tape", (number, number))
+    held = names(archive.diagnostics(stage, {}))
+    assert [name for name in held if name.startswith("tapes/")] == ["tapes/new.tape"]
+    monkeypatch.setattr(archive, "LARGEST_TAPE", 50)
+    assert not [name for name in names(archive.diagnostics(stage, {})) if name.startswith("tapes/")]
 
 
 def test_a_disk_that_takes_nothing_is_told_and_leaves_nothing(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,24 +34,26 @@ def test_the_summary_and_the_settings_tell_what_the_camera_is(peer: Peer, flavou
     assert f"Model: {NAMES[flavour].model}" in said
     assert f"Serial Number: {NAMES[flavour].serial}" in said
     assert "Maximum Capability: 4294967296" in said
-    assert "value: 90%" in said
+    # gphoto2 reads a Sony body's battery only as one of its own properties, 0xd218.
+    assert ("/main/other/d218" if flavour == "sony" else "value: 90%") in said
     assert "Image Capture" in said or "Canon EOS Capture" in said
-    for name in ("shutterspeed", "iso", "batterylevel"):
+    for name in ("shutterspeed", "iso"):
         assert name in said
 
 
-def test_a_shutter_speed_that_is_set_is_kept_and_a_capture_comes_byte_for_byte(peer: Peer) -> None:
+def test_a_shutter_speed_that_is_set_is_kept_and_a_capture_comes_byte_for_byte(peer: Peer, flavour: Flavour) -> None:
+    wanted = "1/4" if flavour == "sony" else "0.5"  # as gphoto2 writes them for this maker
     said = peer.gphoto2(
-        *("--set-config", "shutterspeed=0.5", "--capture-image-and-download", "--filename", "shot.jpg"),
+        *("--set-config", f"shutterspeed={wanted}", "--capture-image-and-download", "--filename", "shot.jpg"),
         *("--get-config", "shutterspeed"),
     )
-    assert "Current: 0.5" in said
+    assert f"Current: {wanted}" in said
     assert (peer.folder / "shot.jpg").read_bytes() == peer.picture(1)
     assert peer.exposures() == 1
 
 
 def test_several_captures_in_a_row_are_all_downloaded() -> None:
-    """Fifty of them: tests/campaigns/camera_peers.py. Six cameras side by side, because gphoto2 mostly waits."""
+    """Fifty of them: tests/campaigns/camera_peers.py. Ten cameras side by side, because gphoto2 mostly waits."""
 
     def three(camera: tuple[Way, Flavour]) -> int:
         way, flavour = camera

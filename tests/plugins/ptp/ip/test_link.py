@@ -17,9 +17,12 @@ import pytest
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.transcript import Transcript, Way, parse_transcript
+from plugins.emulated.cameras.body import CameraFaults
+from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.ptp.ip.link import PtpIpLink
 from plugins.ptp.ip.wire import PtpIpAddress, Wire, readable
 from plugins.ptp.link import LinkEvent
+from tests.plugins.ptp.ptp_rig import Studio
 from tests.waiting import wait_for
 
 OK = 0x2001
@@ -304,3 +307,21 @@ def test_a_connection_that_another_thread_closes_is_lost_at_whatever_moment(
     monkeypatch.setattr(select, "select", close_and_wait)
     with theirs, pytest.raises(DeviceGone):
         work(wire)
+
+
+def test_an_event_port_that_opens_late_is_waited_for() -> None:
+    faults = CameraFaults(late_events_s=0.5)
+    with EmulatedPtpCamera(Studio().expose, faults=faults) as camera:
+        link = PtpIpLink.connect(PtpIpAddress.parse(camera.address), deadline=in_seconds(20))
+        link.close()
+
+
+def test_an_event_port_that_never_opens_is_named_with_the_camera() -> None:
+    faults = CameraFaults(late_events_s=600.0)
+    with EmulatedPtpCamera(Studio().expose, faults=faults) as camera:
+        address = PtpIpAddress.parse(camera.address)
+        with pytest.raises(DeviceRefused) as caught:
+            PtpIpLink.connect(address, deadline=in_seconds(20))
+        assert caught.value.code == "camera-no-events"
+        assert camera.names.model in caught.value.what
+        assert str(address.event_port) in caught.value.what

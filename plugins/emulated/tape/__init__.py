@@ -1,0 +1,1 @@
+"""Devices that are replayed from a tape. Entry: `serving`."""
