@@ -25,6 +25,7 @@ from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, Proto
 from hal.finding import Finder, Found, Problem, Wanted
 from hal.serial_link import SerialLink
 from plugins.finding.access import forbidden, holders
+from plugins.projectors.network.device_server import is_url
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 
 RULES: Final = "70-velatura-serial.rules"
@@ -61,7 +62,7 @@ class Heard:
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
     """Every serial port of this machine and of stage.toml."""
     profiles = [load_profile(name, wanted.stage) for name in shipped_profiles()]
-    profiles = [profile for profile in profiles if profile.serial is not None]
+    profiles = [profile for profile in profiles if profile.serial is not None and profile.serial.baud]
     with ThreadPoolExecutor(AT_ONCE, thread_name_prefix="ports") as pool:
         return list(pool.map(lambda port: _found(port, wanted, profiles, deadline), _ports(wanted)))
 
@@ -71,6 +72,8 @@ def _ports(wanted: Wanted) -> list[Port]:
     ports: dict[str, Port] = {}
     for settings in wanted.of("projector", "serial"):
         name = str(settings.get("port", ""))
+        if is_url(name):
+            continue  # behind a device server: it is tested by its driver
         path = wanted.stage / name
         ports[str(path.resolve())] = Port(name, path, "named in stage.toml", settings)
     with contextlib.suppress(OSError):
