@@ -6,22 +6,20 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from hal.codecs.projectors.json_rpc import OBJECT_END, is_whole
 from hal.codecs.projectors.profiles import ProjectorProfile
 from hal.codecs.projectors.serial_protocol import (
     Answer,
     Notice,
     Reply,
     command_bytes,
-    head_bytes,
     parse_line,
     query_bytes,
-    rest_bytes,
 )
-from hal.codecs.projectors.serial_table import Frame, Query, SerialTable
+from hal.codecs.projectors.serial_table import Query, SerialTable
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
+from plugins.projectors.messages import read_message
 
 REAPPEAR_S: Final = 4.0
 """Time to wait for an unplugged port: USB adapters need a second or two to come back."""
@@ -208,7 +206,7 @@ class SerialConversation:
         """The next line that is not empty, or the next frame; None when the deadline passes."""
         while True:
             try:
-                line = self._message(link, deadline)
+                line = read_message(link, self._table, deadline)
             except ProtocolError as error:
                 self._garbage = error
                 link.drain()
@@ -217,32 +215,6 @@ class SerialConversation:
                 return self._abnormal(link)
             if line.strip():
                 return line
-
-    def _message(self, link: ByteLink, deadline: Deadline) -> bytes:
-        if self._table.frame:
-            return self._framed(link, self._table.frame, deadline)
-        return self._object(link, deadline) if self._table.json else self._ended(link, deadline)
-
-    def _object(self, link: ByteLink, deadline: Deadline) -> bytes:
-        """A JSON object, up to the brace that closes it."""
-        longest = self._table.longest_answer
-        data = link.read_until(OBJECT_END, limit=longest, deadline=deadline)
-        while not is_whole(data) and len(data) < longest:
-            data += link.read_until(OBJECT_END, limit=longest - len(data), deadline=deadline)
-        return data
-
-    def _framed(self, link: ByteLink, frame: Frame, deadline: Deadline) -> bytes:
-        head = link.read_exactly(head_bytes(frame), deadline=deadline)
-        rest = rest_bytes(frame, head, longest=self._table.longest_answer)
-        return head + link.read_exactly(rest, deadline=deadline)
-
-    def _ended(self, link: ByteLink, deadline: Deadline) -> bytes:
-        """A line up to its terminator; a terminator in quotes does not end the line."""
-        quote, longest = self._table.quirks.quote.encode("latin-1"), self._table.longest_answer
-        line = link.read_until(self._table.terminator, limit=longest, deadline=deadline)
-        while quote and line.count(quote) % 2 and len(line) < longest:
-            line += link.read_until(self._table.terminator, limit=longest - len(line), deadline=deadline)
-        return line
 
     def _abnormal(self, link: ByteLink) -> bytes | None:
         """Data without a terminator, if it is complete by the rule for abnormal states."""

@@ -7,6 +7,7 @@ of its own, with the greeting and the digest of the password.
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable
 from typing import Final
 
@@ -27,6 +28,7 @@ STX: Final = b"\x02"
 ETX: Final = b"\x03"
 GREETING_S: Final = 5.0
 _LONGEST: Final = 256
+_NUMBER: Final = re.compile(rb"\AAD[0-9A-Z]{2};")
 
 
 class NtControlLink:
@@ -77,7 +79,8 @@ class NtControlLink:
     def write(self, data: bytes, *, deadline: Deadline) -> None:
         self._command += data
         while (end := self._command.find(ETX)) >= 0:
-            body = bytes(self._command[:end]).rpartition(STX)[2]
+            # The number of a projector on a serial line is not used here.
+            body = _NUMBER.sub(b"", bytes(self._command[:end]).rpartition(STX)[2])
             del self._command[: end + 1]
             if self._link is None:
                 self._greet(deadline)

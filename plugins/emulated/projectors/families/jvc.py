@@ -25,8 +25,9 @@ class JvcBoard:
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers = []
         for line in self._lines.whole(data):
-            head, command = line[:1], line[3:]
-            if busy or line[1:3] != _UNIT:
+            noise, unit, command = line.rpartition(_UNIT)
+            head = noise[-1:]  # what came before it is passed over
+            if busy or not unit:
                 continue
             if head == b"!" and self._do(command):
                 answers.append(b"\x06" + _UNIT + command[:2] + b"\n")

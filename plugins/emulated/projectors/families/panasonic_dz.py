@@ -15,7 +15,7 @@ _PHASES: Final = {LampPhase.STANDBY: b"0", LampPhase.WARMING: b"1", LampPhase.LI
 
 
 class PanasonicDzBoard:
-    """``number``: its own on the line; ZZ is for all. Commands without a number come from the LAN port."""
+    """``number``: its own on the line; ZZ is for all, and for what comes from the LAN port."""
 
     def __init__(self, lamp: EmulatedLamp, *, number: bytes = b"01") -> None:
         self._lamp = lamp
@@ -27,10 +27,10 @@ class PanasonicDzBoard:
         for line in self._lines.whole(data):
             if not line.startswith(b"\x02"):
                 continue
-            head, semicolon, rest = line[1:].partition(b";")
-            if semicolon and head not in (b"AD" + self._number, b"ADZZ"):
+            head, _, command = line[1:].partition(b";")
+            if head not in (b"AD" + self._number, b"ADZZ"):
                 continue
-            said = b"ER401" if busy else self._act(rest if semicolon else head)
+            said = b"ER401" if busy else self._act(command)
             answers.append(b"\x02" + said + b"\x03")
         return answers
 

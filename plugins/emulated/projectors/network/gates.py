@@ -98,7 +98,7 @@ class NtControlGate(OpenGate):
         self._kept[:] = rest
         if not line.startswith(self._proof + b"00"):
             return Heard(b"ERRA\r" if self._proof else b"ERR1\r", close=True)
-        return Heard(commands=b"\x02" + line[len(self._proof) + 2 :] + b"\x03")
+        return Heard(commands=b"\x02ADZZ;" + line[len(self._proof) + 2 :] + b"\x03")
 
     def answer(self, said: bytes) -> bytes:
         body = said.strip(b"\x02\x03")
