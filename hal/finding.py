@@ -65,15 +65,15 @@ class Wanted:
     """Where to search. ``stage``: relative paths start there; ``known``: the devices of its stage.toml.
 
     ``serial_ports``: the folder with stable names of serial ports; ``search``: (host, UDP port) of the search
-    for projectors, None: no search; ``listen``: (host, port) for their answers. ``answer_s``: time limit for
-    an answer on a serial line; healthy projectors need a tenth of a second.
+    for projectors, None (the default): nothing is sent to a network; ``listen``: (host, port) for their answers.
+    ``answer_s``: time limit for an answer on a serial line; healthy projectors need a tenth of a second.
     """
 
     stage: Path
     known: tuple[Known, ...] = ()
     serial_ports: Path = Path("/dev/serial/by-id")
     system_ports: bool = True
-    search: tuple[str, int] | None = ("255.255.255.255", 4352)
+    search: tuple[str, int] | None = None
     listen: tuple[str, int] = ("", 4352)
     search_s: float = 10.0
     answer_s: float = 0.6

@@ -55,6 +55,10 @@ class BufferedLink(ABC):
         self._buffer = bytearray()
         self._transcript = transcript
 
+    def record(self, transcript: Transcript | None) -> None:
+        """Record all bytes from now on; None: none any more."""
+        self._transcript = transcript
+
     @abstractmethod
     def _receive(self, wait_s: float) -> bytes:
         """Bytes that arrive within ``wait_s``; b"" if none did."""

@@ -14,6 +14,7 @@ EXTRAS: Final = {
     "panel": "run a kiosk (velatura serve) with its panel and accounts",
     "bench": "emulated devices (velatura demo, emulate) and velatura plan",
     "gphoto2": "cameras through libgphoto2",
+    "mains": "mains by network: PDUs by SNMP, relays by Modbus",
     "cluster": "solve on many machines (--scheduler)",
 }
 """Purpose of each extra of pyproject.toml that people install."""
@@ -24,6 +25,7 @@ _MODULES: Final = {
     "panel": "aiomqtt anyio argon2 multipart prometheus_client python_multipart starlette uvicorn",
     "bench": "embreex tifffile",
     "gphoto2": "gphoto2",
+    "mains": "pymodbus pysnmp",
     "cluster": "dask distributed",
 }
 EXTRA_OF: Final = {module: extra for extra, modules in _MODULES.items() for module in modules.split()}

@@ -13,6 +13,7 @@ from typing import Any, Final
 from controller.config.loader import FILE
 from controller.core.errors import UsageError
 from controller.core.storage import exclusive
+from controller.doctor.search_address import PJLINK, search_address
 from controller.doctor.trying import Trying, devices_of
 from controller.doctor.values import Examination, Finding
 from controller.doctor.writing import write
@@ -37,9 +38,16 @@ class Tools:
 
 
 def examine(
-    *, stage: Path | None, write_it: bool, reporter: Reporter, cancel: threading.Event, tools: Tools | None = None
+    *,
+    stage: Path | None,
+    write_it: bool,
+    reporter: Reporter,
+    cancel: threading.Event,
+    network: str = "",
+    tools: Tools | None = None,
 ) -> Examination:
-    """The result of `velatura doctor`. ``write_it``: also write the devices found to stage.toml.
+    """The result of `velatura doctor`. ``write_it``: also write the devices found to stage.toml. ``network``: the
+    interface on which projectors are searched, "all", or "": no search, and only the stage's own devices are asked.
 
     Raises UsageError("already-running") while another program works on the stage, and what writing raises.
     """
@@ -50,7 +58,9 @@ def examine(
         if stage is not None and (folder / FILE).exists():
             stack.enter_context(exclusive(folder / LOCK, what_is_running="Velatura"))
         checked, wrong = _checked(folder, tools) if stage is not None else (None, [])
-        wanted = Wanted(folder, _known(checked), **(tools.wanted or {}))
+        search = (search_address(network), PJLINK) if network else None
+        wanted = Wanted(folder, _known(checked), **{"search": search, **(tools.wanted or {})})
+        _say_what_is_sent(wanted, reporter)
         found, problems = _search(wanted, tools.finders, deadline, reporter)
         seen = _compared(checked, found, [*wrong, *problems], tools)
         if checked is not None:
@@ -60,6 +70,20 @@ def examine(
             raise UsageError(wrong[0].problem.code, what=wrong[0].problem.what, remedy=wrong[0].problem.remedy)
         seen = replace(seen, written=write(folder, None if checked is None else checked.stage, seen))
     return seen
+
+
+def _say_what_is_sent(wanted: Wanted, reporter: Reporter) -> None:
+    """Name every place outside this computer that gets a message."""
+    addresses = [
+        str(place) for one in wanted.known for place in (one.settings.get("address"), one.settings.get("port"))
+        if place and (one.settings.get("address") or "://" in str(place))
+    ]  # fmt: skip
+    if addresses:
+        reporter.say(f"Asking the stage's own devices on the network: {', '.join(dict.fromkeys(addresses))}.")
+    if wanted.search is None:
+        reporter.say("Not searching the network. --network INTERFACE sends a search for projectors.")
+    else:
+        reporter.say("Sending a search for projectors (PJLink, UDP port {1}) to {0}.".format(*wanted.search))
 
 
 def _checked(folder: Path, tools: Tools) -> tuple[Checked | None, list[Finding]]:

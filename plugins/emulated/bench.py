@@ -40,11 +40,11 @@ from plugins.emulated.optics.staging import (
 from plugins.emulated.optics.stands import SETTINGS, Stands, read_room, read_stands
 from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World
-from plugins.emulated.projectors.boards import USUAL, baud_of, board_named
+from plugins.emulated.projectors.boards import USUAL, board_named
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
 from plugins.emulated.projectors.quick_profile import quick_profile
-from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.emulated.projectors.wires import projector_on_its_wire
 from plugins.emulated.scenario import ScenarioPlayer, read_scenario
 from plugins.emulated.tape.serving import serve_tape
 from plugins.emulated.usb.bench import UsbDevices, read_usb
@@ -204,18 +204,12 @@ def _start(
     boot_s = boot_times(truth.mains)
     wires = {}
     for projector, lamp in zip(truth.projectors, lamps, strict=True):
-        wire = EmulatedSerialProjector(
-            stage / projector.port,
-            lamp,
-            baud=baud_of(projector.board),
-            board=board_named(projector.board)(lamp),
-            boot_s=boot_s.get(projector.name, 0.0),
-        )
+        wire = projector_on_its_wire(stage, projector, lamp, boot_s.get(projector.name, 0.0))
         wires[projector.name] = wire
         if scenario is not None:
             wire.scenario = ScenarioPlayer(scenario, device=projector.name, faults=wire.faults, lamp=lamp, plug=wire)
         stack.enter_context(wire)
-        out.served(projector.name, "projector", str(wire.port))
+        out.served(projector.name, "projector", wire.address)
     if not on_usb:
         camera = stack.enter_context(_network_camera(world, truth.camera))
         out.served("camera", "camera", camera.address)

@@ -17,7 +17,7 @@ from typing import Any, Final
 from serial.tools import list_ports
 
 from hal.codecs.projectors.profiles import ProjectorProfile
-from hal.codecs.projectors.serial_protocol import Answer, Reply, head_bytes, parse_line, query_bytes, rest_bytes
+from hal.codecs.projectors.serial_protocol import Answer, Reply, parse_line, query_bytes
 from hal.codecs.projectors.serial_table import Query, SerialTable
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
@@ -25,6 +25,8 @@ from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, Proto
 from hal.finding import Finder, Found, Problem, Wanted
 from hal.serial_link import SerialLink
 from plugins.finding.access import forbidden, holders
+from plugins.projectors.messages import read_message
+from plugins.projectors.network.device_server import is_url
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 
 RULES: Final = "70-velatura-serial.rules"
@@ -61,7 +63,7 @@ class Heard:
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
     """Every serial port of this machine and of stage.toml."""
     profiles = [load_profile(name, wanted.stage) for name in shipped_profiles()]
-    profiles = [profile for profile in profiles if profile.serial is not None]
+    profiles = [profile for profile in profiles if profile.serial is not None and profile.serial.baud]
     with ThreadPoolExecutor(AT_ONCE, thread_name_prefix="ports") as pool:
         return list(pool.map(lambda port: _found(port, wanted, profiles, deadline), _ports(wanted)))
 
@@ -71,6 +73,8 @@ def _ports(wanted: Wanted) -> list[Port]:
     ports: dict[str, Port] = {}
     for settings in wanted.of("projector", "serial"):
         name = str(settings.get("port", ""))
+        if is_url(name):
+            continue  # behind a device server: it is tested by its driver
         path = wanted.stage / name
         ports[str(path.resolve())] = Port(name, path, "named in stage.toml", settings)
     with contextlib.suppress(OSError):
@@ -248,13 +252,9 @@ def _question(profile: ProjectorProfile) -> tuple[Query, bytes]:
 
 
 def _line(link: SerialLink, table: SerialTable, deadline: Deadline) -> bytes:
-    """The next line or frame, or other data."""
+    """The next message, or other data."""
     try:
-        if table.frame is None:
-            return link.read_until(table.terminator, limit=table.longest_answer, deadline=deadline)
-        head = link.read_exactly(head_bytes(table.frame), deadline=deadline)
-        rest = rest_bytes(table.frame, head, longest=table.longest_answer)
-        return head + link.read_exactly(rest, deadline=deadline)
+        return read_message(link, table, deadline)
     except ProtocolError:
         return link.drain()
 

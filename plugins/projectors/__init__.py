@@ -1,1 +1,1 @@
-"""Projectors by serial line and PJLink. Entry: `serial.DRIVER`, `pjlink.DRIVER`; profiles by `profile_files`."""
+"""Projectors by serial line, LAN port, PJLink. Entry: `serial.DRIVER`, `pjlink.DRIVER`; profiles: `profile_files`."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from hal.codecs.projectors.power_view import PowerView
@@ -19,8 +20,9 @@ from hal.registry import Driver, OpenContext
 from hal.serial_link import SerialLink
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
+from plugins.projectors.network.device_server import open_url
 from plugins.projectors.optional_answers import OptionalAnswers
-from plugins.projectors.serial_conversation import COOLS, SerialConversation
+from plugins.projectors.serial_conversation import COOLS, SERIAL_CHECK, SerialConversation
 from plugins.projectors.serial_settings import checked_address, read_settings, serial_table, told_powers
 
 T = TypeVar("T")
@@ -38,6 +40,7 @@ class SerialProjector:
     profile : the family's table; it needs a ``serial`` part
     name : its name for the technician, for messages
     address : the projector's address on the line, or None for the profile's
+    check : what a technician should check if it is silent
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class SerialProjector:
         name: str,
         address: str | None = None,
         transcript: Transcript | None = None,
+        check: str = SERIAL_CHECK,
     ) -> None:
         table = serial_table(profile)
         self._name = name
@@ -59,6 +63,8 @@ class SerialProjector:
         self._open_link = open_link
         self._opened_at_s = time.monotonic()
         self._answered = False
+        # Which shutter moves is known once one did: the commands of the other would not open it again.
+        self._shutter = None if "lens_shutter_close" in table.commands else "shutter"
         self._optional = OptionalAnswers(name, _FIELDS)
         self._talk = SerialConversation(
             self._opened,
@@ -68,6 +74,7 @@ class SerialProjector:
             address=checked_address(table, address),
             notice=self._noticed,
             slow=self._may_be_starting,
+            check=check,
         )
 
     def open(self, deadline: Deadline) -> None:
@@ -153,11 +160,19 @@ class SerialProjector:
         with self._turn(deadline):
             if not self.capabilities.shutter:
                 raise self._refused("projector-no-shutter", "has no shutter")
-            reply = self._talk.command("shutter_close" if closed else "shutter_open", deadline=deadline)
+            which = self._shutter
+            reply = self._moved(which or "lens_shutter", closed, deadline)
+            if which is None and reply is not Reply.ACCEPTED:
+                which, reply = "shutter", self._moved("shutter", closed, deadline)
+            if reply is Reply.ACCEPTED:
+                self._shutter = which or "lens_shutter"
             if reply is None:
                 raise self._talk.no_answer()
             if reply in (Reply.REFUSED, Reply.COOLING):
                 raise self._refused("projector-refused-shutter", "refused to move its shutter; it may be off")
+
+    def _moved(self, which: str, closed: bool, deadline: Deadline) -> Reply | None:
+        return self._talk.command(f"{which}_close" if closed else f"{which}_open", deadline=deadline)
 
     def close(self) -> None:
         self._talk.close()
@@ -284,9 +299,15 @@ def check_serial_projector(settings: Mapping[str, Any], context: OpenContext) ->
 def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
     profile, port, baud, address = read_settings(settings, context)
-    transcript = context.transcript("serial", port.name)
+    transcript = context.transcript("serial", port.name if isinstance(port, Path) else port)
+
+    def line(until: Deadline) -> ByteLink:
+        if isinstance(port, Path):
+            return SerialLink(port, baud=baud, deadline=until, transcript=transcript)
+        return open_url(port, baud=baud, deadline=until, transcript=transcript)
+
     projector = SerialProjector(
-        lambda until: SerialLink(port, baud=baud, deadline=until, transcript=transcript),
+        line,
         profile,
         name=str(settings["port"]),
         address=address,
@@ -303,7 +324,8 @@ DRIVER = Driver(
     open=open_serial_projector,
     settings={
         "profile": "the family's table: a shipped name such as optoma-later, or a .toml file of the stage",
-        "port": "the serial port; a stable name such as /dev/serial/by-id/..., or a path relative to the stage",
+        "port": "the serial port; a stable name such as /dev/serial/by-id/..., a path relative to the stage, or a port "
+        "of a device server: socket://host:port or rfc2217://host:port",
         "baud": "baud rate (default: the profile's)",
         "address": "the projector's number on the line (default: the profile's)",
     },

@@ -12,20 +12,21 @@ from hal.codecs.projectors.serial_protocol import (
     Notice,
     Reply,
     command_bytes,
-    head_bytes,
     parse_line,
     query_bytes,
-    rest_bytes,
 )
-from hal.codecs.projectors.serial_table import Frame, Query, SerialTable
+from hal.codecs.projectors.serial_table import Query, SerialTable
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
+from plugins.projectors.messages import read_message
 
 REAPPEAR_S: Final = 4.0
 """Time to wait for an unplugged port: USB adapters need a second or two to come back."""
 COOLS: Final = "projector-cools"
 """Code of the DeviceBusy of a projector whose lamp cools."""
+SERIAL_CHECK: Final = "its serial cable, and the baud rate and profile in stage.toml"
+"""What to check if a projector on a serial line is silent."""
 
 
 class SerialConversation:
@@ -35,7 +36,7 @@ class SerialConversation:
     lost answer no query is sent until that answer can no longer come.
 
     ``notice`` is called for every unsolicited line; ``slow`` is true if the projector starts or cools, and must not
-    be asked often.
+    be asked often; ``check``: what a technician should check if it is silent.
     """
 
     def __init__(
@@ -48,7 +49,9 @@ class SerialConversation:
         address: str,
         notice: Callable[[Notice], None],
         slow: Callable[[], bool],
+        check: str = SERIAL_CHECK,
     ) -> None:
+        self._check_what = check
         self._open_link = open_link
         self._name = name
         self._timing = profile.timing
@@ -59,6 +62,7 @@ class SerialConversation:
         self._link: ByteLink | None = None
         self._closed = False
         self._sent = b""
+        self._number = 1
         self._sent_at_s = -1e9
         self._owed = 0
         self._owed_until_s = 0.0
@@ -96,9 +100,9 @@ class SerialConversation:
                 if settled:
                     self._clear(self._connected(deadline))  # half an answer must not be joined with the next
                 else:
-                    self._settle(deadline)
+                    self._settled(deadline)
                     settled = True
-                self._say(query_bytes(self._table, query, self._address), deadline)
+                self._say(query_bytes(self._table, query, self._address, self._number), deadline)
                 reply = self._listen(query, deadline.within(self._timing.answer_s))
             except DeviceGone:
                 self._hang_up()
@@ -114,13 +118,9 @@ class SerialConversation:
 
     def command(self, command: str, *, deadline: Deadline) -> Reply | None:
         """Send a command once; None if no reply came. Never sent again: the caller must check its effect."""
+        self._settled(deadline)
         try:
-            self._settle(deadline)
-        except DeviceGone:
-            self._hang_up()
-            self._settle(deadline)
-        try:
-            self._say(command_bytes(self._table, command, self._address), deadline)
+            self._say(command_bytes(self._table, command, self._address, self._number), deadline)
             reply = self._listen(None, deadline.within(self._timing.command_s))
         except DeviceGone:
             self._hang_up()
@@ -140,8 +140,16 @@ class SerialConversation:
         return DeviceTimeout(
             "projector-no-answer",
             what=f"The projector at {self._name} did not answer.",
-            remedy="Check its mains power, its serial cable, and the baud rate and profile in stage.toml.",
+            remedy=f"Check its mains power, {self._check_what}.",
         )
+
+    def _settled(self, deadline: Deadline) -> None:
+        """``_settle``, on a new link if this one was lost: a network port is closed after a while without commands."""
+        try:
+            self._settle(deadline)
+        except DeviceGone:
+            self._hang_up()
+            self._settle(deadline)
 
     def _settle(self, deadline: Deadline) -> None:
         """Wait until the projector may be asked again, and remove old data from the link."""
@@ -172,6 +180,7 @@ class SerialConversation:
         except DeviceTimeout as error:
             raise self.no_answer() from error
         self._sent, self._sent_at_s = data, time.monotonic()
+        self._number += 1
         self._owed += 1
         self._owed_until_s = self._sent_at_s + self._timing.late_s
 
@@ -197,11 +206,7 @@ class SerialConversation:
         """The next line that is not empty, or the next frame; None when the deadline passes."""
         while True:
             try:
-                line = (
-                    self._framed(link, self._table.frame, deadline)
-                    if self._table.frame
-                    else self._ended(link, deadline)
-                )
+                line = read_message(link, self._table, deadline)
             except ProtocolError as error:
                 self._garbage = error
                 link.drain()
@@ -210,19 +215,6 @@ class SerialConversation:
                 return self._abnormal(link)
             if line.strip():
                 return line
-
-    def _framed(self, link: ByteLink, frame: Frame, deadline: Deadline) -> bytes:
-        head = link.read_exactly(head_bytes(frame), deadline=deadline)
-        rest = rest_bytes(frame, head, longest=self._table.longest_answer)
-        return head + link.read_exactly(rest, deadline=deadline)
-
-    def _ended(self, link: ByteLink, deadline: Deadline) -> bytes:
-        """A line up to its terminator; a terminator in quotes does not end the line."""
-        quote, longest = self._table.quirks.quote.encode("latin-1"), self._table.longest_answer
-        line = link.read_until(self._table.terminator, limit=longest, deadline=deadline)
-        while quote and line.count(quote) % 2 and len(line) < longest:
-            line += link.read_until(self._table.terminator, limit=longest - len(line), deadline=deadline)
-        return line
 
     def _abnormal(self, link: ByteLink) -> bytes | None:
         """Data without a terminator, if it is complete by the rule for abnormal states."""

@@ -11,6 +11,7 @@ from hal.codecs.projectors.serial_table import SerialTable
 from hal.errors import PluginError
 from hal.registry import OpenContext, setting
 from hal.values import Power
+from plugins.projectors.network.device_server import is_url, parse_url
 from plugins.projectors.profile_files import load_profile
 
 
@@ -45,11 +46,27 @@ def checked_address(table: SerialTable, address: str | None) -> str:
     return address
 
 
-def read_settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[ProjectorProfile, Path, int, str | None]:
-    """Profile, port, baud rate and address of a stage.toml table. Raises PluginError and ProtocolError."""
+def read_settings(
+    settings: Mapping[str, Any], context: OpenContext
+) -> tuple[ProjectorProfile, Path | str, int, str | None]:
+    """Profile, port, baud rate and address of a stage.toml table. Raises PluginError and ProtocolError.
+
+    The port is a file, or the URL of a device server.
+    """
     profile = load_profile(setting(settings, "profile", str), context.stage)
     table = serial_table(profile)
     address = setting(settings, "address", str)
     checked_address(table, address)
+    baud = setting(settings, "baud", int, table.baud)
+    if not baud:
+        raise PluginError(
+            "profile-not-serial",
+            what=f"The profile {profile.name!r} is for a network port.",
+            remedy='Use the driver "network" with the projector\'s address.',
+        )
+    port = setting(settings, "port", str)
+    if is_url(port):
+        parse_url(port)
+        return profile, port, baud, address
     # Not resolved: the symlink is the stable name, and leads elsewhere after the adapter was unplugged.
-    return profile, context.stage / setting(settings, "port", str), setting(settings, "baud", int, table.baud), address
+    return profile, context.stage / port, baud, address

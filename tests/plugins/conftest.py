@@ -14,11 +14,14 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import BOARDS, USUAL
+from plugins.emulated.projectors.boards import BOARDS, USUAL, login_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.network.gates import GATES
+from plugins.emulated.projectors.network.server import EmulatedNetworkProjector
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.quick_profile import quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.projectors.network.driver import open_network_projector
 from plugins.projectors.pjlink import PjLinkProjector, open_pjlink_projector
 from plugins.projectors.profile_files import load_profile
 from plugins.projectors.serial import SerialProjector, open_serial_projector
@@ -59,6 +62,15 @@ class SerialPair:
 
 
 @dataclass(frozen=True)
+class NetworkPair:
+    """A driver and the emulated projector at the other end of its network."""
+
+    driver: SerialProjector
+    emulator: EmulatedNetworkProjector
+    stage: Path
+
+
+@dataclass(frozen=True)
 class PjLinkPair:
     driver: PjLinkProjector
     emulator: EmulatedPjLinkProjector
@@ -89,6 +101,7 @@ def each(names: Iterable[str], work: Callable[[str], object]) -> None:
 
 
 OpenSerial = Callable[..., SerialPair]
+OpenNetwork = Callable[..., "NetworkPair"]
 OpenPjLink = Callable[..., PjLinkPair]
 
 
@@ -122,6 +135,42 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
         pair = SerialPair(open_serial_projector(table, context, in_seconds(20)), emulator, tmp_path)
         opened.append(pair)
         return pair
+
+    yield make
+    for pair in opened:
+        pair.driver.close()
+        pair.emulator.stop()
+
+
+@pytest.fixture
+def open_network(tmp_path: Path) -> Iterator[OpenNetwork]:
+    """Start an emulated projector on its own LAN port and open its driver; other keyword arguments go to the emulator.
+
+    ``profile``, ``edit``, ``timing``, ``board`` and ``name`` as in ``open_serial``; ``gate``: another login than the
+    profile's.
+    """
+    opened: list[NetworkPair] = []
+
+    def make(*, settings: dict[str, Any] | None = None, **kwargs: Any) -> NetworkPair:
+        timing = kwargs.pop("timing", LAMP)
+        lamp = kwargs.pop("lamp", None) or EmulatedLamp(timing)
+        profile = kwargs.pop("profile", "panasonic-dz")
+        edit = kwargs.pop("edit", lambda text: text)
+        name = kwargs.pop("name", "left")
+        board = (kwargs.pop("board", None) or BOARDS[profile])(lamp)
+        gate = kwargs.pop("gate", None) or GATES[login_of(profile)]
+        (tmp_path / f"{name}.toml").write_text(edit(quick_profile(timing, base=profile)))
+        emulator = EmulatedNetworkProjector(lamp, board, gate=gate, **kwargs)
+        emulator.start()
+        table = {"profile": f"{name}.toml", "address": emulator.address, **(settings or {})}
+        context = OpenContext(tmp_path, transcripts=tmp_path / "transcripts")
+        try:
+            driver = open_network_projector(table, context, in_seconds(20))
+        except BaseException:
+            emulator.stop()
+            raise
+        opened.append(NetworkPair(driver, emulator, tmp_path))
+        return opened[-1]
 
     yield make
     for pair in opened:

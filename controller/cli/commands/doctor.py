@@ -23,6 +23,15 @@ def doctor(
         bool,
         typer.Option("--outputs", help="Switch the lamps on and find which output each projector shows."),
     ] = False,
+    network: Annotated[
+        str,
+        typer.Option(
+            "--network",
+            metavar="INTERFACE",
+            help="Also search for projectors on this network interface (such as eth0), or on all. Without it, "
+            "nothing is sent except to the stage's own devices.",
+        ),
+    ] = "",
     as_json: Json = False,
 ) -> int:
     """Find and test the connected devices without switching a lamp on. Report faults and how to correct them."""
@@ -36,7 +45,7 @@ def doctor(
             "stage-missing", what="No stage was given.", remedy="Give the folder of stage.toml, existing or new."
         )
     with cancelled_by_signals() as cancel, console.reporter(as_json=as_json) as reporter:
-        seen = examine(stage=stage, write_it=write, reporter=reporter, cancel=cancel)
+        seen = examine(stage=stage, write_it=write, reporter=reporter, cancel=cancel, network=network)
         if outputs and stage is not None:
             seen = examine_outputs(seen, stage=stage, reporter=reporter, cancel=cancel)
     console.show_result(seen.as_json() if as_json else seen.as_text(), as_json=as_json)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from hal.codecs.projectors.network_table import NetworkTable, parse_network
 from hal.codecs.projectors.serial_table import MAY_BE_UNKNOWN, SerialTable, parse_serial
 from hal.codecs.projectors.toml_table import Table, parse_toml
 from hal.values import LampRules
@@ -46,7 +47,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorProfile:
-    """A family of projectors. ``serial`` is None for PJLink.
+    """A family of projectors. ``serial`` is None for PJLink; ``network``: its own LAN port, if it takes these commands.
 
     ``unknown``: commands and queries with unknown codes; the driver refuses calls that need them.
     """
@@ -58,6 +59,7 @@ class ProjectorProfile:
     lamp: LampRules
     timing: Timing
     serial: SerialTable | None
+    network: NetworkTable | None = None
     unknown: tuple[str, ...] = ()
 
 
@@ -85,6 +87,7 @@ def parse_profile(text: str, *, file: str = "profile") -> ProjectorProfile:
         lamp=_lamp(root.table("lamp")),
         timing=_timing(root.table("timing")),
         serial=parse_serial(root, unknown) if protocol == "serial" else None,
+        network=parse_network(root.table("network")) if protocol == "serial" and root.has("network") else None,
         unknown=unknown,
     )
     head.finish()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
+from hal.codecs.projectors.json_rpc import Message, Said, json_bytes, parse_message
 from hal.codecs.projectors.serial_table import Frame, Query, SerialTable
 from hal.errors import ProtocolError
 from hal.escapes import escaped
@@ -19,6 +20,7 @@ from hal.values import Power
 
 MOST_HOURS: Final = 99_999
 _LONGEST_VALUE: Final = 64
+_HEX_DIGITS: Final = re.compile(r"[0-9A-Fa-f]{1,8}")
 _SHAPE_PARTS: Final = re.compile(r"\{value\}|\{any\}|\?\*\d+|\?| |[^{?]+|.", re.DOTALL)
 
 
@@ -49,17 +51,19 @@ class Notice:
     trouble: str | None
 
 
-def command_bytes(table: SerialTable, name: str, address: str) -> bytes:
-    """The bytes of a command of the profile, e.g. ``power_on``."""
-    return _filled(table, table.commands[name], address)
+def command_bytes(table: SerialTable, name: str, address: str, number: int = 1) -> bytes:
+    """The bytes of a command of the profile, e.g. ``power_on``; ``number`` of the message, where it carries one."""
+    return _filled(table, table.commands[name], address, number)
 
 
-def query_bytes(table: SerialTable, query: Query, address: str) -> bytes:
-    """The bytes of a question."""
-    return _filled(table, query.send, address)
+def query_bytes(table: SerialTable, query: Query, address: str, number: int = 1) -> bytes:
+    """The bytes of a question; ``number`` as in ``command_bytes``."""
+    return _filled(table, query.send, address, number)
 
 
-def _filled(table: SerialTable, template: str, address: str) -> bytes:
+def _filled(table: SerialTable, template: str, address: str, number: int) -> bytes:
+    if table.json:
+        return json_bytes(template, number)
     return bytes.fromhex(template) if table.binary else template.replace("{address}", address).encode("latin-1")
 
 
@@ -70,6 +74,10 @@ def head_bytes(frame: Frame) -> int:
 
 def rest_bytes(frame: Frame, head: bytes, *, longest: int) -> int:
     """How many bytes follow the first ``head_bytes`` of a frame. ProtocolError for a count that cannot be."""
+    if frame.lengths:
+        if head[0] not in frame.lengths:
+            raise _garbage(head)
+        return frame.lengths[head[0]] - 1
     digits = head[frame.count_at :]
     if frame.hexadecimal and not re.fullmatch(rb"[0-9A-Fa-f]{2}", digits):
         raise _garbage(head)
@@ -90,20 +98,43 @@ def parse_line(
     ------
     ProtocolError("projector-garbage")  for a line that the profile does not know
     """
+    if table.json:
+        return _object(table, parse_message(line, sent), query, line)
     text = _text(table, line, sent)
     if table.notices.prefix and text.startswith(table.notices.prefix):
         return _notice(table, text)
-    if (refusal := _reply(table, text, ((table.cooling, Reply.COOLING), (table.refused, Reply.REFUSED)))) is not None:
-        return refusal
-    if query is not None:
-        for shape in query.answers:
-            if (match := _pattern(shape, _flags(table), table.binary).fullmatch(text)) is not None:
-                return _answer(table, query, match[1], line)
-    if (reply := _reply(table, text, ((table.accepted, Reply.ACCEPTED), (table.ignored, Reply.NOTHING)))) is not None:
-        return reply
-    if not text and (table.quirks.prompt or table.quirks.echo):
+    meaning = _reply(table, text, ((table.cooling, Reply.COOLING), (table.refused, Reply.REFUSED)))
+    if meaning is None and table.quirks.ack_first:
+        meaning = _reply(table, text, ((table.accepted, Reply.ACCEPTED),))
+    if meaning is None and query is not None and (answer := _shaped(table, query, text, line)) is not None:
+        return answer
+    meaning = meaning or _reply(table, text, ((table.accepted, Reply.ACCEPTED), (table.ignored, Reply.NOTHING)))
+    if meaning is None and not text and (table.quirks.prompt or table.quirks.echo):
+        meaning = Reply.NOTHING
+    if meaning is None:
+        raise _garbage(line)
+    return meaning
+
+
+def _shaped(table: SerialTable, query: Query, text: str, line: bytes) -> Answer | Reply | None:
+    for shape in query.answers:
+        if (match := _pattern(shape, _flags(table), table.binary).fullmatch(text)) is not None:
+            return _answer(table, query, match[1], line)
+    return None
+
+
+def _object(table: SerialTable, message: Message, query: Query | None, line: bytes) -> Answer | Reply:
+    """Read a JSON object: only the answer to the message that was sent last means anything."""
+    if message.said is Said.OTHER:
         return Reply.NOTHING
-    raise _garbage(line)
+    if message.said is Said.ERROR:
+        return _reply(table, message.text, ((table.cooling, Reply.COOLING),)) or Reply.REFUSED
+    if query is None:
+        return Reply.ACCEPTED
+    answer = _shaped(table, query, message.text, line)
+    if answer is None:
+        raise _garbage(line)
+    return answer
 
 
 def _reply(table: SerialTable, text: str, meanings: Sequence[tuple[tuple[str, ...], Reply]]) -> Reply | None:
@@ -120,8 +151,9 @@ def _flags(table: SerialTable) -> int:
 def _text(table: SerialTable, line: bytes, sent: bytes) -> str:
     """What a line says: without terminator, prompt and echo; a binary frame as hexadecimal without its checksum."""
     if table.binary:
-        if table.frame is not None and table.frame.checksum:
-            if len(line) < 2 or sum(line[:-1]) & 0xFF != line[-1]:
+        if table.frame is not None and table.frame.checksum != "none":
+            begin = 1 if table.frame.checksum == "sum-but-first" else 0
+            if len(line) < 2 or sum(line[begin:-1]) & 0xFF != line[-1]:
                 raise _garbage(line)
             line = line[:-1]
         return line.hex().upper()
@@ -171,6 +203,8 @@ def _read(query: Query, value: str) -> str:
     """A value of a binary frame as the text that it stands for."""
     if query.reads == "text":
         return value
+    if query.reads == "hex-digits":
+        return str(int(value, 16)) if _HEX_DIGITS.fullmatch(value) else value
     data = bytes.fromhex(value)
     if query.reads == "ascii":
         text = data.partition(b"\0")[0].decode("latin-1")

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from hal.codecs.projectors.toml_table import Table
 from hal.values import Power
 
-COMMANDS: Final = ("power_on", "power_off", "shutter_close", "shutter_open")
+COMMANDS: Final = (
+    "power_on", "power_off", "shutter_close", "shutter_open", "lens_shutter_close", "lens_shutter_open",
+)  # fmt: skip
 QUERIES: Final = ("power", "lamp_hours", "shutter", "model", "firmware")
 MAY_BE_UNKNOWN: Final = ("power_on", "power_off", "power", "lamp_hours")
 POWERS: Final = tuple(power.value for power in Power)
-READS: Final = {"text": "", "ascii": "hex", "little-endian": "hex", "big-endian": "hex"}
+READS: Final = {"text": "", "hex-digits": "", "ascii": "hex", "little-endian": "hex", "big-endian": "hex"}
 UNITS: Final = {"hours": 1, "minutes": 60, "seconds": 3600}
 _PLACEHOLDER: Final = re.compile(r"\{([^{}]*)\}")
 _WORD: Final = re.compile(r"[a-z][a-z0-9-]{0,39}")
@@ -29,8 +31,8 @@ class Query:
     """One query: its bytes, the shapes of its answer (``{value}`` marks the value) and the meaning of values.
 
     ``absent``: values for "not known now"; ``unknown``: power states with an unknown meaning.
-    ``reads``: how a number or name is written: ``text``, or in binary frames ``little-endian``, ``big-endian`` and
-    ``ascii`` (up to a NUL). ``per_hour``: units of lamp time in an hour.
+    ``reads``: how a number or name is written: ``text``, ``hex-digits``, or in binary frames ``little-endian``,
+    ``big-endian`` and ``ascii`` (up to a NUL). ``per_hour``: units of lamp time in an hour.
     """
 
     send: str
@@ -56,13 +58,16 @@ class Frame:
     """Format of answers that carry their own length.
 
     ``count_at``: offset of the count in the frame; ``hexadecimal``: the count is two hex digits, else one byte;
-    ``overhead``: bytes of the frame that the count leaves out; ``checksum``: the last byte is the sum of all others.
+    ``overhead``: bytes of the frame that the count leaves out. ``checksum``: the last byte is the sum of all others
+    (``sum``), or of all but the first (``sum-but-first``). ``lengths``: the length by the first byte; then there is no
+    count.
     """
 
     count_at: int
     hexadecimal: bool
     overhead: int
-    checksum: bool
+    checksum: str
+    lengths: Mapping[int, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +76,8 @@ class Quirks:
 
     ``prompt``: bytes before a line that mean nothing; ``echo``: what was sent comes back first, any number of times;
     ``any_case``: upper and lower case are the same; ``quote``: a terminator between two of these does not end the line;
-    ``abnormal_terminator``: in an abnormal state an answer ends in this instead of the terminator.
+    ``abnormal_terminator``: in an abnormal state an answer ends in this instead of the terminator. ``ack_first``: every
+    message is acknowledged by a line of its own, which is never an answer.
     """
 
     prompt: str = ""
@@ -79,15 +85,19 @@ class Quirks:
     any_case: bool = False
     quote: str = ""
     abnormal_terminator: bytes = b""
+    ack_first: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class SerialTable:
     """The command table of a serial family. ``{address}`` in a command stands for the projector's address.
 
+    ``baud`` is 0 for a family that has only a network port.
+
     Answers end in ``terminator``, or carry their length (``frame``). ``binary``: commands and shapes are written as
     hexadecimal bytes, where ``?`` stands for any byte and ``?*9`` for nine. ``cooling``: replies that refuse because
-    the lamp cools; ``ignored``: lines without meaning.
+    the lamp cools; ``ignored``: lines without meaning. ``json``: each message is a JSON-RPC object, written as
+    in ``hal.codecs.projectors.json_rpc``; a shape is the text of a result, and each error refuses.
     """
 
     baud: int
@@ -103,6 +113,7 @@ class SerialTable:
     ignored: tuple[str, ...] = ()
     frame: Frame | None = None
     binary: bool = False
+    json: bool = False
     quirks: Quirks = Quirks()
 
 
@@ -114,28 +125,31 @@ def parse_serial(root: Table, unknown: tuple[str, ...]) -> SerialTable:
     """
     line = root.table("serial")
     frame = _frame(root.table("frame")) if root.has("frame") else None
-    binary = line.choice("notation", ("text", "hex"), "text") == "hex"
-    terminator = b"" if frame else _bytes(line, "terminator", line.string("terminator"))
-    if not terminator and frame is None:
+    notation = line.choice("notation", ("text", "hex", "json"), "text")
+    binary = notation == "hex"
+    whole = frame is not None or notation == "json"  # an answer shows its own end
+    terminator = b"" if whole else _bytes(line, "terminator", line.string("terminator"))
+    if not terminator and not whole:
         raise line.wrong("terminator", "it is empty")
     address = line.string("address", "")
     if not ((address.isascii() and address.isalnum()) or not address):
         raise line.wrong("address", f"{address!r} may have only letters and digits")
-    replies = root.table("replies")
+    replies = root.table("replies", required=notation != "json")
     made = SerialTable(
-        baud=line.whole("baud", 300, 921_600),
+        baud=0 if root.has("network") and not line.has("baud") else line.whole("baud", 300, 921_600),
         terminator=terminator,
         address=address,
         longest_answer=line.whole("longest_answer", 4, 4096),
         commands=_commands(root.table("commands"), unknown, binary),
         queries=_queries(root.table("queries"), unknown, binary),
-        accepted=_shapes(replies, "accepted", binary),
-        refused=_shapes(replies, "refused", binary),
+        accepted=_shapes(replies, "accepted", binary, required=notation != "json"),
+        refused=_shapes(replies, "refused", binary, required=False),
         cooling=_shapes(replies, "cooling", binary, required=False),
         ignored=_shapes(replies, "ignored", binary, required=False),
         notices=_notices(root.table("notices", required=False)),
         frame=frame,
         binary=binary,
+        json=notation == "json",
         quirks=_quirks(root.table("quirks", required=False)),
     )
     line.finish()
@@ -144,11 +158,18 @@ def parse_serial(root: Table, unknown: tuple[str, ...]) -> SerialTable:
 
 
 def _frame(table: Table) -> Frame:
+    if table.has("lengths"):
+        lengths = table.wholes("lengths", 1, 255)
+        if wrong := [key for key in lengths if not re.fullmatch(_BYTE, key)]:
+            raise table.wrong("lengths", f"{wrong[0]!r} is not a byte such as 1D")
+        made = Frame(0, False, 1, "none", {int(key, 16): length for key, length in lengths.items()})
+        table.finish()
+        return made
     made = Frame(
         count_at=table.whole("count_at", 0, 64),
         hexadecimal=table.choice("count", ("byte", "hex")) == "hex",
         overhead=table.whole("overhead", 1, 64),
-        checksum=table.choice("checksum", ("sum", "none")) == "sum",
+        checksum=table.choice("checksum", ("sum", "sum-but-first", "none")),
     )
     if made.overhead <= made.count_at:
         raise table.wrong("overhead", "it must include the bytes up to the count (count_at)")
@@ -161,6 +182,7 @@ def _quirks(table: Table) -> Quirks:
         prompt=table.string("prompt", ""),
         echo=table.flag("echo"),
         any_case=table.flag("any_case"),
+        ack_first=table.flag("ack_first"),
         quote=table.string("quote", ""),
         abnormal_terminator=_bytes(table, "abnormal_terminator", table.string("abnormal_terminator", "")),
     )
@@ -174,8 +196,11 @@ def _commands(table: Table, unknown: tuple[str, ...], binary: bool) -> dict[str,
         _check_unknown(table, name, unknown)
         if table.has(name) or (name.startswith("power") and name not in unknown):
             commands[name] = _template(table, name, table.string(name), {"address"}, binary)
-    if ("shutter_close" in commands) != ("shutter_open" in commands):
-        raise table.wrong("shutter_close", "give both shutter_close and shutter_open, or neither")
+    for close, opens in (("shutter_close", "shutter_open"), ("lens_shutter_close", "lens_shutter_open")):
+        if (close in commands) != (opens in commands):
+            raise table.wrong(close, f"give both {close} and {opens}, or neither")
+    if "lens_shutter_close" in commands and "shutter_close" not in commands:
+        raise table.wrong("lens_shutter_close", "give shutter_close too, for models that refuse it")
     table.finish()
     return commands
 

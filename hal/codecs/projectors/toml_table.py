@@ -91,6 +91,12 @@ class Table:
                 raise inner.wrong(name, f"{value!r} is not one of {', '.join(allowed)}")
         return dict(values)
 
+    def wholes(self, key: str, low: int, high: int) -> dict[str, int]:
+        """A table of whole numbers, each between ``low`` and ``high``."""
+        values = self._value(key, dict, "a table", None)
+        inner = Table(values, (*self._path, key), self._text, self._file)
+        return {name: inner.whole(name, low, high) for name in values}
+
     def table(self, key: str, *, required: bool = True) -> Table:
         values = self._value(key, dict, "a table", None if required else {})
         return Table(values, (*self._path, key), self._text, self._file)

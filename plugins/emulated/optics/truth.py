@@ -155,7 +155,8 @@ class Panels:
 class ProjectorTruth:
     """A projector; ``port`` and ``profile`` are relative to the stage folder.
 
-    ``board``: the family whose control board it has (``projectors.boards.BOARDS``)
+    ``board``: the family whose control board it has (``projectors.boards.BOARDS``); ``tcp_port``: it is reached by
+    its own LAN port on this computer, with the login of its family and ``password``, and not by a serial line
     """
 
     name: str
@@ -169,6 +170,8 @@ class ProjectorTruth:
     lamp: LampTruth
     panels: Panels = Panels()
     board: str = "optoma-later"
+    tcp_port: Annotated[int, Between(0, 65_535)] = 0
+    password: str = ""
 
 
 @dataclass(frozen=True, slots=True)

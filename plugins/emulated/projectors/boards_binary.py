@@ -15,12 +15,19 @@ _BURNING: Final = (LampPhase.WARMING, LampPhase.LIT)
 
 
 class NecBoard:
-    """The binary protocol: five bytes of header, of which the last counts the data, the data, and the sum."""
+    """The binary protocol: five bytes of header, of which the last counts the data, the data, and the sum.
+
+    ``lens_shutter``: a model that has one; ``heard``: the codes of the commands that it read.
+    """
 
     _OPERATION: Final = {LampPhase.STANDBY: 0x00, LampPhase.WARMING: 0x04, LampPhase.LIT: 0x04, LampPhase.COOLING: 0x05}
 
-    def __init__(self, lamp: EmulatedLamp, *, projector_id: int = 1, model_code: int = 0x31) -> None:
+    def __init__(
+        self, lamp: EmulatedLamp, *, projector_id: int = 1, model_code: int = 0x31, lens_shutter: bool = False
+    ) -> None:
         self._lamp = lamp
+        self._shutters = (b"\x02\x10", b"\x02\x11") + ((b"\x02\x16", b"\x02\x17") if lens_shutter else ())
+        self.heard: list[bytes] = []
         self._ids = bytes([projector_id, model_code])
         self._buffer = bytearray()
 
@@ -55,15 +62,16 @@ class NecBoard:
 
     def _act(self, code: bytes, data: bytes) -> bytes | None:
         """The data of the answer; None: an error."""
+        self.heard.append(code)
         if code == b"\x02\x00":
             return b"" if self._lamp.strike() else None
         if code == b"\x02\x01":
             self._lamp.extinguish()
             return b""
-        if code in (b"\x02\x10", b"\x02\x11"):
+        if code in self._shutters:
             if self._lamp.phase not in _BURNING:
                 return None
-            self._lamp.shutter_closed = code == b"\x02\x10"
+            self._lamp.shutter_closed = code in (b"\x02\x10", b"\x02\x16")
             return b""
         told = {b"\x00\x85\x01": self._running, b"\x00\xbf\x02": self._basic}
         if (tell := told.get(code + data)) is not None:

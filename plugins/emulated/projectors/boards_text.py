@@ -9,35 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from plugins.emulated.projectors.families.collecting import BURNING, Lines, broken
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
-
-_LONGEST: Final = 64
-_BURNING: Final = (LampPhase.WARMING, LampPhase.LIT)
-
-
-class _Lines:
-    """Collects commands that end in one byte; with ``start``, each begins at that byte, after any noise."""
-
-    def __init__(self, end: int, start: int | None = None) -> None:
-        self._end, self._start = end, start
-        self._line = bytearray()
-
-    def whole(self, data: bytes) -> list[bytes]:
-        lines = []
-        for byte in data:
-            if byte == self._end:
-                lines.append(bytes(self._line))
-                self._line.clear()
-            elif byte == self._start:
-                self._line[:] = bytes([byte])
-            elif len(self._line) < _LONGEST:
-                self._line.append(byte)
-        return lines
-
-
-def _broken(lamp: EmulatedLamp) -> bool:
-    """Whether the projector stands in an error state: it was to burn, and its lamp failed or is too hot."""
-    return lamp.phase not in _BURNING and (lamp.too_hot or (lamp.failed and lamp.strikes > 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +26,7 @@ class EpsonBoard:
     def __init__(self, lamp: EmulatedLamp, quirks: EpsonQuirks | None = None) -> None:
         self._lamp = lamp
         self._quirks = quirks or EpsonQuirks()
-        self._lines = _Lines(ord("\r"))
+        self._lines = Lines(ord("\r"))
         self._owes_prompt = False
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
@@ -69,13 +42,13 @@ class EpsonBoard:
     def _answer(self, line: bytes, busy: bool) -> bytes:
         if self._quirks.deaf_while_warming and self._lamp.phase is LampPhase.WARMING:
             return b""
-        prompt = b"" if _broken(self._lamp) else b":"
+        prompt = b"" if broken(self._lamp) else b":"
         reply = b"ERR" if busy else self._act(line.strip(b"\n "))
         return b"" if reply is None else (reply + b"\r" if reply else b"") + prompt
 
     def _act(self, line: bytes) -> bytes | None:
         """The reply before the prompt: b"" nothing, None: the prompt comes later."""
-        burning = self._lamp.phase in _BURNING
+        burning = self._lamp.phase in BURNING
         if line in (b"PWR ON", b"PWR OFF"):
             return self._switch(line == b"PWR ON")
         if line in (b"MUTE ON", b"MUTE OFF") and burning:
@@ -96,7 +69,7 @@ class EpsonBoard:
         return None if self._owes_prompt else b""
 
     def _power(self) -> bytes:
-        if _broken(self._lamp):
+        if broken(self._lamp):
             return b"05"
         codes = {LampPhase.STANDBY: b"00", LampPhase.LIT: b"01", LampPhase.WARMING: b"02", LampPhase.COOLING: b"03"}
         return codes[self._lamp.phase]
@@ -120,7 +93,7 @@ class BenqBoard:
     def __init__(self, lamp: EmulatedLamp, quirks: BenqQuirks | None = None) -> None:
         self._lamp = lamp
         self._quirks = quirks or BenqQuirks()
-        self._lines = _Lines(ord("\r"), ord("*"))
+        self._lines = Lines(ord("\r"), ord("*"))
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers, prompt = [], b""
@@ -136,7 +109,7 @@ class BenqBoard:
         return []
 
     def _reply(self, line: bytes, busy: bool) -> bytes:
-        quirks, standby = self._quirks, self._lamp.phase not in _BURNING
+        quirks, standby = self._quirks, self._lamp.phase not in BURNING
         answer = b"*Block item#" if busy else self._act(line.lower())
         if quirks.starless_in_standby and standby and b"=" in answer:
             answer = answer.removeprefix(b"*")
@@ -151,7 +124,7 @@ class BenqBoard:
             return b"*Illegal format#"
         if key == b"pow" and value in (b"on", b"off"):
             return self._switch(value == b"on")
-        standby = self._lamp.phase not in _BURNING
+        standby = self._lamp.phase not in BURNING
         if value == b"?" and key in (b"pow", b"ltim"):
             hours = b"*LTIM= %d" if self._quirks.bare_hours else b"*LTIM=%d#"
             return hours % self._lamp.hours if key == b"ltim" else b"*POW=OFF#" if standby else b"*POW=ON#"
@@ -171,7 +144,10 @@ class BenqBoard:
 
 
 class ChristieBoard:
-    """Messages in parentheses; a command is acknowledged only if # asks for it. Status lines come unasked."""
+    """Messages in parentheses; a command is acknowledged only if # asks for it. Status lines come unasked.
+
+    ``lamps`` False: a model with lasers, which has no lamp hours and tells none.
+    """
 
     _FYI: Final = b'(65535 00000 FYI00000 "(SST+LAMP?001) Lamp Hours = %d:00 (h:m)")'
     _ERROR: Final = b'(65535 00000 ERR00000 "System Error: (SST+LAMP?002) Lamp = Failed to strike")'
@@ -182,9 +158,10 @@ class ChristieBoard:
         LampPhase.WARMING: b'011 "Warming Up"',
     }
 
-    def __init__(self, lamp: EmulatedLamp) -> None:
+    def __init__(self, lamp: EmulatedLamp, *, lamps: bool = True) -> None:
         self._lamp = lamp
-        self._lines = _Lines(ord(")"), ord("("))
+        self._lamps = lamps
+        self._lines = Lines(ord(")"), ord("("))
         self._phase = lamp.phase
         self._told_broken = False
 
@@ -196,11 +173,11 @@ class ChristieBoard:
         due = []
         if self._lamp.phase is not self._phase:
             self._phase = self._lamp.phase
-            due.append(self._FYI % self._lamp.hours)
-        broken = _broken(self._lamp)
-        if broken and not self._told_broken:
+            due += [self._FYI % self._lamp.hours] if self._lamps else []
+        is_broken = broken(self._lamp)
+        if is_broken and not self._told_broken:
             due.append(self._ERROR)
-        self._told_broken = broken
+        self._told_broken = is_broken
         return due
 
     def _reply(self, message: bytes, busy: bool) -> bytes:
@@ -234,7 +211,7 @@ class ChristieBoard:
             b"SHU": b"%d" % self._lamp.shutter_closed,
             b"LPH": b"%04d" % self._lamp.hours,
         }
-        if name not in values:
+        if name not in values or (name == b"LPH" and not self._lamps):
             return self._error(b"00009", name, b"Unknown request")
         return b"(" + name + b"!" + values[name] + b")"
 
@@ -247,7 +224,7 @@ class PanasonicBoard:
 
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
-        self._lines = _Lines(0x03, 0x02)
+        self._lines = Lines(0x03, 0x02)
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         lines = [line for line in self._lines.whole(data) if line.startswith(b"\x02")]
@@ -267,7 +244,7 @@ class PanasonicBoard:
         elif line == b"POF":
             self._lamp.extinguish()
             done = True
-        elif line in (b"OSH:0", b"OSH:1") and self._lamp.phase in _BURNING:
+        elif line in (b"OSH:0", b"OSH:1") and self._lamp.phase in BURNING:
             self._lamp.shutter_closed = line == b"OSH:1"
             done = True
         return line if done else b"ER402" if line.startswith(b"OSH:") else b"ER401"

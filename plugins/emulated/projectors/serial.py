@@ -111,6 +111,11 @@ class EmulatedSerialProjector:
         self.stop()
 
     @property
+    def address(self) -> str:
+        """The name of its port."""
+        return str(self.port)
+
+    @property
     def path(self) -> str | None:
         """The tty behind the symlink now; None while unplugged."""
         with self._lock:

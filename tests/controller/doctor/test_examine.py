@@ -313,3 +313,39 @@ def test_without_a_stage_only_what_is_plugged_in_is_told(hall: Hall, monkeypatch
     assert seen.tried == ()
     assert len(seen.new) == 1
     assert seen.healthy
+
+
+def test_nothing_is_searched_on_a_network_unless_it_is_asked_for(tmp_path: Path) -> None:
+    class Said(Told):
+        def __init__(self) -> None:
+            self.all: list[str] = []
+
+        def say(self, text: str, *rest: Any, **more: Any) -> None:
+            self.all.append(text)
+
+    wanted: list[Any] = []
+
+    def find(told: Any, deadline: Any) -> list[Found]:
+        wanted.append(told)
+        return []
+
+    for network in ("", "all", "lo"):
+        reporter = Said()
+        tools = Tools((Finder("network", find),), None)
+        if network == "lo":
+            with pytest.raises(UsageError, match="no broadcast address"):
+                examine(
+                    stage=None,
+                    write_it=False,
+                    reporter=reporter,
+                    cancel=threading.Event(),
+                    network=network,
+                    tools=tools,
+                )
+            continue
+        examine(stage=None, write_it=False, reporter=reporter, cancel=threading.Event(), network=network, tools=tools)
+        place = "255.255.255.255" if network else "Not searching the network"
+        assert any(place in line for line in reporter.all)
+    assert [told.search for told in wanted] == [None, ("255.255.255.255", 4352)]
+    with pytest.raises(UsageError, match="'eth77'"):
+        examine(stage=None, write_it=False, reporter=Said(), cancel=threading.Event(), network="eth77", tools=Tools(()))

@@ -1,4 +1,4 @@
-"""Both projector drivers against the shared conformance suite, over real bytes."""
+"""Every projector driver against the shared conformance suite, over real bytes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import pytest
 
 from hal.conformance import ProjectorConformance
 from hal.interfaces import Projector
+from plugins.emulated.projectors.boards import BOARDS, baud_of, login_of
 from plugins.emulated.projectors.optoma import OptomaQuirks
-from plugins.projectors.profile_files import shipped_profiles
 
 
 class TestSerialProjector(ProjectorConformance):
@@ -33,9 +33,22 @@ class TestSerialProjectorThatAcknowledgesQuestionsFirst(ProjectorConformance):
 class TestEverySerialFamily(ProjectorConformance):
     poll_s = 0.05
 
-    @pytest.fixture(params=[name for name in shipped_profiles() if name not in ("optoma-later", "pjlink")])
+    @pytest.fixture(params=[name for name in BOARDS if name != "optoma-later" and baud_of(name)])
     def projector(self, request: pytest.FixtureRequest, open_serial: Any) -> Projector:
         driver: Projector = open_serial(profile=request.param).driver
+        return driver
+
+
+class TestEveryNetworkFamily(ProjectorConformance):
+    poll_s = 0.05
+
+    @pytest.fixture(params=[name for name in BOARDS if login_of(name)])
+    def projector(self, request: pytest.FixtureRequest, open_network: Any) -> Projector:
+        locked = login_of(request.param) != "none"
+        settings = {"password": "secret123"} if locked else {}
+        driver: Projector = open_network(
+            profile=request.param, settings=settings, password="secret123" if locked else ""
+        ).driver
         return driver
 
 

@@ -14,13 +14,15 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power
 from plugins.emulated.projectors.board_sanyo import SanyoBoard
+from plugins.emulated.projectors.boards import baud_of
+from plugins.emulated.projectors.boards_binary import NecBoard
 from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.profile_files import shipped_profiles
 from tests.plugins.conftest import each, hasty, wait_for_power
 
 SOON = 30.0
-SERIAL = [name for name in shipped_profiles() if name != "pjlink"]
+SERIAL = [name for name in shipped_profiles() if name != "pjlink" and baud_of(name)]
 SWITCHABLE = [name for name in SERIAL if name != "optoma-ep910"]
 
 
@@ -270,6 +272,29 @@ def test_a_sanyo_whose_lamp_failed_cools_and_then_reports_a_fault(open_serial: A
     pair.emulator.lamp.fail()
     wait_for_power(pair.driver, Power.FAULT)
     assert pair.driver.status(deadline=in_seconds(SOON)).faults == ("error-standby",)
+
+
+@pytest.mark.parametrize(
+    ("lens_shutter", "moves"), [(True, [b"\x02\x16", b"\x02\x17"]), (False, [b"\x02\x10", b"\x02\x11"])]
+)
+def test_a_necs_lens_shutter_is_used_where_there_is_one(
+    open_serial: Any, lens_shutter: bool, moves: list[bytes]
+) -> None:
+    boards: list[NecBoard] = []
+
+    def board(lamp: EmulatedLamp) -> NecBoard:
+        boards.append(NecBoard(lamp, lens_shutter=lens_shutter))
+        return boards[0]
+
+    pair = open_serial(profile="nec", board=board)
+    with pytest.raises(DeviceRefused):
+        pair.driver.set_shutter(True, deadline=in_seconds(SOON))  # in standby neither shutter moves
+    burn(pair)
+    for closed in (True, False, True, False):
+        pair.driver.set_shutter(closed, deadline=in_seconds(SOON))
+        assert pair.emulator.lamp.shutter_closed is closed
+    told = [code for code in boards[0].heard if code in (b"\x02\x10", b"\x02\x11", b"\x02\x16", b"\x02\x17")]
+    assert told[-4:] == moves * 2
 
 
 def test_a_family_without_an_emulated_board_is_not_taken_for_an_optoma(open_serial: Any) -> None:

@@ -28,9 +28,19 @@ LAMP_QUESTION = {
     "nec": bytes.fromhex("03 8A 00 00 00 8D"),
     "panasonic": b"\x02Q$L\x03",
     "sanyo": b"CR3\r",
+    "panasonic-dz": b"\x02ADZZ;Q$L:1\x03",
+    "jvc": b"?\x89\x01IFLT\n",
+    "digital-projection": b"*laser.hours ?\r",
+    "digital-projection-v": b"V99G0004\r",
+    "hitachi": bytes.fromhex("BE EF 03 06 00 C2 FF 02 00 90 10 00 00"),
+    "acer": b"* 0 Lamp\r",
+    "viewsonic": bytes.fromhex("07 14 00 05 00 34 00 00 15 01 63"),
 }
 """In the bytes of the makers' documents."""
-END = {"epson-escvp21": b":", "christie": b")", "panasonic": b"\x03", "nec": b""}
+END = {
+    "epson-escvp21": b":", "christie": b")", "panasonic": b"\x03", "nec": b"",
+    "panasonic-dz": b"\x03", "jvc": b"\n", "hitachi": b"", "viewsonic": b"",
+}  # fmt: skip
 
 
 def quick(text: str) -> str:

@@ -1,0 +1,53 @@
+"""JVC D-ILA: a head, the unit 89 01, a command, LF; what can't be done now is not answered.
+
+Written from JVC's LAN connection specification of 2021 (docs/reference/projectors.md); shares no parser with the
+driver, so that a common mistake would show.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from plugins.emulated.projectors.families.collecting import Lines, broken
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
+
+_UNIT: Final = b"\x89\x01"
+_PHASES: Final = {LampPhase.STANDBY: b"0", LampPhase.LIT: b"1", LampPhase.COOLING: b"2", LampPhase.WARMING: b"3"}
+
+
+class JvcBoard:
+    """``!`` do, ``?`` ask, ``@`` answer, 06 acknowledged."""
+
+    def __init__(self, lamp: EmulatedLamp) -> None:
+        self._lamp = lamp
+        self._lines = Lines(ord("\n"))
+
+    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
+        answers = []
+        for line in self._lines.whole(data):
+            noise, unit, command = line.rpartition(_UNIT)
+            head = noise[-1:]  # what came before it is passed over
+            if busy or not unit:
+                continue
+            if head == b"!" and self._do(command):
+                answers.append(b"\x06" + _UNIT + command[:2] + b"\n")
+            elif head == b"?" and (told := self._told(command)) is not None:
+                answers.append(b"\x06" + _UNIT + command[:2] + b"\n")
+                answers.append(b"@" + _UNIT + command[:2] + told + b"\n")
+        return answers
+
+    def notices(self) -> list[bytes]:
+        return []
+
+    def _do(self, command: bytes) -> bool:
+        if command == b"PW1":
+            return self._lamp.strike()
+        if command == b"PW0":
+            self._lamp.extinguish()
+            return True
+        return command == b""  # a check of the connection
+
+    def _told(self, command: bytes) -> bytes | None:
+        power = b"4" if broken(self._lamp) else _PHASES[self._lamp.phase]
+        told = {b"PW": power, b"MD": b"ILAFPJ -- B5B1", b"IFLT": b"%04X" % self._lamp.hours}
+        return told.get(command)

@@ -1,0 +1,179 @@
+"""What a projector's network port does before it lets commands through to its control board, one object a connection.
+
+Written from the makers' documents (docs/reference/projectors.md); shares no parser with the driver, so that a common
+mistake would show.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What comes of received bytes: ``say`` back at once, ``commands`` for the board, ``close`` the connection."""
+
+    say: bytes = b""
+    commands: bytes = b""
+    close: bool = False
+
+
+class Gate(Protocol):
+    """``greeting`` is sent first; ``closes``: the connection ends after each answer."""
+
+    greeting: bytes
+    closes: bool
+
+    def hear(self, data: bytes) -> Heard: ...
+
+    def answer(self, said: bytes) -> bytes:
+        """An answer of the board as it goes out."""
+
+
+class OpenGate:
+    """Commands at once, as on the serial line."""
+
+    greeting = b""
+    closes = False
+
+    def __init__(self, password: str = "", source: random.Random | None = None) -> None:
+        self._password = password
+        self._source = source or random.Random()
+        self._passed = False
+        self._kept = bytearray()
+
+    def hear(self, data: bytes) -> Heard:
+        return Heard(commands=data)
+
+    def answer(self, said: bytes) -> bytes:
+        return said
+
+
+class EscVpNetGate(OpenGate):
+    """Epson: 16 bytes of CONNECT with any number of headers of 18; 0x20 accepts."""
+
+    def hear(self, data: bytes) -> Heard:
+        if self._passed:
+            return Heard(commands=data)
+        self._kept += data
+        if len(self._kept) < 16 or len(self._kept) < 16 + 18 * self._kept[15]:
+            return Heard()
+        head, count = bytes(self._kept[:16]), self._kept[15]
+        headers = [bytes(self._kept[16 + 18 * n : 34 + 18 * n]) for n in range(count)]
+        rest = bytes(self._kept[16 + 18 * count :])
+        if head[:12] != b"ESC/VP.net\x10\x03":
+            return Heard(b"ESC/VP.net\x10\x03\0\0\x40\0", close=True)
+        given = [header[2:].rstrip(b"\0") for header in headers if header[:1] == b"\x01"]
+        if self._password and not given:
+            return Heard(b"ESC/VP.net\x10\x03\0\0\x41\0", close=True)
+        if self._password and given[0] != self._password.encode():
+            return Heard(b"ESC/VP.net\x10\x03\0\0\x43\0", close=True)
+        self._passed = True
+        return Heard(b"ESC/VP.net\x10\x03\0\0\x20\0", rest)
+
+
+class NtControlGate(OpenGate):
+    """Panasonic: each command has the digest of account, password and random text before it; closes by default."""
+
+    closes = True
+    digest = "md5"
+
+    def __init__(self, password: str = "", source: random.Random | None = None) -> None:
+        super().__init__(password, source)
+        salt = f"{self._source.getrandbits(32):08x}"
+        number = {"md5": 1, "sha256": 2}[self.digest]
+        self.greeting = f"NTCONTROL {number} {salt}\r".encode() if password else b"NTCONTROL 0\r"
+        secret = f"admin1:{password}:{salt}".encode()
+        self._proof = hashlib.new(self.digest, secret).hexdigest().encode() if password else b""
+
+    def hear(self, data: bytes) -> Heard:
+        self._kept += data
+        line, end, rest = bytes(self._kept).partition(b"\r")
+        if not end:
+            return Heard()
+        self._kept[:] = rest
+        if not line.startswith(self._proof + b"00"):
+            return Heard(b"ERRA\r" if self._proof else b"ERR1\r", close=True)
+        return Heard(commands=b"\x02ADZZ;" + line[len(self._proof) + 2 :] + b"\x03")
+
+    def answer(self, said: bytes) -> bytes:
+        body = said.strip(b"\x02\x03")
+        if body.startswith(b"ER"):
+            return {b"ER401": b"ERR3", b"ER402": b"ERR2"}.get(body, b"ERR1") + b"\r"
+        return b"00" + body + b"\r"
+
+
+class NtControlSha256Gate(NtControlGate):
+    """The same with SHA-256, as later models may be set to."""
+
+    digest = "sha256"
+
+
+class AdcpGate(OpenGate):
+    """Sony: a random text, answered by the SHA-256 of it and the password; ``NOKEY`` without one."""
+
+    def __init__(self, password: str = "", source: random.Random | None = None) -> None:
+        super().__init__(password, source)
+        salt = f"{self._source.getrandbits(32):08x}"
+        self.greeting = f"{salt}\r\n".encode() if password else b"NOKEY\r\n"
+        self._proof = hashlib.sha256((salt + password).encode()).hexdigest().encode() if password else b""
+        self._passed = not password
+
+    def hear(self, data: bytes) -> Heard:
+        if self._passed:
+            return Heard(commands=data)
+        self._kept += data
+        line, end, rest = bytes(self._kept).partition(b"\r\n")
+        if not end:
+            return Heard()
+        if line.lower() != self._proof:
+            return Heard(b"err_auth\r\n", close=True)
+        self._passed = True
+        return Heard(b"ok\r\n", rest)
+
+
+class JvcGate(OpenGate):
+    """JVC, models of 2021: ``PJ_OK``, then ``PJREQ_`` and the password, filled up with NUL; ``PJACK``."""
+
+    greeting = b"PJ_OK"
+
+    def _expected(self) -> tuple[bytes, ...]:
+        if not self._password:
+            return (b"PJREQ",)
+        told = b"PJREQ_" + self._password.encode()
+        return (told.ljust(16, b"\0"), told.ljust(22, b"\0"))
+
+    def hear(self, data: bytes) -> Heard:
+        if self._passed:
+            return Heard(commands=data)
+        self._kept += data
+        told = bytes(self._kept)
+        for expected in sorted(self._expected(), key=len, reverse=True):
+            if told.startswith(expected):
+                self._passed = True
+                return Heard(b"PJACK", told[len(expected) :])
+        if told != b"PJREQ" and any(expected.startswith(told) for expected in self._expected()):
+            return Heard()
+        self._kept.clear()
+        return Heard(b"PJNAK")
+
+
+class JvcHashedGate(JvcGate):
+    """JVC, later models: the SHA-256 of the password and a fixed text."""
+
+    def _expected(self) -> tuple[bytes, ...]:
+        return (b"PJREQ_" + hashlib.sha256((self._password + "JVCKWPJ").encode()).hexdigest().encode(),)
+
+
+GATES: Final[Mapping[str, Callable[[str, random.Random], Gate]]] = {
+    "none": OpenGate,
+    "escvpnet": EscVpNetGate,
+    "ntcontrol": NtControlGate,
+    "adcp": AdcpGate,
+    "jvc": JvcGate,
+}
+"""By the login that a profile names."""
