@@ -57,8 +57,8 @@ def indirect_light(
 
     Returns
     -------
-    ``IndirectLight`` with ``forward(direct)``, the indirect light G d of a direct camera picture d, ``adjoint(picture)``,
-    and ``direct_target(total)``, the d with d + G d = ``total`` where projectors light the object. All are (camera rows,
+    ``IndirectLight`` with ``forward(direct)``, the indirect light G d of a direct picture d, ``adjoint(picture)``, and
+    ``direct_target(total)``, the d with d + G d = ``total`` where projectors light the object. All are (camera rows,
     columns, 3) float32, without the black image. None where a projector has no ``indirect`` light
     """
     points_m, normals = (None, None) if geometry is None else (geometry.points_m, geometry.normals)

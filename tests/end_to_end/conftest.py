@@ -70,10 +70,13 @@ def finish_a_demo(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def prepared_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that ``velatura demo --prepare-only`` wrote; to be copied, not to be touched."""
+    """The folder that ``velatura demo --prepare-only --room dark`` wrote; to be copied, not to be touched.
+
+    In the dark a bench is ready at once: for tests that are not about light.
+    """
 
     def prepare(folder: Path) -> None:
-        assert velatura("demo", "--prepare-only", "--out", folder / "out").code == 0
+        assert velatura("demo", "--prepare-only", "--room", "dark", "--out", folder / "out").code == 0
 
     folder, _ = made_once(tmp_path_factory, "prepared", prepare)
     return folder / "out"

@@ -15,7 +15,7 @@ from numba import prange
 from controller.bundle.live_maps import MOST_CORRELATION, MOST_RADIUS_PX, REACH, TILE
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.jit import compiled
-from controller.transport.simd.scaling import SIDE, STEPS, scale_of_four, scale_of_one, window_steps
+from controller.transport.simd.scaling import SIDE, STEPS, Index, scale_of_four, scale_of_one, window_steps
 
 MARGIN: Final = SIDE
 LEVELS: Final = STEPS + 1
@@ -40,7 +40,7 @@ class Thrown(NamedTuple):
 
 
 @compiled()
-def thrown_back(thrown: Thrown, row: int, first: int, last: int, out: FloatImage) -> None:
+def thrown_back(thrown: Thrown, row: int, first: Index, last: Index, out: FloatImage) -> None:
     """Light by way of other surfaces in a row of the target, at columns ``first`` to ``last``; ``out`` is a row."""
     i, part, values = np.int64(thrown.up[row]), thrown.part_up[row], thrown.falling.shape[1]
     above, below = thrown.falling[i], thrown.falling[min(i + 1, thrown.falling.shape[0] - 1)]
