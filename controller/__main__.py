@@ -81,7 +81,7 @@ def demo(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the stage and the report.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Random seed of the stage.", min=0, max=2**32 - 1)] = 1,
-    room: Annotated[str | None, typer.Option(help="Light of the stage: dark, room or hard (default: dark).")] = None,
+    room: Annotated[str | None, typer.Option(help="Light of the stage: dark, room or hard (default: room).")] = None,
     prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Only write OUT/stage.")] = False,
     as_json: Json = False,
 ) -> None:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
         solve,
         solve_base,
     )
-    from controller.api.transport import build_transport, transport_from_matrices
+    from controller.api.transport import build_transport, indirect_light, transport_from_matrices
     from controller.calibrate.metapixels.from_phase import FittedPixels
     from controller.calibrate.values import (
         Calibration,
@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from controller.solve.bounded.solver import Solution
     from controller.solve.metrics import Comparison
     from controller.transport import LightTransport
+    from controller.transport.indirect import IndirectLight
 
 __all__ = [
     "Base",
@@ -72,6 +73,7 @@ __all__ = [
     "Developed",
     "FittedPixels",
     "Geometry",
+    "IndirectLight",
     "LightTransport",
     "MergedBracket",
     "Metapixels",
@@ -92,6 +94,7 @@ __all__ = [
     "encode",
     "export",
     "fit_metapixels",
+    "indirect_light",
     "measure_response",
     "merge_brackets",
     "reachable_target",
@@ -109,7 +112,7 @@ _MODULES: Final = {
     "controller.api.calibration": (
         "CalibratedRun", "calibrate", "decode", "fit_metapixels", "measure_response", "read_run",
     ),
-    "controller.api.transport": ("build_transport", "transport_from_matrices"),
+    "controller.api.transport": ("build_transport", "indirect_light", "transport_from_matrices"),
     "controller.api.solving": (
         "ReachableTarget", "base_image", "encode", "reachable_target", "scale", "solve", "solve_base",
     ),
@@ -126,6 +129,7 @@ _MODULES: Final = {
     "controller.solve.bounded.solver": ("Solution",),
     "controller.solve.metrics": ("Comparison",),
     "controller.transport": ("LightTransport",),
+    "controller.transport.indirect": ("IndirectLight",),
 }  # fmt: skip
 _HOME: Final = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,13 +18,19 @@ from controller.artefacts.geometry import read_geometry
 from controller.artefacts.grade import graded
 from controller.calibrate.correspondence import decode as correspondence_decode
 from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
+from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
+from controller.calibrate.photometry.separation import indirect_share, shown_contrast
 from controller.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
 from controller.capture.patterns import plan_patterns
 from controller.capture.profile import CameraProfile, load_profile
 from controller.capture.raw import CAMERA_BLUR_PX, SRGB_TO_XYZ
 from controller.core.errors import CalibrationError, UsageError
 from controller.transport import LightTransport
+from controller.transport.indirect import IndirectLight
+
+PASSES: Final = 2
+"""Of telling light apart: the share follows from the response, the response from the share."""
 
 
 def decode(captures: CaptureSet) -> Correspondence:
@@ -83,7 +90,7 @@ def fit_metapixels(captures: CaptureSet, correspondence: Correspondence) -> Fitt
     return fit_pixels(captures.pictures, plan_patterns(captures.projector_px), correspondence)
 
 
-def calibrate(captures: Mapping[str, CaptureSet]) -> Calibration:
+def calibrate(captures: Mapping[str, CaptureSet], *, indirect: bool = False) -> Calibration:
     """Calibrate several projectors from their captures: response, correspondence and metapixels of each.
 
     The same steps as ``velatura calibrate`` in its fast mode. Geometry (poses and points) is not part of it.
@@ -92,11 +99,14 @@ def calibrate(captures: Mapping[str, CaptureSet]) -> Calibration:
     ----------
     captures : by projector name; (rows, columns, 3) pictures of one camera position, all in one unit. Needs all
         patterns but ``random-*``. The black picture of the first projector counts for all
+    indirect : tell direct from indirect light, by the contrast of the sinusoids (Nayar et al. 2006), and measure the
+        response in direct light. They must have been drawn with the response that ``measure_response`` gives
 
     Returns
     -------
     ``Calibration``: ``projectors`` in the order given, each with ``name``, ``metapixels``, ``radiometry``, ``white``
-    (camera rows, columns, 3) float32 and ``phase_map``; ``black`` (camera rows, columns, 3) float32; ``object_mask``
+    (camera rows, columns, 3) float32 and ``phase_map``; with ``indirect`` the white is the direct light, and
+    ``indirect`` of the same shape the rest of it; ``black`` (camera rows, columns, 3) float32; ``object_mask``
     (camera rows, columns) bool; ``camera_to_xyz`` (3, 3), of sRGB where the pictures do not say it
 
     Errors: those of ``measure_response``, ``decode`` and ``fit_metapixels``; ``projector-reaches-nothing``,
@@ -106,7 +116,7 @@ def calibrate(captures: Mapping[str, CaptureSet]) -> Calibration:
         raise UsageError("captures-missing", what="No captures were given.", remedy="Give at least one CaptureSet.")
     parts, mosaics = [], []
     for name, one in captures.items():
-        part, mosaic = _calibrated(name, one)
+        part, mosaic = _calibrated(name, one, indirect=indirect)
         parts.append(part)
         mosaics.append(mosaic)
     first = next(iter(captures.values()))
@@ -116,7 +126,9 @@ def calibrate(captures: Mapping[str, CaptureSet]) -> Calibration:
     return Calibration(tuple(parts), black, object_mask(parts), to_xyz, (red, green, blue), mosaics[-1])
 
 
-def _calibrated(name: str, captures: CaptureSet) -> tuple[ProjectorCalibration, npt.NDArray[np.int64] | None]:
+def _calibrated(
+    name: str, captures: CaptureSet, *, indirect: bool
+) -> tuple[ProjectorCalibration, npt.NDArray[np.int64] | None]:
     radiometry = measure_response(captures)
     correspondence = decode(captures)
     if not correspondence.valid.any():
@@ -127,7 +139,17 @@ def _calibrated(name: str, captures: CaptureSet) -> tuple[ProjectorCalibration, 
         )
     fitted = fit_metapixels(captures, correspondence)
     white = np.nan_to_num(np.maximum(captures.pictures["white"] - captures.pictures["black"], 0)).astype(np.float32)
-    return ProjectorCalibration(name, fitted.metapixels, radiometry, white, fitted.phase_map), fitted.mosaic
+    if not indirect:
+        return ProjectorCalibration(name, fitted.metapixels, radiometry, white, fitted.phase_map), fitted.mosaic
+    plan, encoded_with = plan_patterns(captures.projector_px), radiometry.response
+    for _ in range(PASSES):
+        contrast = shown_contrast(radiometry, encoded_with)
+        share = indirect_share(captures.pictures, plan, white, correspondence.projector_px, linearity=contrast)
+        known = KnownIndirect(share * white, radiometry)
+        radiometry = measure_radiometry(captures.pictures, plan, indirect=known)[0]
+    thrown = share * white
+    part = ProjectorCalibration(name, fitted.metapixels, radiometry, white - thrown, fitted.phase_map, thrown)
+    return part, fitted.mosaic
 
 
 class CalibratedRun:
@@ -150,6 +172,11 @@ class CalibratedRun:
     def transport(self) -> LightTransport:
         """The light transport, with the corrections at depth edges if the run has measured them."""
         return self._calibrated.transport
+
+    @property
+    def indirect(self) -> IndirectLight | None:
+        """The light by way of other surfaces; None if the run measured none that counts."""
+        return self._calibrated.indirect
 
     @cached_property
     def geometry(self) -> Geometry:

@@ -15,9 +15,11 @@ from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.solve import appearance
 from controller.solve.appearance import Base
 from controller.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, Solution, solve_bounded
-from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
+from controller.solve.exposed import exposed
+from controller.solve.feasibility import target_radiance
 from controller.solve.scaling.dither import to_device
 from controller.transport import LightTransport
+from controller.transport.indirect import IndirectLight
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,16 +30,23 @@ class ReachableTarget:
     ``exposure``: light of a white pixel of the picture
     ``reachable`` (camera rows, columns) bool: on the object, and not too bright, too dark or too saturated
     ``share``: the part of the object's pixels that is reachable, 0 to 1
+    ``direct`` like ``radiance``: what ``solve`` has to aim at, so that with its indirect light it becomes ``radiance``
     """
 
     radiance: FloatImage
     exposure: float
     reachable: Mask
     share: float
+    direct: FloatImage
 
 
 def reachable_target(
-    transport: LightTransport, picture: npt.ArrayLike, black: npt.ArrayLike | None = None, *, share: float = 0.95
+    transport: LightTransport,
+    picture: npt.ArrayLike,
+    black: npt.ArrayLike | None = None,
+    *,
+    share: float = 0.95,
+    indirect: IndirectLight | None = None,
 ) -> ReachableTarget:
     """Make a picture as bright as the projectors can show it.
 
@@ -47,14 +56,15 @@ def reachable_target(
     picture : (camera rows, columns, 3) linear, at least 0; 1 is a white surface. As seen from the camera
     black : (camera rows, columns, 3) light with all projectors at black; without it 0
     share : above 0 and up to 1, the part of the object's pixels that must be reachable
+    indirect : of ``indirect_light`` or ``read_run``: light by way of other surfaces
 
     Errors: ``image-wrong-size``, ``target-not-finite``, ``share-out-of-range``, ``no-light``.
     """
     wanted = as_image(picture)
     dark = _black(black, wanted)
-    exposure = choose_exposure(transport, wanted, dark, share=share)
-    found = feasibility(transport, np.float32(exposure) * wanted, dark)
-    return ReachableTarget(target_radiance(wanted, dark, exposure), exposure, found.reachable, found.share)
+    found = exposed(transport, wanted, dark, share=share, indirect=indirect)
+    radiance, direct = (target_radiance(image, dark, 1.0) for image in (found.wanted, found.needed))
+    return ReachableTarget(radiance, found.exposure, found.possible.reachable, found.possible.share, direct)
 
 
 def solve(

@@ -10,11 +10,13 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.api.arrays import as_image
-from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
+from controller.calibrate.values import Calibration, Geometry, Metapixels, ProjectorCalibration, Radiometry
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.transport import LightTransport, factory
 from controller.transport.gaussians.custom_weights import patches_of_weights
+from controller.transport.indirect import IndirectLight
+from controller.transport.indirect_fit import fit_indirect
 
 LINEAR = Radiometry(np.tile(np.linspace(0, 1, 256), (3, 1)), np.eye(3))
 
@@ -40,6 +42,27 @@ def build_transport(calibration: Calibration) -> LightTransport:
     Errors: ``calibration-inconsistent``.
     """
     return factory.build_transport(calibration)
+
+
+def indirect_light(
+    calibration: Calibration, transport: LightTransport, geometry: Geometry | None = None
+) -> IndirectLight | None:
+    """The light that arrives by way of other surfaces, G: camera picture = black + d + G d, with d = T p.
+
+    Parameters
+    ----------
+    calibration : of ``calibrate`` with ``indirect=True``, or of ``read_run``
+    transport : of ``build_transport`` for this calibration
+    geometry : of ``read_run``; with it G follows the shape of the surface, without it only what lies near
+
+    Returns
+    -------
+    ``IndirectLight`` with ``forward(direct)``, the indirect light G d of a direct picture d, ``adjoint(picture)``, and
+    ``direct_target(total)``, the d with d + G d = ``total`` where projectors light the object. All are (camera rows,
+    columns, 3) float32, without the black image. None where a projector has no ``indirect`` light
+    """
+    points_m, normals = (None, None) if geometry is None else (geometry.points_m, geometry.normals)
+    return fit_indirect(calibration, transport.object_mask, points_m, normals)
 
 
 def transport_from_matrices(

@@ -24,6 +24,7 @@ class Light:
     ``white`` (camera rows, columns, 3) float32: HDR white of this projector alone less ``black``, NaN where saturated
     ``black`` (camera rows, columns, 3) float32: all projectors at black, NaN where saturated
     ``camera_to_xyz`` (3, 3): linear camera RGB to CIE XYZ (D65)
+    ``segment`` (1,): see ``Radiometry``; None where colours add
     """
 
     response: Float64
@@ -31,10 +32,11 @@ class Light:
     white: FloatImage
     black: FloatImage
     camera_to_xyz: Float64
+    segment: Float64 | None = None
 
     @property
     def radiometry(self) -> Radiometry:
-        return Radiometry(self.response, self.mixing)
+        return Radiometry(self.response, self.mixing, _segment(self.segment))
 
     @staticmethod
     def path(run: Path, projector: str) -> Path:
@@ -46,7 +48,11 @@ class Light:
     @classmethod
     def read(cls, run: Path, projector: str) -> Self:
         arrays = load_arrays(cls.path(run, projector))
-        return cls(**{name: arrays[name] for name in _names(cls)})
+        return cls(**{name: arrays.get(name) for name in _names(cls)})  # type: ignore[arg-type]
+
+
+def _segment(kept: Float64 | None) -> float:
+    return 0.0 if kept is None else float(kept[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,26 +214,29 @@ LEAST_P95: Final = 0.02
 class Indirect:
     """``indirect-PROJECTOR.npz``: the share of its white that is indirect, and its radiometry in direct light.
 
-    ``share`` (camera rows, columns, 3) float32, 0 to 1; ``response``, ``mixing``: see ``Radiometry``
+    ``share`` (camera rows, columns, 3) float32, 0 to 1; ``response``, ``mixing``, ``segment``: as of ``Light``
     """
 
     share: FloatImage
     response: Float64
     mixing: Float64
+    segment: Float64 | None = None
 
     @property
     def radiometry(self) -> Radiometry:
-        return Radiometry(self.response, self.mixing)
+        return Radiometry(self.response, self.mixing, _segment(self.segment))
 
     def write(self, run: Path, projector: str) -> Path:
         path = npz_path(run, StepKind.INDIRECT, projector)
-        save_arrays(path, {"share": self.share.astype(np.float16), "response": self.response, "mixing": self.mixing})
+        kept: dict[str, npt.NDArray[Any]] = {"response": self.response, "mixing": self.mixing}
+        kept["share"] = self.share.astype(np.float16)
+        save_arrays(path, kept if self.segment is None else kept | {"segment": self.segment})
         return path
 
     @classmethod
     def read(cls, run: Path, projector: str) -> Self:
         arrays = load_arrays(npz_path(run, StepKind.INDIRECT, projector))
-        return cls(arrays["share"].astype(np.float32), arrays["response"], arrays["mixing"])
+        return cls(arrays["share"].astype(np.float32), arrays["response"], arrays["mixing"], arrays.get("segment"))
 
 
 @dataclass(frozen=True, slots=True)

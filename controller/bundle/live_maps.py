@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.bundle.format import damaged
+from controller.bundle.live_indirect import LiveIndirect, read_indirect
 from controller.bundle.reader import Bundle
 
 MOST_RADIUS_PX: Final = 12
@@ -62,7 +63,10 @@ class OutputMaps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveMaps:
-    """A stage's maps. ``gain``, ``offset`` (height, width, 3) float16, ``present`` (height, width) uint8."""
+    """A stage's maps. ``gain``, ``offset`` (height, width, 3) float16, ``present`` (height, width) uint8.
+
+    ``indirect``: light by way of other surfaces; None where there is none that counts
+    """
 
     target_px: tuple[int, int]
     gain: npt.NDArray[np.float16]
@@ -71,6 +75,7 @@ class LiveMaps:
     unit: float
     noise: Float
     outputs: tuple[OutputMaps, ...]
+    indirect: LiveIndirect | None = None
 
     @classmethod
     def read(cls, bundle: Bundle) -> Self:
@@ -84,6 +89,7 @@ class LiveMaps:
             (width, height), gain, bundle.live_array("offset"), bundle.live_array("present"),
             float(_shaped(bundle.live_array("unit"), (1,), "f4", "unit")[0]),
             _shaped(bundle.live_array("noise"), (TILE, TILE), "f4", "noise"), outputs,
+            _indirect(bundle, (height, width)) if "indirect.factors" in live.arrays else None,
         )  # fmt: skip
         _shaped(found.gain, (height, width, 3), "f2", "gain")
         _shaped(found.offset, (height, width, 3), "f2", "offset")
@@ -94,7 +100,19 @@ class LiveMaps:
         """The bundle's live section: every array by its name in it."""
         parts = {f"{output.name}.{key}": values for output in self.outputs for key, values in output.arrays().items()}
         whole: dict[str, npt.NDArray[Any]] = {"gain": self.gain, "offset": self.offset, "present": self.present}
+        if self.indirect is not None:
+            parts |= {f"indirect.{key}": values for key, values in self.indirect.arrays().items()}
         return whole | {"unit": np.array([self.unit], np.float32), "noise": self.noise} | parts
+
+
+def _indirect(bundle: Bundle, size: tuple[int, int]) -> LiveIndirect:
+    def array(key: str, shape: tuple[int, ...], dtype: str) -> npt.NDArray[Any]:
+        return _shaped(bundle.live_array(f"indirect.{key}"), shape, dtype, f"indirect.{key}")
+
+    try:
+        return read_indirect(array, size)
+    except ValueError as wrong:
+        raise damaged(str(wrong)) from wrong
 
 
 def _output(bundle: Bundle, name: str, size_px: tuple[int, int]) -> OutputMaps:
@@ -153,7 +171,11 @@ def compensate(maps: LiveMaps, target: Bytes, brightness: float) -> tuple[Bytes,
 def compensate_light(maps: LiveMaps, light: Float) -> tuple[Bytes, ...]:
     """The frames for a radiance (height, width, 3)."""
     gain = maps.gain.astype(np.float32) * brightness_factor(maps, 1.0)
-    scale = np.maximum(light * gain - maps.offset.astype(np.float32), 0)
+    above = light * gain - maps.offset.astype(np.float32)
+    if maps.indirect is not None:
+        falling = maps.indirect.falling(maps.indirect.samples(light))
+        above -= maps.indirect.surface.astype(np.float32) * maps.indirect.spread(falling / np.float32(maps.unit))
+    scale = np.maximum(above, 0)
     return tuple(_frame(maps, output, scale) for output in maps.outputs)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -65,10 +66,26 @@ class Radiometry:
     ``response`` (3, 256) float64: linear light of each 8-bit value per channel, 0 at black, 1 at white, rising
     ``mixing`` (3, 3) float64: camera channel (row) by projector channel (column), each row summing to 1, so that
     white is white; the strength of the light is in the projector's white image
+    ``segment``: share of white that a white segment makes, of what red, green and blue have in common; 0 without one
     """
 
     response: Float64
     mixing: Float64
+    segment: float = 0.0
+
+    def emitted(self, light: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """What is shown, (..., 3), of the channels' own light (..., 3): with what a white segment adds to greys."""
+        if not self.segment:
+            return light
+        common = light.min(axis=-1, keepdims=True)
+        return np.asarray(light + light.dtype.type(self.segment) * (common - light))
+
+    def channels(self, shown: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """The inverse: the channels' own light for what is to be shown; above 1 where a colour is too saturated."""
+        if not self.segment:
+            return shown
+        common = shown.min(axis=-1, keepdims=True)
+        return np.asarray((shown - shown.dtype.type(self.segment) * common) / shown.dtype.type(1 - self.segment))
 
 
 @dataclass(frozen=True, slots=True)

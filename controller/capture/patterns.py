@@ -12,6 +12,7 @@ import enum
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -49,6 +50,12 @@ MOST_TILES = 4000
 """With more Gray cells than this, a colour tile covers 2x2 of them: wider, so that defocus affects less of each."""
 
 
+PARTS_ACROSS: Final = 8
+"""Of the grade's pattern: so many large bright and dark parts along its longer side, about."""
+DARKEST, STEEPNESS, OWN_COLOUR = 0.05, 4.0, 0.5
+"""Light of the dark ones, how sharp their borders are, and how much colours differ."""
+
+
 class PatternKind(enum.Enum):
     """How a pattern is generated."""
 
@@ -65,7 +72,8 @@ class Pattern:
 
     ``colour`` (FLAT) fraction of full light per channel; ``axis`` (GRAY) 0 for x, 1 for y; ``bit`` (GRAY) 0 is the
     coarsest of ``bits``; ``tile_cells`` (MOSAIC) Gray cells along a tile's side; ``frequency`` (SINUSOID) x and y in
-    cycles per projector pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (MOSAIC, RANDOM).
+    cycles per projector pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (MOSAIC, RANDOM); ``coarse`` (RANDOM) with
+    large bright and dark parts, too, which throw light on each other.
     """
 
     name: str
@@ -78,6 +86,7 @@ class Pattern:
     frequency: tuple[float, float] = (0.0, 0.0)
     phase_rad: float = 0.0
     seed: int = 0
+    coarse: bool = False
 
     @property
     def needs_response(self) -> bool:
@@ -139,7 +148,7 @@ def plan_patterns(size_px: tuple[int, int], *, random_patterns: int = 1) -> Patt
     ]
     for name, frequency in BLUR_FREQUENCIES.items():
         patterns += _steps(f"blur-{name}", frequency, BLUR_STEPS)
-    patterns += [Pattern(f"random-{n}", PatternKind.RANDOM, seed=n) for n in range(random_patterns)]
+    patterns += [Pattern(f"random-{n}", PatternKind.RANDOM, seed=n, coarse=True) for n in range(random_patterns)]
     return PatternPlan(size_px, tuple(patterns))
 
 
@@ -205,7 +214,8 @@ def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
             angle = 2 * np.pi * (pattern.frequency[0] * x + pattern.frequency[1] * y) - pattern.phase_rad
             return (0.5 + 0.5 * np.cos(angle)).astype(np.float32)
         case PatternKind.RANDOM:
-            return _random_image(pattern.seed, size_px)
+            image = _random_image(pattern.seed, size_px)
+            return image * _large_parts(pattern.seed, size_px) if pattern.coarse else image
         case PatternKind.COLOUR_TILES:
             raise UsageError(
                 "mosaic-has-no-light",
@@ -257,3 +267,17 @@ def _random_image(seed: int, size_px: tuple[int, int]) -> FloatImage:
         noise = cv2.GaussianBlur(random.standard_normal((height, width, 3), dtype=np.float32), (0, 0), sigma_px)
         image += share * np.clip(0.5 + 0.25 * noise / noise.std(), 0, 1)
     return np.ascontiguousarray(np.clip(image, 0, 1), dtype=np.float32)
+
+
+def _large_parts(seed: int, size_px: tuple[int, int]) -> FloatImage:
+    """Factors of large parts, a tenth of the picture wide and more, in each channel some of its own."""
+    width, height = size_px
+    random = np.random.default_rng(seed + 15485863)
+    side = max(width, height) / PARTS_ACROSS
+    parts = random.standard_normal((4, math.ceil(height / side) + 3, math.ceil(width / side) + 3), dtype=np.float32)
+    parts = np.stack([OWN_COLOUR * own + parts[3] for own in parts[:3]], axis=2)
+    rows, columns = parts.shape[:2]
+    grown = cv2.resize(parts, (round(columns * side), round(rows * side)), interpolation=cv2.INTER_CUBIC)
+    first = round(side)
+    inside = grown[first : first + height, first : first + width]
+    return np.asarray(DARKEST + (1 - DARKEST) / (1 + np.exp(-STEEPNESS * inside)), np.float32)

@@ -25,8 +25,8 @@ from hal.errors import DeviceError
 MARK = "demo.json"
 BUILDING = ".stage.part"
 PHOTOGRAPH = "photograph.png"
-DEFAULT_ROOM = "dark"
-"""Until the solver knows light that comes back from object and room."""
+DEFAULT_ROOM = "room"
+"""With light that comes back from object, table and wall, as stages have it."""
 POWER_DOWN_S = 10.0
 """Emulated lamps go off at once; a dead bench must not delay the end of the demo."""
 

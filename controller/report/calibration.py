@@ -30,6 +30,7 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.report import plots
+from controller.report.light import light_gallery, whites
 from controller.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.report.pictures import Crop, crop_around, fitted, to_screen
 from controller.run.journal import Journal
@@ -75,6 +76,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
             ("Maps", "Cropped to the object; dark where nothing is known.",
              (ReportPicture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
             *_blamed(run, figures),
+            *light_gallery(calibration, crop),
             ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures)),
         ),
         steps=tuple(figures["steps"].items()),
@@ -131,7 +133,7 @@ def size_px(covariance_px2: FloatImage) -> npt.NDArray[np.floating[Any]]:
 
 
 def _white(calibration: Calibration, crop: Crop) -> ByteImage:
-    lit = sum((part.white for part in calibration.projectors), start=calibration.black)
+    lit = np.asarray(sum(whites(calibration), start=calibration.black), np.float32)
     level = float(np.nanpercentile(lit[calibration.object_mask], 99))
     return fitted(_cut(to_screen(lit, calibration.camera_to_xyz, white=level), crop), longest_px=LONGEST_PX)
 

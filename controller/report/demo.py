@@ -21,6 +21,7 @@ from controller.artefacts.solved import Solved, is_solved, read_base_figures, re
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
+from controller.report.light import light_gallery, whites
 from controller.report.page import Goal, Page, PictureRow, ReportPicture, refined_row, write_report
 from controller.report.pictures import Crop, crop_around, error_picture, fitted, to_screen
 from controller.run.journal import Journal
@@ -167,7 +168,7 @@ def _page(
     steps: Mapping[StepId, float],
 ) -> Page:
     crop = crop_around(calibration.object_mask)
-    lit = sum((part.white for part in calibration.projectors), start=calibration.black)
+    lit = np.asarray(sum(whites(calibration), start=calibration.black), np.float32)
     white = float(np.percentile(lit[calibration.object_mask], 99))
     before = _cropped(to_screen(lit, calibration.camera_to_xyz, white=white), crop)
     rows = tuple(_row(appearance, before, calibration, crop) for appearance in judged)
@@ -178,7 +179,11 @@ def _page(
         f" on {machine['cores']} cores.",
         goals=_goals(judged, figures),
         rows=rows,
-        galleries=(*_verification_gallery(run, figures), _frames_gallery(judged, checked)),
+        galleries=(
+            *_verification_gallery(run, figures),
+            *light_gallery(calibration, crop),
+            _frames_gallery(judged, checked),
+        ),
         steps=tuple((str(step), seconds) for step, seconds in steps.items()),
         facts=_facts(checked, calibration, figures),
     )

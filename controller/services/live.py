@@ -29,7 +29,7 @@ from controller.run.state_machine import Event
 from controller.run.step_id import StepId
 from controller.services.calibrate import stage_trust, usable_calibration
 from controller.services.live_frame_file import FileSource, holds_frames
-from controller.solve.feasibility import choose_exposure
+from controller.solve.exposed import exposure
 from controller.solve.scaling.interactive import Interactive
 from controller.stage.check import Checked, check_stage
 from controller.stage.session import StageSession
@@ -108,7 +108,9 @@ def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> Read
     black = calibrated.calibration.black
     white: FloatImage = np.ones_like(black)
     share = checked.stage.tables.solve.exposure_share
-    brightness = choose_exposure(calibrated.transport, white, black, share=share, drive=calibrated.drive)
+    brightness = exposure(
+        calibrated.transport, white, black, share=share, drive=calibrated.drive, indirect=calibrated.indirect
+    )
     reporter.say(f"White of a target has the radiance {brightness:.7g}.")
     return Ready(maps, brightness, _in_bundle(checked, calibrated.folder.name))
 

@@ -25,10 +25,10 @@ from controller.solve.appearance import (
     make_appearance,
     solve_base,
 )
-from controller.solve.bounded.solver import check_target
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
-from controller.solve.feasibility import Feasibility, choose_exposure, feasibility, target_radiance
+from controller.solve.exposed import exposed
+from controller.solve.feasibility import Feasibility, target_radiance
 from controller.solve.targets.values import Target
 from controller.transport import LightTransport
 from controller.transport.indirect import IndirectLight
@@ -147,44 +147,17 @@ def aim_at(
     With ``indirect`` light all of this is asked of the direct light that the picture leaves to be made. A pixel is too
     dark, too, where more indirect light falls than is wanted. Raises what ``choose_exposure`` raises.
     """
-    if indirect is None:
-        exposure = choose_exposure(transport, picture, black, share=options.share, drive=drive)
-        wanted = needed = np.float32(exposure) * picture
-    else:
-        reach = transport.reach()
-        exposure = indirect_exposure(transport, picture, black, indirect, share=options.share, drive=drive)
-        wanted = np.float32(exposure) * picture
-        needed = black + indirect.direct_target(wanted - black, reach=reach)
-    possible = feasibility(transport, needed, black, drive=drive)
+    found = exposed(transport, picture, black, share=options.share, drive=drive, indirect=indirect)
+    exposure, wanted, needed, possible = found.exposure, found.wanted, found.needed, found.possible
     figures: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
     if options.adapt > 0:
         adapted, cut_off, kept = adapt_gently(transport, needed, black, white=exposure, most=options.adapt, drive=drive)
         wanted = needed = adapted.target
         possible = adapted.after
         if indirect is not None:
-            wanted = wanted + indirect.forward(np.clip(needed - black, 0, reach))
+            wanted = wanted + indirect.forward(np.clip(needed - black, 0, transport.reach()))
         figures |= {"contrast_kept_cut_off": cut_off, "contrast_kept": kept, "adapted_share": possible.share}
     return Aim(wanted, target_radiance(needed, black, 1.0), possible, exposure, figures)
-
-
-def indirect_exposure(
-    transport: LightTransport,
-    picture: FloatImage,
-    black: FloatImage,
-    indirect: IndirectLight,
-    *,
-    share: float,
-    drive: DriveLevels,
-) -> float:
-    """As ``choose_exposure``, where a part of the picture's light comes by way of other surfaces.
-
-    As direct light is linear in the picture while none of it is out of reach, both are taken apart once.
-    """
-    check_target(transport, picture)
-    exposure = choose_exposure(transport, picture, black, share=share, drive=drive)
-    direct = indirect.direct_target(np.float32(exposure) * picture) / np.float32(exposure)
-    needed = np.where(transport.object_mask[..., None], np.maximum(direct, 0), picture).astype(np.float32)
-    return choose_exposure(transport, needed, black, share=share, drive=drive)
 
 
 def _solved(

@@ -124,7 +124,7 @@ def built_wheel(folder: Path) -> Path:
 
 def prepared_stage(folder: Path) -> Path:
     """The demo's stage for projectors at an X server, with a bundle beside it."""
-    words = ["demo", "--prepare-only", "--out", str(folder / "out")]
+    words = ["demo", "--prepare-only", "--room", "dark", "--out", str(folder / "out")]
     subprocess.run([sys.executable, "-m", "controller", *words], check=True, cwd=ROOT, capture_output=True)
     stage = folder / "out" / "stage"
     described = stage / "stage.toml"

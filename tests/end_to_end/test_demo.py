@@ -64,7 +64,9 @@ def test_the_report_has_every_promised_key(report: Any) -> None:
 def test_its_figures_are_what_a_good_calibration_gives(report: Any, finished_demo: FinishedDemo) -> None:
     assert report["captures"]["count"] == len(shots(run_of(finished_demo.stage))) > 100
     assert 0 < report["geometry"]["reprojection_rms_px"] < 0.1
-    assert {row["grade"] for row in report["verification"].values()} == {"A"}
+    # in the room, light between surfaces makes grade B of two projectors
+    assert {row["grade"] for row in report["verification"].values()} <= {"A", "B"}
+    assert all(0.04 < row["indirect"]["median"] < 0.12 for row in report["verification"].values())
     assert report["metapixels"]["fitted"] > 0.3 * 3 * 280 * 210
     assert report["bundle"]["ratio"] > 1.5
     assert all(0.5 < one["reachable_share"] <= 1 for one in report["appearances"])
@@ -107,6 +109,11 @@ def test_the_page_is_one_file_that_asks_nobody_for_anything(page: str) -> None:
     sources = re.findall(r'src="([^"]*)"', page)
     assert len(sources) >= 6 * len(APPEARANCES)
     assert all(source.startswith("data:image/") for source in sources)
+
+
+def test_the_page_shows_direct_and_indirect_light(page: str) -> None:
+    assert "Direct and indirect light" in page
+    assert "Share of indirect light" in page
 
 
 def test_the_page_shows_every_appearance_with_before_target_achieved_and_error(page: str, report: Any) -> None:

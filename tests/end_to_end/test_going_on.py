@@ -111,7 +111,7 @@ class Story:
 @pytest.fixture(scope="module")
 def story(tmp_path_factory: pytest.TempPathFactory, bumpy_ball: Path) -> Story:
     out = tmp_path_factory.mktemp("going on") / "out"
-    prepared = velatura("demo", "--prepare-only", "--object", bumpy_ball, "--out", out)
+    prepared = velatura("demo", "--prepare-only", "--room", "dark", "--object", bumpy_ball, "--out", out)
     assert prepared.result == {"stage": str(out / "stage")}
     toml = out / "stage" / "stage.toml"
     toml.write_text(toml.read_text().replace("power_down_s = 10.0", "power_down_s = 3.0") + QUICK)

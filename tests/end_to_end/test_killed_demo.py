@@ -19,11 +19,11 @@ pytestmark = pytest.mark.timeout(600)
 def test_a_killed_demos_bench_ends_by_itself_and_the_same_command_goes_on(prepared_once: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(prepared_once, tmp_path / "out"))
     with_ports_of_its_own(out / "stage")
-    with Command("demo", "--out", out) as demo:
+    with Command("demo", "--room", "dark", "--out", out) as demo:
         demo.wait_for("Waiting for stable light")
         demo.kill()
     # At once: the bench and the player of the killed one may still be there.
-    with Command("demo", "--out", out) as demo:
+    with Command("demo", "--room", "dark", "--out", out) as demo:
         demo.wait_for("Waiting for stable light")
         assert lamps(out / "stage") == {"left": True, "right": True, "above": True}
         stopped = demo.interrupt()
@@ -38,7 +38,7 @@ def test_a_killed_demos_bench_ends_by_itself_and_the_same_command_goes_on(prepar
 def test_ctrl_c_while_the_bench_starts_ends_both(prepared_once: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(prepared_once, tmp_path / "out"))
     with_ports_of_its_own(out / "stage")
-    with Command("demo", "--out", out) as demo:
+    with Command("demo", "--room", "dark", "--out", out) as demo:
         demo.wait_for_message("Starting the bench")
         stopped = demo.interrupt()
     assert stopped.code == 130

@@ -31,7 +31,7 @@ def test_a_port_in_use_is_told(served: tuple[Path, Bench]) -> None:
 
 
 def test_a_demo_beside_it_is_told_of_the_port_in_use_and_lights_nothing(served: tuple[Path, Bench]) -> None:
-    assert wrong_code(velatura("demo", "--out", served[0].parent), code=3) == "port-in-use"
+    assert wrong_code(velatura("demo", "--room", "dark", "--out", served[0].parent), code=3) == "port-in-use"
     assert lamps(served[0]) == {}
 
 
@@ -51,7 +51,7 @@ def test_a_stage_in_use_is_told_and_the_one_at_work_is_not_disturbed(served: tup
     with Command("calibrate", stage) as working:
         working.wait_for("Switching the projectors on")
         for command in ("calibrate", "appearance", "demo"):
-            where = ["--out", stage.parent] if command == "demo" else [stage]
+            where = ["--room", "dark", "--out", stage.parent] if command == "demo" else [stage]
             assert wrong_code(velatura(command, *where)) == "already-running"
         assert working.interrupt().code == 130
 

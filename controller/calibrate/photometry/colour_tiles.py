@@ -48,8 +48,9 @@ class KnownIndirect:
 
     def of(self, levels: npt.NDArray[np.uint8]) -> FloatImage:
         """Indirect light of a picture of device values (..., 3): that of white, times the picture's mean light."""
-        light = [self.radiometry.response[c][levels[..., c]].mean() for c in range(3)]
-        return np.asarray(self.white * (self.radiometry.mixing @ np.array(light)).astype(np.float32), np.float32)
+        light = np.stack([self.radiometry.response[c][levels[..., c]] for c in range(3)], axis=-1)
+        mean = self.radiometry.emitted(light).mean(axis=tuple(range(light.ndim - 1)))
+        return np.asarray(self.white * (self.radiometry.mixing @ mean).astype(np.float32), np.float32)
 
 
 def measure_tiles(

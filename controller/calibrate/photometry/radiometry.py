@@ -33,6 +33,15 @@ LEAST_INDEPENDENCE = 0.01
 MOST_STRAY = 0.3
 STIFFNESS = 1e-3
 WORST_FALL = 0.03
+SUSPECT_ADDITIVITY = 0.02
+"""From here on a white segment is looked for."""
+BETTER = 0.7
+LEAST_SEGMENT = 0.03
+MOST_SEGMENT = 0.7
+REMEDY = (
+    "Switch off the projector's brilliant-colour, white-boost and dynamic modes (often called BrilliantColor, "
+    "White Peaking or Dynamic). Then calibrate again."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +51,7 @@ class RadiometryReport:
     ``pixels`` camera pixels used; ``tiles`` that were measured, of all patterns together; ``scatter`` median absolute
     deviation of the tiles from the fit, of full scale; ``stray`` share of a tile's white that comes from other tiles;
     ``additivity`` largest relative difference between white and what the tiles say of it, over the camera's channels
+    ``segment``: see ``Radiometry``; 0 where colours add
     """
 
     pixels: int
@@ -49,6 +59,7 @@ class RadiometryReport:
     scatter: float
     stray: float
     additivity: float
+    segment: float = 0.0
 
 
 def measure_radiometry(
@@ -82,22 +93,38 @@ def measure_radiometry(
             remedy="Check that its lamp is lit, its shutter open and its picture on the object, then calibrate again.",
         )
     fit = _fit(tiles)
-    scatter = float(1.4826 * np.median(np.abs(fit.residual)))
-    if scatter > WORST_SCATTER or fit.fall > WORST_FALL or fit.additivity > WORST_ADDITIVITY:
+    if not fit.good or fit.additivity > SUSPECT_ADDITIVITY:
+        # white may have a light of its own
+        other = _fit(tiles, with_segment=True)
+        if other.good and other.segment > LEAST_SEGMENT and other.scatter < BETTER * fit.scatter:
+            fit = other
+    scatter = fit.scatter
+    if not fit.good:
         raise CalibrationError(
             "colours-do-not-add",
             what=f"The projector's colours are not additive: tiles differ by {100 * scatter:.0f} % from the sum of "
             f"three responses, white by {100 * fit.additivity:.0f} %.",
-            remedy="Switch off the projector's brilliant-colour, white-boost and dynamic modes. Then calibrate again.",
+            remedy=REMEDY,
         )
     stray = float(fit.stray.mean())
-    report = RadiometryReport(tiles.pixels, tiles.ratio.shape[0], scatter, stray, fit.additivity)
-    return Radiometry(fit.response, fit.mixing), report
+    report = RadiometryReport(tiles.pixels, tiles.ratio.shape[0], scatter, stray, fit.additivity, fit.segment)
+    return Radiometry(fit.response, fit.mixing, fit.segment), report
+
+
+def white_segment(name: str, share: float) -> str:
+    """What a technician should know of a projector with a white segment."""
+    return (
+        f"Projector {name} adds white light of its own: {100 * share:.0f} % of its white is not the sum of red, green "
+        f"and blue. {REMEDY} If it can't be switched off, Velatura calculates with it; bright colours are then darker."
+    )
 
 
 @dataclass(slots=True)
 class _RadiometryFit:
-    """``response`` (3, 256), ``mixing`` (3, 3), ``stray`` (3,), ``residual`` (tiles, 3); ``fall``: how far r fell."""
+    """``response`` (3, 256), ``mixing`` (3, 3), ``stray`` (3,), ``residual`` (tiles, 3); ``fall``: how far r fell.
+
+    ``segment``: see ``Radiometry``
+    """
 
     response: Float64
     mixing: Float64
@@ -105,9 +132,19 @@ class _RadiometryFit:
     residual: Float64
     fall: float = 0.0
     additivity: float = 0.0
+    segment: float = 0.0
+
+    @property
+    def scatter(self) -> float:
+        return float(1.4826 * np.median(np.abs(self.residual)))
+
+    @property
+    def good(self) -> bool:
+        """Whether the tiles follow from it."""
+        return self.scatter <= WORST_SCATTER and self.fall <= WORST_FALL and self.additivity <= WORST_ADDITIVITY
 
 
-def _fit(tiles: TileMeasurements) -> _RadiometryFit:
+def _fit(tiles: TileMeasurements, *, with_segment: bool = False) -> _RadiometryFit:
     """Mixing with the responses held, responses with the mixing held, new weights, until nothing changes."""
     x = np.arange(256) / 255
     gamma = np.full(3, FIRST_GAMMA)
@@ -116,6 +153,8 @@ def _fit(tiles: TileMeasurements) -> _RadiometryFit:
     for number in range(ROUNDS):
         before = fit.response.copy()
         rough = number < ROUGH_ROUNDS
+        if with_segment:
+            _fit_segment(tiles, weight, fit)
         _fit_mixing(tiles, weight, fit, with_stray=not rough)
         _fit_responses(tiles, weight, gamma, fit)
         if rough:
@@ -130,14 +169,29 @@ def _fit(tiles: TileMeasurements) -> _RadiometryFit:
     return fit
 
 
-def _shown(tiles: TileMeasurements, response: Float64) -> Float64:
-    """(tiles, 3) light of each tile's levels per projector channel."""
+def _channels(tiles: TileMeasurements, response: Float64) -> Float64:
+    """(tiles, 3) each projector channel's own light of each tile's levels."""
     return np.stack([response[channel][tiles.levels[:, channel]] for channel in range(3)], axis=1)
+
+
+def _shown(tiles: TileMeasurements, fit: _RadiometryFit) -> Float64:
+    """(tiles, 3) light of each tile per projector channel, with what a white segment adds."""
+    return Radiometry(fit.response, fit.mixing, fit.segment).emitted(_channels(tiles, fit.response))
+
+
+def _fit_segment(tiles: TileMeasurements, weight: Float64, fit: _RadiometryFit) -> None:
+    """The share of white that is not the sum of three colours: of what a tile's channels have in common."""
+    own = _channels(tiles, fit.response)
+    common = own.min(axis=1, keepdims=True) - own @ fit.mixing.T
+    around = (fit.mixing @ _shown(tiles, fit).mean(axis=0)) * fit.stray
+    off = (tiles.ratio - around) / (1 - fit.stray) - own @ fit.mixing.T
+    found = float(np.sum(weight * common * off) / np.sum(weight * common**2))
+    fit.segment = float(np.clip(found, 0.0, MOST_SEGMENT))
 
 
 def _fit_mixing(tiles: TileMeasurements, weight: Float64, fit: _RadiometryFit, *, with_stray: bool) -> None:
     """Per camera channel: ratio = (1 - e) m . r + e mean(m . r), the three of m adding up to 1."""
-    shown = _shown(tiles, fit.response)
+    shown = _shown(tiles, fit)
     mean = shown.mean(axis=0)
     for channel in range(3):
         root = np.sqrt(weight[:, channel])
@@ -161,11 +215,11 @@ def _fit_mixing(tiles: TileMeasurements, weight: Float64, fit: _RadiometryFit, *
 
 
 def _fit_responses(tiles: TileMeasurements, weight: Float64, gamma: Float64, fit: _RadiometryFit) -> None:
-    around = fit.mixing @ _shown(tiles, fit.response).mean(axis=0)
+    around = fit.mixing @ _shown(tiles, fit).mean(axis=0)
     curves = _solve(tiles, weight, gamma, fit, white_known=True)
     fit.fall = float(np.max(np.maximum.accumulate(curves, axis=1) - curves))
     fit.response = np.stack([_rising(curve) for curve in curves])
-    own = _shown(tiles, fit.response) @ fit.mixing.T
+    own = _shown(tiles, fit) @ fit.mixing.T
     fit.residual = tiles.ratio - (own + fit.stray * (around - own))
 
 
@@ -180,14 +234,16 @@ def _solve(
     last = KNOTS - 1 if white_known else KNOTS
     fixed = np.zeros(KNOTS)
     fixed[-1] = float(white_known)
-    around = fit.mixing @ _shown(tiles, fit.response).mean(axis=0)
+    around = fit.mixing @ _shown(tiles, fit).mean(axis=0)
     equations, values = [], []
+    least = _channels(tiles, fit.response).argmin(axis=1)
     for channel in range(3):
         root = np.sqrt(weight[:, channel])
         direct = (tiles.ratio[:, channel] - fit.stray[channel] * around[channel]) / (1 - fit.stray[channel])
         parts = []
         for primary, basis in enumerate(bases):
-            rows = basis[tiles.levels[:, primary]] * fit.mixing[channel, primary]
+            share = (1 - fit.segment) * fit.mixing[channel, primary] + fit.segment * (least == primary)
+            rows = basis[tiles.levels[:, primary]] * share[:, None]
             direct = direct - rows @ fixed
             parts.append(rows[:, 1:last])
         equations.append(np.concatenate(parts, axis=1) * root[:, None])

@@ -35,7 +35,7 @@ UNDECODED_SHARE = 0.02
 
 
 class ErrorCause(enum.IntEnum):
-    """Codes of the label map; the first that holds is taken, in this order, INDIRECT before UNEXPLAINED."""
+    """Codes of the label map; the first that holds is taken, in this order, INDIRECT before DIMMED."""
 
     FINE = 0
     SATURATED = 1
@@ -145,15 +145,21 @@ def attribute_error(
     sigma = _noise(np.maximum(seen, 0), exposure_s)
     x, y, spread = _places(light, n, shown.shape)
     # From the last to the first: what is written later stands before.
-    if indirect is not None:
-        near_indirect = _near(np.where(lit, np.sum(indirect * indirect, axis=2), 0))
-        much = near_indirect > INDIRECT_SHARE**2 * near_power
-        label(ErrorCause.INDIRECT, much & (near_error < near_indirect), bad)
     label(ErrorCause.DEFOCUS, spread > BLURRED_PX, bad)
     label(ErrorCause.GRAZING, _stretch(x, y) > STRETCHED, bad)
     label(ErrorCause.DARK, _near(np.where(lit, np.nan_to_num(sigma) ** 2, 0)) > 0.5 * near_error, bad)
     moved, dimmed = _explained(light, n, shown, predicted, error, lit & measured)
     label(ErrorCause.DIMMED, dimmed > EXPLAINED, bad)
+    if indirect is not None:
+        # a lamp that is darker errs alike everywhere, light by way of other surfaces from place to place
+        use = (lit & measured)[:, :, None]
+        of_lamp = np.sum(np.where(use, light_seen * predicted, 0), axis=(0, 1), dtype=np.float64)
+        of_lamp /= np.maximum(np.sum(np.where(use, predicted * predicted, 0), axis=(0, 1), dtype=np.float64), 1e-30)
+        rest = np.where(use, light_seen - of_lamp.astype(np.float32) * predicted, 0)
+        near_indirect = _near(np.where(lit, np.sum(indirect * indirect, axis=2), 0))
+        much = near_indirect > INDIRECT_SHARE**2 * near_power
+        own = _near(np.sum(rest * rest, axis=2)) > EXPLAINED * near_error
+        label(ErrorCause.INDIRECT, much & own & (near_error < near_indirect), bad & (labels != ErrorCause.DARK))
     label(ErrorCause.MOVED, (moved > EXPLAINED) & (moved > dimmed), bad)
     label(ErrorCause.EDGE, _edges(x, y, lit), bad)
     bright = part.white.min(axis=2) > UNDECODED_SHARE * float(np.percentile(part.white, 99.9))

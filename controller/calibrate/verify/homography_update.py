@@ -80,4 +80,4 @@ def update_radiometry(radiometry: Radiometry, gain: tuple[float, float, float]) 
     White light of camera channel c is now sum_k mixing[c, k] gain[k] times what it was.
     """
     mixing = radiometry.mixing * np.asarray(gain)
-    return Radiometry(radiometry.response, mixing / mixing.sum(axis=1, keepdims=True))
+    return Radiometry(radiometry.response, mixing / mixing.sum(axis=1, keepdims=True), radiometry.segment)

@@ -26,6 +26,7 @@ _FORMATS: Final[Mapping[tuple[str, int], tuple[int, int, int]]] = {
     ("u2", 3): (gl.GL_RGB16UI, gl.GL_RGB_INTEGER, gl.GL_UNSIGNED_SHORT),
     ("f2", 3): (gl.GL_RGB16F, gl.GL_RGB, gl.GL_HALF_FLOAT),
     ("f4", 1): (gl.GL_R32F, gl.GL_RED, gl.GL_FLOAT),
+    ("f4", 3): (gl.GL_RGB32F, gl.GL_RGB, gl.GL_FLOAT),
 }
 _KEPT: Final = (gl.GL_CURRENT_PROGRAM, gl.GL_DRAW_FRAMEBUFFER_BINDING, gl.GL_READ_FRAMEBUFFER_BINDING,
                 gl.GL_VERTEX_ARRAY_BINDING)  # fmt: skip
@@ -43,6 +44,11 @@ class LiveRenderer:
         self._target = _texture(np.zeros((height, width, 3), np.uint8))
         self._maps_of_target = [_texture(values) for values in (maps.present, maps.gain, maps.offset)]
         self._noise = _texture(maps.noise)
+        self._light = light_table()
+        indirect = maps.indirect
+        grid = (1, 1) if indirect is None else indirect.grid
+        surface = np.zeros((1, 1, 3), np.float16) if indirect is None else indirect.surface
+        self._thrown = [_texture(surface), _texture(np.zeros((*grid, 3), np.float32))]
         self._scale = _empty(width, height, gl.GL_RGBA32F)
         self._outputs = [_OutputTextures(output) for output in maps.outputs]
         self._buffer = _name(gl.glGenFramebuffers)
@@ -88,7 +94,7 @@ class LiveRenderer:
 
     def close(self) -> None:
         """Free the textures; the context must be current."""
-        textures = [self._target, *self._maps_of_target, self._noise, self._scale]
+        textures = [self._target, *self._maps_of_target, *self._thrown, self._noise, self._scale]
         for output in self._outputs:
             textures += [output.frame, *output.inputs.values()]
         gl.glDeleteTextures(len(textures), (gl.GLuint * len(textures))(*textures))
@@ -101,11 +107,26 @@ class LiveRenderer:
         gl.glActiveTexture(gl.GL_TEXTURE0)
         gl.glBindTexture(gl.GL_TEXTURE_2D, self._target)
         _put(target, replace=True)
+        self._put_falling(target, brightness)
         present, gain, offset = self._maps_of_target
-        program = self._scaling
-        program.use(target=self._target, present=present, gain=gain, offset=offset, tables=self._outputs[0].tables)
+        surface, falling = self._thrown
+        program, indirect = self._scaling, self._maps.indirect
+        program.use(
+            target=self._target, present=present, gain=gain, offset=offset, tables=self._outputs[0].tables,
+            surface=surface, falling=falling,
+        )  # fmt: skip
+        gl.glUniform1f(program.at("side"), 0.0 if indirect is None else indirect.side)
         gl.glUniform1f(program.at("factor"), float(brightness_factor(self._maps, brightness)))
         _draw_to(self._scale, *self._maps.target_px)
+
+    def _put_falling(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
+        """What falls on blocks by way of other surfaces, found here: the target's samples are few."""
+        indirect = self._maps.indirect
+        if indirect is None:
+            return
+        falling = indirect.falling((self._light * np.float32(brightness))[indirect.samples(target)])
+        gl.glBindTexture(gl.GL_TEXTURE_2D, self._thrown[1])
+        _put(np.ascontiguousarray(falling / np.float32(self._maps.unit), np.float32), replace=True)
 
     def _draw_frame(self, output: _OutputTextures, into: int) -> None:
         program, values = self._framing, output.values

@@ -18,17 +18,32 @@ uniform usampler2D present;
 uniform sampler2D gain;
 uniform sampler2D offset;
 uniform sampler2D tables;
+uniform sampler2D surface;
+uniform sampler2D falling;
 uniform float factor;
+uniform float side;
 float light(uint value) { return texelFetch(tables, ivec2(int(value), 0), 0).r; }
+vec3 thrown(ivec2 at) {
+    ivec2 size = textureSize(falling, 0);
+    vec2 place = clamp((vec2(at) - (side - 1.0) / 2.0) / side, vec2(0.0), vec2(size - 1));
+    ivec2 first = min(ivec2(place), max(size - 2, ivec2(0)));
+    ivec2 next = min(first + 1, size - 1);
+    vec2 part = place - vec2(first);
+    vec3 above = mix(texelFetch(falling, first, 0).rgb, texelFetch(falling, ivec2(next.x, first.y), 0).rgb, part.x);
+    vec3 below = mix(texelFetch(falling, ivec2(first.x, next.y), 0).rgb, texelFetch(falling, next, 0).rgb, part.x);
+    return texelFetch(surface, at, 0).rgb * mix(above, below, part.y);
+}
 void main() {
     ivec2 at = ivec2(gl_FragCoord.xy);
     uvec3 value = texelFetch(target, at, 0).rgb;
     vec3 wanted = vec3(light(value.r), light(value.g), light(value.b));
     vec3 found = wanted * (texelFetch(gain, at, 0).rgb * factor) - texelFetch(offset, at, 0).rgb;
+    if (side > 0.0) found -= thrown(at);
     scale = vec4(max(found, vec3(0.0)), float(texelFetch(present, at, 0).r) / 255.0);
 }
 """
-"""Step 1: C_s at every pixel of the target, and beside it where there is base light."""
+"""Step 1: C_s at every pixel of the target, and beside it where there is base light. ``side`` is 0 where no light comes
+by way of other surfaces."""
 
 FRAME: Final = """#version 330 core
 out vec4 colour;

@@ -31,6 +31,7 @@ def to_device(
     ``phase``: this projector's offset in the blue-noise tile; superimposed projectors should have different ones.
     Raises UsageError("response-not-rising", "frame-shape-wrong").
     """
+    frame = radiometry.channels(frame)
     if method != "blue-noise":
         return encode_frame(frame, radiometry.response, dither=method == "diffusion")
     light = checked_response(radiometry.response)
@@ -40,8 +41,9 @@ def to_device(
 
 
 def to_light(frame: ByteImage, radiometry: Radiometry) -> FloatImage:
-    """Linear light (rows, columns, 3) of device values, by the response."""
-    return np.stack([radiometry.response[c][frame[..., c]] for c in range(3)], -1).astype(np.float32)
+    """Linear light (rows, columns, 3) of device values, by the response and a white segment."""
+    light = np.stack([radiometry.response[c][frame[..., c]] for c in range(3)], -1).astype(np.float32)
+    return np.asarray(radiometry.emitted(light), np.float32)
 
 
 @cache

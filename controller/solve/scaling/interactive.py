@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from controller.bundle.live_indirect import LiveIndirect, between
 from controller.bundle.live_maps import (
     FULL,
     LiveMaps,
@@ -33,16 +34,18 @@ from controller.solve.appearance import Base
 from controller.solve.bounded.solver import check_target
 from controller.solve.scaling.kernels import (
     MARGIN,
-    scale_blocks,
+    Thrown,
     scale_picture,
     scale_plainly,
     scale_twos,
     shares_of,
     show,
+    small_picture,
     sums_of,
 )
 from controller.solve.scaling.stage_maps import reduction, scaling_maps
 from controller.transport import LightTransport
+from controller.transport.indirect import IndirectLight
 from controller.transport.simd.scaling import STEPS
 
 BLOCK_SIGMA_PX: Final = 0.56
@@ -88,6 +91,7 @@ class Interactive:
         self._gain = _padded(maps.gain.astype(np.float32) * brightness_factor(maps, 1.0))
         self._offset = _padded(maps.offset.astype(np.float32))
         self._used = _used(maps)
+        self._thrown = _thrown(maps)
         self._outputs = tuple(self._prepared(output) for output in maps.outputs)
         self._table = light_table()
 
@@ -100,12 +104,12 @@ class Interactive:
         picture = np.ascontiguousarray(target, np.float32)
         factor, block = self._factor, self._block
         maps = self._gain, self._offset, self._used
-        if factor == 2 and block == 1 and not (self.camera[0] % 2 or self.camera[1] % 2):
+        even = not (self.camera[0] % 2 or self.camera[1] % 2)
+        if self.maps.indirect is None and factor == 2 and block == 1 and even:
             finite = scale_twos(picture.ravel(), *maps, self.camera[1], self._side, self._scale)
-        elif factor == 1:
-            finite = scale_plainly(picture, block, *maps, self._side, self._scale)
         else:
-            finite = scale_blocks(picture, factor, block, *maps, self._side, self._scale)
+            small = picture if factor == 1 else small_picture(picture, factor)
+            finite = scale_plainly(small, block, *maps, self._side, self._scale, self._of(small))
         if not finite:
             raise UsageError(
                 "target-not-finite",
@@ -129,8 +133,17 @@ class Interactive:
         _check_size(picture.shape, (height, width, 3), "the targets of this stage's live mode")
         light = np.float32(brightness) * self._table
         pixels = np.ascontiguousarray(picture, np.uint8)
-        scale_picture(pixels, light, self._block, self._gain, self._offset, self._used, self._side, self._scale)
+        indirect, thrown = self.maps.indirect, self._thrown
+        if indirect is not None:
+            thrown = _with(thrown, indirect, light[indirect.samples(pixels)])
+        maps = self._gain, self._offset, self._used
+        scale_picture(pixels, light, self._block, *maps, self._side, self._scale, thrown)
         self._show(into)
+
+    def _of(self, light: FloatImage) -> Thrown:
+        """What surfaces throw back where a radiance (height, width, 3) of the targets' size is seen."""
+        indirect = self.maps.indirect
+        return self._thrown if indirect is None else _with(self._thrown, indirect, indirect.samples(light))
 
     def _show(self, into: Sequence[ByteImage]) -> None:
         for output, frame in zip(self._outputs, into, strict=True):
@@ -170,7 +183,11 @@ class Interactive:
 
 
 def interactive(
-    transport: LightTransport, base: Base, black: FloatImage, radiometries: Sequence[Radiometry]
+    transport: LightTransport,
+    base: Base,
+    black: FloatImage,
+    radiometries: Sequence[Radiometry],
+    indirect: IndirectLight | None = None,
 ) -> Interactive:
     """Prepare ``base`` to be scaled on the clock, by radiances of the camera's size.
 
@@ -178,7 +195,8 @@ def interactive(
     ``check_target`` for ``black``.
     """
     check_target(transport, black)
-    return Interactive(scaling_maps(transport, base, black, radiometries), transport.camera_shape)
+    maps = scaling_maps(transport, base, black, radiometries, indirect=indirect)
+    return Interactive(maps, transport.camera_shape)
 
 
 def _check_size(found: tuple[int, ...], wanted: tuple[int, ...], what: str) -> None:
@@ -204,6 +222,23 @@ def _used(maps: LiveMaps) -> npt.NDArray[np.int32]:
     found = lit.any(axis=1)
     first, last = lit.argmax(axis=1), lit.shape[1] - lit[:, ::-1].argmax(axis=1)
     return np.stack([np.where(found, first, 0), np.where(found, last, 0)], 1).astype(np.int32)
+
+
+def _thrown(maps: LiveMaps) -> Thrown:
+    """Without what falls, which differs from picture to picture."""
+    empty = np.zeros(0, np.float32)
+    indirect, gain = maps.indirect, maps.gain.astype(np.float32)
+    if indirect is None:
+        return Thrown(empty, np.zeros((0, 0), np.float32), np.zeros(0, np.int32), empty)
+    surface = np.divide(indirect.surface.astype(np.float32), gain, out=np.zeros_like(gain), where=gain > 0)
+    rows = between(maps.target_px[1], indirect.grid[0], indirect.side)
+    return Thrown(surface.ravel(), np.zeros((indirect.grid[0], 3 * maps.target_px[0]), np.float32), *rows)
+
+
+def _with(thrown: Thrown, indirect: LiveIndirect, light: FloatImage) -> Thrown:
+    """With what falls where samples have that radiance."""
+    across = indirect.across(indirect.falling(light))
+    return thrown._replace(falling=across.reshape(len(across), -1))
 
 
 def _padded(values: FloatImage) -> FloatImage:

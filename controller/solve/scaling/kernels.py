@@ -6,7 +6,7 @@ around it, so that no window ends outside.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from numba import prange
 from controller.bundle.live_maps import MOST_CORRELATION, MOST_RADIUS_PX, REACH, TILE
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.jit import compiled
-from controller.transport.simd.scaling import SIDE, STEPS, scale_of_four, scale_of_one, window_steps
+from controller.transport.simd.scaling import SIDE, STEPS, Index, scale_of_four, scale_of_one, window_steps
 
 MARGIN: Final = SIDE
 LEVELS: Final = STEPS + 1
@@ -23,6 +23,30 @@ LEVELS: Final = STEPS + 1
 _REACH, _RADIUS, _CORRELATION = np.float32(REACH), np.float32(MOST_RADIUS_PX), np.float32(MOST_CORRELATION)
 
 Used = npt.NDArray[np.int32]
+
+
+class Thrown(NamedTuple):
+    """Light by way of other surfaces, as the loops take it off the wanted light; of no size where there is none.
+
+    ``surface`` (3 x target pixels,): what a pixel makes of falling light; ``falling`` (grid rows, 3 x columns): that
+    light in the rows of blocks' middles; ``up``, ``part_up``: the row of blocks before each row of the target, and the
+    part of the way to the next
+    """
+
+    surface: FloatImage
+    falling: FloatImage
+    up: npt.NDArray[np.int32]
+    part_up: FloatImage
+
+
+@compiled()
+def thrown_back(thrown: Thrown, row: int, first: Index, last: Index, out: FloatImage) -> None:
+    """Light by way of other surfaces in a row of the target, at columns ``first`` to ``last``; ``out`` is a row."""
+    i, part, values = np.int64(thrown.up[row]), thrown.part_up[row], thrown.falling.shape[1]
+    above, below = thrown.falling[i], thrown.falling[min(i + 1, thrown.falling.shape[0] - 1)]
+    surface = thrown.surface[row * values : (row + 1) * values]
+    for k in range(3 * first, 3 * last):
+        out[k] = surface[k] * (above[k] + part * (below[k] - above[k]))
 
 
 @compiled(parallel=True)
@@ -51,7 +75,14 @@ def scale_twos(
 
 @compiled(parallel=True)
 def scale_plainly(
-    picture: FloatImage, block: int, gain: FloatImage, offset: FloatImage, used: Used, side: int, scale: FloatImage
+    picture: FloatImage,
+    block: int,
+    gain: FloatImage,
+    offset: FloatImage,
+    used: Used,
+    side: int,
+    scale: FloatImage,
+    thrown: Thrown,
 ) -> bool:
     """The scale of a radiance (rows, columns, 3) of the targets' size, in blocks; whether all is finite."""
     rows, columns, _ = picture.shape
@@ -60,6 +91,10 @@ def scale_plainly(
     share = np.float32(1 / block**2)
     for row in prange(high):
         total = np.float32(0)
+        less = np.zeros((block, 3 * columns), np.float32)
+        if thrown.surface.size:
+            for v in range(row * block, min((row + 1) * block, rows)):
+                thrown_back(thrown, v, 0, columns, less[v - row * block])
         for x in range(wide):
             k = 4 * ((row + MARGIN) * side + MARGIN + x)
             for c in range(3):
@@ -68,7 +103,8 @@ def scale_plainly(
                     for u in range(x * block, min((x + 1) * block, columns)):
                         i = 3 * (v * columns + u) + c
                         total += picture[v, u, c] * np.float32(0)
-                        found += max(picture[v, u, c] * gain[i] - offset[i], np.float32(0))
+                        light = picture[v, u, c] - less[v - row * block, 3 * u + c]
+                        found += max(light * gain[i] - offset[i], np.float32(0))
                 scale[k + c] = found * share
         good[row] = total == 0
     return bool(good.all())
@@ -89,21 +125,12 @@ def _reduced(picture: FloatImage, factor: int, out: FloatImage) -> None:
                 out[y, x, c] = light * share
 
 
-def scale_blocks(
-    picture: FloatImage,
-    factor: int,
-    block: int,
-    gain: FloatImage,
-    offset: FloatImage,
-    used: Used,
-    side: int,
-    scale: FloatImage,
-) -> bool:
-    """The same for a radiance that is ``factor`` times the targets' size."""
+def small_picture(picture: FloatImage, factor: int) -> FloatImage:
+    """A radiance reduced to the targets' size."""
     rows, columns, _ = picture.shape
     small = np.empty((-(-rows // factor), -(-columns // factor), 3), np.float32)
     _reduced(picture, factor, small)
-    return scale_plainly(small, block, gain, offset, used, side, scale)
+    return small
 
 
 @compiled(parallel=True)
@@ -116,6 +143,7 @@ def scale_picture(
     used: Used,
     side: int,
     scale: FloatImage,
+    thrown: Thrown,
 ) -> None:
     """The scale of a picture (rows, columns, 3) of the targets' size; ``light`` (256,): radiance of its values."""
     rows, columns, _ = picture.shape
@@ -123,18 +151,32 @@ def scale_picture(
     share = np.float32(1 / block**2)
     for row in prange(high):
         into = (row + MARGIN) * side + MARGIN
+        if block == 1 and thrown.surface.size:
+            less = np.empty((1, 3 * columns), np.float32)
+            thrown_back(thrown, row, np.int64(used[row, 0]), np.int64(used[row, 1]), less[0])
+            for x in range(np.int64(used[row, 0]), np.int64(used[row, 1])):
+                r = light[picture[row, x, 0]] - less[0, 3 * x]
+                g = light[picture[row, x, 1]] - less[0, 3 * x + 1]
+                b = light[picture[row, x, 2]] - less[0, 3 * x + 2]
+                scale_of_one(r, g, b, gain, offset, row * columns + x, scale, into + x)
+            continue
         if block == 1:
             for x in range(np.int64(used[row, 0]), np.int64(used[row, 1])):
                 r, g, b = light[picture[row, x, 0]], light[picture[row, x, 1]], light[picture[row, x, 2]]
                 scale_of_one(r, g, b, gain, offset, row * columns + x, scale, into + x)
             continue
+        taken = np.zeros((block, 3 * columns), np.float32)
+        if thrown.surface.size:
+            for v in range(row * block, min((row + 1) * block, rows)):
+                thrown_back(thrown, v, 0, columns, taken[v - row * block])
         for x in range(wide):
             for c in range(3):
                 found = np.float32(0)
                 for v in range(row * block, min((row + 1) * block, rows)):
                     for u in range(x * block, min((x + 1) * block, columns)):
                         i = 3 * (v * columns + u) + c
-                        found += max(light[picture[v, u, c]] * gain[i] - offset[i], np.float32(0))
+                        wanted = light[picture[v, u, c]] - taken[v - row * block, 3 * u + c]
+                        found += max(wanted * gain[i] - offset[i], np.float32(0))
                 scale[4 * (into + x) + c] = found * share
 
 

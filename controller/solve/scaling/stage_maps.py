@@ -19,9 +19,12 @@ from controller.bundle.live_maps import FULL, TILE, LiveMaps, OutputMaps, packed
 from controller.calibrate.values import Radiometry
 from controller.capture.encoding import checked_response
 from controller.core.arrays import FloatImage
+from controller.core.errors import WorkError
 from controller.solve.appearance import Base
 from controller.solve.scaling.dither import blue_noise
+from controller.solve.scaling.indirect_maps import indirect_maps
 from controller.transport import LightTransport
+from controller.transport.indirect import IndirectLight
 from controller.transport.planes import image_planes, plane_frames, plane_image
 
 LARGEST_TARGET_PX: Final = 2048
@@ -41,15 +44,23 @@ def scaling_maps(
     radiometries: Sequence[Radiometry],
     names: Sequence[str] | None = None,
     *,
+    indirect: IndirectLight | None = None,
     largest_px: int = LARGEST_TARGET_PX,
     spread: float = NARROWED,
 ) -> LiveMaps:
     """The maps of a stage with the black image ``black`` (rows, columns, 3).
 
     One radiometry and one of ``names``, those of the outputs, a projector; targets' sides are at most ``largest_px``;
-    means are taken over the part ``spread`` of a pixel's spread, 1 for those of the paper (eq. 6).
-    Raises UsageError("response-not-rising").
+    means are taken over the part ``spread`` of a pixel's spread, 1 for those of the paper (eq. 6). ``indirect``: light
+    by way of other surfaces, which is left out of what the projectors make.
+    Raises UsageError("response-not-rising"), WorkError("live-white-segment").
     """
+    if any(radiometry.segment for radiometry in radiometries):
+        raise WorkError(
+            "live-white-segment",
+            what="A projector adds white light of its own. Live targets can't be calculated for it.",
+            remedy="Switch off its brilliant-colour and white-boost modes and calibrate again, or solve appearances.",
+        )
     factor = reduction(transport.camera_shape, largest_px)
     lit = base.inverse > 0
     unit = float(np.median(1 / base.inverse[lit])) if lit.any() else 1.0
@@ -73,11 +84,16 @@ def scaling_maps(
                 checked_response(radiometry.response), (17 * n % TILE, 29 * n % TILE),
             )
         )  # fmt: skip
-    gain = reduced(plane_image(base.inverse), factor, unit).astype(np.float16)
+    inverse = plane_image(base.inverse)
+    gain = reduced(inverse, factor, unit).astype(np.float16)
     dark = reduced(np.maximum(black, 0), factor) * gain.astype(np.float32) / np.float32(unit)
     offset = np.maximum(dark, reduced(plane_image(base.inverse * image_planes(np.maximum(black, 0))), factor))
+    thrown = None
+    if indirect is not None:
+        reach = transport.reach()
+        thrown = indirect_maps(indirect, reach, black, inverse, unit, factor, lambda image: reduced(image, factor))
     size_px = present.shape[1], present.shape[0]
-    return LiveMaps(size_px, gain, _rounded_up(offset), present, unit, blue_noise(), tuple(outputs))
+    return LiveMaps(size_px, gain, _rounded_up(offset), present, unit, blue_noise(), tuple(outputs), thrown)
 
 
 def _rounded_up(values: FloatImage) -> npt.NDArray[np.float16]:

@@ -42,4 +42,5 @@ def live_maps(calibrated: Calibrated, outputs: Mapping[str, str]) -> LiveMaps:
     return scaling_maps(
         calibrated.transport, calibrated.base, calibration.black,
         [part.radiometry for part in calibration.projectors], [outputs[part.name] for part in calibration.projectors],
+        indirect=calibrated.indirect,
     )  # fmt: skip

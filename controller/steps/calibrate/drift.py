@@ -20,6 +20,7 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
+from controller.solve.scaling.dither import to_light
 from controller.steps import costs
 from controller.steps.capture.patterns import bracket
 from controller.steps.capture.photographs import Planned, take_all
@@ -115,5 +116,10 @@ def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
 
 def linear_frames(calibrated: Calibrated, pattern: Pattern) -> list[FloatImage]:
     """The light of ``shown_frames``: (rows, columns, 3), linear, for each projector."""
-    sizes = [part.metapixels.valid.shape for part in calibrated.calibration.projectors]
-    return [frame(pattern, (columns, rows)) for rows, columns in sizes]
+    found = []
+    for part, shown in zip(calibrated.calibration.projectors, shown_frames(calibrated, pattern).values(), strict=True):
+        rows, columns = part.metapixels.valid.shape
+        # with a white segment colours are not shown as drawn
+        drawn = part.radiometry.segment == 0
+        found.append(frame(pattern, (columns, rows)) if drawn else to_light(shown, part.radiometry))
+    return found

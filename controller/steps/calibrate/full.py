@@ -17,11 +17,12 @@ from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.geometry.self_calibration import reconstruct
 from controller.calibrate.geometry.values import CameraPrior
 from controller.calibrate.metapixels.from_phase import fit_pixels
-from controller.calibrate.photometry.radiometry import measure_radiometry
+from controller.calibrate.photometry.radiometry import measure_radiometry, white_segment
 from controller.capture.patterns import PatternPlan, plan_patterns
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig, RigProjector
+from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
@@ -83,6 +84,8 @@ def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) ->
     context.advance(0.5)
     captures = Developed(taken, {"black": black, "white": white})
     radiometry, report = measure_radiometry(captures, plan)
+    if radiometry.segment:
+        context.reporter.say(white_segment(projector.name, radiometry.segment), Level.WARNING)
     matrix = bracket[0].read().camera_to_xyz
     light = Light(
         response=radiometry.response,
@@ -90,6 +93,7 @@ def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) ->
         white=np.maximum(white - black, 0).astype(np.float32),
         black=black,
         camera_to_xyz=_SRGB_TO_XYZ if matrix is None else matrix,
+        segment=np.array([radiometry.segment]) if radiometry.segment else None,
     )
     figures = write_radiometry_figures(context.folder, projector.name, asdict(report))
     return [light.write(context.folder, projector.name), figures]

@@ -113,9 +113,11 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
 def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
     """The light of the pattern: its device values may have been chosen by a response that was corrected since."""
     meant = frame(pattern, size_px)
-    if part.indirect is None or VERIFICATION.index(folder).exists():
+    again = VERIFICATION.index(folder).exists()
+    if part.radiometry.segment == 0 and (part.indirect is None or again):
         return meant
-    return to_light(device_frame(pattern, size_px, Light.read(folder, part.name).response), part.radiometry)
+    response = part.radiometry.response if again else Light.read(folder, part.name).response
+    return to_light(device_frame(pattern, size_px, response), part.radiometry)
 
 
 def _indirect_figures(folder: Path, projector: str) -> dict[str, object]:

@@ -51,7 +51,8 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     median, p95 = indirect_figures(share, light.white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     figures = IndirectFigures(median, p95, tuple(float(value) for value in change))
-    found = Indirect(share, radiometry.response, radiometry.mixing)
+    segment = np.array([radiometry.segment]) if radiometry.segment else None
+    found = Indirect(share, radiometry.response, radiometry.mixing, segment)
     return [found.write(folder, name), figures.write(folder, name)]
 
 

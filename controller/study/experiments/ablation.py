@@ -45,7 +45,7 @@ def _ways(subject: Subject, wanted: ReachableTarget) -> list[tuple[str, Callable
 
     def solved(transport: LightTransport, smoothness: float) -> Sequence[FloatImage]:
         weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
-        return solve_bounded(transport, wanted.radiance, black, smoothness=smoothness, weights=weights).frames
+        return solve_bounded(transport, wanted.direct, black, smoothness=smoothness, weights=weights).frames
 
     def gaussians(metapixels: Sequence[Metapixels]) -> LightTransport:
         return build_transport(with_metapixels(plain, metapixels))
@@ -56,7 +56,7 @@ def _ways(subject: Subject, wanted: ReachableTarget) -> list[tuple[str, Callable
         return build_transport(with_metapixels(plain, even), patches=patches_of_weights(weights, (shape[0], shape[1])))
 
     return [
-        (FALLS[0], lambda: unbounded_inverse(raw, wanted.radiance, black)),
+        (FALLS[0], lambda: unbounded_inverse(raw, wanted.direct, black)),
         (FALLS[1], lambda: solved(raw, 0.0)),
         (FALLS[2], lambda: solved(gaussians(found), 0.0)),
         (FALLS[3], lambda: solved(gaussians(even), 0.0)),

@@ -53,12 +53,12 @@ def _ways(subject: Subject, wanted: ReachableTarget, best: int) -> list[tuple[st
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
 
     def bounded(transport: LightTransport, smoothness: float) -> Sequence[FloatImage]:
-        return solve_bounded(transport, wanted.radiance, black, weights=weights, smoothness=smoothness).frames
+        return solve_bounded(transport, wanted.direct, black, weights=weights, smoothness=smoothness).frames
 
     return [
         ("one projector, division at each pixel", lambda: traditional_compensation(calibration, wanted.radiance, best)),
         ("feathered projectors", lambda: feathered(calibration, wanted.radiance)),
-        ("unconstrained inverse, clipped", lambda: unbounded_inverse(raw, wanted.radiance, black)),
+        ("unconstrained inverse, clipped", lambda: unbounded_inverse(raw, wanted.direct, black)),
         ("bounded, no pixel model", lambda: bounded(raw, 0.0)),
         (OURS, lambda: bounded(subject.transport, SMOOTHNESS)),
     ]

@@ -63,14 +63,14 @@ def rising_sinusoid(subject: Subject) -> Result:
             name = _by(len(which), amplitude)
             subject.advance(0.25 * number + 0.12 * (len(which) > 1), name)
             transport = alone if len(which) == 1 else subject.transport
-            frames = subject.frames_of(which, solve_bounded(transport, wanted.radiance, black).frames)
+            frames = subject.frames_of(which, solve_bounded(transport, wanted.direct, black).frames)
             pictures[name] = subject.light.photograph(f"{len(which)}-{number}", frames, white=wanted.white)
             contrast[name] = kept_contrast(pictures[name], wanted, waves)
     first = last_kept(waves.frequency, contrast[_by(1, FAINT)])
     for number, (name, base) in enumerate(bases(wanted, black, subject.mask, first).items()):
         subject.advance(0.5 + 0.16 * number, name)
         solved = solve_base(subject.transport, base, black)
-        ways: dict[str, Sequence[FloatImage]] = {name: scale_frames(subject.transport, solved, wanted.radiance, black)}
+        ways: dict[str, Sequence[FloatImage]] = {name: scale_frames(subject.transport, solved, wanted.direct, black)}
         if name == HIGH:
             ways[NARROWER] = live_frames(subject, solved, wanted.radiance)
         for way, made in ways.items():

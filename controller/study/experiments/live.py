@@ -38,7 +38,7 @@ def _ways(subject: Subject, wanted: ReachableTarget) -> list[tuple[str, Callable
     calibration, transport, black = subject.calibration, subject.transport, subject.calibration.black
 
     def papers(base: Base) -> Sequence[FloatImage]:
-        return scale_frames(transport, base, wanted.radiance, black)
+        return scale_frames(transport, base, wanted.direct, black)
 
     ways: list[tuple[str, Callable[[], Sequence[FloatImage]]]] = []
     for kind in BASES:
@@ -47,7 +47,7 @@ def _ways(subject: Subject, wanted: ReachableTarget) -> list[tuple[str, Callable
             (_named(kind, PAPERS), partial(papers, base)),
             (_named(kind, OURS), partial(live_frames, subject, base, wanted.radiance)),
         ]
-    return [*ways, (FULL, lambda: solve_bounded(transport, wanted.radiance, black).frames)]
+    return [*ways, (FULL, lambda: solve_bounded(transport, wanted.direct, black).frames)]
 
 
 LIVE = Experiment(

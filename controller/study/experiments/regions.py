@@ -46,7 +46,7 @@ def regions(subject: Subject) -> Result:
 
     def keep(name: str, frames: Sequence[FloatImage], seconds: float, objective: float) -> None:
         picture = subject.light.photograph(f"{len(results)}", frames, white=wanted.white)
-        results.append(RegionResult(name, seconds, objective, predicted(transport, frames, black), picture))
+        results.append(RegionResult(name, seconds, objective, predicted(subject, frames), picture))
 
     for number, size_px in enumerate(SIZES):
 
@@ -54,10 +54,10 @@ def regions(subject: Subject) -> Result:
             subject.advance((number + share) / (len(SIZES) + 1), f"regions of {size_px}")
 
         found = solve_regions(
-            transport, wanted.radiance, black, solver=solver, size_px=size_px, weights=weights, progress=progress
+            transport, wanted.direct, black, solver=solver, size_px=size_px, weights=weights, progress=progress
         )
         keep(f"regions of {size_px}", found.frames, found.seconds, found.objective)
-    whole = solve_bounded(transport, wanted.radiance, black, weights=weights)
+    whole = solve_bounded(transport, wanted.direct, black, weights=weights)
     keep("global", whole.frames, whole.seconds, whole.objective)
     again = subject.light.photograph("again", whole.frames, white=wanted.white)
     inner = np.zeros(subject.mask.shape, np.bool_)

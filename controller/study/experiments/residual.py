@@ -55,11 +55,11 @@ def residual(subject: Subject) -> Result:
         subject.advance(number / len(counts), f"{count} projectors")
         which = sorted(order[:count])
         transport = build_transport(subject.with_projectors(which))
-        solution = solve_bounded(transport, wanted.radiance, black)
+        solution = solve_bounded(transport, wanted.direct, black)
         frames = subject.frames_of(which, solution.frames)
         picture = subject.light.photograph(f"{count}", frames, white=wanted.white)
         again = subject.light.photograph(f"{count}-again", frames, white=wanted.white)
-        model = predicted(transport, solution.frames, black)
+        model = predicted(subject, solution.frames, transport)
         results.append(
             ResidualResult(
                 count,

@@ -56,9 +56,9 @@ def _frames(subject: Subject, which: Sequence[int], wanted: ReachableTarget, *, 
     calibration, black = subject.with_projectors(which), subject.calibration.black
     if naive:
         raw = raw_transport(paper_model(calibration), [subject.light.dots(n).shares for n in which])
-        return unbounded_inverse(raw, wanted.radiance, black)
+        return unbounded_inverse(raw, wanted.direct, black)
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
-    return solve_bounded(build_transport(calibration), wanted.radiance, black, weights=weights).frames
+    return solve_bounded(build_transport(calibration), wanted.direct, black, weights=weights).frames
 
 
 def _behind(results: Sequence[SharpnessResult]) -> FloatImage:

@@ -184,6 +184,11 @@ def unbounded_inverse(
     return plane_frames(np.clip(found.reshape(3, -1) * scale, 0, 1).astype(np.float32), transport.sizes)
 
 
-def predicted(transport: LightTransport, frames: Sequence[FloatImage], black: FloatImage) -> FloatImage:
-    """What the camera should see of these frames by the model: T p + K."""
-    return np.asarray(transport.forward(frames) + black, np.float32)
+def predicted(subject: Subject, frames: Sequence[FloatImage], transport: LightTransport | None = None) -> FloatImage:
+    """What the camera should see of these frames by the model: (I + G) L p + K.
+
+    ``transport``: of the projectors that ``frames`` are for; else of all.
+    """
+    direct = (subject.transport if transport is None else transport).forward(frames)
+    whole = direct if subject.indirect is None else direct + subject.indirect.forward(direct)
+    return np.asarray(whole + subject.calibration.black, np.float32)

@@ -16,9 +16,11 @@ from controller.calibrate.verify.drift import Drift
 from controller.core.arrays import FloatImage, Mask
 from controller.run.runner import Context
 from controller.solve.drive_levels import DriveLevels
-from controller.solve.feasibility import choose_exposure, feasibility, target_radiance
+from controller.solve.exposed import exposed
+from controller.solve.feasibility import target_radiance
 from controller.solve.targets.values import Target
 from controller.transport import LightTransport
+from controller.transport.indirect import IndirectLight
 
 Shares = sp.csr_matrix[np.float64]
 BenchChange = Mapping[str, Any]
@@ -61,13 +63,15 @@ class SessionParts:
 class Subject:
     """A calibrated stage.
 
-    ``transport``: of all projectors, as appearances are solved with; ``size``: small, medium or paper; ``seed``
+    ``transport``: of all projectors, as appearances are solved with; ``indirect``: light by way of other surfaces,
+    where there is any that counts; ``size``: small, medium or paper; ``seed``
     """
 
     calibration: Calibration
     geometry: Geometry
     transport: LightTransport
     light: Photographer
+    indirect: IndirectLight | None = None
     size: str = "small"
     seed: int = 1
     advance: Callable[[float, str], None] = lambda fraction, note: None
@@ -116,24 +120,29 @@ class Subject:
         black = self.calibration.black
         drive = self.drive if transport is None else DriveLevels(transport)
         transport = self.transport if transport is None else transport
-        exposure = choose_exposure(transport, target.image, black, share=share, drive=drive)
-        radiance = np.float32(exposure) * target.image
-        possible = feasibility(transport, radiance, black, drive=drive)
-        mask: Mask = possible.reachable & target.mask
-        return ReachableTarget(target_radiance(radiance, black, 1.0), mask, exposure)
+        found = exposed(transport, target.image, black, share=share, drive=drive, indirect=self.indirect)
+        mask: Mask = found.possible.reachable & target.mask
+        radiance, direct = (target_radiance(image, black, 1.0) for image in (found.wanted, found.needed))
+        return ReachableTarget(radiance, mask, found.exposure, direct)
 
 
 @dataclass(frozen=True, slots=True)
 class ReachableTarget:
     """A target as radiance.
 
-    ``radiance`` (rows, columns, 3) float32, at least the black image; ``mask`` (rows, columns): where it says something
-    that is in reach; ``white``: radiance of a perfect white
+    ``radiance`` (rows, columns, 3) float32, at least the black image; ``direct``: what of it projectors are to make
+    directly, with the black image; ``mask`` (rows, columns): where it says something that is in reach; ``white``:
+    radiance of a perfect white
     """
 
     radiance: FloatImage
     mask: Mask
     white: float
+    _direct: FloatImage | None = None
+
+    @property
+    def direct(self) -> FloatImage:
+        return self.radiance if self._direct is None else self._direct
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ def photograph_target(subject: Subject) -> Target:
 def live_frames(subject: Subject, base: Base, radiance: FloatImage) -> Sequence[FloatImage]:
     """What ``velatura live`` shows of ``radiance`` (rows, columns, 3): base times scale by narrower means, 8 bits."""
     radiometries = [part.radiometry for part in subject.calibration.projectors]
-    maps = scaling_maps(subject.transport, base, subject.calibration.black, radiometries)
+    maps = scaling_maps(subject.transport, base, subject.calibration.black, radiometries, indirect=subject.indirect)
     frames = Interactive(maps, subject.transport.camera_shape).frames(radiance)
     return [to_light(frame, radiometry) for frame, radiometry in zip(frames, radiometries, strict=True)]
 
@@ -47,7 +47,7 @@ def trial(subject: Subject, name: str) -> Trial:
     wanted = subject.wanted(photograph_target(subject))
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
     black = subject.calibration.black
-    solution = solve_bounded(subject.transport, wanted.radiance, black, weights=weights, smoothness=SMOOTHNESS)
+    solution = solve_bounded(subject.transport, wanted.direct, black, weights=weights, smoothness=SMOOTHNESS)
     return shown(subject, name, wanted, solution.frames)
 
 

@@ -39,7 +39,7 @@ def arranged(truth: BenchTruth, room: str, thing: StageObject) -> BenchTruth:
 
 
 def _hard(truth: BenchTruth) -> BenchTruth:
-    """All the rest, as strong as with real devices; but no white segment, which calibration refuses."""
+    """All the rest, as strong as with real devices."""
     rng = np.random.default_rng([truth.seed, 8])
     sensor = dataclasses.replace(truth.camera.sensor, response_spread=0.01, hot_pixels=2e-4, shutter_spread=0.02)
     return dataclasses.replace(
@@ -54,7 +54,7 @@ def _hard_projector(projector: ProjectorTruth, rng: np.random.Generator) -> Proj
     turn = rng.uniform(0.0, 2.0 * np.pi, 2)
     red, blue = ((0.3 * float(np.cos(angle)), 0.3 * float(np.sin(angle))) for angle in turn)
     panels = Panels(shift_px=(red, (0.0, 0.0), blue), magnified=(-4e-4, 0.0, 4e-4))
-    light = dataclasses.replace(projector.light, glare=0.02)
+    light = dataclasses.replace(projector.light, glare=0.02, white_segment=0.25)
     return dataclasses.replace(projector, light=light, panels=panels)
 
 

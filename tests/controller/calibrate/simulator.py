@@ -36,6 +36,8 @@ class Scene:
     lit_share_of_pixel: int = 8
     """of 10, a side; even, so that the pixel stays in the middle"""
     exposure: float = 0.7
+    white_segment: float = 0.0
+    """Share of white that is not the sum of the three colours."""
     electrons: float = 30000.0
     read_electrons: float = 6.0
     gamma: float = 2.2
@@ -132,6 +134,8 @@ class Stage:
     def photograph(self, device: ByteImage) -> FloatImage:
         scene = self.scene
         linear = np.stack([scene.response()[c][device[:, :, c]] for c in range(3)], axis=-1).astype(np.float32)
+        # a white segment of the colour wheel shows what the three colours have in common once more
+        linear += np.float32(scene.white_segment) * (linear.min(axis=-1, keepdims=True) - linear)
         image = self.light(0.002 + 0.998 * linear) + 0.003
         if scene.noisy:
             electrons = np.maximum(image, 0) * scene.electrons

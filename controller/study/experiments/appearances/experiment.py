@@ -92,7 +92,7 @@ def _shown(subject: Subject, alone: Subject, best: int, look: Look, target: Targ
     black, light = subject.calibration.black, subject.light
     began_s = time.perf_counter()
     frames = solve_bounded(
-        subject.transport, wanted.radiance, black, smoothness=SMOOTHNESS,
+        subject.transport, wanted.direct, black, smoothness=SMOOTHNESS,
         weights=appearance_weights(wanted.radiance, wanted.mask, wanted.white),
     ).frames  # fmt: skip
     seconds = time.perf_counter() - began_s
@@ -113,7 +113,7 @@ def _shown(subject: Subject, alone: Subject, best: int, look: Look, target: Targ
         by_one=pictures[1],
         ours=quality(subject, pictures[0], wanted),
         whole=quality(subject, pictures[0], wanted, target.mask & subject.mask),
-        model=quality(subject, predicted(subject.transport, frames, black), wanted),
+        model=quality(subject, predicted(subject, frames), wanted),
         alone=quality(subject, pictures[1], wanted),
         dimmer=dimmed.white / wanted.white,
         alone_dimmed=quality(subject, pictures[2], dimmed, both),

@@ -142,12 +142,13 @@ def _measured(subject: Subject) -> dict[str, Durations]:
     subject.advance(0.6, "new appearance")
     photograph = shipped_photograph("astronaut")
     wanted = subject.wanted(through_camera(wrap_photograph(photograph, subject.geometry, subject.mask)))
-    ready = interactive(subject.transport, base, black, [part.radiometry for part in calibration.projectors])
+    radiometries = [part.radiometry for part in calibration.projectors]
+    ready = interactive(subject.transport, base, black, radiometries, subject.indirect)
     ready.frames(wanted.radiance)
     found[APPEARANCE] = _fastest(partial(ready.frames, wanted.radiance), REPEATS)
     subject.advance(0.7, "a full solve")
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
-    full = partial(solve_bounded, subject.transport, wanted.radiance, black, weights=weights, smoothness=SMOOTHNESS)
+    full = partial(solve_bounded, subject.transport, wanted.direct, black, weights=weights, smoothness=SMOOTHNESS)
     found[FULL] = _fastest(full, 1)
     return found
 

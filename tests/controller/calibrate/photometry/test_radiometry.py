@@ -7,6 +7,9 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from controller.calibrate.photometry.colour_tiles import measure_tiles
 from controller.calibrate.photometry.radiometry import measure_radiometry
@@ -151,7 +154,26 @@ def test_tiles_with_saturated_pixels_are_left_out() -> None:
     assert report.tiles < measure_radiometry(before_response(scene()), PLAN)[1].tiles
 
 
-def test_a_white_segment_in_the_colour_wheel_is_found_out() -> None:
+@pytest.mark.parametrize("share", [0.06, 0.35])
+def test_a_white_segment_in_the_colour_wheel_is_measured(share: float) -> None:
+    wheel = scene(white_segment=share)
+    radiometry, report = measure_radiometry(before_response(wheel), PLAN)
+    assert radiometry.segment == pytest.approx(share, abs=0.01)
+    assert report.segment == radiometry.segment
+    assert max(off(radiometry, wheel)) < 0.01
+
+
+def test_colours_that_add_have_no_segment() -> None:
+    assert measure_radiometry(before_response(scene()), PLAN)[0].segment == 0
+
+
+@given(arrays(np.float64, (20, 3), elements=st.floats(0, 1)), st.floats(0, 0.6))
+def test_what_a_segment_adds_is_taken_off_again(light: Float64, segment: float) -> None:
+    radiometry = Radiometry(np.tile(X, (3, 1)), np.eye(3), segment)
+    np.testing.assert_allclose(radiometry.channels(radiometry.emitted(light)), light, atol=1e-12)
+
+
+def test_white_that_is_brighter_than_any_segment_makes_it_is_refused() -> None:
     captures = dict(before_response(scene()))
     captures["white"] = captures["black"] + 1.3 * (captures["white"] - captures["black"])
     with pytest.raises(CalibrationError) as caught:

@@ -59,6 +59,22 @@ def random_live(seed: int) -> Arrays:
     return arrays
 
 
+def random_indirect(seed: int) -> Arrays:
+    """Light by way of other surfaces on 3 x 4 blocks, a third of what is wanted."""
+    random = np.random.default_rng(seed)
+    width, height = TARGET
+    places = random.integers(0, (height, width), (64, 12, 2))
+    sampled = np.stack([random.random((64, 12, 3)), 0.02 * random.random((64, 12, 3)), 2 * random.random((64, 12, 3))])
+    return {
+        "indirect.factors": (random.random((12, 12)) / 20).astype(np.float32),
+        "indirect.grid": np.array([3, 4], np.uint16),
+        "indirect.side": np.array([16.5], np.float32),
+        "indirect.places": places.astype(np.uint16),
+        "indirect.sampled": sampled.astype(np.float32),
+        "indirect.surface": random.random((height, width, 3)).astype(np.float16),
+    }
+
+
 def write(path: Path, arrays: Arrays) -> Path:
     frames = {name: np.zeros((rows, columns, 3), np.uint8) for name, columns, rows in OUTPUTS}
     write_bundle(path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS,
@@ -71,9 +87,11 @@ def maps_of(path: Path) -> LiveMaps:
         return LiveMaps.read(bundle)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_frames_by_shaders_are_those_of_the_reference_to_one_device_value(tmp_path: Path, seed: int) -> None:
-    bundle = write(tmp_path / "live.vel", random_live(seed))
+@pytest.mark.parametrize(("seed", "indirect"), [(1, False), (2, True)])
+def test_frames_by_shaders_are_those_of_the_reference_to_one_device_value(
+    tmp_path: Path, seed: int, indirect: bool
+) -> None:
+    bundle = write(tmp_path / "live.vel", random_live(seed) | (random_indirect(seed) if indirect else {}))
     target = np.random.default_rng(seed).integers(0, 256, (*TARGET[::-1], 3), dtype=np.uint8)
     np.savez(tmp_path / "asked.npz", target=target, brightness=1.3)
     subprocess.run(
@@ -135,12 +153,15 @@ def test_the_reference_is_the_weighted_mean_written_down_pixel_by_pixel(tmp_path
         ("P2.response", np.zeros((3, 255), np.float32)),
         ("unit", np.array([np.nan], np.float32)),
         ("P1.unmix", np.full((3, 3), np.inf, np.float32)),
+        ("indirect.factors", np.zeros((11, 12), np.float32)),
+        ("indirect.places", np.full((64, 12, 2), 60, np.uint16)),
+        ("indirect.side", np.zeros(1, np.float32)),
     ],
 )
 def test_a_live_section_of_another_shape_or_without_numbers_is_refused(
     tmp_path: Path, name: str, values: npt.NDArray[Any]
 ) -> None:
-    path = write(tmp_path / "live.vel", random_live(1) | {name: values})
+    path = write(tmp_path / "live.vel", random_live(1) | random_indirect(1) | {name: values})
     with pytest.raises(BundleError, match="damaged"):
         maps_of(path)
 

@@ -19,6 +19,7 @@ from controller.solve.scaling.interactive import Interactive
 from controller.solve.scaling.stage_maps import NARROWED, footprints, reduced, reduction, scaling_maps
 from controller.solve.targets.values import linear_to_srgb
 from controller.transport import LightTransport, build_transport
+from controller.transport.indirect import IndirectLight
 
 Stage = tuple[Calibration, LightTransport, Base]
 
@@ -139,6 +140,59 @@ def test_a_radiance_gives_the_frames_of_the_reference(stage: Stage, largest_px: 
     frames = Interactive(maps, transport.camera_shape).frames(radiance)
     for frame, reference in zip(frames, compensate_light(maps, reduced(radiance, factor)), strict=True):
         assert np.abs(frame.astype(int) - reference).mean() <= 0.5
+
+
+def thrown_back(stage: Stage) -> IndirectLight:
+    """A sixth of what the stage sees comes by way of other surfaces: of all of them, and more of near ones."""
+    _, transport, _ = stage
+    rows, columns = transport.camera_shape
+    grid, side = (-(-rows // 8), -(-columns // 8)), 8
+    y, x = np.divmod(np.arange(grid[0] * grid[1]), grid[1])
+    near = np.exp(-0.5 * (np.subtract.outer(x, x) ** 2 + np.subtract.outer(y, y) ** 2) / 9)
+    factors = (near / near.sum(axis=1, keepdims=True) + 1 / len(x)).astype(np.float32) / 2
+    paint = np.repeat(0.15 + 0.1 * np.sin(np.arange(columns) / 3)[None, :, None], rows, axis=0)
+    surface = np.repeat(paint, 3, axis=2).astype(np.float32)
+    return IndirectLight(factors, surface, transport.object_mask, grid, side)
+
+
+@pytest.mark.parametrize("largest_px", [2048, 100], ids=["camera's size", "half of it"])
+def test_the_processor_leaves_room_for_indirect_light_as_the_reference_does(largest_px: int) -> None:
+    stage = solved("white")
+    calibration, transport, base = stage
+    radiometries = [part.radiometry for part in calibration.projectors]
+    maps = scaling_maps(
+        transport, base, calibration.black, radiometries, indirect=thrown_back(stage), largest_px=largest_px
+    )
+    target, brightness = wanted(stage, largest_px)
+    scaler = Interactive(maps)
+    frames = scaler.blank()
+    scaler.show_picture(target, brightness, frames)
+    plain = compensate(dataclasses.replace(maps, indirect=None), target, brightness)
+    radiance = light_table()[target] * np.float32(brightness)
+    as_light = Interactive(maps, maps.present.shape).frames(radiance)
+    for n, reference in enumerate(compensate(maps, target, brightness)):
+        lit = maps.outputs[n].shape[..., 0] > 0
+        assert np.abs(reference.astype(int) - plain[n])[lit].mean() > 3, "indirect light counts here"
+        for made in (frames[n], as_light[n]):
+            assert np.abs(made.astype(int) - reference)[lit].mean() <= 0.75
+
+
+def test_a_live_picture_with_its_indirect_light_is_as_bright_as_wanted() -> None:
+    stage = solved("white")
+    calibration, transport, base = stage
+    indirect = thrown_back(stage)
+    radiometries = [part.radiometry for part in calibration.projectors]
+    target, brightness = wanted(stage)
+    light = light_table()[target] * np.float32(brightness)
+    mask = transport.object_mask & (0.7 * transport.reach() > light).all(axis=2)
+    away = {}
+    for name, known in (("known", indirect), ("unknown", None)):
+        maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=known)
+        direct = seen(stage, compensate(maps, target, brightness))
+        whole = direct + indirect.forward(direct) + calibration.black
+        away[name] = abs(float(whole[mask].mean() / light[mask].mean()) - 1)
+    assert away["known"] < 0.02
+    assert away["unknown"] > 4 * away["known"]
 
 
 def test_a_picture_of_another_size_is_refused_with_both_sizes(stage: Stage) -> None:

@@ -149,7 +149,7 @@ def test_rooms_differ_in_what_bench_toml_says_and_dark_says_nothing(tmp_path: Pa
     assert (room.engine, room.projectors[0].lamp.flicker) == ("radiosity", 0.01)
     assert all(p.panels.aligned for p in room.projectors)
     assert hard.camera.sensor.shutter_spread > 0.0
-    assert all(not p.panels.aligned and p.light.glare > 0.0 for p in hard.projectors)
+    assert all(not p.panels.aligned and p.light.glare > 0.0 and p.light.white_segment for p in hard.projectors)
     same = [(p.pose, p.lens, p.focus) for p in dark.projectors]
     assert all([(p.pose, p.lens, p.focus) for p in other.projectors] == same for other in (room, hard))
 
