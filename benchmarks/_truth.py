@@ -13,6 +13,7 @@ from embreex.mesh_construction import TriangleMesh
 
 from controller.capture.raw import develop
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import SIGMA_STEP_PX, directions, samples_of
 from plugins.emulated.optics.render import Renderer, response
@@ -32,22 +33,31 @@ class Truth:
         self.bench: BenchTruth = read_truth(stage)
         self.stage_object: StageObject = object_of(stage, self.bench.object)
         self.samples = samples_of(self.bench, self.stage_object, stage / FOLDER, lambda share: None)
-        self._renderer = Renderer(self.bench, self.samples)
+        indirect = Indirect(self.stage_object, stage / FOLDER)
+        transfer = indirect.transfer(self.bench, self.samples.pixels, lambda share: None, keep=True)
+        self._renderer = Renderer(self.bench, self.samples, transfer)
+        self._direct = self._renderer if transfer is None else Renderer(self.bench, self.samples)
         width, height = self.bench.camera.lens.size_px
         self.shape = (height, width)
 
-    def light(self, n: int, frame: ByteImage) -> FloatImage:
+    def picture(self, frames: Sequence[ByteImage], *, bounced: bool = True) -> FloatImage:
+        """Linear light (rows, columns, 3) before the sensor of a frame for each projector, all of them lit."""
+        renderer = self._renderer if bounced else self._direct
+        return np.asarray(renderer.light(frames, [1.0] * len(frames)), np.float32)
+
+    def light(self, n: int, frame: ByteImage, *, bounced: bool = True) -> FloatImage:
         """Linear light (rows, columns, 3) before the sensor, of projector ``n`` alone less that of its black."""
+        renderer = self._renderer if bounced else self._direct
         levels = [float(index == n) for index in range(len(self.bench.projectors))]
         black = [np.zeros((p.lens.size_px[1], p.lens.size_px[0], 3), np.uint8) for p in self.bench.projectors]
         shown = [frame if index == n else dark for index, dark in enumerate(black)]
-        lit = self._renderer.light(shown, levels)
-        return np.asarray(lit - self._renderer.light(black, levels), np.float32)
+        lit = renderer.light(shown, levels)
+        return np.asarray(lit - renderer.light(black, levels), np.float32)
 
-    def white(self, n: int) -> FloatImage:
+    def white(self, n: int, *, bounced: bool = True) -> FloatImage:
         """``light`` of full white."""
         width, height = self.bench.projectors[n].lens.size_px
-        return self.light(n, np.full((height, width, 3), 255, np.uint8))
+        return self.light(n, np.full((height, width, 3), 255, np.uint8), bounced=bounced)
 
     def response(self, n: int) -> Float64:
         """(3, 256): 0 at black, 1 at white."""

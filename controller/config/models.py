@@ -130,7 +130,7 @@ class SolveTable(ConfigTable):
     mode: Literal["auto", "full", "scale"] = Field(
         default="auto",
         description='"full" (a solve for every appearance), "scale" (base image x scale image), or "auto" (full '
-        "where the target has finer detail than scaling can show)",
+        "where the target has finer detail than scaling can show, or scaling would miss it)",
     )
     base: Literal["minimum", "white", "high-pass"] = Field(
         default="white",

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from controller.calibrate.values import Calibration
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 from controller.solve.bounded.gradient import scale_base
 from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
 from controller.transport import LightTransport
@@ -32,7 +32,8 @@ HEADROOM: Final = 0.5
 FINE_DETAIL: Final = 0.02
 """Share of a target's light above one projector's frequency limit from which a full solve is advised."""
 
-
+MOST_LOST, LITTLE_LOST = 1.7, 0.02
+"""Base x scale may miss so many times what the base misses, or so much of the light; else the solve is a full one."""
 WELL_BELOW: Final = 0.5
 """Fraction of the frequency limit above which a high-pass base keeps detail, so that the scale has none near it."""
 
@@ -166,6 +167,34 @@ def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black
     return float(np.sqrt((fine[transport.object_mask].astype(np.float64) ** 2).sum() / whole)) if whole > 0 else 0.0
 
 
+def _as_good(
+    transport: LightTransport,
+    base: Base,
+    frames: Sequence[FloatImage],
+    target: FloatImage,
+    black: FloatImage,
+    reachable: Mask,
+) -> bool:
+    """Whether scaled frames come about as near their target in reach as the base's own frames come to the base image.
+
+    Beside the shadow of a projector, and around what is out of reach, the pixels of one projector have to make up for
+    another's. A scale, a mean over each pixel's light, does not know of that; a full solve does.
+    """
+    if not reachable.any():
+        return True
+    lost, least = (
+        _lost(transport.forward(shown) + black, wanted, reachable)
+        for shown, wanted in ((frames, target), (base.solution.frames, base.image))
+    )
+    return lost < max(MOST_LOST * least, LITTLE_LOST)
+
+
+def _lost(seen: FloatImage, wanted: FloatImage, mask: Mask) -> float:
+    """95th percentile over a mask of how far a picture misses another, as a share of the pixel's light."""
+    missed = np.abs(seen - wanted)[mask].sum(axis=1)
+    return float(np.percentile(missed / np.maximum(wanted[mask].sum(axis=1), 1e-30), 95))
+
+
 def _low_pass(
     transport: LightTransport, image: FloatImage, present: FloatImage, *, of_limit: float = 1.0
 ) -> FloatImage:
@@ -191,21 +220,25 @@ def make_appearance(
     mode: Mode = "auto",
     smoothness: float = SMOOTHNESS,
     weights: FloatImage | None = None,
+    reachable: Mask | None = None,
     start: Sequence[FloatImage] | None = None,
     tolerance: float = TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Appearance:
-    """Frames for a target radiance: by base and scale, by a full solve, or depending on the target.
+    """Frames for a target radiance: by base and scale, by a full solve, or depending on target and result.
 
-    ``start``: frames of a similar target, for a full solve.
+    ``reachable`` (rows, columns): where base and scale must come near the target, for the mode "auto" to keep them;
+    None: they are judged by the target's detail alone. ``start``: frames of a similar target, for a full solve.
 
     A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 25).
     """
     check_target(transport, target)
     detail = fine_detail(transport, base, target, black)
     if mode == "scale" or (mode == "auto" and detail < FINE_DETAIL):
-        return Appearance(tuple(scale_frames(transport, base, target, black)), "scale", detail, None)
+        scaled = scale_frames(transport, base, target, black)
+        if mode == "scale" or reachable is None or _as_good(transport, base, scaled, target, black, reachable):
+            return Appearance(tuple(scaled), "scale", detail, None)
     solution = solve_bounded(
         transport,
         target,

@@ -186,6 +186,7 @@ def _solved(
         mode=options.mode,
         smoothness=options.smoothness,
         weights=appearance_weights(target_radiance(aim.wanted, black, 1.0), aim.possible.reachable, aim.exposure),
+        reachable=aim.possible.reachable,
         start=start,
         progress=progress,
         cancelled=cancelled,

@@ -87,6 +87,8 @@ def indirect_share(
 def shown_contrast(radiometry: Radiometry, encoded_with: Float64) -> Float64:
     """(3,) contrast per camera channel of a sinusoid that was encoded by one response and shown by another.
 
+    It is of the mean light of all channels, as the gains that free the steps of flicker (``_gains``) are.
+
     ``radiometry``: the projector as it is; ``encoded_with`` (3, 256): the response by which device values were chosen
     """
     angle = 2 * np.pi * np.arange(720) / 720
@@ -99,7 +101,7 @@ def shown_contrast(radiometry: Radiometry, encoded_with: Float64) -> Float64:
         ]
     )
     seen = radiometry.mixing @ light
-    return np.asarray(2 * (seen * np.cos(angle)).mean(axis=1) / seen.mean(axis=1), np.float64)
+    return np.asarray(2 * (seen * np.cos(angle)).mean(axis=1) / seen.mean(), np.float64)
 
 
 def indirect_figures(share: FloatImage, white: FloatImage) -> tuple[float, float]:

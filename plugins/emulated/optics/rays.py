@@ -36,6 +36,7 @@ BEYOND_PX: Final = 4.0
 
 Floats = npt.NDArray[np.float64]
 Progress = Callable[[float], None]
+Hidden = Callable[[Floats, Floats, Floats], npt.NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,22 +163,36 @@ def _lit(
     projector: ProjectorTruth, scene: Any, points: Floats, normals: Floats
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
     """Where a projector lights points, how strongly, and how blurred."""
+
+    def hidden(lens: Floats, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:
+        return _in_shadow(lens, scene, points, distance)
+
+    at, gain = arriving(projector, hidden, points, normals)
+    focus = projector.focus
+    z = (points - projector.pose.position_m) @ projector.pose.rotation[2]
+    sigma = np.hypot(focus.sharpest_px, focus.slope_px_per_m * (z - focus.distance_m))
+    blur = np.clip(np.round(sigma / SIGMA_STEP_PX), 1, 255).astype(np.uint8)
+    return at.astype(np.float32), gain.astype(np.float32), blur
+
+
+def arriving(projector: ProjectorTruth, hidden: Hidden, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """Pixels (N, 2) of a projector that light points, and the light (N,) per linear light 1; 0 in shadow.
+
+    ``hidden`` says for its lens (3,), points and their distances (N,) where something stands between.
+    """
     light, size = projector.light, np.asarray(projector.lens.size_px)
     at, local = project(projector.pose, projector.lens, points)
     distance = length(local)
     z = local[:, 2]
-    towards = (np.asarray(projector.pose.position_m) - points) / np.maximum(distance, 1e-9)[:, None]
-    cosine = dot(normals, towards)
+    lens = np.asarray(projector.pose.position_m)
+    cosine = dot(normals, (lens - points) / np.maximum(distance, 1e-9)[:, None])
     reach = (z > 0.01) & (cosine > 0.0) & np.all((at > -BEYOND_PX) & (at < size - 1 + BEYOND_PX), axis=1)
-    reach[reach] = ~_in_shadow(projector, scene, points[reach], distance[reach])
+    reach[reach] = ~hidden(lens, points[reach], distance[reach])
     off_centre = (at - 0.5 * (size - 1)) / (0.5 * size)
     corner = dot(off_centre, off_centre) / 2.0
     gain = light.brightness * light.reference_m**2 * cosine * distance / np.maximum(z, 0.01) ** 3
     gain *= np.maximum(1.0 - light.vignetting * corner, 0.0)
-    focus = projector.focus
-    sigma = np.hypot(focus.sharpest_px, focus.slope_px_per_m * (z - focus.distance_m))
-    blur = np.clip(np.round(sigma / SIGMA_STEP_PX), 1, 255).astype(np.uint8)
-    return at.astype(np.float32), np.where(reach, gain, 0.0).astype(np.float32), blur
+    return at, np.where(reach, gain, 0.0)
 
 
 def _highlight(
@@ -199,9 +214,8 @@ def _highlight(
     return np.asarray(on_object * strength * (exponent + 8.0) / 8.0 * cosine**exponent)
 
 
-def _in_shadow(projector: ProjectorTruth, scene: Any, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:
+def _in_shadow(lens: Floats, scene: Any, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:
     """Rays from the lens: in shadow when something is hit clearly before the point itself."""
-    lens = np.asarray(projector.pose.position_m)
     ray = ((points - lens) / distance[:, None]).astype(np.float32)
     origin = np.broadcast_to(lens.astype(np.float32), ray.shape).copy()
     if not len(points):

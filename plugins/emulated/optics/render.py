@@ -10,7 +10,7 @@ import functools
 import hashlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from typing import Final, TypeAlias
+from typing import Final, Protocol, TypeAlias
 
 import cv2
 import numba
@@ -20,7 +20,6 @@ from scipy.special import erf
 
 from hal.runtime.jit import compiled
 from plugins.emulated.optics.flaws import veiled
-from plugins.emulated.optics.indirect.transfer import Transfer
 from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX, Samples
 from plugins.emulated.optics.truth import BenchTruth, LightTruth, ProjectorTruth
 
@@ -93,10 +92,17 @@ def pixel_profiles(fill_factor: float) -> tuple[npt.NDArray[np.float32], npt.NDA
     return np.ascontiguousarray(near[..., LARGEST_RADIUS:-LARGEST_RADIUS], dtype=np.float32), radius
 
 
+class Returning(Protocol):
+    """What engines for light between surfaces have in common."""
+
+    def light(self, sent: Sequence[FloatImage | None]) -> FloatImage:
+        """Irradiance (P, 3) at ``Samples.pixels`` for what the pixels (rows, columns, 3) of each projector send out."""
+
+
 class Renderer:
     """Keeps the last layers of each projector, since most frames are shown more than once and by one projector."""
 
-    def __init__(self, truth: BenchTruth, samples: Samples, transfer: Transfer | None = None) -> None:
+    def __init__(self, truth: BenchTruth, samples: Samples, transfer: Returning | None = None) -> None:
         self._truth = truth
         self._transfer = transfer
         self._samples = samples
@@ -130,14 +136,13 @@ class Renderer:
         self._last = (key, image)
         return image
 
-    def _returned(self, transfer: Transfer, frames: Sequence[ByteImage], levels: Sequence[float]) -> FloatImage:
+    def _returned(self, transfer: Returning, frames: Sequence[ByteImage], levels: Sequence[float]) -> FloatImage:
         """Irradiance (P, 3) that object and surfaces throw back."""
-        direct = np.zeros((transfer.back.shape[2], 3), dtype=np.float32)
-        for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
-            if level > 0.0:
-                sent = emitted(self._truth.projectors[index].light, frame)
-                direct += np.float32(level) * transfer.direct(index, sent)
-        return transfer.returned(direct)
+        sent = [
+            np.float32(level) * emitted(projector.light, frame) if level > 0.0 else None
+            for projector, frame, level in zip(self._truth.projectors, frames, levels, strict=True)
+        ]
+        return transfer.light(sent)
 
     def _layer(self, index: int, frame: ByteImage, digest: bytes) -> FloatImage:
         """One projector's light (P, 3) at full lamp, summed over each camera pixel's samples."""

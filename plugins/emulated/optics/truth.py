@@ -227,7 +227,8 @@ class BenchTruth:
     ``indirect``: the share of all projected light that object and room throw back evenly on the object.
 
     ``surfaces``: of the room round the object; ``engine``: "direct" for light straight from the projectors alone,
-    "radiosity" for light between object and surfaces, too, which counts it on so many ``patches``.
+    "radiosity" for light between object and surfaces, too, which counts it on so many ``patches``, "mitsuba" for the
+    same along so many ``paths`` from each small spot of the picture through a scene of Mitsuba 3.
     """
 
     size: str
@@ -244,8 +245,9 @@ class BenchTruth:
     mains: tuple[MainsTruth, ...] = ()
     indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
     surfaces: tuple[SurfaceTruth, ...] = ()
-    engine: Annotated[str, OneOf("direct", "radiosity")] = "direct"
+    engine: Annotated[str, OneOf("direct", "radiosity", "mitsuba")] = "direct"
     patches: Annotated[int, Between(10, 20000)] = 2000
+    paths: Annotated[int, Between(1, 100000)] = 256
 
 
 def write_truth(stage: Path, truth: BenchTruth) -> None:

@@ -12,8 +12,10 @@ import pytest
 from controller.calibrate.values import Calibration
 from controller.core.errors import UsageError
 from controller.solve.appearance import (
+    Appearance,
     Base,
     BaseKind,
+    Mode,
     base_image,
     fine_detail,
     high_pass_base,
@@ -22,6 +24,7 @@ from controller.solve.appearance import (
     scale_frames,
     solve_base,
 )
+from controller.solve.feasibility import feasibility
 from controller.transport import LightTransport, build_transport
 
 Stage = Callable[..., Calibration]
@@ -95,6 +98,23 @@ def test_a_smooth_target_is_left_to_the_scale(stage: Stage) -> None:
     transport, base = based(calibration)
     target = scaled(base, calibration.black, smooth_scale(transport.camera_shape))
     assert make_appearance(transport, base, target, calibration.black).mode == "scale"
+
+
+def test_a_scale_that_clipping_spoils_in_reach_gives_way_to_a_full_solve(stage: Stage) -> None:
+    calibration = stage()
+    transport, base = based(calibration)
+
+    def made(brightness: float, mode: Mode) -> tuple[Appearance, float]:
+        target = scaled(base, calibration.black, brightness * smooth_scale(transport.camera_shape))
+        reachable = feasibility(transport, target, calibration.black).reachable
+        found = make_appearance(transport, base, target, calibration.black, mode=mode, reachable=reachable)
+        error = np.abs(transport.forward(found.frames) + calibration.black - target)[reachable]
+        return found, float(np.percentile(error, 95))
+
+    assert made(1.0, "auto")[0].mode == "scale"
+    quick, full = made(3.0, "scale"), made(3.0, "auto")
+    assert (quick[0].mode, full[0].mode) == ("scale", "full")
+    assert full[1] < 0.8 * quick[1]
 
 
 def test_a_high_pass_base_takes_the_fine_detail_and_leaves_a_smooth_scale(stage: Stage) -> None:

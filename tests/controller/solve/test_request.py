@@ -40,7 +40,8 @@ def picture(pitch_px: float) -> Target:
 @pytest.mark.parametrize(
     ("pitch_px", "mode", "made", "advised"),
     [
-        (40, "auto", "scale", False),
+        (80, "auto", "scale", False),
+        (40, "auto", "full", False),
         (5, "auto", "full", False),
         (5, "scale", "scale", True),
         (40, "scale", "scale", False),

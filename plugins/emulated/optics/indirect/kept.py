@@ -12,6 +12,8 @@ from scipy import sparse
 
 from plugins.emulated.optics.furnished import furnished
 from plugins.emulated.optics.indirect.scattering import Scattering, scattering_of
+from plugins.emulated.optics.indirect.traced import TracedTransfer
+from plugins.emulated.optics.indirect.tracing import traced_transfer
 from plugins.emulated.optics.indirect.transfer import Transfer, transfer_of
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import Progress, key_of
@@ -31,17 +33,22 @@ class Indirect:
 
     def transfer(
         self, truth: BenchTruth, pixels: npt.NDArray[np.int32], progress: Progress, *, keep: bool
-    ) -> Transfer | None:
+    ) -> Transfer | TracedTransfer | None:
         """The transfer of ``truth``; None without engine. ``pixels``: ``Samples.pixels``.
 
         ``keep``: it may come from the file, where it was worked out for this very stage, and goes there.
+        Raises DeviceError ``engine-missing``.
         """
         if truth.engine == "direct":
             return None
-        key = f"{VERSION} {truth.patches} {truth.seed} {key_of(truth, self._thing)}"
+        fineness = truth.patches if truth.engine == "radiosity" else f"{truth.engine} {truth.paths}"
+        key = f"{VERSION} {fineness} {truth.seed} {key_of(truth, self._thing)}"
         found = _read(self._path, key) if keep else None
         if found is None:
-            found = transfer_of(truth, self._scattered(truth, progress), pixels)
+            if truth.engine == "mitsuba":
+                found = traced_transfer(truth, self._thing, pixels, progress)
+            else:
+                found = transfer_of(truth, self._scattered(truth, progress), pixels)
             if keep:
                 _write(self._path, key, found)
         progress(1.0)
@@ -54,21 +61,34 @@ class Indirect:
         return self._scattering[1]
 
 
-def _read(path: Path, key: str) -> Transfer | None:
+def _read(path: Path, key: str) -> Transfer | TracedTransfer | None:
     """A file that is absent, damaged or of another stage counts as none."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             if str(archive["key"]) != key:
                 return None
-            arrive = tuple(_matrix(archive, f"arrive{n}") for n in range(int(archive["projectors"])))
-            return Transfer(arrive, archive["back"], archive["cells"], _matrix(archive, "blend"))
+            blend, projectors = _matrix(archive, "blend"), range(int(archive["projectors"]))
+            if "back" in archive:
+                arrive = tuple(_matrix(archive, f"arrive{n}") for n in projectors)
+                return Transfer(arrive, archive["back"], archive["cells"], blend)
+            parts = tuple(tuple(_matrix(archive, f"part{n}{channel}") for channel in range(3)) for n in projectors)
+            return TracedTransfer(parts, tuple(int(side) for side in archive["group"]), blend)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
 
-def _write(path: Path, key: str, transfer: Transfer) -> None:
-    matrices = {f"arrive{n}": one for n, one in enumerate(transfer.arrive)} | {"blend": transfer.blend}
-    parts: dict[str, Any] = {
+def _write(path: Path, key: str, transfer: Transfer | TracedTransfer) -> None:
+    matrices: dict[str, sparse.csr_matrix] = {"blend": transfer.blend}
+    if isinstance(transfer, Transfer):
+        arrays: dict[str, Any] = {"back": transfer.back, "cells": transfer.cells}
+        matrices |= {f"arrive{n}": one for n, one in enumerate(transfer.arrive)}
+        count = len(transfer.arrive)
+    else:
+        arrays, count = {"group": np.array(transfer.group)}, len(transfer.parts)
+        matrices |= {
+            f"part{n}{channel}": one for n, part in enumerate(transfer.parts) for channel, one in enumerate(part)
+        }
+    arrays |= {
         f"{name}_{part}": getattr(matrix, part)
         for name, matrix in matrices.items()
         for part in ("data", "indices", "indptr", "shape")
@@ -77,8 +97,7 @@ def _write(path: Path, key: str, transfer: Transfer) -> None:
     temporary = path.with_name(path.name + ".part")
     try:
         with temporary.open("wb") as file:
-            counts: dict[str, Any] = {"key": np.array(key), "projectors": np.array(len(transfer.arrive))}
-            np.savez(file, **counts, back=transfer.back, cells=transfer.cells, **parts)
+            np.savez(file, key=np.array(key), projectors=np.array(count), **arrays)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

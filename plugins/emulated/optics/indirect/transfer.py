@@ -6,6 +6,7 @@ I = F R (E + I), so I = (1 - F R)^-1 F R E: every number of bounces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -44,6 +45,14 @@ class Transfer:
     back: FloatImage
     cells: npt.NDArray[np.int32]
     blend: sparse.csr_matrix
+
+    def light(self, sent: Sequence[FloatImage | None]) -> FloatImage:
+        """Irradiance (pixels, 3) that comes back for what each projector sends out; None: nothing."""
+        direct = np.zeros((self.back.shape[2], 3), dtype=np.float32)
+        for index, image in enumerate(sent):
+            if image is not None:
+                direct += self.direct(index, image)
+        return self.returned(direct)
 
     def direct(self, projector: int, emitted: FloatImage) -> FloatImage:
         """Irradiance (L, 3) on the patches of what a projector's pixels (rows, columns, 3) send out."""

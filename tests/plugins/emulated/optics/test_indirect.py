@@ -92,7 +92,7 @@ def indirect(folder: Path, vase_and_bust: StageObject) -> Indirect:
 def transfer_in(indirect: Indirect, truth: BenchTruth, thing: StageObject, shares: list[float]) -> Transfer:
     samples = cast(truth, thing, lambda share: None)
     found = indirect.transfer(truth, samples.pixels, shares.append, keep=True)
-    assert found is not None
+    assert isinstance(found, Transfer)
     return found
 
 

@@ -13,7 +13,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from hal.errors import DeviceError
+from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.indirect.scattering import scattering_of
+from plugins.emulated.optics.indirect.tracing import traced_transfer
 from plugins.emulated.optics.indirect.transfer import transfer_of
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import cast
@@ -93,9 +96,11 @@ def test_light_that_bounces_is_mitsubas(make: Callable[[], StageObject], least_s
     stage_object = make()
     truth, frame = stage_of(stage_object), frame_of(4)
     samples = cast(truth, stage_object, lambda share: None)
-    transfer = transfer_of(truth, scattering_of(stage_object, truth.patches, truth.seed), samples.pixels)
+    engines = (
+        transfer_of(truth, scattering_of(stage_object, truth.patches, truth.seed), samples.pixels),
+        traced_transfer(truth, stage_object, samples.pixels, lambda share: None),
+    )
     direct = Renderer(truth, samples).light([frame], [1.0])
-    found = Renderer(truth, samples, transfer).light([frame], [1.0]).astype(np.float64)
     shape = mitsuba_mesh(stage_object, tmp_path)
     halves = [path_traced(truth, shape, frame, seed) for seed in (1, 2)]
     wanted = (halves[0] + halves[1]) / 2.0
@@ -103,7 +108,37 @@ def test_light_that_bounces_is_mitsubas(make: Callable[[], StageObject], least_s
     noise = float(np.mean((halves[0] - halves[1])[lit] ** 2)) / 4.0
     level = float(np.mean(wanted[lit] ** 2))
     assert noise <= 0.015**2 * level
-    assert np.mean((found - direct)[lit]) >= least_share * np.mean(wanted[lit])
-    assert np.mean((found - wanted)[lit] ** 2) - noise <= 0.02**2 * level
-    # Summed over the picture, noise and pixels at edges hardly count.
-    assert found[lit].mean() == pytest.approx(wanted[lit].mean(), rel=0.005)
+    for transfer in engines:
+        found = Renderer(truth, samples, transfer).light([frame], [1.0]).astype(np.float64)
+        assert np.mean((found - direct)[lit]) >= least_share * np.mean(wanted[lit])
+        assert np.mean((found - wanted)[lit] ** 2) - noise <= 0.02**2 * level
+        # Summed over the picture, noise and pixels at edges hardly count.
+        assert found[lit].mean() == pytest.approx(wanted[lit].mean(), rel=0.005)
+
+
+def test_a_mitsuba_that_can_not_run_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "absent.so"))
+    stage_object = two_objects()
+    truth = dataclasses.replace(stage_of(stage_object), engine="mitsuba")
+    with pytest.raises(DeviceError) as refused:
+        Indirect(stage_object, tmp_path).transfer(truth, np.arange(4, dtype=np.int32), print, keep=True)
+    assert refused.value.code == "engine-missing"
+    assert "radiosity" in refused.value.remedy
+
+
+def test_what_was_traced_is_kept_for_the_very_same_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage_object = two_objects()
+    truth = dataclasses.replace(stage_of(stage_object), engine="mitsuba", subsamples=1, paths=4)
+    pixels = cast(truth, stage_object, lambda share: None).pixels
+    sent = [np.random.default_rng(1).random((28, 36, 3)).astype(np.float32)]
+    first = Indirect(stage_object, tmp_path).transfer(truth, pixels, lambda share: None, keep=True)
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "absent.so"))
+    again = Indirect(stage_object, tmp_path).transfer(truth, pixels, lambda share: None, keep=True)
+    assert first is not None
+    assert again is not None
+    np.testing.assert_array_equal(first.light(sent), again.light(sent))
+    assert first.light(sent).max() > 0.0
+    with pytest.raises(DeviceError):
+        Indirect(stage_object, tmp_path).transfer(
+            dataclasses.replace(truth, paths=5), pixels, lambda share: None, keep=True
+        )

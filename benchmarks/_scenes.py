@@ -1,0 +1,91 @@
+"""Objects whose surfaces light each other: a bust in a painted corner, a bowl, a vase beside a bust."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import trimesh
+
+from controller.core.arrays import Float64
+from controller.solve.targets.values import linear_to_srgb
+from plugins.emulated.optics.shapes import BUST_AXIS_X, VASE_AXIS_X, bust, paint_bust, paint_vase, vase
+
+Part = tuple[Float64, Float64, Float64]
+"""Vertices (V, 3) in metres, y up and z towards the audience, triangles (F, 3), and linear colours (V, 3)."""
+GRID: Final = 120
+OPENING: Final = np.deg2rad(110.0)
+"""Between the walls of the corner."""
+
+
+def corner() -> Part:
+    """Two walls and a floor, painted in squares and stripes, and a bust before them."""
+    half, side, high = 0.5 * OPENING, 0.22, 0.30
+    walls = []
+    for sign, light, dark in (
+        (-1.0, (0.80, 0.35, 0.28), (0.62, 0.22, 0.20)),
+        (1.0, (0.35, 0.62, 0.78), (0.24, 0.45, 0.62)),
+    ):
+        out = np.array([sign * np.sin(half), 0.0, np.cos(half)])
+        walls.append(_plane(np.zeros(3), side * out, np.array([0.0, high, 0.0]), light, dark, 5))
+    out = side * np.array([[-np.sin(half), 0.0, np.cos(half)], [np.sin(half), 0.0, np.cos(half)]])
+    floor = _plane(np.zeros(3), out[0], out[1], (0.75, 0.72, 0.65), (0.55, 0.52, 0.46), 4)
+    head = _standing(bust(200, 240), paint_bust, BUST_AXIS_X)
+    head[0][:] = 0.62 * head[0] + (0.0, 0.002, 0.115)
+    return _together(*walls, floor, head)
+
+
+def bowl() -> Part:
+    """A deep bowl that opens towards the audience, with rings and sectors."""
+    turn, tilt = np.meshgrid(np.linspace(0, 2 * np.pi, 2 * GRID), np.linspace(0.0, np.deg2rad(75.0), GRID))
+    points = 0.15 * np.stack((np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)), axis=-1)
+    marked = (np.floor(turn / (np.pi / 6)) + np.floor(tilt / 0.26)) % 2 < 1
+    colours = np.where(marked[..., None], (0.80, 0.62, 0.42), (0.70, 0.72, 0.74))
+    return points.reshape(-1, 3), _triangles(*turn.shape), colours.reshape(-1, 3)
+
+
+def two_objects() -> Part:
+    """A vase beside a bust, less than a finger's width apart."""
+    left = _standing(vase(240, 320), paint_vase, VASE_AXIS_X)
+    right = _standing(bust(240, 280), paint_bust, BUST_AXIS_X)
+    right[0][:, 0] += left[0][:, 0].max() - right[0][:, 0].min() + 0.006
+    return _together(left, right)
+
+
+SCENES: Final[Mapping[str, Callable[[], Part]]] = {"corner": corner, "bowl": bowl, "two-objects": two_objects}
+
+
+def write_scene(name: str, file: Path) -> Path:
+    """Write a scene of ``SCENES`` as a mesh file that the bench reads; returns ``file``."""
+    vertices, faces, colours = SCENES[name]()
+    encoded = np.rint(255 * linear_to_srgb(colours.astype(np.float32))).astype(np.uint8)
+    trimesh.Trimesh(vertices, faces, vertex_colors=encoded, process=False).export(file)
+    return file
+
+
+def _plane(at: Float64, across: Float64, up: Float64, light: object, dark: object, squares: int) -> Part:
+    u, v = np.meshgrid(np.linspace(0, 1, GRID), np.linspace(0, 1, GRID))
+    points = at + u[..., None] * across + v[..., None] * up
+    marked = (np.floor(squares * u) + np.floor(squares * v)) % 2 < 1
+    colours = np.where(marked[..., None], np.asarray(light), np.asarray(dark))
+    return points.reshape(-1, 3), _triangles(GRID, GRID), colours.reshape(-1, 3)
+
+
+def _standing(surface: tuple[Float64, object], paint: Callable[[Float64], object], axis_x: float) -> Part:
+    points = np.asarray(surface[0], np.float64)
+    colours = np.asarray(paint(points), np.float64)
+    return points - (axis_x, 0.0, 0.0), np.asarray(surface[1], np.float64), colours
+
+
+def _triangles(rows: int, columns: int) -> Float64:
+    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    one, two = (first, first + 1, first + columns), (first + 1, first + columns + 1, first + columns)
+    return np.stack([np.stack(corners, axis=1) for corners in (one, two)], axis=1).reshape(-1, 3).astype(np.float64)
+
+
+def _together(*parts: Part) -> Part:
+    first = np.cumsum([0, *(len(part[0]) for part in parts[:-1])])
+    faces = [part[1] + offset for part, offset in zip(parts, first, strict=True)]
+    return np.concatenate([p[0] for p in parts]), np.concatenate(faces), np.concatenate([p[2] for p in parts])

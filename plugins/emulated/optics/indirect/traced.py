@@ -1,0 +1,204 @@
+"""Light between surfaces along paths through Mitsuba's scene, recorded once: every frame's light is then a product.
+
+Camera pixels that see the same spot are a cell. From each cell paths leave as diffuse light would, and bounce from
+surface to surface. At each surface they meet, every projector's light there counts: a weight on that projector's pixel.
+So the light of all paths is a sparse matrix for each projector, and it is what a path tracer would find, for any frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from plugins.emulated.optics.furnished import Scene, furnished
+from plugins.emulated.optics.indirect.mitsuba_scene import MitsubaScene
+from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.rays import Progress, arriving, directions
+from plugins.emulated.optics.truth import BenchTruth
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+FloatImage = npt.NDArray[np.float32]
+
+CELLS_ACROSS: Final = 194
+"""Of the camera's picture; a cell is split where it sees more than one surface."""
+PIXELS_ACROSS: Final = 100
+"""About so many groups of a projector's pixels, between which recorded light does not tell."""
+PATHS_AT_ONCE: Final = 400_000
+BOUNCES: Final = 10
+SPLIT_M: Final = 0.02
+"""A cell has no more depth than this."""
+NEAREST: Final = 9
+"""Cells between which a camera pixel's light is interpolated."""
+TURN_M: Final = 0.02
+"""A turn of the normal by one radian counts as so far away."""
+
+
+@dataclass(frozen=True, slots=True)
+class TracedTransfer:
+    """Irradiance that comes back, for what each projector sends out.
+
+    ``parts``: for each projector and channel (cells, groups of its pixels); ``group``: pixels along a group's side;
+    ``blend`` (pixels, cells): of ``Samples.pixels`` the cells that they take their light from
+    """
+
+    parts: tuple[tuple[sparse.csr_matrix, ...], ...]
+    group: tuple[int, ...]
+    blend: sparse.csr_matrix
+
+    def light(self, sent: Sequence[FloatImage | None]) -> FloatImage:
+        """Irradiance (pixels, 3) for what the pixels (rows, columns, 3) of each projector send out; None: nothing."""
+        cells = np.zeros((self.blend.shape[1], 3), dtype=np.float32)
+        for parts, side, image in zip(self.parts, self.group, sent, strict=True):
+            if image is not None:
+                means = grouped(image, side)
+                for channel, part in enumerate(parts):
+                    cells[:, channel] += part @ means[:, channel]
+        return np.asarray(self.blend @ cells, dtype=np.float32)
+
+
+def grouped(image: FloatImage, side: int) -> FloatImage:
+    """(groups, 3): the means of ``side`` x ``side`` pixels; at the right and lower edge of those that are left."""
+    rows, columns = np.arange(0, image.shape[0], side), np.arange(0, image.shape[1], side)
+    sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
+    high = np.minimum(rows + side, image.shape[0]) - rows
+    wide = np.minimum(columns + side, image.shape[1]) - columns
+    return np.asarray((sums / (high[:, None] * wide)[..., None]).reshape(-1, image.shape[2]), dtype=np.float32)
+
+
+def trace(truth: BenchTruth, thing: StageObject, pixels: npt.NDArray[np.int32], progress: Progress) -> TracedTransfer:
+    """Trace ``truth.paths`` paths from each cell; ``pixels``: ``Samples.pixels``.
+
+    Use ``tracing.traced_transfer``, which does this in a process of its own. Raises DeviceError ``engine-missing``.
+    """
+    scene = furnished(thing, truth.surfaces)
+    rng = np.random.default_rng([truth.seed, 6])
+    group = tuple(max(1, round(p.lens.size_px[0] / PIXELS_ACROSS)) for p in truth.projectors)
+    at_once = max(1, PATHS_AT_ONCE // truth.paths)
+    blocks: list[list[list[sparse.csr_matrix]]] = []
+    traced = MitsubaScene(scene)
+    cells = _cells(truth, traced, pixels)
+    for first in range(0, cells.count, at_once):
+        last = min(first + at_once, cells.count)
+        blocks.append(_block(truth, scene, traced, cells, np.arange(first, last), group, rng))
+        progress(last / cells.count)
+    parts = tuple(
+        tuple(sparse.vstack([block[n][channel] for block in blocks]).tocsr() for channel in range(3))
+        for n in range(len(truth.projectors))
+    )
+    return TracedTransfer(parts, group, cells.blend())
+
+
+@dataclass(frozen=True, slots=True)
+class _Cells:
+    """``points``, ``normals`` (pixels, 3): what each pixel sees; ``order``, ``starts``: the pixels of each cell."""
+
+    points: Floats
+    normals: Floats
+    order: Integers
+    starts: Integers
+
+    @property
+    def count(self) -> int:
+        return len(self.starts) - 1
+
+    def draw(self, cells: Integers, paths: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Points and normals, ``paths`` for each of these cells, of any of its pixels."""
+        begin, end = self.starts[cells], self.starts[cells + 1]
+        # One after another, so that every pixel gives as many.
+        turn = (np.arange(paths)[None] + rng.random((len(cells), 1))) / paths
+        pixel = self.order[np.minimum(begin[:, None] + (turn * (end - begin)[:, None]), end[:, None] - 1).astype(int)]
+        return self.points[pixel.ravel()], self.normals[pixel.ravel()]
+
+    def blend(self) -> sparse.csr_matrix:
+        """(pixels, cells): smooth weights of the nearest cells that face as a pixel does, 1 in sum."""
+        count = np.diff(self.starts)[:, None]
+        centres, facing = (
+            np.add.reduceat(values[self.order], self.starts[:-1]) / count for values in (self.points, self.normals)
+        )
+        tree = cKDTree(np.concatenate([centres, TURN_M * facing], axis=1))
+        places = np.concatenate([self.points, TURN_M * self.normals], axis=1)
+        nearest = tree.query(places, k=np.arange(1, min(NEAREST, self.count) + 1), workers=-1)
+        away, found = np.asarray(nearest[0], np.float64), np.asarray(nearest[1], np.int64)
+        weight = (1.0 - (away / (1.001 * away[:, -1:] + 1e-12)) ** 2) ** 2
+        weight /= weight.sum(axis=1, keepdims=True)
+        rows = np.repeat(np.arange(len(places)), found.shape[1])
+        whole = sparse.csr_matrix((weight.ravel(), (rows, found.ravel())), shape=(len(places), self.count))
+        return whole.astype(np.float32)
+
+
+def _cells(truth: BenchTruth, traced: MitsubaScene, pixels: npt.NDArray[np.int32]) -> _Cells:
+    width = truth.camera.lens.size_px[0]
+    row, column = np.divmod(pixels.astype(np.int64), width)
+    points, normals = np.zeros((len(row), 3)), np.zeros((len(row), 3))
+    missed = np.arange(len(row))
+    for dx, dy in ((0.0, 0.0), (-0.4, -0.4), (0.4, 0.4), (-0.4, 0.4), (0.4, -0.4)):
+        rays = directions(truth.camera.pose, truth.camera.lens, column[missed] + dx, row[missed] + dy)
+        found = traced.hit(np.broadcast_to(np.asarray(truth.camera.pose.position_m), rays.shape), rays)
+        points[missed[found.ray]], normals[missed[found.ray]] = found.points, found.normals
+        missed = np.setdiff1d(missed, missed[found.ray])
+    side = max(1, round(width / CELLS_ACROSS))
+    block = (row // side) * width + column // side
+    depth = np.floor(np.linalg.norm(points - truth.camera.pose.position_m, axis=1) / SPLIT_M).astype(np.int64)
+    turned = np.round(normals).astype(np.int64) @ (1, 3, 9) + 13
+    cell = np.unique((block * 4096 + depth % 4096) * 27 + turned, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(cell, kind="stable")
+    return _Cells(points, normals, order, np.searchsorted(cell[order], np.arange(int(cell.max()) + 2)))
+
+
+def _block(
+    truth: BenchTruth,
+    scene: Scene,
+    traced: MitsubaScene,
+    cells: _Cells,
+    mine: Integers,
+    group: tuple[int, ...],
+    rng: np.random.Generator,
+) -> list[list[sparse.csr_matrix]]:
+    """For each projector and channel the rows of these cells."""
+    points, normals = cells.draw(mine, truth.paths, rng)
+    row = np.repeat(np.arange(len(mine)), truth.paths)
+    through = np.full((len(row), 3), 1.0 / truth.paths)
+    found: list[list[tuple[Any, ...]]] = [[] for _ in truth.projectors]
+    for _ in range(BOUNCES):
+        met = traced.leave(points, normals, _diffuse(normals, rng))
+        row, points, normals = row[met.ray], met.points, met.normals
+        through = through[met.ray] * scene.albedo(points, met.faces, met.weights)
+        for n, projector in enumerate(truth.projectors):
+            at, gain = arriving(projector, traced.hidden, points, normals)
+            width, height = projector.lens.size_px
+            x, y = np.floor(at + 0.5).astype(np.int64).T
+            lit = np.flatnonzero((gain > 0.0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+            place = (y[lit] // group[n]) * (-(-width // group[n])) + x[lit] // group[n]
+            found[n].append((row[lit], place, through[lit] * gain[lit, None]))
+    return [
+        _matrices(part, len(mine), -(-p.lens.size_px[0] // side) * -(-p.lens.size_px[1] // side))
+        for part, p, side in zip(found, truth.projectors, group, strict=True)
+    ]
+
+
+def _matrices(part: list[tuple[Any, ...]], rows: int, columns: int) -> list[sparse.csr_matrix]:
+    """(rows, columns) for each channel; entries at one place are added up."""
+    row, place, weight = (np.concatenate([bounce[n] for bounce in part]) for n in range(3))
+    key, back = np.unique(row * columns + place, return_inverse=True)
+    where = (key // columns, key % columns)
+    sums = [np.bincount(back.reshape(-1), weights=weight[:, c], minlength=len(key)) for c in range(3)]
+    return [sparse.csr_matrix((one.astype(np.float32), where), shape=(rows, columns)) for one in sums]
+
+
+def _diffuse(normals: Floats, rng: np.random.Generator) -> Floats:
+    """Directions (N, 3) about normals, as many as the cosine to them."""
+    root, turn = rng.random(len(normals)), 2.0 * np.pi * rng.random(len(normals))
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    first = np.cross(normals, helper)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    second = np.cross(normals, first)
+    sine = np.sqrt(root)[:, None]
+    around = sine * (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second)
+    return np.asarray(around + np.sqrt(1.0 - root)[:, None] * normals)
