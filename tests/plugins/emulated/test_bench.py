@@ -26,10 +26,13 @@ from hal.values import Power
 from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.cameras.shot import ShotSettings
 from plugins.emulated.optics.stands import Stands
-from plugins.emulated.optics.truth import BenchTruth, MainsTruth, read_truth, write_truth
+from plugins.emulated.optics.truth import BenchTruth, MainsTruth, ProjectorTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World
-from plugins.emulated.projectors.boards import BOARDS, USUAL
-from plugins.projectors.serial import open_serial_projector
+from plugins.emulated.projectors.boards import BOARDS, USUAL, login_of
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.wires import projector_on_its_wire
+from plugins.projectors.network.driver import open_network_projector
+from plugins.projectors.serial import SerialProjector, open_serial_projector
 
 SERVE = """
 import sys
@@ -104,29 +107,58 @@ def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(
     assert not any(tty.is_symlink() for tty in ttys)
 
 
-def test_every_family_with_power_codes_can_be_emulated(
+SIX = ("benq", "nec", "hitachi", "panasonic-dz", "sony-adcp", "jvc")
+"""As many as a bench may have, in every notation, three of them on their LAN port."""
+
+
+def test_projectors_of_many_families_are_served_on_serial_lines_and_lan_ports(
     tmp_path: Path, shrink: Callable[[BenchTruth], BenchTruth]
 ) -> None:
-    families = sorted(set(BOARDS) - {USUAL, "optoma-ep910"})
-    EmulatedBench(Stands(len(families))).prepare(tmp_path / "stage", size="small", object_file=None, seed=11)
+    assert set(SIX) < set(BOARDS) - {USUAL}
+    EmulatedBench(Stands(len(SIX))).prepare(tmp_path / "stage", size="small", object_file=None, seed=11)
     truth = shrink(read_truth(tmp_path / "stage"))
     others = [
-        dataclasses.replace(projector, board=family)
-        for projector, family in zip(truth.projectors, families, strict=True)
+        dataclasses.replace(projector, board=family, **network_of(family))
+        for projector, family in zip(truth.projectors, SIX, strict=True)
     ]
     write_truth(tmp_path / "stage", dataclasses.replace(truth, projectors=tuple(others)))
     with served(tmp_path / "stage") as process:
         try:
             assert not [record for record in until_ready(process) if "error" in record]
             for projector in others:
-                settings = {"profile": f"bench/{projector.board}-fast.toml", "port": projector.port}
-                driver = open_serial_projector(settings, OpenContext(tmp_path / "stage"), in_seconds(20))
+                driver = opened(tmp_path / "stage", projector)
                 driver.switch_on(deadline=in_seconds(60))
                 assert driver.status(deadline=in_seconds(20)).power in (Power.WARMING, Power.ON), projector.board
                 driver.close()
         finally:
             process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=20) == 0
+
+
+def network_of(family: str) -> dict[str, Any]:
+    """A free TCP port and a password, for a family with a login."""
+    if login_of(family) in ("", "none"):
+        return {}
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return {"tcp_port": free.getsockname()[1], "password": "secret12"}
+
+
+def opened(stage: Path, projector: ProjectorTruth) -> SerialProjector:
+    settings = {"profile": f"bench/{projector.board}-fast.toml"}
+    if not projector.tcp_port:
+        return open_serial_projector({**settings, "port": projector.port}, OpenContext(stage), in_seconds(20))
+    settings |= {"address": f"127.0.0.1:{projector.tcp_port}", "password": projector.password}
+    return open_network_projector(settings, OpenContext(stage), in_seconds(20))
+
+
+@pytest.mark.parametrize(("board", "tcp_port"), [("sony-adcp", 0), ("sanyo", 4001)])
+def test_a_family_on_a_wire_that_it_does_not_have_is_refused(prepared: Path, board: str, tcp_port: int) -> None:
+    truth = read_truth(prepared)
+    odd = dataclasses.replace(truth.projectors[0], board=board, tcp_port=tcp_port)
+    with pytest.raises(DeviceError) as caught:
+        projector_on_its_wire(prepared, odd, EmulatedLamp(LampTiming(0.1, 0.1)), 0.0)
+    assert caught.value.code == "board-without-wire"
+    assert board in caught.value.what
 
 
 def test_a_family_without_a_board_is_refused_with_those_there_are(prepared: Path) -> None:
