@@ -129,7 +129,7 @@ def _traditional(
         context.advance(number / len(names), name)
         solved = read_solved(context.folder, name, calibrated.projectors)
         frames = device_frames(
-            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.target, best)
+            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.wish.target, best)
         )
         shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
         picture = photograph_hdr(

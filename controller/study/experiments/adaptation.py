@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from controller.calibrate.photometry.reflectance import own_reflectance
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.report.pictures import Crop, crop_around
 from controller.solve.adapt import adapted_target
 from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
@@ -67,6 +67,10 @@ def _at_exposure(
     possible = feasibility(transport, wanted, black, drive=drive)
     targets = {CUT: wanted, ADAPTED: adapted_target(transport, wanted, black, drive=drive)}
     matrix, crop, results = subject.calibration.camera_to_xyz, crop_around(subject.mask), []
+
+    def on_screen(image: FloatImage) -> ByteImage:
+        return screen(np.where(shown[..., None], image, 0).astype(np.float32), matrix, white, crop)
+
     for way, asked in targets.items():
         frames = solve_bounded(transport, asked, black, smoothness=SMOOTHNESS).frames
         picture = subject.light.photograph(f"{share:.2f}-{way.replace(' ', '-')}", frames, white=white)
@@ -76,15 +80,14 @@ def _at_exposure(
                 ghosting(picture, wanted, own, matrix, white, shown, shown & ~possible.reachable),
                 float(lab_of(picture[shown], matrix, white)[:, 0].mean()),
                 by_pixels(picture, wanted, matrix, white, reachable=possible.reachable, valid=mask, lit=subject.mask),
-                flip_of(*(screen(np.where(shown[..., None], one, 0).astype(np.float32), matrix, white, crop)
-                          for one in (wanted, picture)), shown, crop),
+                flip_of(on_screen(wanted), on_screen(picture), shown, crop),
                 picture, wanted, white,
             )
         )  # fmt: skip
     return results
 
 
-def flip_of(reference: FloatImage, picture: FloatImage, mask: Mask, crop: Crop) -> float | None:
+def flip_of(reference: ByteImage, picture: ByteImage, mask: Mask, crop: Crop) -> float | None:
     """Mean of FLIP (Andersson et al. 2020) over a mask, of 8-bit pictures (rows, columns, 3); None if not installed."""
     try:
         import flip_evaluator

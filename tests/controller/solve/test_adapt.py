@@ -34,7 +34,7 @@ def shown(target: FloatImage, floor: FloatImage = STAGE.black) -> FloatImage:
 def checked(size_px: int) -> FloatImage:
     """(rows, columns) of 0 and 1."""
     y, x = np.mgrid[0:120, 0:160]
-    return ((y // size_px + x // size_px) % 2).astype(np.float32)
+    return np.asarray((y // size_px + x // size_px) % 2, np.float32)
 
 
 def highlight(peak: float) -> FloatImage:

@@ -47,7 +47,7 @@ def test_the_sheet_is_the_one_of_least_energy(seed: int, length: float, share: f
     random = np.random.default_rng(seed)
     size = 40
     obstacle = np.where(random.random(size) < share, random.random(size), 0.0)
-    steps = sp.diags_array([np.ones(size - 1), -np.ones(size - 1)], offsets=[1, 0], shape=(size - 1, size))
+    steps = sp.csr_matrix(np.diff(np.eye(size), axis=0))
     stiffness = sp.csr_matrix(sp.identity(size) + length**2 * (steps.T @ steps))
     found = lowest_above(stiffness, obstacle)
     root = np.linalg.cholesky(stiffness.toarray()).T

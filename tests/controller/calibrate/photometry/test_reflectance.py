@@ -38,7 +38,7 @@ def test_shape_takes_the_shading_away_and_leaves_the_paint() -> None:
         parts.append(replace(part, white=(light[..., None] * gain * paint()).astype(np.float32)))
     calibration = replace(SUBJECT.calibration, projectors=tuple(parts))
     found = own_reflectance(calibration, geometry)
-    known = np.isfinite(found).all(axis=2)
+    known = np.asarray(np.isfinite(found).all(axis=2))
     assert known[calibration.object_mask].mean() > 0.95
     assert not known[~calibration.object_mask].any()
     np.testing.assert_allclose(found[known], paint()[known] / 0.9, rtol=0.02)
