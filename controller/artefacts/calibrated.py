@@ -9,6 +9,7 @@ from controller.artefacts.calibration import read_calibration
 from controller.artefacts.depth_edges import edged
 from controller.artefacts.geometry import camera_px, has_geometry, read_geometry
 from controller.artefacts.solved import SolvedBase
+from controller.calibrate.photometry.reflectance import own_reflectance
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.solve.appearance import Base, prepare_base
@@ -30,6 +31,7 @@ class Calibrated:
         self._indirect_known = False
         self._base: Base | None = None
         self._drive: DriveLevels | None = None
+        self._reflectance: FloatImage | None = None
 
     @property
     def base_folder(self) -> Path:
@@ -89,6 +91,14 @@ class Calibrated:
         if self._drive is None:
             self._drive = DriveLevels(self.transport)
         return self._drive
+
+    @property
+    def reflectance(self) -> FloatImage:
+        """The object's own pattern (rows, columns, 3), NaN where it is not known."""
+        if self._reflectance is None:
+            geometry = read_geometry(self.folder, self.projectors) if has_geometry(self.folder) else None
+            self._reflectance = own_reflectance(self.calibration, geometry)
+        return self._reflectance
 
     def keep_base(self, base: Base) -> None:
         self._base = base

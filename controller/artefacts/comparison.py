@@ -32,7 +32,9 @@ class Compared:
 
     ``delta_e00_median``, ``delta_e00_p95``: CIEDE2000; ``rmse`` of the target's white; ``sharpness_lambda`` 0 to 1
     (paper 6, eq. 9), all over the reachable pixels of the object; ``reachable_share`` of its pixels, if it is known;
-    ``window_px`` the side of the resolution map's windows, camera pixels; ``refined`` what refining it achieved
+    ``window_px`` the side of the resolution map's windows, camera pixels; ``refined`` what refining it achieved;
+    ``pixels`` the differences by sets of pixels, ``ghosting`` the object's own pattern in it, ``adapted`` how near it
+    is to its adapted target (docs/reference/report.md); None in runs from before they were measured
     """
 
     run: str
@@ -47,6 +49,9 @@ class Compared:
     reachable_share: float | None
     window_px: int
     refined: Any = None
+    pixels: Any = None
+    ghosting: Any = None
+    adapted: Any = None
 
 
 @dataclass(frozen=True, slots=True)

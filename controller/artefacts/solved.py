@@ -84,6 +84,15 @@ def read_target(run: Path, name: str) -> Target:
 
 
 @dataclass(frozen=True, slots=True)
+class Asked:
+    """A target as it was asked for: radiance (rows, columns, 3); where it is reachable, and where it says something."""
+
+    target: FloatImage
+    reachable: Mask
+    valid: Mask
+
+
+@dataclass(frozen=True, slots=True)
 class Solved:
     """``appearance-NAME.npz`` and ``.json``: an appearance's frames, its target, and the mask where it is reachable.
 
@@ -91,6 +100,7 @@ class Solved:
     ``linear``: the same before dithering, linear light in [0, 1]
     ``target`` (camera rows, columns, 3): radiance in full scales per second; ``reachable`` (camera rows, columns)
     ``figures``: of the solve (docs/reference/report.md); ``exposure`` is the radiance of the target's white
+    ``asked``: before any adaptation; None where this is ``target``
     """
 
     frames: dict[str, ByteImage]
@@ -98,15 +108,25 @@ class Solved:
     target: FloatImage
     reachable: Mask
     figures: dict[str, object]
+    asked: Asked | None = None
 
     @property
     def exposure(self) -> float:
         return float(str(self.figures["exposure"]))
 
+    @property
+    def wish(self) -> Asked:
+        """What results are judged by; of a run from before adaptation was told, all pixels say something."""
+        if self.asked is not None:
+            return self.asked
+        return Asked(self.target, self.reachable, np.ones_like(self.reachable))
+
     def write(self, run: Path, name: str) -> list[Path]:
         frames = {**_named("device", self.frames), **_named("linear", self.linear)}
         arrays = npz_path(run, StepKind.APPEARANCE, name)
-        save_arrays(arrays, {**frames, "target": self.target, "reachable": self.reachable})
+        asked = {} if self.asked is None else _named("asked", {
+            "target": self.asked.target, "reachable": self.asked.reachable, "valid": self.asked.valid})  # fmt: skip
+        save_arrays(arrays, {**frames, "target": self.target, "reachable": self.reachable, **asked})
         return [arrays, write_json(json_path(run, StepKind.APPEARANCE, name), self.figures)]
 
 
@@ -184,7 +204,9 @@ def read_solved(run: Path, name: str, projectors: Sequence[str]) -> Solved:
     figures: Mapping[str, object] = read_json(json_path(run, StepKind.APPEARANCE, name))
     # Runs from before journal format 2 have the frames by the projectors' names only.
     prefix = "device-" if all(f"device-{projector}" in arrays for projector in projectors) else ""
-    target, reachable = arrays["target"], arrays["reachable"]
+    target, reachable, asked = arrays["target"], arrays["reachable"], None
+    if "asked-target" in arrays:
+        asked = Asked(arrays["asked-target"], arrays["asked-reachable"], arrays["asked-valid"])
     if (refining := read_refining(run, name)) is not None:
         arrays, prefix = load_arrays(npz_path(run, StepKind.REFINED, name)), "device-"
         figures = {**figures, "refined": refining}
@@ -194,6 +216,7 @@ def read_solved(run: Path, name: str, projectors: Sequence[str]) -> Solved:
         target=target,
         reachable=reachable,
         figures=dict(figures),
+        asked=asked,
     )
 
 

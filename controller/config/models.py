@@ -138,11 +138,11 @@ class SolveTable(ConfigTable):
         '"high-pass" (the fine detail of each target, with a solve for each)',
     )
     adapt: float = Field(
-        default=0.0,
+        default=1.0,
         ge=0,
         le=1,
-        description="how much a target is adapted to the available light to keep its local contrast, from 0 (too "
-        "bright parts are clipped) to 1",
+        description="how far a target is bent where light is lacking, so that the object's own pattern does not "
+        "show, from 0 (what can't be shown is cut off) to 1",
     )
     refine: int = Field(
         default=REFINE,

@@ -35,7 +35,7 @@ from controller.steps.appearance.publishing import (
 )
 from controller.steps.appearance.refining import RefineOptions, refine_steps
 from controller.steps.appearance.requests import wishes_of
-from controller.steps.appearance.solving import SolveOptions, device_frames, solve_steps
+from controller.steps.appearance.solving import device_frames, options_of, solve_steps
 from controller.steps.calibrate.grade import gate_step
 
 PLAYBACK_S = 4.0
@@ -75,7 +75,7 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     wishes = wishes_of(stage, calibrated)
     names = [wish.name for wish in wishes]
     table = stage.tables.solve
-    options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
+    options = options_of(table)
     after = [
         StepId(StepKind.GEOMETRY),
         *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.INDIRECT),
@@ -129,7 +129,7 @@ def _traditional(
         context.advance(number / len(names), name)
         solved = read_solved(context.folder, name, calibrated.projectors)
         frames = device_frames(
-            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.target, best)
+            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.wish.target, best)
         )
         shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
         picture = photograph_hdr(

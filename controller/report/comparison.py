@@ -20,7 +20,16 @@ from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.report import plots
-from controller.report.page import Goal, Page, PageTable, PictureRow, ReportPicture, refined_row, write_report
+from controller.report.page import (
+    Goal,
+    Page,
+    PageTable,
+    PictureRow,
+    ReportPicture,
+    judged_rows,
+    refined_row,
+    write_report,
+)
 from controller.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
 from controller.run.journal import Journal
 from controller.run.runner import Context, Step
@@ -70,7 +79,7 @@ def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]
     crop = crop_around(on_object)
     lit = sum((part.white for part in calibration.projectors), start=calibration.black)
     white = float(np.nanpercentile(lit[on_object], 99)) if on_object.any() else 1.0
-    target = np.where(on_object[..., None], solved.target, calibration.black).astype(np.float32)
+    target = np.where(on_object[..., None], solved.wish.target, calibration.black).astype(np.float32)
     to_xyz = calibration.camera_to_xyz
     drawn = {
         "before": to_screen(lit, to_xyz, white=white),
@@ -157,6 +166,7 @@ def _row(run: Path, one: Compared) -> PictureRow:
     known = [(label, form.format(value(one))) for label, value, form in _FIGURES]
     if one.reachable_share is not None:
         known.append(("within reach", f"{100 * one.reachable_share:.1f} % of the object"))
+    known.extend(judged_rows({"pixels": one.pixels, "ghosting": one.ghosting, "adapted": one.adapted}))
     known.extend(refined_row(one.refined))
     known.append(("photographed", time.strftime(MOMENT, time.localtime(one.photographed_unix_s))))
     pictures = []

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.calibration import read_calibration
 from controller.artefacts.geometry import read_geometry_figures
 from controller.artefacts.grade import PICTURE, read_grade_figures
@@ -22,12 +23,13 @@ from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
 from controller.report.light import light_gallery, whites
-from controller.report.page import Goal, Page, PictureRow, ReportPicture, refined_row, write_report
+from controller.report.page import Goal, Page, PictureRow, ReportPicture, judged_rows, refined_row, write_report
 from controller.report.pictures import Crop, crop_around, error_picture, fitted, to_screen
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.solve.metrics import Comparison, compare
 from controller.stage.check import Checked, check_stage
+from controller.steps.appearance.compare import judged
 from hal.runtime.compute import usable_cpus
 
 GOAL_DELTA_E = 4.0
@@ -47,6 +49,7 @@ class AppearanceComparison:
     traditional: FloatImage
     ours: Comparison
     theirs: Comparison
+    judged: Mapping[str, Any]
 
     @property
     def times_better(self) -> float:
@@ -57,11 +60,12 @@ def write_demo_report(out: Path, run: Path, checked: Checked) -> tuple[Path, Pat
     """Write ``report.html`` and ``report.json`` of a finished demo run into ``out``."""
     calibration = read_calibration(run, checked.names)
     names = [table.name for table in checked.stage.tables.appearances]
-    judged = [_judge(run, name, calibration, checked.names) for name in names]
+    reflectance = Calibrated(run, checked.names).reflectance
+    found = [_judge(run, name, calibration, reflectance, checked.names) for name in names]
     with Journal(run) as journal:
         steps, shots = journal.steps(), journal.shot_count()
-    figures = _figures(run, checked.names, judged, steps, shots)
-    return write_report(out, _page(run, checked, calibration, judged, figures, steps), figures)
+    figures = _figures(run, checked.names, found, steps, shots)
+    return write_report(out, _page(run, checked, calibration, found, figures, steps), figures)
 
 
 def report_again(run: Path, out: Path) -> Mapping[str, str]:
@@ -91,17 +95,21 @@ def report_again(run: Path, out: Path) -> Mapping[str, str]:
     return {"report": str(html), "figures": str(figures)}
 
 
-def _judge(run: Path, name: str, calibration: Calibration, projectors: Sequence[str]) -> AppearanceComparison:
+def _judge(
+    run: Path, name: str, calibration: Calibration, reflectance: FloatImage, projectors: Sequence[str]
+) -> AppearanceComparison:
     solved = read_solved(run, name, projectors)
     photograph = read_photograph_of(run, StepKind.PHOTOGRAPH, name)
     traditional = read_photograph_of(run, StepKind.TRADITIONAL, name)
-    mask: Mask = solved.reachable & calibration.object_mask
+    mask: Mask = solved.wish.reachable & calibration.object_mask
 
     def against(picture: FloatImage) -> Comparison:
-        return compare(picture, solved.target, calibration.camera_to_xyz, solved.exposure, mask)
+        return compare(picture, solved.wish.target, calibration.camera_to_xyz, solved.exposure, mask)
 
     title = str(solved.figures["title"])
-    return AppearanceComparison(name, title, solved, photograph, traditional, against(photograph), against(traditional))
+    ours, theirs = against(photograph), against(traditional)
+    more = judged(calibration, reflectance, solved, photograph)
+    return AppearanceComparison(name, title, solved, photograph, traditional, ours, theirs, more)
 
 
 def _figures(
@@ -156,6 +164,7 @@ def _appearance_figures(appearance: AppearanceComparison) -> dict[str, Any]:
         },
         "times_better": appearance.times_better,
         "refined": appearance.solved.figures.get("refined"),
+        **appearance.judged,
     }
 
 
@@ -194,7 +203,7 @@ def _cropped(image: Any, crop: Crop) -> Any:
 
 
 def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration, crop: Crop) -> PictureRow:
-    mask = appearance.solved.reachable & calibration.object_mask
+    mask = appearance.solved.wish.reachable & calibration.object_mask
 
     def screen(image: FloatImage) -> Any:
         return _cropped(to_screen(image, calibration.camera_to_xyz, white=appearance.solved.exposure), crop)
@@ -203,18 +212,14 @@ def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration
         return _cropped(error_picture(comparison.error_map, mask), crop)
 
     outside = ~calibration.object_mask[..., None]
-    target = np.where(outside, calibration.black, appearance.solved.target).astype(np.float32)
+    wish = appearance.solved.wish.target
+    target = np.where(outside, calibration.black, wish).astype(np.float32)
     return PictureRow(
         title=appearance.title,
         figures=(
-            ("median CIEDE2000", f"{appearance.ours.delta_e00_median:.2f}"),
-            ("95th percentile", f"{appearance.ours.delta_e00_p95:.2f}"),
+            *judged_rows(appearance.judged),
             ("traditional, median", f"{appearance.theirs.delta_e00_median:.2f}"),
             ("times better", f"{appearance.times_better:.1f}"),
-            (
-                "within reach",
-                f"{100 * float(np.asarray(appearance.solved.figures['reachable_share'])):.1f} % of the object",
-            ),
             (
                 "solved",
                 f"{appearance.solved.figures['mode']}, {float(str(appearance.solved.figures['seconds'])):.2f} s",

@@ -16,6 +16,7 @@ from controller.artefacts.names import REPORT_FIGURES, REPORT_PAGE
 from controller.core.arrays import ByteImage
 from controller.core.storage import write_atomically
 from controller.report.pictures import ERROR_SCALE_DELTA_E, data_uri, scale_bar
+from controller.solve.judged import as_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,18 @@ def refined_row(figures: Any) -> tuple[tuple[str, str], ...]:
     count = len(figures["photographs"])
     text = f"{figures['before']:.2f} to {figures['after']:.2f}{expected}, {count} photograph{'s' * (count != 1)}"
     return (("refined", text),)
+
+
+def judged_rows(figures: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """An appearance's error by sets of pixels, its ghosting, and the error of its adapted target, where known."""
+    rows = as_rows(figures["pixels"]) if figures["pixels"] is not None else []
+    if (ghost := figures["ghosting"]) is not None:
+        both = ghost["both"]
+        rows.append(("ghosting", f"correlation {both['correlation']:.2f}, {100 * both['share']:.1f} % of the pattern"))
+    if (adapted := figures["adapted"]) is not None:
+        rows.append(("adapted target, median / 95 %", f"{adapted['delta_e00_median']:.2f} / "
+                     f"{adapted['delta_e00_p95']:.2f}; {100 * adapted['reachable_share']:.1f} % in reach"))  # fmt: skip
+    return tuple(rows)
 
 
 def render(page: Page) -> str:

@@ -37,7 +37,7 @@ from controller.steps.appearance.cluster_solve import answering_on
 from controller.steps.appearance.publishing import publish_step
 from controller.steps.appearance.rendering import scene_wish
 from controller.steps.appearance.requests import wishes_of
-from controller.steps.appearance.solving import SolveOptions, base_choice, solve_steps
+from controller.steps.appearance.solving import base_choice, options_of, solve_steps
 from controller.steps.calibrate.dots import dot_steps
 from controller.steps.calibrate.full import calibration_steps
 from controller.steps.calibrate.grade import (
@@ -139,7 +139,7 @@ def make_appearances(
         wishes += [scene_wish(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve
         kept = base_choice(table.base)
-        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, chosen or kept, table.adapt)
+        options = replace(options_of(table), base=chosen or kept)
         if quick:
             # a high-pass base would be solved again for each
             options = replace(options, mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))

@@ -39,6 +39,13 @@ class DriveLevels:
         _solve(self._light, image_planes(light), self.mask, out)
         return out
 
+    def light(self, levels: FloatImage) -> FloatImage:
+        """The light (rows, columns, 3) float32 of such a colour (rows, columns, 3): the inverse of ``of``."""
+        out = np.empty(levels.shape, np.float32)
+        for channel in range(3):
+            out[..., channel] = sum(self._light[channel, colour] * levels[..., colour] for colour in range(3))
+        return out
+
 
 @compiled(parallel=True)
 def _solve(B: FloatImage, light: FloatImage, mask: Mask, out: FloatImage) -> None:

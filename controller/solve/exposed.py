@@ -44,10 +44,18 @@ def exposed(
     """
     drive = DriveLevels(transport) if drive is None else drive
     found = exposure(transport, picture, black, share=share, drive=drive, indirect=indirect)
-    wanted = needed = np.float32(found) * picture
-    if indirect is not None:
-        needed = black + indirect.direct_target(wanted - black, reach=transport.reach())
+    wanted = np.float32(found) * picture
+    needed = direct_part(transport, wanted, black, indirect)
     return Exposed(found, wanted, needed, feasibility(transport, needed, black, drive=drive))
+
+
+def direct_part(
+    transport: LightTransport, wanted: FloatImage, black: FloatImage, indirect: IndirectLight | None
+) -> FloatImage:
+    """What the projectors' direct light and the black image are to make of ``wanted`` (rows, columns, 3)."""
+    if indirect is None:
+        return wanted
+    return black + indirect.direct_target(wanted - black, reach=transport.reach())
 
 
 def exposure(

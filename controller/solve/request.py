@@ -10,11 +10,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Final
 
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask
-from controller.solve.adapt import adapt_gently
+from controller.solve.adapt import adapted_target
 from controller.solve.appearance import (
     FINE_DETAIL,
     Appearance,
@@ -27,8 +28,8 @@ from controller.solve.appearance import (
 )
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
-from controller.solve.exposed import exposed
-from controller.solve.feasibility import Feasibility, target_radiance
+from controller.solve.exposed import direct_part, exposed
+from controller.solve.feasibility import Feasibility, feasibility, target_radiance
 from controller.solve.targets.values import Target
 from controller.transport import LightTransport
 from controller.transport.indirect import IndirectLight
@@ -38,12 +39,16 @@ ADVICE_FULL_SOLVE = (
 )
 
 
+ADAPTATIONS: Final = 2
+"""An adapted target throws back other light than was asked for, and so needs another floor."""
+
+
 @dataclass(frozen=True, slots=True)
 class SolveOptions:
     """``share`` of the object's pixels that each target's exposure makes reachable; ``smoothness`` of eq. 3.
 
     ``base``: the base image; with "high-pass" each appearance solves one of its own
-    ``adapt``: greatest strength of the contrast adaptation, from 0 (none) to 1
+    ``adapt``: how far targets are bent into what the stage can make, from 0 (cut off) to 1
     """
 
     share: float
@@ -68,15 +73,20 @@ class AppearanceResult:
     """A solved appearance.
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
-    ``target`` (rows, columns, 3) float32: radiance aimed at
-    ``reachable`` (rows, columns) bool: valid pixels of the picture that are reachable
+    ``target`` (rows, columns, 3) float32: radiance aimed at, adapted where that was wanted
+    ``reachable`` (rows, columns) bool: valid pixels of the picture where ``target`` is reachable
+    ``asked`` (rows, columns, 3) float32: radiance that was asked for, before any adaptation
+    ``asked_reachable``, ``valid`` (rows, columns) bool: where that is reachable; where the picture says something
     ``figures``: mode, exposure, seconds, reachable_share, fine_detail, advice, iterations, kkt; with adaptation also
-        the share and the contrast kept before and after it
+        adapted_share, that of the pixels where ``target`` is reachable
     """
 
     frames: tuple[FloatImage, ...]
     target: FloatImage
     reachable: Mask
+    asked: FloatImage
+    asked_reachable: Mask
+    valid: Mask
     figures: dict[str, float | int | str | None] = field(default_factory=dict)
 
 
@@ -115,7 +125,9 @@ def solve_appearance(
         "iterations": 0 if made.solution is None else made.solution.iterations,
         "kkt": None if made.solution is None else made.solution.kkt,
     }
-    return AppearanceResult(made.frames, aim.wanted, aim.possible.reachable & requested.mask, figures)
+    valid = requested.mask
+    reachable, asked_reachable = (found.reachable & valid for found in (aim.possible, aim.asked_possible))
+    return AppearanceResult(made.frames, aim.wanted, reachable, aim.asked, asked_reachable, valid, figures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,12 +135,15 @@ class Aim:
     """What a solve aims at, (rows, columns, 3) radiance.
 
     ``wanted``: the whole picture; ``direct``: what the projectors are to make of it by their direct light, with the
-    black image; ``possible``: how that lies in what they can make; ``figures``: see ``AppearanceResult``
+    black image; ``possible``: how that lies in what they can make; ``asked``, ``asked_possible``: ``wanted`` before it
+    was adapted, and how that lay in it; ``figures``: see ``AppearanceResult``
     """
 
     wanted: FloatImage
     direct: FloatImage
     possible: Feasibility
+    asked: FloatImage
+    asked_possible: Feasibility
     exposure: float
     figures: dict[str, float | int | str | None]
 
@@ -148,16 +163,18 @@ def aim_at(
     dark, too, where more indirect light falls than is wanted. Raises what ``choose_exposure`` raises.
     """
     found = exposed(transport, picture, black, share=options.share, drive=drive, indirect=indirect)
-    exposure, wanted, needed, possible = found.exposure, found.wanted, found.needed, found.possible
-    figures: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
+    wanted, needed, possible = found.wanted, found.needed, found.possible
+    figures: dict[str, float | int | str | None] = {"exposure": found.exposure, "reachable_share": possible.share}
     if options.adapt > 0:
-        adapted, cut_off, kept = adapt_gently(transport, needed, black, white=exposure, most=options.adapt, drive=drive)
-        wanted = needed = adapted.target
-        possible = adapted.after
-        if indirect is not None:
-            wanted = wanted + indirect.forward(np.clip(needed - black, 0, transport.reach()))
-        figures |= {"contrast_kept_cut_off": cut_off, "contrast_kept": kept, "adapted_share": possible.share}
-    return Aim(wanted, target_radiance(needed, black, 1.0), possible, exposure, figures)
+        for _ in range(1 if indirect is None else ADAPTATIONS):
+            shown = np.clip(needed - black, 0, transport.reach())
+            floor = black if indirect is None else black + indirect.forward(shown)
+            wanted = adapted_target(transport, found.wanted, floor, strength=options.adapt, drive=drive)
+            needed = direct_part(transport, wanted, black, indirect)
+        possible = feasibility(transport, needed, black, drive=drive)
+        figures |= {"adapted_share": possible.share}
+    direct = target_radiance(needed, black, 1.0)
+    return Aim(wanted, direct, possible, found.wanted, found.possible, found.exposure, figures)
 
 
 def _solved(

@@ -32,7 +32,7 @@ from controller.stage.run import LONGEST_RUN_S
 from controller.stage.session import StageSession
 from controller.steps import costs
 from controller.steps.appearance.requests import wishes_of
-from controller.steps.appearance.solving import SolveOptions, Wish, solve_steps
+from controller.steps.appearance.solving import Wish, options_of, solve_steps
 from hal.deadline import in_seconds
 
 FOLDER: Final = "without"
@@ -69,9 +69,8 @@ def solve_without(
         own = run / FOLDER / slots_without(run, missing).name
         survivors = Survivors(run, left, own)
         requests = _requests(checked, survivors, _installed(folder, checked))
-        table = checked.stage.tables.solve
+        options = options_of(checked.stage.tables.solve)
         scale = costs.scale(size for _, size in output_sizes(checked).values())
-        options = SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base)
         names = [request.name for request in requests]
         install_step = Step(
             StepId(StepKind.PUBLISH), partial(_publish, checked, tuple(missing), run, names),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,11 +16,14 @@ from controller.artefacts.camera import inherit_camera
 from controller.artefacts.comparison import Compared, ComparedImages, write_compared
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.solved import Solved, read_solved, solved_figures_path
-from controller.core.arrays import Mask
+from controller.calibrate.values import Calibration
+from controller.core.arrays import FloatImage, Mask
 from controller.core.storage import sha256_of
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
+from controller.solve.ghosting import ghosting
+from controller.solve.judged import as_table, by_pixels
 from controller.solve.metrics import compare, sharpness_windows
 from controller.steps import costs
 from controller.steps.appearance.publishing import PLAYED, bundle_display, photograph_hdr
@@ -53,8 +57,8 @@ def compare_steps(
 
 
 def compared_mask(calibrated: Calibrated, solved: Solved) -> Mask:
-    """Mask of the comparison, (rows, columns): pixels on the object where the target can be reached."""
-    return solved.reachable & calibrated.calibration.object_mask
+    """Mask of the comparison, (rows, columns): pixels on the object where what was asked for can be reached."""
+    return solved.wish.reachable & calibrated.calibration.object_mask
 
 
 def window_px(shape: tuple[int, ...]) -> int:
@@ -77,8 +81,9 @@ def _compare(
     picture = photograph_hdr(rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of)
     context.advance(0.7, "comparing with the target")
     mask, size_px = compared_mask(calibrated, solved), window_px(picture.shape)
-    found = compare(picture, solved.target, calibrated.calibration.camera_to_xyz, solved.exposure, mask)
-    local, _ = sharpness_windows(picture, solved.target, solved.exposure, mask, size_px)
+    asked = solved.wish.target
+    found = compare(picture, asked, calibrated.calibration.camera_to_xyz, solved.exposure, mask)
+    local, _ = sharpness_windows(picture, asked, solved.exposure, mask, size_px)
     one = Compared(
         run=context.folder.name,
         name=name,
@@ -92,8 +97,26 @@ def _compare(
         reachable_share=_number(solved.figures.get("reachable_share")),
         window_px=size_px,
         refined=solved.figures.get("refined"),
+        **judged(calibrated.calibration, calibrated.reflectance, solved, picture),
     )
     return write_compared(context.folder, one, ComparedImages(picture, found.error_map.astype(np.float16), local))
+
+
+def judged(calibration: Calibration, reflectance: FloatImage, solved: Solved, picture: FloatImage) -> dict[str, Any]:
+    """What a photograph (rows, columns, 3) says beyond the pixels in reach: ``pixels``, ``ghosting``, ``adapted``.
+
+    Raises what ``solve.metrics.compare`` raises.
+    """
+    asked, lit, matrix, white = solved.wish, calibration.object_mask, calibration.camera_to_xyz, solved.exposure
+    sets = by_pixels(picture, asked.target, matrix, white, reachable=asked.reachable, valid=asked.valid, lit=lit)
+    shown = lit & asked.valid
+    ghost = ghosting(picture, asked.target, reflectance, matrix, white, shown, shown & ~asked.reachable)
+    adapted = None
+    if solved.asked is not None and (reached := solved.reachable & lit).any():
+        found = compare(picture, solved.target, matrix, white, reached)
+        adapted = {"delta_e00_median": found.delta_e00_median, "delta_e00_p95": found.delta_e00_p95,
+                   "reachable_share": float(reached.sum() / max(int(lit.sum()), 1))}  # fmt: skip
+    return {"pixels": as_table(sets), "ghosting": None if ghost is None else asdict(ghost), "adapted": adapted}
 
 
 def _number(value: object) -> float | None:

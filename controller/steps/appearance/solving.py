@@ -11,9 +11,10 @@ from typing import get_args
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.solved import Solved, SolvedBase
+from controller.artefacts.solved import Asked, Solved, SolvedBase
 from controller.calibrate.values import Calibration
 from controller.capture.patterns import Pattern, PatternKind, plan_patterns
+from controller.config.models import SolveTable
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError
 from controller.run.progress import Level
@@ -26,6 +27,11 @@ from controller.solve.targets.values import Target
 from controller.steps import costs
 
 BASE = StepId(StepKind.BASE)
+
+
+def options_of(table: SolveTable) -> SolveOptions:
+    """How appearances are solved by [solve] of stage.toml, wherever they are."""
+    return SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +173,7 @@ def _solve_appearance(
         target=made.target,
         reachable=made.reachable,
         figures=figures,
+        asked=Asked(made.asked, made.asked_reachable, made.valid),
     )
     return solved.write(context.folder, wish.name)
 
@@ -179,4 +186,4 @@ def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dic
     }
 
 
-__all__ = ["SolveOptions", "Wish", "device_frames", "solve_steps"]
+__all__ = ["SolveOptions", "Wish", "device_frames", "options_of", "solve_steps"]

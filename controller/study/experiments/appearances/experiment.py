@@ -15,6 +15,7 @@ from controller.core.errors import VelaturaError
 from controller.report.pictures import Crop, crop_around, error_picture
 from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.solve.bounded.weights import appearance_weights
+from controller.solve.judged import TITLES, PixelSet, by_pixels
 from controller.solve.metrics import colour_difference
 from controller.solve.targets.values import Target
 from controller.solve.traditional import traditional_compensation
@@ -37,7 +38,8 @@ class PhotographedLook:
     """One look, photographed.
 
     ``share`` of the object at the target's exposure in reach; ``ours``, ``model`` (what the light transport predicts of
-    the same frames) and ``alone`` (one projector, same exposure) over the pixels in reach, ``whole`` ours over all.
+    the same frames) and ``alone`` (one projector, same exposure) over the pixels in reach, ``whole`` ours over all lit
+    ones, ``pixels`` ours by sets of pixels.
     At the exposure that one projector can reach by itself, ``dimmer`` times ours: ``alone_dimmed``, over the pixels
     that both can reach, and ``ours_there``, at our own exposure, over the same ones
     """
@@ -49,6 +51,7 @@ class PhotographedLook:
     by_one: FloatImage
     ours: Quality
     whole: Quality
+    pixels: dict[str, PixelSet]
     model: Quality
     alone: Quality
     dimmer: float
@@ -113,6 +116,15 @@ def _shown(subject: Subject, alone: Subject, best: int, look: Look, target: Targ
         by_one=pictures[1],
         ours=quality(subject, pictures[0], wanted),
         whole=quality(subject, pictures[0], wanted, target.mask & subject.mask),
+        pixels=by_pixels(
+            pictures[0],
+            wanted.radiance,
+            subject.calibration.camera_to_xyz,
+            wanted.white,
+            reachable=wanted.mask,
+            valid=target.mask,
+            lit=subject.mask,
+        ),
         model=quality(subject, predicted(subject, frames), wanted),
         alone=quality(subject, pictures[1], wanted),
         dimmer=dimmed.white / wanted.white,
@@ -187,15 +199,26 @@ def _shortfall(one: PhotographedLook) -> str:
     return f"The solve comes to {one.model.delta_e:.2f}; the rest is the calibration's error and noise."
 
 
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
+
+
 def _tables(shown: Sequence[PhotographedLook], left_out: Sequence[LeftOut]) -> tuple[ResultTable, ...]:
     columns = (
-        "appearance", "made by", "way", "compared", "exposure", "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda"
+        "appearance", "made by", "way", "compared", "exposure", "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda",
+        "left out of the visible object",
     )  # fmt: skip
     rows: list[tuple[Cell, ...]] = []
     for one in shown:
+        missing = {TITLES[name]: round(each.left_out_share, 4) for name, each in one.pixels.items()}
+        visible, name = one.pixels["visible"], TITLES["visible"]
+        rows.append(
+            (one.look.title, one.look.made_by, "ours", name, 1.0, _rounded(visible.delta_e00_median),
+             _rounded(visible.delta_e00_p95), None, None, None, missing[name])
+        )  # fmt: skip
         for way, compared, exposure, found in (
             ("ours", "in reach", 1.0, one.ours),
-            ("ours", "the whole object", 1.0, one.whole),
+            ("ours", TITLES["lit"], 1.0, one.whole),
             ("ours, by the model", "in reach", 1.0, one.model),
             ("one projector", "in reach", 1.0, one.alone),
             ("ours", "in reach of one", 1.0, one.ours_there),
@@ -205,6 +228,7 @@ def _tables(shown: Sequence[PhotographedLook], left_out: Sequence[LeftOut]) -> t
                 (
                     one.look.title, one.look.made_by, way, compared, round(exposure, 3), round(found.delta_e, 2),
                     round(found.delta_e_p95, 2), round(found.rmse, 4), round(found.ssim, 4), round(found.sharpness, 3),
+                    missing.get(compared),
                 )
             )  # fmt: skip
     looks: list[tuple[Cell, ...]] = [

@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import pytest
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.comparison import PICTURES, compared_in, history_of, pictures_of
-from controller.artefacts.solved import Solved
+from controller.artefacts.solved import Asked, Solved, read_solved
 from controller.capture.raw import SRGB_TO_XYZ
 from controller.core.arrays import FloatImage, save_arrays
 from controller.core.errors import UsageError
@@ -171,6 +171,27 @@ def test_each_appearance_is_judged_by_its_photograph_against_its_target(stage: S
         assert picture in PICTURES
         assert file.read_bytes()[:2] == b"\xff\xd8"
     assert len(pictures_of(stage.folder, marble)) == len(PICTURES)
+
+
+def test_what_was_asked_for_counts_and_each_set_of_pixels_is_told(stage: Stage) -> None:
+    solved = read_solved(stage.calibrated.folder, "gold", NAMES)
+    wish = Asked(np.asarray(1.5 * solved.target, np.float32), solved.reachable.copy(), np.ones(CAMERA, np.bool_))
+    wish.reachable[:, : CAMERA[1] // 2] = False
+    replace(solved, asked=wish).write(stage.calibrated.folder, "gold")
+    run = stage.run(FIRST, names=("gold",))
+    (gold,) = compared_in(run)
+    assert gold.delta_e00_median > 3, "the photograph shows the adapted target"
+    assert gold.adapted["delta_e00_median"] < 1
+    in_reach, lit, visible = (gold.pixels[name] for name in ("in_reach", "lit", "visible"))
+    assert in_reach["delta_e00_median"] == pytest.approx(gold.delta_e00_median, rel=1e-3)
+    assert in_reach["left_out_share"] > 0.5 > lit["left_out_share"] >= visible["left_out_share"] == 0
+    assert gold.ghosting["both"]["correlation"] < 0.05, "the object is plain"
+    write_comparison_report(run, "stage")
+    page = (run / "report.html").read_text()
+    for title in ("in reach", "all lit pixels", "whole visible object", "adapted target"):
+        assert f"{title}, median / 95 %" in page
+    (row,) = json.loads((run / "report.json").read_text())["appearances"]
+    assert row["pixels"] == gold.pixels
 
 
 def test_a_camera_that_goes_away_costs_only_what_was_not_photographed(stage: Stage) -> None:

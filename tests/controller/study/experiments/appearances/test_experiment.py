@@ -164,8 +164,7 @@ def shown(look: Look, ours: float, model: float, alone: float) -> PhotographedLo
     of = partial(Quality, delta_e_p95=0.0, rmse=0.0, ssim=1.0, sharpness=1.0)
     return PhotographedLook(
         look, ReachableTarget(nothing, np.ones((2, 2), np.bool_), 1.0), 1.0, nothing, nothing, of(ours), of(ours),
-        of(model),
-        of(alone),        0.5, of(alone), of(ours), 1.0,
+        {}, of(model), of(alone), 0.5, of(alone), of(ours), 1.0,
     )  # fmt: skip
 
 

@@ -1,0 +1,130 @@
+"""A smooth limit over what single pixels need: an elastic sheet that lies on obstacles, on the object alone.
+
+The sheet is the least one above its obstacles of all that are held down by springs and drawn flat by their tension
+(the obstacle problem); it is found on cells of about a hundredth of the picture by active sets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from controller.core.arrays import Float64, FloatImage, Mask
+
+CELL: Final = 0.012
+"""Side of a cell, relative to the picture's longer side."""
+LEAST_SIDE_PX: Final = 4
+THIN: Final = 0.005
+"""Obstacles narrower than this part of the picture are left out: grazing edges, specks, noise."""
+QUANTILE: Final = 0.95
+"""Of the needs in a cell, the one that counts as its obstacle."""
+REACH: Final = 0.04
+"""How far the sheet needs to fall to 1/e beside an obstacle, relative to the picture's longer side."""
+ROUNDS: Final = 60
+SOFT_CELLS: Final = 0.7
+"""Standard deviation of the last smoothing, in cells."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet:
+    """The cells of one object, for any number of limits.
+
+    ``mask`` (rows, columns) of the object; ``side`` of a cell in pixels; ``cells`` (rows, columns of cells): those with
+    a pixel of the object; ``stiffness`` (cells, cells): springs and tension
+    """
+
+    mask: Mask
+    side: int
+    cells: Mask
+    stiffness: Any
+
+    @classmethod
+    def on(cls, mask: Mask) -> Self:
+        """For an object's ``mask`` (rows, columns)."""
+        longer = max(mask.shape)
+        side = max(LEAST_SIDE_PX, round(CELL * longer))
+        cells = np.asarray(_blocks(mask, side).any(axis=2), np.bool_)
+        length = REACH * longer / side
+        tension = _differences(cells)
+        stiffness = sp.identity(tension.shape[1]) + length**2 * (tension.T @ tension)
+        return cls(mask, side, cells, sp.csr_matrix(stiffness))
+
+    def above(self, need: FloatImage) -> FloatImage:
+        """(rows, columns) float32: a smooth limit above ``need`` of that shape, where this is more than 0; 0 far off.
+
+        Narrow obstacles and a twentieth of each cell's pixels may stand out of it.
+        """
+        if not (self.mask & (need > 0)).any():
+            return np.zeros_like(need)
+        thin = round(THIN * max(self.mask.shape)) | 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (thin, thin))
+        wide = cv2.morphologyEx(
+            np.where(self.mask, need, 0).astype(np.float32), cv2.MORPH_OPEN, disc,
+            borderType=cv2.BORDER_CONSTANT, borderValue=0,
+        )  # fmt: skip
+        inside = np.where(_blocks(self.mask, self.side), _blocks(wide, self.side), np.nan)[self.cells]
+        obstacle = np.nanquantile(inside, QUANTILE, axis=1).astype(np.float64)
+        lying = np.zeros(self.cells.shape, np.float32)
+        lying[self.cells] = lowest_above(self.stiffness, obstacle)
+        return self._on_pixels(lying)
+
+    def _on_pixels(self, values: FloatImage) -> FloatImage:
+        """Values of cells, interpolated over those that hold a pixel of the object."""
+        rows, columns = self.mask.shape
+        across, down = ((np.arange(n, dtype=np.float32) - (self.side - 1) / 2) / self.side for n in (columns, rows))
+        at_x, at_y = np.meshgrid(across.astype(np.float32), down.astype(np.float32))
+
+        def spread(image: FloatImage) -> FloatImage:
+            soft = cv2.GaussianBlur(image, (0, 0), SOFT_CELLS)
+            found = cv2.remap(soft, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            return np.asarray(found, np.float32)
+
+        share = np.maximum(spread(self.cells.astype(np.float32)), np.float32(1e-3))
+        return np.asarray(np.where(self.mask, spread(values) / share, 0), np.float32)
+
+
+def lowest_above(stiffness: Any, obstacle: Float64) -> Float64:
+    """The sheet h (cells,) of least h' A h / 2 with h >= ``obstacle`` (cells,); A = ``stiffness``, an M-matrix.
+
+    Where it lies on an obstacle it presses on it; elsewhere A h = 0 (Hintermueller, Ito, Kunisch 2003).
+    """
+    lies = obstacle > 0
+    height = np.where(lies, obstacle, 0.0)
+    for _ in range(ROUNDS):
+        height = np.where(lies, obstacle, 0.0)
+        free = np.flatnonzero(~lies)
+        if free.size and lies.any():
+            part = stiffness[free]
+            height[free] = splu(sp.csc_matrix(part[:, free])).solve(-(part @ height))
+        pressed = stiffness @ height
+        after = np.where(lies, pressed > 0, height < obstacle - 1e-9)
+        if (after == lies).all():
+            break
+        lies = after
+    return np.asarray(np.maximum(height, obstacle))
+
+
+def _differences(cells: Mask) -> Any:
+    """(pairs, cells): one row for each two cells side by side, their difference."""
+    number = np.full(cells.shape, -1)
+    number[cells] = np.arange(int(cells.sum()))
+    pairs = [(a[both], b[both]) for a, b in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))
+             for both in ((a >= 0) & (b >= 0),)]  # fmt: skip
+    first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    row = np.arange(first.size)
+    values = np.concatenate([np.ones(first.size), -np.ones(first.size)])
+    at = (np.concatenate([row, row]), np.concatenate([first, second]))
+    return sp.csr_matrix((values, at), shape=(first.size, int(cells.sum())))
+
+
+def _blocks(image: npt.NDArray[Any], side: int) -> npt.NDArray[Any]:
+    """(rows of cells, columns of cells, pixels): the pixels of each cell; what lies beyond the picture is 0."""
+    rows, columns = (-(-n // side) for n in image.shape)
+    whole = np.pad(image, ((0, rows * side - image.shape[0]), (0, columns * side - image.shape[1])))
+    return whole.reshape(rows, side, columns, side).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
