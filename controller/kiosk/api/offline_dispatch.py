@@ -63,7 +63,8 @@ def status_text(state: Mapping[str, Any]) -> str:
     """The state as text for a terminal; control characters of devices are removed."""
     lines = [f"{state['stage']}: {state['state']}" + (f" ({state['reason']})" if state["reason"] else "")]
     if state.get("playing"):
-        lines.append(f"Playing {state['playing']}.")
+        lines.append(f"Playing {state['playing']}{', one of all in turn' if state.get('in_turn') else ''}.")
+    lines += [f"Warning: {warning}" for warning in state.get("warnings", ())]
     for row in state["devices"]:
         values = ", ".join(f"{value['label']} {value['text']}" for value in row["values"])
         lines.append(f"  {row['kind']:<10} {row['name']:<12} {values}")
@@ -72,7 +73,8 @@ def status_text(state: Mapping[str, Any]) -> str:
     job = state.get("job")
     if job and not job["ended"]:
         step = job["steps"][-1] if job["steps"] else {"title": "", "done": 0.0}
-        lines.append(f"{job['name']}: {step['title']} {step['done']:.0%}")
+        now = job.get("waits") or f"{step['title']} {step['done']:.0%}"
+        lines.append(f"{job['name']}: {now}")
     return "\n".join(map(printable, lines))
 
 

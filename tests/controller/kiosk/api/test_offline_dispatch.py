@@ -150,3 +150,11 @@ def test_of_two_who_make_accounts_at_once_neither_loses_one(tmp_path: Path, monk
     monkeypatch.setattr(direct, "stage_lock", after_another)
     call(stage, "add-account", name="vera", role="viewer", password="a good long one")
     assert [one["name"] for one in call(stage, "accounts")] == ["otto", "vera"]
+
+
+def test_warnings_what_is_shown_in_turn_and_a_job_that_waits_are_told_in_words() -> None:
+    state = KioskState(1, "The vase", "playing", "open", 0.0, playing="marble", in_turn=True, warnings=("Read this.",),
+                       job=Job(1, "Full recalibration", waits="It starts soon."))  # fmt: skip
+    lines = status_text(plain(state)).split("\n")
+    assert lines[1:3] == ["Playing marble, one of all in turn.", "Warning: Read this."]
+    assert lines[-1] == "Full recalibration: It starts soon."
