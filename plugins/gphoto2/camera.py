@@ -17,7 +17,8 @@ from hal.errors import DeviceGone, DeviceRefused
 from hal.registry import Driver, OpenContext
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.gphoto2.errors import shot_lost
-from plugins.gphoto2.process import CRASHED, LibraryProcess, load_library
+from plugins.gphoto2.library import load_library
+from plugins.library_process import CRASHED, LibraryProcess
 
 _MOST_NOTES: Final = 1000
 
@@ -31,7 +32,13 @@ class Gphoto2Camera:
 
     def __init__(self, *, port: str, serial: str, deadline: Deadline) -> None:
         self._troubles: deque[tuple[str, str]] = deque(maxlen=_MOST_NOTES)
-        self.process = LibraryProcess(port, serial, lambda code, what: self._troubles.append((code, what)))
+        self.process = LibraryProcess(
+            "plugins.gphoto2.worker",
+            "libgphoto2",
+            start=(port,),
+            serial=serial,
+            note=lambda code, what: self._troubles.append((code, what)),
+        )
         try:
             self._capabilities: CameraCapabilities = self.process.ask("capabilities", deadline=deadline)
         except BaseException:

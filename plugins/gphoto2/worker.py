@@ -1,16 +1,14 @@
 """The process in which libgphoto2 runs: `python -m plugins.gphoto2.worker FD` answers requests on a socket.
 
 A fault in the library, or in a camera's driver of it, ends this process and not the controller. A call that hangs ends
-with it, too: the controller kills it. Requests and answers are those of ``plugins.gphoto2.process``.
+with it, too: the controller kills it. Requests and answers are those of ``plugins.library_process``.
 """
 
 from __future__ import annotations
 
 import contextlib
-import signal
 import sys
 import time
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,8 +16,9 @@ from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.gphoto2 import opened as device
 from plugins.gphoto2.errors import shot_lost, translated
+from plugins.gphoto2.library import load_library
 from plugins.gphoto2.opened import Opened
-from plugins.gphoto2.process import Answer, Failed, load_library
+from plugins.library_process import Answer, Failed, served
 
 _LISTEN_MS: Final = 50
 _MOST_FILES: Final = 8
@@ -156,16 +155,7 @@ class Worker:
 
 
 def main() -> int:
-    # Ctrl-C goes to every process of the terminal; this one ends when its controller closes the socket.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with Connection(int(sys.argv[1])) as socket:
-        port, serial = socket.recv()
-        worker = Worker(load_library(), port, serial)
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                socket.send(worker.answer(*socket.recv()))
-        worker.close()
-    return 0
+    return served(lambda port, serial: Worker(load_library(), port, serial))
 
 
 if __name__ == "__main__":

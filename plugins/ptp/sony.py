@@ -112,7 +112,7 @@ class SonyBody:
             self._channel.link.wait_event(_POLL_S, deadline=deadline)
         picture = self._picture(deadline)
         if picture is None:
-            raise broken("something that is not a picture")
+            raise broken("an object that is not a picture")
         return [picture]
 
     def download(self, picture: Picture, file: PendingFile, *, deadline: Deadline) -> None:

@@ -1,12 +1,13 @@
-"""The controller's side of the process in which libgphoto2 runs.
+"""Libraries in C that may crash or hang, in a process of their own: the controller's side, and the process' loop.
 
-A request is (name of a method of ``worker.Worker``, its arguments). The answer is ``Failed``, or (result, the camera's
-serial number, seconds that the library took).
+A request is (name of a method of the worker, its arguments). The answer is ``Failed``, or (result, the device's serial
+number, seconds that the library took).
 """
 
 from __future__ import annotations
 
 import contextlib
+import signal
 import socket
 import subprocess
 import sys
@@ -15,11 +16,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
-from typing import Any, Final, Self
+from typing import Any, Final, Protocol, Self
 
 import hal.errors
 from hal.deadline import SLICE_S, Deadline, turn
-from hal.errors import DeviceError, DeviceGone, PluginError
+from hal.errors import DeviceError, DeviceGone
 
 _END_S: Final = 0.7
 CRASHED: Final = "camera-library-ended"
@@ -50,13 +51,18 @@ Answer = Failed | tuple[Any, str, float]
 class LibraryProcess:
     """Starts the process when it is needed, and again after it ended or was killed. One caller at a time.
 
-    ``port``, ``serial``: see ``plugins.gphoto2.camera``; ``note`` is called with (code, sentence) after a fault that
-    was corrected. ``took_s``: what the library needed for the last request, without the way there and back.
+    ``module``: whose ``main`` runs ``served``; ``library``: its name for people; ``start``: what the worker gets first
+    besides the serial number that the camera must have, "" for any; ``note`` is called with (code, sentence) after a
+    fault that was corrected. ``took_s``: what the library needed for the last request, without the way there and back.
     """
 
-    def __init__(self, port: str, serial: str, note: Callable[[str, str], object]) -> None:
+    def __init__(
+        self, module: str, library: str, *, start: tuple[Any, ...], serial: str, note: Callable[[str, str], object]
+    ) -> None:
         self.took_s = 0.0
-        self._port = port
+        self._module = module
+        self._library = library
+        self._start = start
         self._serial = serial
         self._note = note
         self._turn = threading.Lock()
@@ -75,7 +81,7 @@ class LibraryProcess:
         Raises what the worker raises, DeviceGone if the process ended, DeviceTimeout or Cancelled: a request that takes
         too long is ended by killing the process.
         """
-        with turn(self._turn, deadline, partial(_still_time, deadline)):
+        with turn(self._turn, deadline, partial(self._still_time, deadline)):
             answer = self._answer(name, arguments, deadline)
             if isinstance(answer, Failed) and answer.lost:
                 self._note(answer.code, answer.what)
@@ -100,18 +106,18 @@ class LibraryProcess:
         _kill(process)
 
     def _answer(self, name: str, arguments: tuple[Any, ...], deadline: Deadline) -> Answer:
-        _still_time(deadline)
+        self._still_time(deadline)
         process, connection = self._started()
         try:
             connection.send((name, arguments))
             while not connection.poll(min(SLICE_S, deadline.left_s())):
-                _still_time(deadline)
+                self._still_time(deadline)
             answer: Answer = connection.recv()
             return answer
         except (EOFError, OSError):
             self._stop()
             self._check_open()
-            return Failed.of(_ended(process.returncode), lost=True)
+            return Failed.of(self._ended(process.returncode), lost=True)
         except BaseException:
             # Its answer would be taken for the next one's.
             self._stop()
@@ -123,12 +129,12 @@ class LibraryProcess:
             ours, theirs = socket.socketpair()
             with theirs:
                 process = subprocess.Popen(  # noqa: S603 - this Python, with a module of ours
-                    [sys.executable, "-m", "plugins.gphoto2.worker", str(theirs.fileno())],
+                    [sys.executable, "-m", self._module, str(theirs.fileno())],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                 )
             self._running = process, Connection(ours.detach())
-            self._running[1].send((self._port, self._serial))
+            self._running[1].send((*self._start, self._serial))
         return self._running
 
     def _stop(self) -> None:
@@ -141,36 +147,43 @@ class LibraryProcess:
         if self._closed:
             raise DeviceGone("camera-closed", what="The camera was closed.", remedy="Open the camera again.")
 
+    def _ended(self, code: int) -> DeviceGone:
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        return DeviceGone(
+            CRASHED,
+            what=f"The process of {self._library} ended by itself ({how}).",
+            remedy="Switch the camera off and on, then try again. If it happens again, use another driver for it.",
+        )
 
-def load_library() -> Any:
-    """The wheel's module. Raises PluginError("gphoto2-missing")."""
-    try:
-        import gphoto2
-    except ImportError as error:
-        raise PluginError(
-            "gphoto2-missing",
-            what=f"The library for this camera is not installed ({error}).",
-            remedy="Install it into Velatura's environment: pip install 'velatura[gphoto2]'.",
-        ) from error
-    return gphoto2
+    def _still_time(self, deadline: Deadline) -> None:
+        deadline.check(
+            "camera-no-answer",
+            what=f"The camera did not answer {self._library} in time.",
+            remedy="Check that it is awake. If it does not answer, switch it off and on.",
+        )
+
+
+class LibraryWorker(Protocol):
+    """The library's side: does one request after the other."""
+
+    def answer(self, name: str, arguments: tuple[Any, ...]) -> Answer: ...
+
+    def close(self) -> None: ...
+
+
+def served(make: Callable[..., LibraryWorker]) -> int:
+    """The process: ``make`` gets what ``start`` holds, then the serial number. Ends when the controller does."""
+    # Ctrl-C goes to every process of the terminal; this one ends when its controller closes the socket.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with Connection(int(sys.argv[1])) as connection:
+        worker = make(*connection.recv())
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                connection.send(worker.answer(*connection.recv()))
+        worker.close()
+    return 0
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
     process.kill()
     process.wait()
-
-
-def _ended(code: int) -> DeviceGone:
-    return DeviceGone(
-        CRASHED,
-        what=f"The process of libgphoto2 ended by itself ({f'signal {-code}' if code < 0 else f'exit code {code}'}).",
-        remedy="Switch the camera off and on, then try again. If it happens again, use the driver ptp for this camera.",
-    )
-
-
-def _still_time(deadline: Deadline) -> None:
-    deadline.check(
-        "camera-no-answer",
-        what="The camera did not answer libgphoto2 in time.",
-        remedy="Check that it is awake. If it does not answer, switch it off and on.",
-    )

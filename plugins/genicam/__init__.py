@@ -1,0 +1,1 @@
+"""Machine vision cameras (GenICam: GigE Vision, USB3 Vision) by Aravis. Entry: `camera.DRIVER`."""

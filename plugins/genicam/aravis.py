@@ -1,0 +1,185 @@
+"""The few functions of the library Aravis that a still camera needs, by ctypes.
+
+Every pointer here is the library's own. A wrong one ends the process, so only ``worker`` uses this module, in a process
+of its own.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint32, c_uint64, c_void_p
+from dataclasses import dataclass
+from typing import Any, Final
+
+from hal.codecs.ptp.values import printable
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
+
+LIBRARY: Final = "libaravis-0.8.so.0"
+_SUCCESS: Final = 0
+_TIMEOUT: Final = 5
+_GONE: Final = frozenset({6, 7})
+"""Codes of ArvDeviceError: no answer in time; not connected, not found."""
+_SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
+    "arv_camera_new": (c_void_p, (c_char_p, c_void_p)),
+    "arv_camera_get_vendor_name": (c_char_p, (c_void_p, c_void_p)),
+    "arv_camera_get_model_name": (c_char_p, (c_void_p, c_void_p)),
+    "arv_camera_get_device_serial_number": (c_char_p, (c_void_p, c_void_p)),
+    "arv_camera_get_exposure_time_bounds": (None, (c_void_p, POINTER(c_double), POINTER(c_double), c_void_p)),
+    "arv_camera_get_exposure_time": (c_double, (c_void_p, c_void_p)),
+    "arv_camera_set_exposure_time": (None, (c_void_p, c_double, c_void_p)),
+    "arv_camera_get_pixel_format_as_string": (c_char_p, (c_void_p, c_void_p)),
+    "arv_camera_set_pixel_format_from_string": (None, (c_void_p, c_char_p, c_void_p)),
+    "arv_camera_dup_available_pixel_formats_as_strings": (POINTER(c_char_p), (c_void_p, POINTER(c_uint), c_void_p)),
+    "arv_camera_is_feature_available": (c_int, (c_void_p, c_char_p, c_void_p)),
+    "arv_camera_set_string": (None, (c_void_p, c_char_p, c_char_p, c_void_p)),
+    "arv_camera_acquisition": (c_void_p, (c_void_p, c_uint64, c_void_p)),
+    "arv_buffer_get_status": (c_int, (c_void_p,)),
+    "arv_buffer_get_image_width": (c_int, (c_void_p,)),
+    "arv_buffer_get_image_height": (c_int, (c_void_p,)),
+    "arv_buffer_get_data": (c_void_p, (c_void_p, POINTER(c_size_t))),
+    "g_object_unref": (None, (c_void_p,)),
+    "g_error_free": (None, (c_void_p,)),
+    "g_free": (None, (c_void_p,)),
+}
+
+
+class _Error(ctypes.Structure):
+    _fields_ = [("domain", c_uint32), ("code", c_int), ("message", c_char_p)]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """An image as it came: ``data`` of ``format`` (PFNC's name), whole rows from the top."""
+
+    width_px: int
+    height_px: int
+    format: str
+    data: bytes
+
+
+class AravisCamera:
+    """One open camera. ``name``: Aravis' own, the serial number or the network address; "" takes the first.
+
+    Raises DeviceGone, DeviceBusy, DeviceRefused, DeviceTimeout; PluginError("aravis-missing") without the library.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._library = _loaded()
+        self._camera = self._ask("arv_camera_new", name.encode() or None)
+        if not self._camera:
+            raise _gone("none was found")
+
+    def text(self, what: str) -> str:
+        """``vendor_name``, ``model_name``, ``device_serial_number``, ``pixel_format_as_string``."""
+        return printable((self._ask(f"arv_camera_get_{what}", self._camera) or b"").decode(errors="replace"))
+
+    def exposure_bounds_s(self) -> tuple[float, float]:
+        low, high = c_double(), c_double()
+        self._ask("arv_camera_get_exposure_time_bounds", self._camera, byref(low), byref(high))
+        return low.value / 1e6, high.value / 1e6
+
+    def set_exposure(self, seconds: float) -> float:
+        """Set it; return what the camera has then."""
+        self._ask("arv_camera_set_exposure_time", self._camera, c_double(1e6 * seconds))
+        return float(self._ask("arv_camera_get_exposure_time", self._camera)) / 1e6
+
+    def formats(self) -> list[str]:
+        """The names of its pixel formats."""
+        count = c_uint()
+        names = self._ask("arv_camera_dup_available_pixel_formats_as_strings", self._camera, byref(count))
+        try:
+            return [printable(names[at].decode(errors="replace")) for at in range(count.value)]
+        finally:
+            self._library.g_free(names)
+
+    def set_format(self, name: str) -> None:
+        self._ask("arv_camera_set_pixel_format_from_string", self._camera, name.encode())
+
+    def has(self, feature: str) -> bool:
+        return bool(self._ask("arv_camera_is_feature_available", self._camera, feature.encode()))
+
+    def choose(self, feature: str, value: str) -> None:
+        """Set an enumeration, where the camera has it."""
+        if self.has(feature):
+            self._ask("arv_camera_set_string", self._camera, feature.encode(), value.encode())
+
+    def frame(self, seconds: float) -> Frame:
+        """One image, exposed after this call began."""
+        buffer = self._ask("arv_camera_acquisition", self._camera, c_uint64(int(1e6 * max(seconds, 0.001))))
+        if not buffer:
+            raise _late()
+        try:
+            if self._library.arv_buffer_get_status(buffer) != _SUCCESS:
+                raise DeviceBusy(
+                    "camera-frame-cut",
+                    what="The camera sent an incomplete image.",
+                    remedy="Use a wired network with large packets (MTU 9000), or a faster USB port.",
+                )
+            size = c_size_t()
+            data = self._library.arv_buffer_get_data(buffer, byref(size))
+            width, height = (int(getattr(self._library, f"arv_buffer_get_image_{side}")(buffer)) for side in _SIDES)
+            return Frame(width, height, self.text("pixel_format_as_string"), ctypes.string_at(data, size.value))
+        finally:
+            self._library.g_object_unref(buffer)
+
+    def close(self) -> None:
+        camera, self._camera = self._camera, None
+        if camera:
+            self._library.g_object_unref(camera)
+
+    def _ask(self, name: str, *arguments: Any) -> Any:
+        """Call a function whose last parameter takes a GError."""
+        error = POINTER(_Error)()
+        result = getattr(self._library, name)(*arguments, ctypes.cast(ctypes.pointer(error), c_void_p))
+        if error:
+            code, said = error.contents.code, (error.contents.message or b"").decode(errors="replace")
+            self._library.g_error_free(ctypes.cast(error, c_void_p))
+            raise _meant(code, printable(said))
+        return result
+
+
+_SIDES: Final = ("width", "height")
+
+
+def _loaded() -> Any:
+    try:
+        library = ctypes.CDLL(LIBRARY)
+    except OSError as error:
+        raise PluginError(
+            "aravis-missing",
+            what=f"The library for GenICam cameras is not installed ({error}).",
+            remedy="Install Debian's package libaravis-0.8-0.",
+        ) from error
+    for name, (returns, takes) in _SIGNATURES.items():
+        function: Callable[..., Any] = getattr(library, name)
+        function.restype, function.argtypes = returns, takes  # type: ignore[attr-defined]
+    return library
+
+
+def _meant(code: int, said: str) -> DeviceError:
+    if code == _TIMEOUT:
+        return _late()
+    if code in _GONE:
+        return _gone(said)
+    return DeviceRefused(
+        "camera-refused",
+        what=f"The camera refused a command ({said}).",
+        remedy="End other programs that use it, and check its settings with the maker's own program.",
+    )
+
+
+def _gone(said: str) -> DeviceGone:
+    return DeviceGone(
+        "camera-off",
+        what=f"Aravis finds no such camera ({said}).",
+        remedy="Check its power, its cable, and that this computer's network address fits the camera's.",
+    )
+
+
+def _late() -> DeviceTimeout:
+    return DeviceTimeout(
+        "camera-no-picture",
+        what="The camera sent no image in time.",
+        remedy="Check its trigger settings: it must run freely.",
+    )
