@@ -13,6 +13,8 @@ import warnings
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from serial import rfc2217
+
 from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout, PluginError
 from hal.links import BufferedLink, ByteLink, TcpLink
@@ -120,13 +122,22 @@ class Rfc2217Link(BufferedLink):
         )
 
 
+class _Port(rfc2217.Serial):  # type: ignore[misc]
+    """pyserial's client, which forgets its socket, open, if the other end has closed the connection."""
+
+    def close(self) -> None:
+        connection = getattr(self, "_socket", None)
+        super().close()
+        if connection is not None:
+            with contextlib.suppress(OSError):
+                connection.close()
+
+
 def _open(url: str, baud: int, opened: queue.SimpleQueue[Any], left: threading.Event) -> None:
     try:
-        from serial import rfc2217
-
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # pyserial 3.5 names its thread in an old way
-            made = rfc2217.Serial(url, baudrate=baud, timeout=SLICE_S)
+            made = _Port(url, baudrate=baud, timeout=SLICE_S)
     except Exception as error:  # noqa: BLE001 - it is raised again in the waiting thread
         opened.put(error)
         return
@@ -137,12 +148,7 @@ def _open(url: str, baud: int, opened: queue.SimpleQueue[Any], left: threading.E
 
 
 def _close(made: Any) -> None:
-    """Close what was opened; pyserial waits for its reader, and forgets its socket if the other end has closed it."""
-    if isinstance(made, BaseException):
-        return
-    connection = getattr(made, "_socket", None)
-    with contextlib.suppress(*_LOST):
-        made.close()
-    if connection is not None:
-        with contextlib.suppress(OSError):
-            connection.close()
+    """Close what was opened; pyserial waits for its reader."""
+    if not isinstance(made, BaseException):
+        with contextlib.suppress(*_LOST):
+            made.close()

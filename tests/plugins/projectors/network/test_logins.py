@@ -72,7 +72,7 @@ def test_no_transcript_holds_the_password(open_network: Any) -> None:
     for profile in LOCKED:
         pair = open_network(profile=profile, name=profile, password="secret123", settings={"password": "secret123"})
         pair.driver.status(deadline=in_seconds(SOON))
-        told = [file.read_text() for file in (pair.stage / "transcripts").glob(f"{profile}-*.txt")]
+        told = [file.read_text() for file in (pair.stage / "transcripts").glob("tcp-*.txt")]
         assert told
         assert any("<" in text for text in told)
         assert not any("secret123" in text for text in told)
