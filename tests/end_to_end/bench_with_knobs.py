@@ -7,13 +7,16 @@ Usage: python -m tests.end_to_end.bench_with_knobs STAGE. Lines: ``unplug left``
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
+import traceback
 from pathlib import Path
 from typing import Any
 
 from plugins.emulated import bench
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.projectors import wires
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 
@@ -48,11 +51,16 @@ def turn(knob: str, name: str) -> None:
 
 def listen() -> None:
     for line in sys.stdin:
-        turn(*line.split())
+        try:
+            turn(*line.split())
+        except BaseException:  # noqa: BLE001 - a test that waits for the knob would wait for its timeout
+            traceback.print_exc()
+            os._exit(1)
         print(json.dumps({"knob": line.strip()}), flush=True)
 
 
 if __name__ == "__main__":
-    vars(bench).update(EmulatedSerialProjector=KnownProjector, EmulatedPtpCamera=KnownCamera)
+    vars(bench).update(EmulatedPtpCamera=KnownCamera)
+    vars(wires).update(EmulatedSerialProjector=KnownProjector)
     threading.Thread(target=listen, daemon=True).start()
     sys.exit(bench.EmulatedBench().serve(Path(sys.argv[1]), json_lines=True))
