@@ -16,6 +16,7 @@ EXTRAS: Final = {
     "gphoto2": "cameras through libgphoto2",
     "mains": "mains by network: PDUs by SNMP, relays by Modbus",
     "cluster": "solve on many machines (--scheduler)",
+    "study": "judge a study by FLIP, and light of Mitsuba on the emulated stage",
 }
 """Purpose of each extra of pyproject.toml that people install."""
 _MODULES: Final = {
@@ -27,6 +28,7 @@ _MODULES: Final = {
     "gphoto2": "gphoto2",
     "mains": "pymodbus pysnmp",
     "cluster": "dask distributed",
+    "study": "drjit flip_evaluator mitsuba",
 }
 EXTRA_OF: Final = {module: extra for extra, modules in _MODULES.items() for module in modules.split()}
 """The extra of each imported third-party module; "" for the base installation."""

@@ -7,6 +7,7 @@ of its own.
 from __future__ import annotations
 
 import ctypes
+import time
 from collections.abc import Callable
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
@@ -16,12 +17,17 @@ from hal.codecs.ptp.values import printable
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
 
 LIBRARY: Final = "libaravis-0.8.so.0"
+CONTROL_S: Final = 6.0
 _SUCCESS: Final = 0
 _TIMEOUT: Final = 5
 _GONE: Final = frozenset({6, 7})
 """Codes of ArvDeviceError: no answer in time; not connected, not found."""
 _SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
     "arv_camera_new": (c_void_p, (c_char_p, c_void_p)),
+    "arv_camera_is_gv_device": (c_int, (c_void_p,)),
+    "arv_camera_get_device": (c_void_p, (c_void_p,)),
+    "arv_gv_device_is_controller": (c_int, (c_void_p,)),
+    "arv_gv_device_take_control": (c_int, (c_void_p, c_void_p)),
     "arv_camera_get_vendor_name": (c_char_p, (c_void_p, c_void_p)),
     "arv_camera_get_model_name": (c_char_p, (c_void_p, c_void_p)),
     "arv_camera_get_device_serial_number": (c_char_p, (c_void_p, c_void_p)),
@@ -69,6 +75,21 @@ class AravisCamera:
         self._camera = self._ask("arv_camera_new", name.encode() or None)
         if not self._camera:
             raise _gone("none was found")
+        self._take_control()
+
+    def _take_control(self) -> None:
+        """On a network, one program has a camera until its heartbeats stop: for three seconds after it has crashed."""
+        if not self._library.arv_camera_is_gv_device(self._camera):
+            return
+        device, ends_s = self._library.arv_camera_get_device(self._camera), time.monotonic() + CONTROL_S
+        while not self._library.arv_gv_device_is_controller(device):
+            try:
+                self._ask("arv_gv_device_take_control", device)
+            except DeviceError:
+                if time.monotonic() > ends_s:
+                    self.close()
+                    raise
+                time.sleep(0.2)
 
     def text(self, what: str) -> str:
         """``vendor_name``, ``model_name``, ``device_serial_number``, ``pixel_format_as_string``."""

@@ -25,7 +25,7 @@ from hal.errors import DeviceError
 from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import BOARDS
+from plugins.emulated.projectors.boards import BOARDS, baud_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.quick_profile import quick_profile
@@ -34,7 +34,7 @@ from plugins.emulated.scenario import ScenarioPlayer, parse_scenario
 from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.serial import open_serial_projector
 
-FAMILIES = (*BOARDS, "pjlink")
+FAMILIES = (*(family for family in BOARDS if baud_of(family)), "pjlink")
 DEADLINE_S = 0.6
 GRACE_S = 0.3
 """How late a call may end on a loaded machine: waiting is done in slices of 0.05 s."""

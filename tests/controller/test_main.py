@@ -140,7 +140,7 @@ def test_help_names_every_command_with_its_first_sentence(capsys: pytest.Capture
     for arguments in ([], ["--help"]):
         assert shell.run(arguments) == 0
         shown = capsys.readouterr().out
-        assert all(command.__name__ in shown for command in shell.COMMANDS)
+        assert all(command.__name__.replace("_", "-") in shown for command in shell.COMMANDS)
         assert "A command for these tests." in shown
 
 

@@ -14,7 +14,7 @@ import typer
 from controller.__main__ import application
 
 ROOT = Path(__file__).parents[2]
-FORMATS = r"transcript 1|bundle signature 1"
+FORMATS = r"transcript 1|tape 1|bundle signature 1"
 """First words of file formats; no command is meant."""
 NAMED = re.compile(rf"(?<![\w./-])(?:\.venv/bin/)?velatura (?!{FORMATS})([a-z][a-z-]*)((?: [\w./=-]+)*)")
 
@@ -39,7 +39,7 @@ def wrong(text: str, root: Any) -> list[str]:
     """The commands and options of ``text`` that do not exist."""
     found = []
     for match in NAMED.finditer(text):
-        name, words = match[1], match[2].split()
+        name, words = match[1], match[2].partition(" -- ")[0].split()  # after that come another program's words
         command = root.commands.get(name)
         if command is not None and hasattr(command, "commands") and words and words[0] in command.commands:
             command = command.commands[words.pop(0)]

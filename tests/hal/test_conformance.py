@@ -77,6 +77,7 @@ class MemoryCamera(Base):
         suffix, kind = (".dng", FileKind.RAW) if self.settings.raw else (".jpg", FileKind.JPEG)
         data = os.urandom(100)
         path = destination.with_suffix(suffix) if self.flaw == "suffix" else Path(f"{destination}{suffix}")
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as file:
             file.write(data)
             file.flush()

@@ -172,7 +172,8 @@ class _Commands:
                 self._bus.unplug(self._devices.pop(name))
             case "set":
                 holder, knob = _find(device, command["knob"])
-                setattr(holder, knob, command["value"])
+                is_set = isinstance(getattr(holder, knob), frozenset)
+                setattr(holder, knob, frozenset(command["value"]) if is_set else command["value"])
                 device.on_ready()  # what a fault has held back may go on now
             case "get":
                 holder, knob = _find(device, command["knob"])
@@ -233,7 +234,7 @@ def serve(folder: Path, commands: IO[str], answers: IO[str]) -> None:
                 answer = {"value": table.obey(json.loads(line))}
             except Exception as error:  # noqa: BLE001 - whatever it is, whoever gave the command must hear of it
                 answer = {"error": f"{type(error).__name__}: {error}"}
-            answers.write(json.dumps(answer) + "\n")
+            answers.write(json.dumps(answer, default=sorted) + "\n")  # JSON has no sets
             answers.flush()
 
 

@@ -22,10 +22,12 @@ NAMES = {
     "OpenEXR": "openexr", "PIL": "pillow", "StreamDeck": "streamdeck", "argon2": "argon2-cffi", "hid": "hidapi",
     "cv2": "opencv-contrib-python-headless", "multipart": "python-multipart", "nacl": "pynacl", "serial": "pyserial",
     "prometheus_client": "prometheus-client", "python_multipart": "python-multipart", "skimage": "scikit-image",
-    "usb": "pyusb",
+    "usb": "pyusb", "flip_evaluator": "flip-evaluator",
 }  # fmt: skip
 """The distribution of a module, where it is called otherwise."""
-INDIRECT = {"anyio": "starlette", "cycler": "matplotlib", "llvmlite": "numba", "pydantic_core": "pydantic"}
+INDIRECT = {
+    "anyio": "starlette", "cycler": "matplotlib", "drjit": "mitsuba", "llvmlite": "numba", "pydantic_core": "pydantic",
+}  # fmt: skip
 """Modules that come with another distribution."""
 OWN_PROCESS = {"bpy", "mathutils", "scenes"}
 BLOCKED = """
