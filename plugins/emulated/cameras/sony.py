@@ -18,6 +18,7 @@ _COMPRESSION: Final = 0x5004
 _OLD_FORMATS: Final = {1: 0x10, 2: 0x13, 3: 0x03}
 """The values of the older property for those of the newer one; both are one setting."""
 _DOWN: Final = 2
+_OPEN_SESSION: Final = 0x1002
 _VERSION: Final = 300
 _BELOW: Final = (
     *(8000, 6400, 5000, 4000, 3200, 2500, 2000, 1600, 1250, 1000, 800, 640, 500, 400, 320, 250, 200, 160, 125, 100),
@@ -64,7 +65,8 @@ class EmulatedSonyBody(EmulatedBody):
         with self.lock:
             if self._fetched:
                 self._fetched = False
-                self.card.waiting.pop(next(iter(self.card.waiting), 0), None)
+                if code != _OPEN_SESSION:  # a client that begins again did not get it whole
+                    self.card.waiting.pop(next(iter(self.card.waiting), 0), None)
             return super().answer(code, parameters, data)
 
     def standard(self, code: int, asked: tuple[int, ...]) -> PtpOutcome | None:
