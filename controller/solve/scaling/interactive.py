@@ -156,9 +156,8 @@ class Interactive:
         centre = (output.centre.reshape(-1, 2).astype(np.float32) / FULL * sides).astype(np.float32)
         pixels = len(centre)
         at, shares = np.empty(pixels, np.int32), np.zeros((pixels, 16), np.uint8)
-        shares_of(
-            centre, output.shape.reshape(-1, 3), sigma_table(), self._block, (height, width), self._side, at, shares
-        )
+        lit = np.ascontiguousarray(self.maps.present)
+        shares_of(centre, output.shape.reshape(-1, 3), sigma_table(), self._block, lit, self._side, at, shares)
         present = self._present()
         whole = np.zeros(pixels, np.float32)
         sums_of(present, self._side, at, shares, whole)

@@ -210,44 +210,87 @@ def show(
             out[j + np.uint64(2)] = (np.uint32(levels[blue]) + np.uint32(noise[k + np.uint64(2)])) >> bits
 
 
+@compiled()
+def _shares_in(
+    shape: FloatImage, left: int, top: int, block: int, present: ByteImage, found: FloatImage, lit: FloatImage
+) -> None:
+    """A Gaussian's shares of the sixteen blocks from (``left``, ``top``) on, and those of pixels with base light.
+
+    ``shape``: middle x, y, standard deviations x, y, correlation
+    """
+    x, y, sx, sy, r = shape[0], shape[1], shape[2], shape[3], shape[4]
+    reach_x = min(max(_REACH * sx, np.float32(0.5)), _RADIUS)
+    reach_y = min(max(_REACH * sy, np.float32(0.5)), _RADIUS)
+    found[:], lit[:] = 0, 0
+    first_row = max(top * block, int(np.ceil(y - reach_y)), 0)
+    first_column = max(left * block, int(np.ceil(x - reach_x)), 0)
+    for v in range(first_row, min((top + SIDE) * block, int(np.floor(y + reach_y)) + 1, present.shape[0])):
+        for u in range(first_column, min((left + SIDE) * block, int(np.floor(x + reach_x)) + 1, present.shape[1])):
+            dx, dy = (u - x) / sx, (v - y) / sy
+            share = np.exp(np.float32(-0.5) * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r))
+            k = (v // block - top) * SIDE + u // block - left
+            found[k] += share
+            lit[k] += share * present[v, u]
+
+
+@compiled()
+def _brightest(shape: FloatImage, present: ByteImage) -> tuple[int, int]:
+    """The (row, column) with base light at which a Gaussian is highest; (-1, -1) if it reaches none."""
+    x, y, sx, sy, r = shape[0], shape[1], shape[2], shape[3], shape[4]
+    reach_x = min(max(_REACH * sx, np.float32(0.5)), _RADIUS)
+    reach_y = min(max(_REACH * sy, np.float32(0.5)), _RADIUS)
+    row, column, most = -1, -1, np.float32(0)
+    for v in range(max(int(np.ceil(y - reach_y)), 0), min(int(np.floor(y + reach_y)) + 1, present.shape[0])):
+        for u in range(max(int(np.ceil(x - reach_x)), 0), min(int(np.floor(x + reach_x)) + 1, present.shape[1])):
+            dx, dy = (u - x) / sx, (v - y) / sy
+            share = np.exp(np.float32(-0.5) * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r)) * present[v, u]
+            if share > most:
+                row, column, most = v, u, share
+    return row, column
+
+
 @compiled(parallel=True)
 def shares_of(
     centre: FloatImage,
     shape: ByteImage,
     sigmas: FloatImage,
     block: int,
-    size: tuple[int, int],
+    present: ByteImage,
     side: int,
     at: npt.NDArray[np.int32],
     shares: ByteImage,
 ) -> None:
-    """Each pixel's Gaussian (``bundle.live_maps``) by blocks: the window's first block, and sixteen shares of 255."""
-    height, width = size
+    """Each pixel's Gaussian (``bundle.live_maps``) by blocks: the window's first block, and sixteen shares of 255.
+
+    The window lies around the middle. Where that has no base light, and only the edge of the Gaussian reaches some, it
+    lies around the brightest pixel there: the reference scales such a pixel by what its edge sees.
+    """
     for i in prange(at.size):
         at[i] = -1
         if shape[i, 0] == 0:
             continue
-        x, y = centre[i, 0], centre[i, 1]
-        sx, sy = sigmas[shape[i, 0]], sigmas[shape[i, 1]]
-        r = min(max((np.float32(shape[i, 2]) - np.float32(128)) / np.float32(127), -_CORRELATION), _CORRELATION)
-        left = int(np.floor((x + np.float32(0.5)) / block - np.float32(0.5))) - (SIDE // 2 - 1)
-        top = int(np.floor((y + np.float32(0.5)) / block - np.float32(0.5))) - (SIDE // 2 - 1)
-        reach_x = min(max(_REACH * sx, np.float32(0.5)), _RADIUS)
-        reach_y = min(max(_REACH * sy, np.float32(0.5)), _RADIUS)
-        found = np.zeros(SIDE * SIDE, np.float32)
-        for v in range(max(top * block, 0), min((top + SIDE) * block, height)):
-            for u in range(max(left * block, 0), min((left + SIDE) * block, width)):
-                dx, dy = (u - x), (v - y)
-                if abs(dx) > reach_x or abs(dy) > reach_y:
-                    continue
-                dx, dy = dx / sx, dy / sy
-                share = np.exp(-0.5 * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r))
-                found[(v // block - top) * SIDE + u // block - left] += share
+        r = (np.float32(shape[i, 2]) - np.float32(128)) / np.float32(127)
+        pixel = np.empty(5, np.float32)
+        pixel[0], pixel[1], pixel[2], pixel[3] = centre[i, 0], centre[i, 1], sigmas[shape[i, 0]], sigmas[shape[i, 1]]
+        pixel[4] = min(max(r, -_CORRELATION), _CORRELATION)
+        found, lit = np.empty(SIDE * SIDE, np.float32), np.empty(SIDE * SIDE, np.float32)
+        left = int(np.floor((pixel[0] + np.float32(0.5)) / block - np.float32(0.5))) - (SIDE // 2 - 1)
+        top = int(np.floor((pixel[1] + np.float32(0.5)) / block - np.float32(0.5))) - (SIDE // 2 - 1)
+        _shares_in(pixel, left, top, block, present, found, lit)
         most = found.max()
+        if lit.max() < 255 * most / 510:  # less than the smallest share: 8 bits lose it
+            row, column = _brightest(pixel, present)
+            if row < 0:
+                continue
+            left, top = column // block - (SIDE // 2 - 1), row // block - (SIDE // 2 - 1)
+            _shares_in(pixel, left, top, block, present, found, lit)
+            most = np.float32(0)
+            for k in range(SIDE * SIDE):
+                most = max(most, found[k] if lit[k] > 0 else np.float32(0))
         if most > 0:
             at[i] = (top + MARGIN) * side + left + MARGIN
             for k in range(SIDE * SIDE):
-                shares[i, k] = np.uint8(np.float32(255) * found[k] / most + np.float32(0.5))
+                shares[i, k] = np.uint8(min(np.float32(255) * found[k] / most, np.float32(255)) + np.float32(0.5))
 
 
 @compiled(parallel=True)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from controller.bundle.live_maps import compensate
 from controller.calibrate.values import Calibration
 from controller.core.errors import UsageError
 from controller.solve.appearance import Base, base_image, scale_frames, solve_base
@@ -50,6 +51,35 @@ def test_the_light_of_the_frames_is_that_of_the_reference(stage: Stage, camera: 
     # dithering alone is about 1 % here
     assert error < 0.02
     assert got[inside].mean() == pytest.approx(wanted[inside].mean(), rel=2e-3)
+
+
+@pytest.mark.parametrize("camera", [(60, 80), (190, 262)], ids=["pixels", "blocks"])
+def test_pixels_that_see_base_light_with_their_edge_alone_are_scaled_as_by_the_reference(
+    stage: Stage, camera: tuple[int, int]
+) -> None:
+    _, _, made = prepared(stage(camera=camera))
+    whole = made.maps
+    shadow = np.s_[:, whole.target_px[0] // 2 :]
+    present, gain = whole.present.copy(), whole.gain.copy()
+    present[shadow], gain[shadow] = 0, 0
+    wide = [dataclasses.replace(o, shape=wider(o.shape)) for o in whole.outputs]
+    maps = dataclasses.replace(whole, present=present, gain=gain, outputs=tuple(wide))
+    picture = np.full((*present.shape, 3), 150, np.uint8)
+    fast = Interactive(maps)
+    frames = fast.blank()
+    fast.show_picture(picture, maps.unit, frames)
+    for got, wanted in zip(frames, compensate(maps, picture, maps.unit), strict=True):
+        lit = wanted.max(-1) > 8
+        assert lit.any()
+        assert (got[lit].max(-1) > 0).all()
+        assert np.abs(got[lit].astype(int) - wanted[lit]).mean() < 2
+
+
+def wider(shape: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Every Gaussian three times as wide along the rows: more than the blocks of its window."""
+    found = shape.copy()
+    found[..., 0] = np.where(shape[..., 0] > 0, np.minimum(shape[..., 0].astype(int) + 51, 200), 0)
+    return found
 
 
 def test_equal_targets_give_equal_bytes(stage: Stage) -> None:
