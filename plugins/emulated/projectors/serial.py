@@ -204,7 +204,7 @@ class EmulatedSerialProjector:
 
     def _turn(self, master: int) -> None:
         readable, _, _ = select.select([master], [], [], _TICK_S)
-        data = os.read(master, 4096) if readable else b""
+        data = self._arrived(master) if readable else b""
         if not self.awake:
             self._due.clear()
             return
@@ -216,11 +216,21 @@ class EmulatedSerialProjector:
         while self._due and self._due[0][0] <= time.monotonic():
             self._say(master, self._due.popleft()[1])
 
+    def _arrived(self, master: int) -> bytes:
+        """What came over this plug; nothing once it is pulled, for its number may be another emulator's by then."""
+        with self._lock:
+            if master != self._master:
+                return b""
+            try:
+                return self._heard(os.read(master, 4096))
+            except BlockingIOError:
+                return b""
+
     def _hear(self, data: bytes) -> None:
         if self.scenario is not None:
             self.scenario.heard(len(data))
         self._wedge()
-        for answer in self._board.feed(self._heard(data), busy=self.faults.now.busy):
+        for answer in self._board.feed(data, busy=self.faults.now.busy):
             if not self.faults.loses_this_one() and not self.wedged:
                 carried, wait_s = self.faults.bent(answer)
                 self._due.append((time.monotonic() + wait_s, carried))
@@ -236,7 +246,8 @@ class EmulatedSerialProjector:
     def _say(self, master: int, data: bytes) -> None:
         with self._lock:
             if master == self._master:  # a new plug must not hear the old one's answers
-                os.write(master, self._heard(data))
+                with contextlib.suppress(BlockingIOError):  # no one reads: a serial line does not wait
+                    os.write(master, self._heard(data))
 
     def _heard(self, data: bytes) -> bytes:
         """What arrives of ``data``: at another baud rate than ours, noise."""
