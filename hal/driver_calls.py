@@ -99,8 +99,8 @@ class Caller:
         if missing := [name for name in _members(needed) if not _has(made, name)]:
             # It may hold a port that is needed again; errors of its close do not matter.
             closed_quietly(made)
-            told = f"a {type(made).__name__} without {', '.join(missing)}"
-            raise self.fault(f"returned from open: {told}, which is not a {kind.replace('_', ' ')}")
+            shown = f"a {type(made).__name__} without {', '.join(missing)}"
+            raise self.fault(f"returned from open: {shown}, which is not a {kind.replace('_', ' ')}")
         also = tuple(extra for extra in optional if all(_has(made, name) for name in _members(extra)))
         return _checked_class(needed, *also)(made, self)
 

@@ -85,20 +85,20 @@ class ModbusRelays:
 
 def _read(settings: Mapping[str, Any]) -> dict[str, Any]:
     host, port = host_and_port(str(setting(settings, "address", str)), PORT)
-    told = {
+    numbers = {
         "unit": setting(settings, "unit", int, 1),
         "first": setting(settings, "first", int, 0),
         "channels": setting(settings, "channels", int),
     }
     allowed = {"unit": (0, 255), "first": (0, 65_000), "channels": (1, 256)}
     for key, (low, high) in allowed.items():
-        if not low <= told[key] <= high:
+        if not low <= numbers[key] <= high:
             raise PluginError(
                 "setting-wrong",
-                what=f"The setting '{key}' is {told[key]}, not {low} to {high}.",
+                what=f"The setting '{key}' is {numbers[key]}, not {low} to {high}.",
                 remedy=f"Correct {key} in stage.toml.",
             )
-    return {"host": host, "port": port, **told}
+    return {"host": host, "port": port, **numbers}
 
 
 def open_modbus_relays(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> ModbusRelays:

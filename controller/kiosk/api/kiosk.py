@@ -116,10 +116,10 @@ class StageKiosk(FolderKiosk):
 
     @property
     def service(self) -> Service:
-        """Raises WorkError("not-set-up", "begins-anew")."""
+        """Raises WorkError("not-set-up", "kiosk-restarting")."""
         service = self._service
         if service is None and not self._last.needs_setup:
-            raise WorkError("begins-anew", what="The kiosk is restarting.", remedy="Try again in a moment.")
+            raise WorkError("kiosk-restarting", what="The kiosk is restarting.", remedy="Try again in a moment.")
         if service is None:
             raise WorkError("not-set-up", what=self._last.reason, remedy="Set the stage up first.")
         return service

@@ -84,13 +84,13 @@ def uninstall(system: System, *, purge: bool, prefix: Path = Path(sys.prefix)) -
 
 def check(system: System, prefix: Path) -> None:
     """Refuse a computer on which the kiosk would not work."""
-    told = dict(
+    here = dict(
         re.findall(r'^(ID|VERSION_ID)="?([^"\n]*)"?$', system.read(Path("/etc/os-release")) or "", re.MULTILINE)
     )
-    if told.get("ID") != "debian" or told.get("VERSION_ID") not in DEBIAN:
+    if here.get("ID") != "debian" or here.get("VERSION_ID") not in DEBIAN:
         raise UsageError(
             "kiosk-system-unknown",
-            what=f"This is {told.get('ID', 'an unknown system')} {told.get('VERSION_ID', '')}, not Debian 12 or 13.",
+            what=f"This is {here.get('ID', 'an unknown system')} {here.get('VERSION_ID', '')}, not Debian 12 or 13.",
             remedy="Install Debian 12 or 13 on this computer.",
         )
     if (system.look("systemctl", "is-active", "display-manager") or "").strip() == "active":

@@ -57,12 +57,12 @@ def solve_without(
     """Solve the installed bundle's appearances without these projectors, and install them as a separate bundle.
 
     Finished steps of the same calibration are not repeated. Returns the bundle's file. Raises what
-    ``usable_calibration``, ``wishes_of`` and the solver raise, and UsageError("nobody-left").
+    ``usable_calibration``, ``wishes_of`` and the solver raise, and UsageError("no-projector-left").
     """
     checked = check_stage(session.stage)
     left = tuple(name for name in checked.names if name not in missing)
     if not left or len(left) == len(checked.names):
-        raise UsageError("nobody-left", what="No working projector would remain.", remedy="Repair a projector.")
+        raise UsageError("no-projector-left", what="No working projector would remain.", remedy="Repair a projector.")
     folder = checked.stage.folder
     with session.locked():
         run = usable_calibration(checked, reporter)

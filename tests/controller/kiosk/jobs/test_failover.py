@@ -27,7 +27,7 @@ width_px = 1400
 height_px = 1050
 
 [[appearances]]"""
-NOBODY, UNKNOWN = "nobody-left", "not-calibrated"
+NOBODY, UNKNOWN = "no-projector-left", "not-calibrated"
 
 
 @pytest.mark.parametrize(

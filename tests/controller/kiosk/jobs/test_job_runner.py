@@ -379,7 +379,7 @@ def test_hours_that_are_sent_while_the_service_is_made_anew_are_refused_and_not_
     monkeypatch.setattr(program, "serving", serving)
     monkeypatch.setattr(program, "StageKiosk", lambda stage: kiosk)
     program.serve(stage=tmp_path, panel=None, leave_lit=False, setup=False, reporter=Silent(), cancel=cancel)
-    assert refused == ["not-set-up", "begins-anew"]
+    assert refused == ["not-set-up", "kiosk-restarting"]
     assert not (tmp_path / "schedule.toml").exists()
 
 
