@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from pythonosc.osc_message_builder import OscMessageBuilder
 from pythonosc.osc_packet import OscPacket, ParseError
 
-from controller.building.protocol import Options, Protocol
+from controller.building.protocol import NetworkOptions, Protocol
 from controller.building.server import changes
 from controller.building.verbs import Verbs
 from controller.core.errors import VelaturaError
@@ -31,10 +31,10 @@ Address: TypeAlias = tuple[str, int]
 State: TypeAlias = dict[str, str | int | float]
 
 
-class OscOptions(Options):
+class OscOptions(NetworkOptions):
     """``feedback``: HOST:PORT of those that hear every change of the state."""
 
-    port: int = Field(9000, ge=1, le=65535)
+    port: int = Field(default=9000, ge=1, le=65535)
     feedback: tuple[str, ...] = ()
 
     @field_validator("feedback")

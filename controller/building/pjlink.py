@@ -14,7 +14,7 @@ from typing import Final
 from pydantic import Field
 
 from controller.building import pjlink_lines as lines
-from controller.building.protocol import Options, Protocol
+from controller.building.protocol import NetworkOptions, Protocol
 from controller.building.verbs import Verbs
 from controller.core.errors import UsageError, VelaturaError
 from controller.core.files import read_text
@@ -26,12 +26,12 @@ MOST_CLIENTS: Final = 16
 _LOG: Final = logging.getLogger("velatura.building")
 
 
-class PjLinkOptions(Options):
+class PjLinkOptions(NetworkOptions):
     """``password_file`` contains only the password (1 to 32 letters and digits); without it everybody in ``allow`` may
     use it.
     """
 
-    port: int = Field(pjlink.PORT, ge=1, le=65535)
+    port: int = Field(default=pjlink.PORT, ge=1, le=65535)
     password_file: Path | None = None
 
 

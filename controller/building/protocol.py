@@ -21,22 +21,33 @@ from controller.kiosk.panel_address import is_loopback
 from controller.kiosk.roles import Role
 
 FILE: Final = "building.toml"
-MODULES: Final = {"osc": "controller.building.osc", "pjlink": "controller.building.pjlink"}
+MODULES: Final = {
+    "osc": "controller.building.osc",
+    "pjlink": "controller.building.pjlink",
+    "cues": "controller.building.cues",
+}
 """Imported only if building.toml names them: they may need an extra."""
 
 
 class Options(BaseModel):
-    """What every protocol has: where it listens, who may use it, and for what. ``per_second``: verbs from one source.
-
-    Without ``allow`` only this machine may use it.
-    """
+    """What every protocol has: what it may do, and ``per_second``: verbs from one source."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+    role: Literal["viewer", "operator"] = "operator"
+    per_second: float = Field(default=10.0, gt=0, le=100)
+
+    @property
+    def where(self) -> str:
+        """For people: where it listens, or what it reads."""
+        raise NotImplementedError
+
+
+class NetworkOptions(Options):
+    """Where a protocol listens, and who may use it. Without ``allow`` only this machine may."""
+
     host: str = "127.0.0.1"
     port: int = Field(ge=1, le=65535)
-    role: Literal["viewer", "operator"] = "operator"
     allow: tuple[str, ...] = ()
-    per_second: float = Field(10.0, gt=0, le=100)
 
     @field_validator("allow")
     @classmethod
@@ -50,6 +61,10 @@ class Options(BaseModel):
         if not is_loopback(self.host) and not self.allow:
             raise ValueError('a host beyond this machine needs "allow", the networks that may use it')
         return self
+
+    @property
+    def where(self) -> str:
+        return f"{self.host}, port {self.port}"
 
     @property
     def address(self) -> tuple[str, int]:
@@ -70,7 +85,7 @@ class Options(BaseModel):
 class Protocol:
     """One protocol: its name in building.toml, the name for people, its options, and what serves it until cancelled.
 
-    ``serve`` raises OSError if it can't listen; it is then tried again.
+    ``serve`` raises OSError or VelaturaError if it can't; it is then tried again.
     """
 
     name: str

@@ -11,6 +11,7 @@ from typing import Final
 
 from controller.building.protocol import Configured
 from controller.building.verbs import Verbs
+from controller.core.errors import VelaturaError
 from controller.kiosk.interface import Kiosk
 
 AGAIN_S: Final = (1.0, 5.0, 30.0)
@@ -54,11 +55,12 @@ async def _kept(one: Configured, verbs: Verbs, kiosk: Kiosk) -> None:
         try:
             await one.protocol.serve(one.options, verbs)
         except Exception as error:  # noqa: BLE001 - one protocol must not end the others
-            if not isinstance(error, OSError):
+            if not isinstance(error, OSError | VelaturaError):
                 _LOG.exception("%s failed.", one.protocol.title)
             if not failed:
-                where = f"{one.options.host}, port {one.options.port}"
-                kiosk.record("building-failed", f"{one.protocol.title} can't listen on {where}: {error}", "error")
+                why = f"{error.what} {error.remedy}" if isinstance(error, VelaturaError) else str(error)
+                what = f"{one.protocol.title} does not work ({one.options.where}). {why}"
+                kiosk.record("building-failed", what, "error")
         pause_s = AGAIN_S[min(failed, len(AGAIN_S) - 1)]
         failed += 1
         await asyncio.sleep(pause_s)

@@ -76,6 +76,14 @@ class Verbs:
         named = (required or fields)[:1]
         return parse(named, {field.name: text for field in named}, strings=True)
 
+    def time_zone(self) -> str:
+        """The stage's time zone, an IANA name."""
+        return self._kiosk.schedule().time_zone
+
+    def record(self, code: str, what: str) -> None:
+        """Add a problem to the event log."""
+        self._kiosk.record(code, f"{self._who}: {what}", "error")
+
     def do(self, verb: str, sent: Mapping[str, Any] | str | bytes = "", *, source: str = "") -> None:
         """Do it for ``source``, such as an address.
 

@@ -94,7 +94,7 @@ def test_an_asker_hears_the_state_and_refusals(kiosk: MemoryKiosk, tmp_path: Pat
         # The listener may not be there at once, and a datagram to nobody is refused at the next call.
         asker.connect(("127.0.0.1", port))
         wait_for(lambda: _sent(asker, message("status")))
-        told = dict(answer() for _ in range(8))  # type: ignore[arg-type, misc]
+        told = {answered[0]: answered[1] for answered in [answer() for _ in range(8)]}
         assert told["/velatura/playing"] == "marble"
         assert told["/velatura/state"] == "playing"
         for verb, code in (("close", "verb-not-allowed"), ("restore", "verb-unknown")):
