@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.building.protocol import read
+from controller.building.protocol import NetworkOptions, read
 from controller.building.verbs import Rate, Verbs
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.roles import Role
@@ -92,5 +92,6 @@ def test_only_named_networks_and_this_machine_are_let_in(tmp_path: Path) -> None
     assert read(tmp_path) == ()
     (tmp_path / "building.toml").write_text('[osc]\nhost = "::"\nallow = ["192.168.1.0/24"]\n')
     (found,) = read(tmp_path)
+    assert isinstance(found.options, NetworkOptions)
     answers = [found.options.allows(host) for host in ("127.0.0.1", "::ffff:192.168.1.7", "192.168.2.7", "fe80::1%a")]
     assert answers == [True, True, False, False]
