@@ -136,7 +136,8 @@ class KioskState:
     jobs, as in the event log, until an operator confirms them. ``in_turn``: ``playing`` is one of those that are
     shown in turn. ``disk_free_bytes``: free space on the stage's disk, in steps of 10 MB, 0 until it is known.
     ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
-    has no valid stage.toml.
+    has no valid stage.toml. ``black``, ``paused``, ``brightness`` (percent): what people changed of the picture until
+    the stage closes.
     """
 
     revision: int
@@ -157,6 +158,9 @@ class KioskState:
     failures: tuple[EventRow, ...] = ()
     in_turn: bool = False
     disk_free_bytes: int = 0
+    black: bool = False
+    paused: bool = False
+    brightness: float = 100.0
 
 
 @dataclass(frozen=True, slots=True)

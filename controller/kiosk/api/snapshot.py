@@ -38,6 +38,7 @@ class Snapshots:
         identity = None
         if index is not None and bundle is not None:
             identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
+        live = service.reconciler.live
         return KioskState(
             revision=revision,
             stage=service.checked.stage.tables.stage.name,
@@ -56,6 +57,9 @@ class Snapshots:
             identifying=service.player.identifying,
             warnings=self._warnings(service),
             failures=service.log.failures,
+            black=live.black,
+            paused=bool(live.held),
+            brightness=round(100 * live.brightness, 1),
         )
 
     def _job(self, service: Service) -> Job | None:
