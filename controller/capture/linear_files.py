@@ -74,6 +74,15 @@ def read_exr(path: Path) -> FloatImage:
     return np.stack(planes, axis=2).astype(np.float32)
 
 
+def exr_chromaticities(path: Path) -> tuple[float, ...] | None:
+    """CIE x and y of red, green, blue and white, eight numbers, where an EXR says them."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), header_only=True) as file:
+        said = file.header().get("chromaticities")
+    return None if said is None else tuple(float(one) for one in said)
+
+
 def exr_bytes(planes: Mapping[str, npt.NDArray[Any]]) -> bytes:
     """An OpenEXR file, 32-bit floats, of channels (rows, columns) by name; (rows, columns, 3) under the name "RGB"."""
     import OpenEXR
