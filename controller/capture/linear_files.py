@@ -83,12 +83,15 @@ def exr_chromaticities(path: Path) -> tuple[float, ...] | None:
     return None if said is None else tuple(float(one) for one in said)
 
 
-def exr_bytes(planes: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """An OpenEXR file, 32-bit floats, of channels (rows, columns) by name; (rows, columns, 3) under the name "RGB"."""
+def exr_bytes(planes: Mapping[str, npt.NDArray[Any]], *, half: bool = False) -> bytes:
+    """An OpenEXR file, floats of 32 bits, or of 16 (``half``).
+
+    ``planes``: channels (rows, columns) by name; (rows, columns, 3) under the name "RGB"
+    """
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
+    channels = {name: np.ascontiguousarray(plane, np.float16 if half else np.float32) for name, plane in planes.items()}
     with tempfile.TemporaryDirectory() as folder:  # the library writes files by name only
         name = Path(folder) / "image.exr"
         OpenEXR.File(header, channels).write(str(name))

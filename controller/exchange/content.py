@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from controller.transport.camera_box import CameraBox
 class Content:
     """One calibrated stage; the large parts are made when a format asks for them.
 
+    ``folder`` of the run
     ``geometry``: poses, and points in the camera's frame, metres
     ``names`` of the projectors, in the geometry's order
     ``step``: every n-th camera pixel becomes a point or a vertex
@@ -31,6 +33,7 @@ class Content:
     ``crop``: the camera pixels of a transport; None: all
     """
 
+    folder: Path
     geometry: Geometry
     names: tuple[str, ...]
     step: int

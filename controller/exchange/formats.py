@@ -46,6 +46,8 @@ FORMATS: Final = (
     Format("st-maps", "a folder with warps as EXR pictures", "st-maps", f"{_HERE}.st_maps:write_maps"),
     Format("transport", "a folder with the light transport as scipy.sparse files", "transport",
            f"{_HERE}.sparse:write_transport"),
+    Format("dataset", "a folder with photographs, calibration, targets and results, for research", "dataset",
+           f"{_HERE}.dataset:write_dataset"),
 )  # fmt: skip
 
 

@@ -46,6 +46,7 @@ def _content(run: Path, step: int | None, crop: CameraBox | None) -> Content:
     names = tuple(projectors_of(run))
     calibrated = Calibrated(run, names)
     return Content(
+        folder=run,
         geometry=geometry,
         names=names,
         step=step or _usual_step(geometry),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -61,6 +62,7 @@ def content(transport: LightTransport) -> Content:
         valid = random.random(centre.shape[:2]) > 0.2
         metapixels.append(Metapixels(centre, np.ones((*valid.shape, 3), np.float32), valid))
     return Content(
+        folder=Path("unused"),
         geometry=geometry,
         names=NAMES,
         step=1,

@@ -17,7 +17,7 @@ from controller.artefacts.projectors import Light
 from controller.calibrate.camera.charuco import find_corners
 from controller.core.arrays import save_arrays
 from controller.exchange.formats import FORMATS, Format
-from tests.docs.synthetic_data import write_run
+from tests.docs.synthetic_data import write_full_run, write_run
 
 
 def answer(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, object]]:
@@ -84,7 +84,7 @@ def test_a_run_is_exported(calibrated: Path, kind: str, file: str, capsys: pytes
 def test_every_format_is_written_where_its_declaration_says(
     chosen: Format, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_run(tmp_path / "run")
+    write_full_run(tmp_path / "run")
     assert run(["export", str(tmp_path / "run"), "--format", chosen.name, "--json"]) == 0
     result = answer(capsys)["result"]
     assert result["written"] == str(tmp_path / "run" / chosen.place)
