@@ -41,7 +41,7 @@ def write_transport(content: Content, folder: Path) -> dict[str, int]:
         matrix = projector_matrix(transport, n, box)
         entries += matrix.nnz
         files[name] = f"{safe_name(name)}.npz"
-        stream_atomically(folder / files[name], lambda file, whole=matrix: sp.save_npz(file, whole))  # type: ignore[misc]
+        stream_atomically(folder / files[name], lambda file, whole=matrix: sp.save_npz(file, whole, compressed=False))  # type: ignore[misc]
     save_arrays(folder / "black.npz", {"black": content.black()[box.window]})
     described = {
         "camera_px": [transport.camera_shape[1], transport.camera_shape[0]],
