@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from controller.api.calibration import CalibratedRun, calibrate, decode, fit_metapixels, measure_response, read_run
     from controller.api.captures import CaptureSet, draw_patterns, read_captures
+    from controller.api.codes import decode_folder
     from controller.api.photographs import Developed, develop, merge_brackets
     from controller.api.results import compare, export
     from controller.api.solving import (
@@ -89,6 +90,7 @@ __all__ = [
     "calibrate",
     "compare",
     "decode",
+    "decode_folder",
     "develop",
     "draw_patterns",
     "encode",
@@ -109,6 +111,7 @@ __all__ = [
 _MODULES: Final = {
     "controller.api.photographs": ("Developed", "develop", "merge_brackets"),
     "controller.api.captures": ("CaptureSet", "draw_patterns", "read_captures"),
+    "controller.api.codes": ("decode_folder",),
     "controller.api.calibration": (
         "CalibratedRun", "calibrate", "decode", "fit_metapixels", "measure_response", "read_run",
     ),

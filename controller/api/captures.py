@@ -18,6 +18,7 @@ from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.errors import UsageError
 
 DESCRIPTION: Final = "captures.toml"
+_KEYS: Final = ("projector_px", "exposure_s", "pictures", "gray", "phase")
 Pictures = Mapping[str, "str | Sequence[tuple[str, float]]"]
 
 
@@ -109,10 +110,10 @@ def read_captures(
     Errors: ``captures-description-wrong``, ``capture-file-missing``; those of ``develop`` when a picture is used.
     """
     folder = Path(folder)
-    said = _description(folder / DESCRIPTION)
+    said = description_of(folder / DESCRIPTION)
     size = projector_px or said.get("projector_px")
     if size is None:
-        raise _wrong(folder, "it does not give the size of the projector", "Give projector_px = [width, height].")
+        raise unfit(folder, "it does not give the size of the projector", "Give projector_px = [width, height].")
     named = pictures if pictures is not None else _pictures(folder, said.get("pictures"))
     each_s = float(exposure_s if exposure_s is not None else said.get("exposure_s", 1.0))
     files: dict[str, list[tuple[Path, float]]] = {}
@@ -128,7 +129,7 @@ def read_captures(
             )
     first = next(iter(files.values()), None)
     if first is None:
-        raise _wrong(folder, "it has no picture of a pattern", "Name the files after the patterns, or list them.")
+        raise unfit(folder, "it has no picture of a pattern", "Name the files after the patterns, or list them.")
     sample = develop(first[0][0], camera=camera)
     width, height = size
     return CaptureSet(
@@ -162,21 +163,22 @@ class _Folder(Mapping[str, FloatImage]):
         return exposure_s if self._camera is None else self._camera.true_exposure(exposure_s)
 
 
-def _description(path: Path) -> dict[str, Any]:
+def description_of(path: Path) -> dict[str, Any]:
+    """The content of captures.toml, {} without one. Raises UsageError("captures-description-wrong")."""
     if not path.exists():
         return {}
     try:
         said = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise _wrong(path, f"it is not TOML ({error})", "Correct the line.") from error
-    unknown = sorted(set(said) - {"projector_px", "exposure_s", "pictures"})
+        raise unfit(path, f"it is not TOML ({error})", "Correct the line.") from error
+    unknown = sorted(set(said) - set(_KEYS))
     if unknown:
-        raise _wrong(path, f"the key {unknown[0]} is not known", "Use projector_px, exposure_s and [pictures].")
+        raise unfit(path, f"the key {unknown[0]} is not known", f"Use {', '.join(_KEYS)}.")
     size = said.get("projector_px", [1, 1])
     if not (isinstance(size, list) and len(size) == 2 and all(isinstance(side, int) and side > 0 for side in size)):
-        raise _wrong(path, "projector_px is not two whole numbers", "Write it as [1400, 1050].")
+        raise unfit(path, "projector_px is not two whole numbers", "Write it as [1400, 1050].")
     if not _is_time(said.get("exposure_s", 1)):
-        raise _wrong(path, "exposure_s is not a number above 0", "Write the exposure time in seconds.")
+        raise unfit(path, "exposure_s is not a number above 0", "Write the exposure time in seconds.")
     return said
 
 
@@ -185,12 +187,12 @@ def _pictures(folder: Path, table: Any) -> Pictures:
     if table is None:
         return {path.stem: path.name for path in sorted(folder.iterdir()) if path.is_file() and _is_pattern(path.stem)}
     if not isinstance(table, dict):
-        raise _wrong(folder, "pictures is not a table", "Write one line for each pattern below [pictures].")
+        raise unfit(folder, "pictures is not a table", "Write one line for each pattern below [pictures].")
     found: dict[str, str | Sequence[tuple[str, float]]] = {}
     for name, value in table.items():
         rows = value if isinstance(value, list) else [{"file": value}]
         if not rows or not all(_is_taken(row) for row in rows):
-            raise _wrong(
+            raise unfit(
                 folder,
                 f"the pattern {name} has no file name",
                 'Write "FILE", or a list of { file = "FILE", exposure_s = SECONDS }.',
@@ -214,5 +216,6 @@ def _is_time(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < np.inf
 
 
-def _wrong(where: Path, why: str, remedy: str) -> UsageError:
+def unfit(where: Path, why: str, remedy: str) -> UsageError:
+    """``why`` completes "FILE can't be used: ..."."""
     return UsageError("captures-description-wrong", what=f"{where} can't be used: {why}.", remedy=remedy)

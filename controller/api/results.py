@@ -14,6 +14,7 @@ from controller.bundle.export import png
 from controller.calibrate.mesh.export import write_glb, write_ply
 from controller.calibrate.mesh.grid_mesh import grid_mesh
 from controller.calibrate.values import Geometry
+from controller.capture.linear_files import exr_bytes
 from controller.capture.raw import SRGB_TO_XYZ
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
@@ -96,7 +97,7 @@ def export(
         _write_mesh(path, content, picture, step)
     elif kind in (".exr", ".png") and not isinstance(content, Mapping | Geometry):
         image = _checked(path, np.asarray(content))
-        write_atomically(path, _png(image) if kind == ".png" else _exr(as_image(image)))
+        write_atomically(path, _png(image) if kind == ".png" else exr_bytes({"RGB": as_image(image)}))
     else:
         raise _wrong(path, type(content).__name__)
     return path
@@ -121,19 +122,6 @@ def _png(image: npt.NDArray[Any]) -> bytes:
     if image.dtype == np.uint8:
         return png(image)
     return png(np.rint(255 * linear_to_srgb(as_image(np.nan_to_num(image)))).astype(np.uint8))
-
-
-def _exr(image: npt.NDArray[np.float32]) -> bytes:
-    """OpenEXR writes files by name only."""
-    import tempfile
-
-    import OpenEXR
-
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with tempfile.TemporaryDirectory() as folder:
-        name = Path(folder) / "image.exr"
-        OpenEXR.File(header, {"RGB": image}).write(str(name))
-        return name.read_bytes()
 
 
 def _wrong(path: Path, what: str) -> UsageError:

@@ -80,8 +80,3 @@ def write_thumbnail(run: Path, name: str, png: bytes) -> None:
 
 def _thumbnail(run: Path, name: str) -> Path:
     return run / f"thumbnail-{name}-{sha256_of(solved_figures_path(run, name))[:16]}.png"
-
-
-def exported_path(run: Path, kind: str) -> Path:
-    """Path of the exported object: a file by its format, or Blender's folder."""
-    return run / ("blender" if kind == "blender" else f"object.{kind}")

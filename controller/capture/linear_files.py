@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from controller.core.arrays import FloatImage, Mask
 from controller.core.files import check_pixels, require_regular
@@ -69,3 +72,27 @@ def read_exr(path: Path) -> FloatImage:
     if any(plane.shape != planes[0].shape for plane in planes):
         raise Unreadable("its channels differ in size")
     return np.stack(planes, axis=2).astype(np.float32)
+
+
+def exr_chromaticities(path: Path) -> tuple[float, ...] | None:
+    """CIE x and y of red, green, blue and white, eight numbers, where an EXR says them."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), header_only=True) as file:
+        said = file.header().get("chromaticities")
+    return None if said is None else tuple(float(one) for one in said)
+
+
+def exr_bytes(planes: Mapping[str, npt.NDArray[Any]], *, half: bool = False) -> bytes:
+    """An OpenEXR file, floats of 32 bits, or of 16 (``half``).
+
+    ``planes``: channels (rows, columns) by name; (rows, columns, 3) under the name "RGB"
+    """
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channels = {name: np.ascontiguousarray(plane, np.float16 if half else np.float32) for name, plane in planes.items()}
+    with tempfile.TemporaryDirectory() as folder:  # the library writes files by name only
+        name = Path(folder) / "image.exr"
+        OpenEXR.File(header, channels).write(str(name))
+        return name.read_bytes()

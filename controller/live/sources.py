@@ -17,6 +17,7 @@ from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.core.files import UnfitFile, check_pixels, read_picture_bytes
 from controller.solve.targets.files import check_picture, read_picture
+from controller.solve.targets.profiles import Unsuitable, embedded_profile
 from controller.solve.targets.values import linear_to_srgb
 
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".exr")
@@ -197,6 +198,14 @@ def unreadable(path: Path, why: str) -> UsageError:
     )
 
 
+def _has_own_colours(path: Path, data: bytes) -> bool:
+    """Whether the picture says what its colours mean, so that they are not simply sRGB."""
+    try:
+        return embedded_profile(data) is not None
+    except Unsuitable as error:
+        raise unreadable(path, str(error)) from error
+
+
 def _as_srgb(path: Path) -> ByteImage:
     if path.suffix.lower() != ".exr":
         try:
@@ -211,7 +220,8 @@ def _as_srgb(path: Path) -> ByteImage:
         if image is None or not (b"IEND" in data[-4096:] or b"\xff\xd9" in data[-4096:]):
             read_picture(path)  # tells what is wrong with it
             raise unreadable(path, "one of its pictures could not be decoded")
-        return np.ascontiguousarray(image[..., ::-1])
+        if not _has_own_colours(path, data):
+            return np.ascontiguousarray(image[..., ::-1])
     light = read_picture(path)[..., :3]
     check_picture(path, light, (light.shape[1], light.shape[0]))
     return np.round(linear_to_srgb(light) * np.float32(255)).astype(np.uint8)

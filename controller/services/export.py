@@ -1,4 +1,4 @@
-"""``velatura export``: the reconstructed object and stage for other programs."""
+"""``velatura export``: a calibrated stage for other programs."""
 
 from __future__ import annotations
 
@@ -8,61 +8,80 @@ from typing import Any, Final
 
 import numpy as np
 
+from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.geometry import has_geometry, projectors_of, read_geometry
-from controller.artefacts.projectors import Light
-from controller.artefacts.published import exported_path
-from controller.calibrate.mesh.blender import scene_script
-from controller.calibrate.mesh.export import write_glb, write_ply
-from controller.calibrate.mesh.grid_mesh import Mesh, grid_mesh
+from controller.artefacts.projectors import Light, Pixels
 from controller.calibrate.values import Geometry
-from controller.core.arrays import ByteImage
+from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError
-from controller.core.storage import write_atomically
+from controller.exchange.content import Content
+from controller.exchange.formats import format_of
+from controller.transport.camera_box import CameraBox
 
-FORMATS: Final = ("glb", "ply", "blender")
 MOST_VERTICES: Final = 1_000_000
-MESH, SCRIPT = "object.glb", "scene.py"
 
 
-def export(*, run: Path, kind: str, out: Path | None, step: int | None) -> dict[str, Any]:
-    """Write the geometry of a finished calibration run as ``kind``; ``out`` a file, for "blender" a folder.
+def export(*, run: Path, kind: str, out: Path | None, step: int | None, crop: str | None = None) -> dict[str, Any]:
+    """Write a finished calibration run in the format ``kind`` to ``out``, a file or a folder.
 
-    ``step``: every n-th camera pixel becomes a vertex; None: at most ``MOST_VERTICES`` vertices.
+    ``step``: every n-th camera pixel becomes a vertex; None: at most ``MOST_VERTICES`` vertices
+    ``crop``: "X,Y,WIDTH,HEIGHT" in camera pixels, for a transport
 
-    Raises UsageError("export-format-unknown", "not-calibrated"), and as the writers.
+    Raises UsageError("export-format-unknown", "not-calibrated", "crop-wrong"), and as the writers.
     """
-    if kind not in FORMATS:
-        raise UsageError(
-            "export-format-unknown",
-            what=f"The export format {kind!r} is unknown.",
-            remedy=f"Choose one of {', '.join(FORMATS)}.",
-        )
+    chosen = format_of(kind)
+    box = None if crop is None else _box(crop)
     if not has_geometry(run):
         raise UsageError(
             "not-calibrated",
             what=f"{run} has no reconstructed geometry.",
             remedy="Give the folder of a finished calibration: STAGE/runs/...",
         )
+    target = run / chosen.place if out is None else out
+    return {"written": target, **chosen.write(_content(run, step, box), target)}
+
+
+def _content(run: Path, step: int | None, crop: CameraBox | None) -> Content:
     geometry = read_geometry(run)
-    known = int(np.isfinite(geometry.points_m[..., 2]).sum())
-    mesh = grid_mesh(geometry, step=step or max(1, math.ceil(math.sqrt(known / MOST_VERTICES))))
     names = tuple(projectors_of(run))
-    target = out if out is not None else exported_path(run, kind)
-    _write(kind, target, geometry, mesh, names, _picture(run, names))
-    return {"written": target, "vertices": len(mesh.vertices_m), "triangles": len(mesh.triangles)}
+    calibrated = Calibrated(run, names)
+    return Content(
+        folder=run,
+        geometry=geometry,
+        names=names,
+        step=step or _usual_step(geometry),
+        picture=_picture(run, names),
+        seen_px=tuple(_seen(run, name) for name in names),
+        metapixels=lambda: tuple(part.metapixels for part in calibrated.calibration.projectors),
+        transport=lambda: calibrated.transport,
+        black=lambda: calibrated.calibration.black,
+        crop=crop,
+    )
 
 
-def _write(
-    kind: str, target: Path, geometry: Geometry, mesh: Mesh, names: tuple[str, ...], picture: ByteImage | None
-) -> None:
-    if kind == "ply":
-        x, y = mesh.camera_px.astype(np.int64).T
-        write_ply(target, mesh, None if picture is None else picture[y, x])
-    elif kind == "glb":
-        write_glb(target, mesh, geometry.camera.size_px, picture)
-    else:
-        write_glb(target / MESH, mesh, geometry.camera.size_px, picture)
-        write_atomically(target / SCRIPT, scene_script(geometry, names, MESH).encode())
+def _usual_step(geometry: Geometry) -> int:
+    known = int(np.isfinite(geometry.points_m[..., 2]).sum())
+    return max(1, math.ceil(math.sqrt(known / MOST_VERTICES)))
+
+
+def _box(crop: str) -> CameraBox:
+    try:
+        left, top, width, height = (int(part) for part in crop.split(","))
+    except ValueError:
+        raise UsageError(
+            "crop-wrong",
+            what=f"{crop!r} is no part of a picture.",
+            remedy="Give --crop X,Y,WIDTH,HEIGHT in whole camera pixels.",
+        ) from None
+    return CameraBox(top, left, top + height, left + width)
+
+
+def _seen(run: Path, name: str) -> FloatImage | None:
+    """(camera rows, columns, 2) x and y in the projector's picture, NaN where unknown; None where not measured."""
+    if not Pixels.path(run, name).is_file():
+        return None
+    found = Pixels.read(run, name).correspondence
+    return np.where(found.valid[..., None], found.projector_px, np.float32(np.nan)).astype(np.float32)
 
 
 def _picture(run: Path, names: tuple[str, ...]) -> ByteImage | None:

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from controller.artefacts.photographs import BLACK, Taken, captures_folder, light_of
+from controller.artefacts.solved import Solved
 from controller.core.arrays import save_arrays
+from controller.services.export import export
 from tests.controller.api.test_photographs import write_captures
 from tests.controller.capture.test_raw import RGGB, mosaic_of, write_dng
 from tests.controller.solve.conftest import plane_calibration
@@ -45,6 +48,27 @@ def write_run(run: Path) -> None:
     (run / "verification.json").write_text(json.dumps(grade))
 
 
+def write_full_run(run: Path) -> None:
+    """``write_run`` with photographs (one black, two exposures of the left projector's white) and an appearance."""
+    write_run(run)
+    y, x = np.mgrid[0 : CAMERA[0], 0 : CAMERA[1]]
+    scene = np.stack([0.5 + x / 96, 1 + 0.5 * y / 64, np.full(x.shape, 0.8)], axis=-1)
+    for of, names in ((BLACK, {"black": (0.01, 1.0)}), (light_of("left"), {"white-0": (1, 0.1), "white-1": (1, 0.4)})):
+        taken = []
+        for name, (light, exposure_s) in names.items():
+            folder = captures_folder(run, of.shot(name))
+            folder.mkdir(parents=True, exist_ok=True)
+            write_dng(folder / f"{name}.dng", mosaic_of(np.minimum(light * scene * exposure_s, 1.0), RGGB))
+            taken.append(Taken(name, folder / f"{name}.dng", exposure_s, projector=of.projector))
+        of.write(run, taken)
+    rng = np.random.default_rng(5)
+    frames = {name: rng.integers(0, 256, (20, 26, 3), dtype=np.uint8) for name in ("left", "right")}
+    linear = {name: np.asarray(frame / 255, np.float32) for name, frame in frames.items()}
+    reachable = (y * CAMERA[1] + x) % 3 > 0
+    target = np.full((*CAMERA, 3), 0.5, np.float32)
+    Solved(frames, linear, target, reachable, {"name": "gold", "title": "Gold", "exposure": 2.0}).write(run, "gold")
+
+
 def _pinhole(right_m: float) -> dict[str, object]:
     return {
         "matrix": [[90.0, 0.0, 40.0], [0.0, 90.0, 30.0], [0.0, 0.0, 1.0]],
@@ -59,6 +83,8 @@ def write_all(folder: Path) -> None:
     """Everything, at the places that the scripts name."""
     write_run(folder / "demo" / "first" / "stage" / "runs" / "20260101-000000-calibrate")
     write_captures(folder / "photographs")
+    write_full_run(folder / "packed" / "run")
+    export(run=folder / "packed" / "run", kind="dataset", out=folder / "dataset", step=None)
     (folder / "bracket").mkdir()
     y, x = np.mgrid[0:64, 0:96]
     scene = np.stack([0.5 + 4 * x / 96, 1 + 2 * y / 64, np.full(x.shape, 1.5)], axis=-1)

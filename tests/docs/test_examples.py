@@ -22,6 +22,7 @@ WRITTEN = {
     "calibrate_from_folder": ("show/gray-x-0.png", "show/phase-x-0.png", "calibration.npz"),
     "develop_and_merge": ("scene.exr",),
     "opencv_calibration": ("projector.png",),
+    "read_dataset": ("dataset.png",),
     "own_matrices": ("frames.npz", "left.png"),
     "first-notebook": ("geometry.png", "object.glb", "projectors.png", "appearance.png", "frames/left.png"),
     "own-data": (),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,14 @@ from controller.core.storage import stream_atomically
 
 OBJECT = "object"
 """The mesh's name in glTF files and in Blender."""
+
+
+class View(NamedTuple):
+    """A node of a glTF file without a mesh: ``matrix`` (4, 4) its pose, ``extras`` what it says of itself."""
+
+    name: str
+    matrix: npt.NDArray[np.float64]
+    extras: Mapping[str, object]
 
 
 def write_ply(path: Path, mesh: Mesh, colours: npt.NDArray[np.uint8] | None = None) -> None:
@@ -51,7 +60,13 @@ def ply_bytes(
     return data
 
 
-def write_glb(path: Path, mesh: Mesh, size_px: tuple[int, int], texture: npt.NDArray[np.uint8] | None = None) -> None:
+def write_glb(
+    path: Path,
+    mesh: Mesh,
+    size_px: tuple[int, int],
+    texture: npt.NDArray[np.uint8] | None = None,
+    views: Sequence[View] = (),
+) -> None:
     """Write vertices in metres, normals, triangles and texture coordinates as one binary glTF file.
 
     glTF's y points up and its cameras look along -z: its frame is the camera's, turned half round x. The texture
@@ -82,6 +97,8 @@ def write_glb(path: Path, mesh: Mesh, size_px: tuple[int, int], texture: npt.NDA
     )
     scene = trimesh.Scene()
     scene.add_geometry(whole, node_name=OBJECT, geom_name=OBJECT)
+    for view in views:
+        scene.graph.update(frame_to=view.name, matrix=view.matrix, metadata=dict(view.extras))
     data: bytes = scene.export(file_type="glb", include_normals=True)
     stream_atomically(path, lambda file: file.write(data))
 

@@ -9,22 +9,24 @@ import typer
 
 from controller.cli import console
 from controller.cli.running import Json
+from controller.exchange.formats import FORMATS
 
 
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished calibration: STAGE/runs/...")],
     kind: Annotated[
-        str, typer.Option("--format", help="glb, ply, or blender (a folder with object.glb and scene.py).")
+        str, typer.Option("--format", help="; ".join(f"{one.name}: {one.what}" for one in FORMATS) + ".")
     ] = "glb",
-    out: Annotated[
-        Path | None, typer.Option(help="Output file, or folder for blender (default: in the run's folder).")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Output file or folder (default: in the run's folder).")] = None,
     step: Annotated[
         int | None, typer.Option(help="Use every n-th camera pixel (default: at most 10^6 pixels).", min=1)
     ] = None,
+    crop: Annotated[
+        str | None, typer.Option(help="For transport: only X,Y,WIDTH,HEIGHT of the camera's picture.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Export the reconstructed object with normals and texture coordinates, or the whole stage for Blender."""
+    """Export a calibration: the object, the views of camera and projectors, warps, or the light transport."""
     from controller.services.export import export as written
 
-    console.show_result(written(run=run, kind=kind, out=out, step=step), as_json=as_json)
+    console.show_result(written(run=run, kind=kind, out=out, step=step, crop=crop), as_json=as_json)

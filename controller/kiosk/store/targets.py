@@ -35,6 +35,8 @@ def fitted(picture: bytes, size_px: tuple[int, int], how: Fit = "fit") -> bytes:
     """
     import cv2
 
+    from controller.solve.targets.profiles import Unsuitable, embedded_profile, with_profile
+
     decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED) if picture else None
     if decoded is None:
         raise UsageError("target-unreadable", what="The target can't be read as a picture.", remedy="Save it as PNG.")
@@ -46,7 +48,14 @@ def fitted(picture: bytes, size_px: tuple[int, int], how: Fit = "fit") -> bytes:
     if scale != 1.0:
         wanted = (max(1, round(width * scale)), max(1, round(height * scale)))
         decoded = cv2.resize(decoded, wanted, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    return cv2.imencode(".png", _in_the_middle(_with_alpha(decoded), size_px))[1].tobytes()
+    try:
+        profile = embedded_profile(picture)
+    except Unsuitable as error:
+        raise UsageError(
+            "target-unreadable", what=f"The target can't be used: {error}.", remedy="Save it as PNG."
+        ) from error
+    png = cv2.imencode(".png", _in_the_middle(_with_alpha(decoded), size_px))[1].tobytes()
+    return png if profile is None else with_profile(png, profile)
 
 
 def _with_alpha(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -9,18 +9,20 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.capture.linear_files import Unreadable, read_exr
+from controller.capture.linear_files import Unreadable, exr_chromaticities, read_exr
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.core.files import read_picture_bytes
+from controller.solve.targets.colour import SPACES, ColourSpace, Primaries, decoded
+from controller.solve.targets.profiles import Profile, Unsuitable, embedded_profile, read_profile
 from controller.solve.targets.values import Target, srgb_to_linear
 
 PHOTOGRAPHS: tuple[str, ...] = ("astronaut", "chelsea", "coffee")
 _ALLOWED = "EXR, PNG or JPEG"
 
 
-def load_target(path: Path, size: tuple[int, int]) -> Target:
-    """Read a picture as seen from the camera: EXR is taken as linear light, PNG (8 or 16 bit) and JPEG as sRGB.
+def load_target(path: Path, size: tuple[int, int], colour: ColourSpace | None = None) -> Target:
+    """Read a picture as seen from the camera, as ``read_picture``.
 
     An alpha channel becomes the mask. Negative light is set to 0; EXR values above 1 are kept.
 
@@ -30,7 +32,7 @@ def load_target(path: Path, size: tuple[int, int]) -> Target:
 
     Raises UsageError "target-unreadable", "target-wrong-size", "target-not-finite".
     """
-    picture = read_picture(path)
+    picture = read_picture(path, colour)
     height, width = picture.shape[:2]
     check_picture(path, picture, size)
     mask = picture[..., 3] > 0.5 if picture.shape[2] == 4 else np.ones((height, width), dtype=np.bool_)
@@ -56,14 +58,32 @@ def check_picture(path: Path, picture: FloatImage, size: tuple[int, int]) -> Non
         )
 
 
-def read_picture(path: Path) -> FloatImage:
-    """(rows, columns, 3 or 4) float32 linear light of an EXR, PNG or JPEG; UsageError("target-unreadable") if not."""
-    if path.suffix.lower() != ".exr":
-        return _read_encoded(path)
+def read_picture(path: Path, colour: ColourSpace | None = None) -> FloatImage:
+    """(rows, columns, 3 or 4) float32 linear sRGB light of an EXR, PNG (8 or 16 bit) or JPEG.
+
+    ``colour``: the file's colour space; None: what the file says (an ICC profile, chromaticities of an EXR), else sRGB.
+    An EXR is linear light.
+
+    Raises UsageError("target-unreadable").
+    """
     try:
-        return read_exr(path)
-    except Unreadable as error:
+        return _read_encoded(path, colour) if path.suffix.lower() != ".exr" else _read_light(path, colour)
+    except (Unreadable, Unsuitable) as error:
         raise _unreadable(path, str(error)) from error
+
+
+def _read_light(path: Path, colour: ColourSpace | None) -> FloatImage:
+    picture = read_exr(path)
+    said = exr_chromaticities(path) if colour is None else None
+    if said is not None:
+        red, green, blue, white = ((said[n], said[n + 1]) for n in (0, 2, 4, 6))
+        space = Primaries(red, green, blue, white)
+    else:
+        space = SPACES[colour or "srgb"]
+    try:
+        return _with_alpha(decoded(picture[..., :3], space), picture[..., 3:])
+    except (np.linalg.LinAlgError, ZeroDivisionError) as error:
+        raise Unsuitable("its chromaticities are no colours") from error
 
 
 def shipped_photograph(name: Literal["astronaut", "chelsea", "coffee"] = "astronaut") -> FloatImage:
@@ -79,8 +99,10 @@ def shipped_photograph(name: Literal["astronaut", "chelsea", "coffee"] = "astron
     return srgb_to_linear(np.asarray(getattr(skimage.data, name)()))
 
 
-def _read_encoded(path: Path) -> FloatImage:
+def _read_encoded(path: Path, colour: ColourSpace | None) -> FloatImage:
     """(rows, columns, 3 or 4) float32, linear, from PNG or JPEG."""
+    if colour is not None and SPACES[colour].curve == "none":
+        raise Unsuitable(f"{colour} is linear light, which only an EXR file can hold")
     try:
         data = read_picture_bytes(path)
     except OSError as error:
@@ -91,19 +113,26 @@ def _read_encoded(path: Path) -> FloatImage:
     # decoders fill missing parts with grey and only print a warning
     if (jpeg and b"\xff\xd9" not in data[-4096:]) or (not jpeg and b"IEND" not in data[-4096:]):
         raise _unreadable(path, "its end is missing")
+    embedded = embedded_profile(data)
+    source = SPACES[colour] if colour else read_profile(embedded) if embedded else SPACES["srgb"]
     try:
-        decoded: npt.NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        picture: npt.NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise _unreadable(path, "it could not be decoded") from error
-    if decoded is None:
+    if picture is None:
         raise _unreadable(path, "it could not be decoded")
-    if decoded.ndim == 2:
-        return srgb_to_linear(np.repeat(decoded[..., None], 3, axis=2))
-    colour = srgb_to_linear(decoded[..., 2::-1])
-    if decoded.shape[2] == 4:
-        alpha = decoded[..., 3:].astype(np.float32) / np.float32(np.iinfo(decoded.dtype).max)
-        return np.concatenate([colour, alpha], axis=2)
-    return colour
+    if picture.ndim == 2:
+        return _linear(np.repeat(picture[..., None], 3, axis=2), source)
+    alpha = picture[..., 3:].astype(np.float32) / np.float32(np.iinfo(picture.dtype).max)
+    return _with_alpha(_linear(picture[..., 2::-1], source), alpha)
+
+
+def _linear(values: npt.NDArray[Any], source: Primaries | Profile) -> FloatImage:
+    return source.decoded(values) if isinstance(source, Profile) else decoded(values, source)
+
+
+def _with_alpha(light: FloatImage, alpha: FloatImage) -> FloatImage:
+    return np.concatenate([light, alpha], axis=2) if alpha.shape[2] else light
 
 
 def _unreadable(path: Path, why: str) -> UsageError:

@@ -17,6 +17,7 @@ from controller.config.models import AppearanceTable
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
+from controller.solve.targets.colour import ColourSpace
 from controller.solve.targets.files import check_picture, load_target, read_picture
 from controller.solve.targets.patterns import Colour, checkerboard, replace_pattern
 from controller.solve.targets.pieces import on_each
@@ -71,7 +72,7 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
     if table.kind in NEEDS_FILE and file is None:
         raise table.place.missing("file", "a picture file, relative to the stage's folder", written=settings)
     if file is not None:
-        _check_picture(table, file, calibrated.camera_px)
+        _check_picture(table, file, calibrated.camera_px, options.get("colour"))
     inputs = {"kind": table.kind, "settings": repr(sorted(options.items()))}
     if table.kind == "blender":
         return blender_request(table.name, calibrated, options, inputs, folder=stage.folder)
@@ -99,20 +100,27 @@ def _options(kind: str) -> dict[str, Any]:
         return {"tint": Colour}
     if kind == "blender":
         return {"scene": str, "samples": int, "seed": int}
+    if kind == "picture":
+        return dict(_OF_FILES)
     if kind not in _MAKERS:
         return {}
     types = get_type_hints(_MAKERS[kind])
     parameters = inspect.signature(_MAKERS[kind]).parameters.values()
     names = (p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY)
-    return {_RENAMED.get(name, name): types[name] for name in names}
+    options = {_RENAMED.get(name, name): types[name] for name in names}
+    return {**options, **_OF_FILES} if kind in NEEDS_FILE else options
 
 
+_OF_FILES: Mapping[str, Any] = {"colour": ColourSpace}
+"""Settings on how a picture file is read."""
 _RENAMED: Mapping[str, str] = {"kind": "figure"}
 """Arguments of makers with another name in stage.toml, where ``kind`` chooses the maker."""
 _ARGUMENTS: Mapping[str, str] = {written: name for name, written in _RENAMED.items()}
 
 
-def _check_picture(table: AppearanceTable, file: Path, camera_px: tuple[int, int] | None) -> None:
+def _check_picture(
+    table: AppearanceTable, file: Path, camera_px: tuple[int, int] | None, colour: ColourSpace | None
+) -> None:
     """Read a picture now, so that an error shows before an hour of solving."""
     if not file.is_file():
         raise UsageError(
@@ -120,23 +128,25 @@ def _check_picture(table: AppearanceTable, file: Path, camera_px: tuple[int, int
             what=f"The picture {file} of appearance {table.name} does not exist.",
             remedy="Add the file, or correct `file` in stage.toml.",
         )
-    picture = read_picture(file)
+    picture = read_picture(file, colour)
     size = camera_px if table.kind == "picture" else None
     check_picture(file, picture, (picture.shape[1], picture.shape[0]) if size is None else size)
 
 
 def _make(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: Calibrated) -> Target:
     mask = calibrated.transport.object_mask
+    options = dict(options)
+    colour = options.pop("colour", None)
     if kind == "picture":
         assert file is not None
         rows, columns = mask.shape
-        return load_target(file, (columns, rows))
+        return load_target(file, (columns, rows), colour)
     if kind == "recolour":
         return recolour(_as_it_is(calibrated), mask, **options)
     geometry = read_geometry(calibrated.folder, calibrated.projectors)
     if kind == "photograph":
         assert file is not None
-        photograph = read_picture(file)[..., :3]
+        photograph = np.maximum(read_picture(file, colour)[..., :3], 0)
         made = on_each(mask, lambda piece: wrap_photograph(photograph, geometry, piece, **options))
     else:
         made = on_each(mask, lambda piece: _MAKERS[kind](geometry, piece, **options))

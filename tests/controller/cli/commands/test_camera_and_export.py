@@ -9,12 +9,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import scipy.sparse
 import trimesh
 
 from controller.__main__ import run
 from controller.artefacts.projectors import Light
 from controller.calibrate.camera.charuco import find_corners
 from controller.core.arrays import save_arrays
+from controller.exchange.formats import FORMATS, Format
+from tests.docs.synthetic_data import write_full_run, write_run
 
 
 def answer(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, object]]:
@@ -75,6 +78,29 @@ def test_a_run_is_exported(calibrated: Path, kind: str, file: str, capsys: pytes
     read: Any = trimesh.load(calibrated / file, force="mesh")
     assert read.area == pytest.approx(0.29 * 0.19, rel=1e-4)
     assert (calibrated / "blender/scene.py").exists() == (kind == "blender")
+
+
+@pytest.mark.parametrize("chosen", FORMATS, ids=lambda one: one.name)
+def test_every_format_is_written_where_its_declaration_says(
+    chosen: Format, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_full_run(tmp_path / "run")
+    assert run(["export", str(tmp_path / "run"), "--format", chosen.name, "--json"]) == 0
+    result = answer(capsys)["result"]
+    assert result["written"] == str(tmp_path / "run" / chosen.place)
+    assert len(result) > 1
+    assert all(value for value in result.values())
+
+
+def test_a_transport_is_cropped_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(tmp_path / "run")
+    command = ["export", str(tmp_path / "run"), "--format", "transport", "--out", str(tmp_path / "t"), "--json"]
+    assert run([*command, "--crop", "4,6,20,10"]) == 0
+    assert scipy.sparse.load_npz(tmp_path / "t" / "left.npz").shape[0] == 3 * 20 * 10
+    capsys.readouterr()
+    for crop, code in (("4,6,20", "crop-wrong"), ("4,6,2000,10", "crop-outside")):
+        assert run([*command, "--crop", crop]) == 2
+        assert answer(capsys)["error"]["code"] == code
 
 
 def test_wrong_formats_and_folders_are_refused(calibrated: Path, capsys: pytest.CaptureFixture[str]) -> None:

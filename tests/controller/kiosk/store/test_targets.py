@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
+
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageCms
 
 from controller.core.errors import UsageError
 from controller.kiosk.store.targets import fitted
 from controller.kiosk.values import Fit
+from controller.solve.targets.profiles import with_profile
 
 VIEW = (60, 40)
 
@@ -73,3 +77,21 @@ def test_what_is_no_picture_is_refused(data: bytes) -> None:
     with pytest.raises(UsageError) as caught:
         fitted(data, VIEW)
     assert caught.value.code == "target-unreadable"
+
+
+def test_a_picture_of_another_size_keeps_its_colour_profile() -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    changed = fitted(with_profile(png_of(120, 40), profile), VIEW)
+    with Image.open(io.BytesIO(changed)) as opened:
+        opened.verify()
+        assert opened.info["icc_profile"] == profile
+        assert opened.size == VIEW
+
+
+def test_a_picture_that_moves_is_refused() -> None:
+    frames = [Image.new("RGB", (30, 20), colour) for colour in ("red", "blue")]
+    file = io.BytesIO()
+    frames[0].save(file, "PNG", save_all=True, append_images=frames[1:])
+    with pytest.raises(UsageError, match="animation") as refused:
+        fitted(file.getvalue(), VIEW)
+    assert refused.value.code == "target-unreadable"
