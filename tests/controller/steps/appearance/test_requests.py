@@ -11,7 +11,7 @@ from PIL import Image
 from controller.artefacts.calibrated import Calibrated
 from controller.core.errors import UsageError
 from controller.solve.targets.files import read_picture
-from controller.steps.appearance.requests import wishes_of
+from controller.steps.appearance.requests import requests_of
 from tests.controller.config.test_stage_file import STAGE, load
 from tests.docs.synthetic_data import CAMERA, write_run
 
@@ -28,8 +28,8 @@ def calibrated(tmp_path: Path) -> Calibrated:
 
 def test_a_picture_is_read_in_the_space_that_the_stage_names(tmp_path: Path, calibrated: Calibrated) -> None:
     text = STAGE + PICTURE.replace("KIND", "picture")
-    plain = wishes_of(load(tmp_path, text), calibrated)[0]
-    wide = wishes_of(load(tmp_path, text + 'colour = "display-p3"\n'), calibrated)[0]
+    plain = requests_of(load(tmp_path, text), calibrated)[0]
+    wide = requests_of(load(tmp_path, text + 'colour = "display-p3"\n'), calibrated)[0]
     for wish, colour in ((plain, None), (wide, "display-p3")):
         light = read_picture(tmp_path / "t.png", colour)  # type: ignore[arg-type]
         np.testing.assert_array_equal(wish.target().image, np.maximum(light, 0))
@@ -39,8 +39,8 @@ def test_a_picture_is_read_in_the_space_that_the_stage_names(tmp_path: Path, cal
 
 def test_a_photograph_is_wrapped_in_the_space_that_the_stage_names(tmp_path: Path, calibrated: Calibrated) -> None:
     text = STAGE + PICTURE.replace("KIND", "photograph") + 'mapping = "plane"\n'
-    plain = wishes_of(load(tmp_path, text), calibrated)[0].target()
-    wide = wishes_of(load(tmp_path, text + 'colour = "rec2020"\n'), calibrated)[0].target()
+    plain = requests_of(load(tmp_path, text), calibrated)[0].target()
+    wide = requests_of(load(tmp_path, text + 'colour = "rec2020"\n'), calibrated)[0].target()
     assert np.isfinite(wide.image).all()
     assert np.abs(plain.image - wide.image).max() > 0.02
 
@@ -51,5 +51,5 @@ def test_a_space_that_does_not_fit_is_refused_before_anything_is_solved(
 ) -> None:
     text = STAGE + PICTURE.replace("KIND", "picture") + f'colour = "{colour}"\n'
     with pytest.raises(UsageError) as refused:
-        wishes_of(load(tmp_path, text), calibrated)
+        requests_of(load(tmp_path, text), calibrated)
     assert refused.value.code == code
