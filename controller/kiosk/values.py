@@ -184,9 +184,25 @@ class Appearance:
 
 
 @dataclass(frozen=True, slots=True)
+class Reach:
+    """How much of a target the projectors can make. Shares of the visible object, 0..1: ``share`` in reach;
+    ``too_bright`` for their light; ``too_dark`` for the room and the other projectors; ``too_colourful``. The rest is
+    not lit, or not in the picture. ``pictures`` of the object: "target", "result" (what it will look like), "map".
+    """
+
+    share: float
+    too_bright: float
+    too_dark: float
+    too_colourful: float
+    pictures: dict[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Achieved:
     """How close the photograph of an appearance is to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
-    percentile of the colour difference (CIEDE2000), ``rmse`` of the target's white, ``sharpness`` 0..1.
+    percentile of the colour difference (CIEDE2000) on the whole visible object, ``rmse`` of the target's white,
+    ``sharpness`` 0..1. ``in_reach``: the median where the target can be reached, which is ``in_reach_share`` of the
+    object; None in photographs of an older version, whose ``delta_e`` is of the part in reach.
     """
 
     run: str
@@ -195,6 +211,8 @@ class Achieved:
     delta_e_p95: float
     rmse: float
     sharpness: float
+    in_reach: float | None = None
+    in_reach_share: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

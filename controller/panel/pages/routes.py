@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response, StreamingResponse
 
+from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
+from controller.kiosk.decide.days import grouped
 from controller.kiosk.operations.fields import parse
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.roles import Role
@@ -36,6 +39,14 @@ _SEEN: Final = (Answer.PICTURE, Answer.JPEG, Answer.PAGE)
 Facts = Callable[[Request], dict[str, Any]]
 
 
+@dataclass(frozen=True, slots=True)
+class FormPage:
+    """The page of a form, drawn from what was typed into it."""
+
+    template: str
+    facts: Callable[[Mapping[str, Any]], dict[str, Any]]
+
+
 class Pages:
     """All pages of one panel. The values of a page are read in a thread."""
 
@@ -53,9 +64,9 @@ class Pages:
             ("/events", Role.VIEWER, "events.html", self._events),
             ("/lamps", Role.VIEWER, "lamps.html", self._lamps),
             ("/password", Role.VIEWER, "password.html", lambda _: {}),
-            ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None}),
+            ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None, "reach": None}),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
-            ("/doctor", Role.OPERATOR, "doctor.html", lambda _: {"findings": list(self._panel.kiosk.doctor())}),
+            ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
             (
                 "/settings",
@@ -72,6 +83,12 @@ class Pages:
             Entry("GET", "/see" + op.path, "session", op.role, self._picture(op))
             for op in self._panel.operations
             if not op.changes and op.answer in _SEEN
+        ]
+        entries += [
+            Entry("GET", "/late/doctor", "session", Role.OPERATOR, self._late("late_doctor.html", self._found)),
+            Entry(
+                "GET", "/late/reach/{target}", "session", Role.OPERATOR, self._late("late_reach.html", self._reached)
+            ),
         ]
         return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]
 
@@ -90,6 +107,7 @@ class Pages:
             "notes": notes,
             "navigation": [(path, label) for path, label, role in NAVIGATION if visitor.role >= role],
             "may": lambda name: visitor.role >= self._least[name],
+            "typed": {},
         }
         return self._drawing.page(template, common | facts)
 
@@ -102,6 +120,19 @@ class Pages:
                 return await self.show(
                     "problem.html", visitor, {"here": request.url.path, "error": error}, answers.status_of(error)
                 )
+
+        return answer
+
+    def _late(self, template: str, facts: Facts) -> Callable[[Request, Visitor], Awaitable[Response]]:
+        """A part of a page that takes seconds; the page's script asks for it, so that the page is there at once."""
+
+        async def answer(request: Request, _: Visitor) -> Response:
+            try:
+                values, status = await self._panel.ask(lambda: facts(request)), 200
+            except answers.FAILURES as error:
+                values, status = {"error": error}, answers.status_of(error)
+            name = template if status == 200 else "late_problem.html"
+            return HTMLResponse(await self._panel.ask(lambda: self._drawing.page(name, values)), status)
 
         return answer
 
@@ -150,10 +181,22 @@ class Pages:
         kiosk = self._panel.kiosk
         return {"reports": lamp_reports(kiosk.snapshot().lamps, kiosk.lamp_history(), kiosk.events())}
 
+    def with_form(self, operation: str) -> FormPage | None:
+        """The page whose form sends this operation, if something is typed into it."""
+        return {
+            "set-schedule": FormPage("schedule.html", lambda typed: self._hours(typed["rows"])),
+            "upload-target": FormPage("target.html", lambda typed: {"target": None, "reach": None}),
+            "compute": FormPage("target.html", lambda typed: self._reach(typed["target"])),
+        }.get(operation)
+
     def _schedule(self, _: Request) -> dict[str, Any]:
+        return self._hours(grouped(self._panel.kiosk.schedule().rows))
+
+    def _hours(self, rows: Sequence[Any]) -> dict[str, Any]:
         schedule = self._panel.kiosk.schedule()
         names = [appearance.name for appearance in self._panel.kiosk.appearances()]
-        return {"schedule": schedule, "days": calendar.days(schedule), "names": names, "zones": calendar.zones()}
+        return {"schedule": schedule, "rows": rows, "days": calendar.days(schedule), "names": names,
+                "zones": calendar.zones(), "allowed": ALLOWED_DAYS}  # fmt: skip
 
     def _results(self, request: Request) -> dict[str, Any]:
         runs = list(self._panel.kiosk.runs())
@@ -171,9 +214,28 @@ class Pages:
         ]
         return {"rows": rows[-EVENTS_SHOWN:][::-1], "level": level, "words": words}
 
+    def _doctor(self, request: Request) -> dict[str, Any]:
+        """Without a script the page has to wait for its part."""
+        return self._found(request) if "wait" in request.query_params else {"findings": None}
+
+    def _found(self, _: Request) -> dict[str, Any]:
+        return {"findings": list(self._panel.kiosk.doctor())}
+
     def _target(self, request: Request) -> dict[str, Any]:
-        self._panel.targets.path(request.path_params["target"])
-        return {"target": request.path_params["target"]}
+        target = request.path_params["target"]
+        return self._reached(request) if "wait" in request.query_params else self._reach(target)
+
+    def _reach(self, target: str) -> dict[str, Any]:
+        self._panel.targets.path(target)
+        return {"target": target, "reach": None}
+
+    def _reached(self, request: Request) -> dict[str, Any]:
+        target = request.path_params["target"]
+        file = self._panel.targets.path(target)
+        return {"target": target, "reach": self._panel.kiosk.reach(file)}
 
     def _accounts(self, _: Request) -> dict[str, Any]:
+        return self.accounts()
+
+    def accounts(self) -> dict[str, Any]:
         return {"accounts": self._panel.accounts.all(), "tokens": self._panel.accounts.tokens(), "shown": None}

@@ -68,6 +68,19 @@
     next.src = camera.dataset.src + "?t=" + Date.now();
   }
 
+  // What takes seconds comes after the page.
+  async function late(place) {
+    let html = "";
+    try {
+      const answer = await fetch(place.dataset.late, { redirect: "manual" });
+      if (answer.type === "opaqueredirect") { location.assign("/login"); return; }
+      html = await answer.text();
+    } catch { /* not reachable */ }
+    if (html) place.innerHTML = html;
+    else place.querySelector(".waiting").textContent = "No answer. Load the page again.";
+  }
+  for (const place of document.querySelectorAll("[data-late]")) late(place);
+
   // A second press before the first one is answered would start the job twice.
   document.addEventListener("submit", (event) => {
     if (event.target.dataset.sent) { event.preventDefault(); return; }

@@ -15,7 +15,6 @@ from pathlib import Path
 from PIL import Image
 
 from controller.core.errors import UsageError, WorkError
-from controller.kiosk.decide.hours import check_schedule
 from controller.kiosk.interface import (
     Achieved,
     Aiming,
@@ -37,6 +36,7 @@ from controller.kiosk.interface import (
     LiveValue,
     NextEvent,
     ProjectorAim,
+    Reach,
     RecalibrationKind,
     Results,
     Schedule,
@@ -45,6 +45,7 @@ from controller.kiosk.interface import (
     Unsubscribe,
 )
 from controller.kiosk.store import settings, targets
+from controller.kiosk.store.schedule_file import check
 from tests.controller.kiosk.vase import TEXT
 
 STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")
@@ -243,8 +244,9 @@ class MemoryKiosk:
 
         return self._begin(f"Computing {name}", "solving", finish)
 
-    def feasibility(self, target: Path) -> Path:
-        return self._drawn("feasibility", 200)
+    def reach(self, target: Path) -> Reach:
+        pictures = {name: self._drawn(name, 200 - 60 * at) for at, name in enumerate(("target", "result", "map"))}
+        return Reach(0.45, 0.3, 0.15, 0.05, pictures)
 
     def appearances(self) -> Sequence[Appearance]:
         return list(self._appearances.values())
@@ -255,7 +257,7 @@ class MemoryKiosk:
         def finish(run: str) -> None:
             for one in names:
                 before = self._comparisons[one].history if one in self._comparisons else ()
-                now = Achieved(run, BORN + 86400 * len(before), 1.25 + len(before), 3.5, 0.012, 0.81)
+                now = Achieved(run, BORN + 86400 * len(before), 1.25 + len(before), 3.5, 0.012, 0.81, 0.66, 0.45)
                 kinds = ("before", "target", "achieved", "error", "resolution")
                 pictures = {kind: self._drawn(kind, 60 + 30 * at) for at, kind in enumerate(kinds)}
                 self._comparisons[one] = Comparison(one, (now, *before), pictures)
@@ -281,8 +283,12 @@ class MemoryKiosk:
     def schedule(self) -> Schedule:
         return self._schedule
 
+    def effect_of_schedule(self, schedule: Schedule) -> str:
+        check(schedule, list(self._appearances))
+        return self.effect
+
     def set_schedule(self, schedule: Schedule) -> None:
-        check_schedule(schedule, list(self._appearances))
+        check(schedule, list(self._appearances))
         self._schedule = schedule
         self.change()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
+from controller.kiosk.interface import Finding
 from controller.kiosk.store.accounts import Accounts
 from controller.panel.pages.routes import NAVIGATION
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, picture, tab
@@ -127,7 +128,9 @@ def test_a_target_is_uploaded_looked_at_and_computed(fresh: Served, browser: Bro
         page.get_by_role("link", name="New appearance").click()
         page.set_input_files("#file", {"name": "t.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()})
         page.get_by_role("button", name="Upload").click()
-        for alt in ("The uploaded target", "Where the target can't be reached: brighter is worse"):
+        expect(page.get_by_text("45 % of the object can look like the picture.")).to_be_visible()
+        expect(page.get_by_text("30 % needs more light than the projectors have")).to_be_visible()
+        for alt in ("What the object will look like, calculated", "Map of what can't be reached"):
             expect(page.get_by_alt_text(alt)).to_have_js_property("complete", True)
             assert page.get_by_alt_text(alt).evaluate("picture => picture.naturalWidth") > 0
         assert not violations(page)
@@ -144,15 +147,39 @@ def test_hours_are_typed_saved_and_stand_in_the_calendar(fresh: Served, browser:
         enter(page, "otto")
         page.get_by_role("link", name="Schedule").click()
         row = page.locator("fieldset.hours").nth(1)
-        row.get_by_label("Day").fill("tue")
+        row.get_by_label("Days").fill("Tuesday - Thursday")
         row.get_by_label("Opens").fill("09:15")
         row.get_by_label("Closes").fill("17:45")
         page.get_by_role("button", name="Save the schedule").click()
         expect(page.get_by_text("The schedule is in use.")).to_be_visible()
         expect(page.get_by_text("09:15 to 17:45").first).to_be_visible()
-        page.locator("fieldset.hours").nth(2).get_by_label("Day").fill("someday")
+        assert [row.day for row in fresh.kiosk.schedule().rows] == ["mon", "tue", "wed", "thu"]
+        page.locator("fieldset.hours").nth(2).get_by_label("Days").fill("someday")
         page.get_by_role("button", name="Save the schedule").click()
-        expect(page.get_by_role("alert")).to_contain_text("The value of 'day' is not valid.")
+        expect(page.get_by_role("alert")).to_contain_text("The day of row 3 is 'someday'.")
+        assert page.locator("fieldset.hours").nth(2).get_by_label("Days").input_value() == "someday"
+
+
+class SlowDoctor(MemoryKiosk):
+    """It examines for longer than a person waits before a white page."""
+
+    def doctor(self) -> Sequence[Finding]:
+        time.sleep(3)
+        return super().doctor()
+
+
+def test_the_doctors_page_is_there_before_its_findings(tmp_path: Path, browser: Browser) -> None:
+    with served(SlowDoctor(tmp_path / "pictures"), tmp_path / "private") as running:
+        with tab(browser, running.address) as page:
+            enter(page, "otto")
+            began_s = time.monotonic()
+            page.goto("/doctor", wait_until="domcontentloaded")
+            expect(page.get_by_text("This takes some seconds.")).to_be_visible()
+            assert time.monotonic() - began_s < 2.5
+            expect(page.get_by_text("Check its mains plug.").first).to_be_visible()
+            assert not violations(page)
+        with running.entered("otto") as client:
+            assert "Check its mains plug." in client.get("/doctor?wait=yes").text, "without a script"
 
 
 def test_each_role_sees_only_what_it_may_do(panel: Served, browser: Browser) -> None:
