@@ -128,6 +128,18 @@ class Grade:
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Where a projector stands around the object, seen from the camera: ``word`` "left", "right above", "in front";
+    ``aside_deg`` from -180 to 180, 0 is the camera's direction, right is positive; ``up_deg`` from -90 to 90.
+    """
+
+    projector: str
+    word: str
+    aside_deg: float
+    up_deg: float
+
+
+@dataclass(frozen=True, slots=True)
 class KioskState:
     """Everything that the panel's first page shows, as of one moment.
 
@@ -135,6 +147,7 @@ class KioskState:
     it began. ``warnings``: sentences on problems that belong to no device (light in the room); ``failures``: failed
     jobs, as in the event log, until an operator confirms them. ``in_turn``: ``playing`` is one of those that are
     shown in turn. ``disk_free_bytes``: free space on the stage's disk, in steps of 10 MB, 0 until it is known.
+    ``places`` of the projectors, empty until they are calibrated.
     ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
     has no valid stage.toml.
     """
@@ -157,6 +170,7 @@ class KioskState:
     failures: tuple[EventRow, ...] = ()
     in_turn: bool = False
     disk_free_bytes: int = 0
+    places: tuple[Place, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

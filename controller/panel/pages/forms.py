@@ -66,7 +66,7 @@ class Forms:
         async def answer(_: Request, visitor: Visitor, sent: Sent) -> Response:
             assert visitor.session is not None
             values: Values = {}
-            sure = sent.texts.pop("sure", "")
+            sure, back = sent.texts.pop("sure", ""), sent.texts.pop("back", "")
             try:
                 values = _values(operation, sent)
                 question = await self._question(operation, values)
@@ -80,7 +80,7 @@ class Forms:
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
             visitor.session.notes.append(("good", operation.sentence(values)))
-            return RedirectResponse(_then(operation, result), 303)
+            return RedirectResponse("/" if back == "/" else _then(operation, result), 303)
 
         return answer
 

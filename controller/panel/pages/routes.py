@@ -21,22 +21,46 @@ from controller.panel.pages import calendar
 from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
 from controller.panel.pages.lamp_days import lamp_reports
 
+GROUPS: Final = ("Show", "Calibration", "System")
 NAVIGATION: Final = (
-    ("/", "Now", Role.VIEWER),
-    ("/appearances", "Appearances", Role.VIEWER),
-    ("/schedule", "Schedule", Role.VIEWER),
-    ("/results", "Results", Role.VIEWER),
-    ("/lamps", "Lamps", Role.VIEWER),
-    ("/events", "Events", Role.VIEWER),
-    ("/doctor", "Doctor", Role.OPERATOR),
-    ("/aiming", "Aiming", Role.TECHNICIAN),
-    ("/settings", "Settings", Role.TECHNICIAN),
-    ("/care", "Backup", Role.TECHNICIAN),
-    ("/accounts", "Accounts", Role.TECHNICIAN),
+    ("/", "Now", Role.VIEWER, "Show"),
+    ("/appearances", "Appearances", Role.VIEWER, "Show"),
+    ("/schedule", "Schedule", Role.VIEWER, "Show"),
+    ("/results", "Results", Role.VIEWER, "Calibration"),
+    ("/aiming", "Aiming", Role.TECHNICIAN, "Calibration"),
+    ("/lamps", "Lamps", Role.VIEWER, "System"),
+    ("/events", "Events", Role.VIEWER, "System"),
+    ("/doctor", "Doctor", Role.OPERATOR, "System"),
+    ("/settings", "Settings", Role.TECHNICIAN, "System"),
+    ("/care", "Backup", Role.TECHNICIAN, "System"),
+    ("/accounts", "Accounts", Role.TECHNICIAN, "System"),
 )
+BELOW: Final = {"/setup": "/settings", "/password": "/accounts"}
+"""Pages that are not in the navigation, and those that they belong to."""
 _SEEN: Final = (Answer.PICTURE, Answer.JPEG, Answer.PAGE)
 
 Facts = Callable[[Request], dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A group of pages: ``path`` of its first one, and ``pages`` (path, label); ``chosen``: the page is one of them."""
+
+    label: str
+    path: str
+    pages: tuple[tuple[str, str], ...]
+    chosen: bool
+
+
+def _navigation(role: Role, here: str) -> list[Group]:
+    allowed = [entry for entry in NAVIGATION if role >= entry[2]]
+    at = here if here in BELOW else "/" + here.split("/")[1]
+    at = BELOW.get(at, at)
+    groups = []
+    for label in GROUPS:
+        pages = tuple((path, name) for path, name, _, group in allowed if group == label)
+        groups.append(Group(label, pages[0][0], pages, any(path == at for path, _ in pages)))
+    return groups
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +129,7 @@ class Pages:
             "visitor": visitor,
             "csrf": session.csrf,
             "notes": notes,
-            "navigation": [(path, label) for path, label, role in NAVIGATION if visitor.role >= role],
+            "navigation": _navigation(visitor.role, str(facts.get("here", "/"))),
             "may": lambda name: visitor.role >= self._least[name],
             "typed": {},
         }
@@ -168,7 +192,12 @@ class Pages:
         return {"text": text, "problem": problem}
 
     def _now(self, _: Request) -> dict[str, Any]:
-        return {"picture": self._panel.kiosk.camera_picture() is not None}
+        """Without the camera's picture, which may wait for the camera: the script asks for it while a job runs."""
+        kiosk = self._panel.kiosk
+        if kiosk.snapshot().needs_setup:
+            return {"appearances": [], "photographed": {}}
+        photographed = {one.name: one.history[0] for one in kiosk.comparisons() if "achieved" in one.pictures}
+        return {"appearances": list(kiosk.appearances()), "photographed": photographed}
 
     def _aiming(self, _: Request) -> dict[str, Any]:
         kiosk = self._panel.kiosk

@@ -35,6 +35,7 @@ from controller.kiosk.interface import (
     LampDay,
     LiveValue,
     NextEvent,
+    Place,
     ProjectorAim,
     Reach,
     RecalibrationKind,
@@ -100,6 +101,11 @@ class MemoryKiosk:
             next_event=NextEvent("Closes", BORN + 7200),
             bundle=BundleIdentity(17, "9f2c" * 16, BORN),
             lamps=(Lamp("left", 1204.0, 88, True, 3000), Lamp("right", 3120.0, 203, False, 3000)),
+            places=(
+                Place("left", "left", -32.0, 4.0),
+                Place("middle", "above", 3.0, 25.0),
+                Place("right", "right", 35.0, 0.0),
+            ),
         )
         self._finish(run, "full")
         for number in range(12):

@@ -13,7 +13,7 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from controller.kiosk.interface import Finding
+from controller.kiosk.interface import BundleIdentity, Finding, Grade
 from controller.kiosk.store.accounts import Accounts
 from controller.panel.pages.routes import NAVIGATION
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, picture, tab
@@ -65,10 +65,16 @@ def test_recalibration_is_one_click_and_is_followed_live_to_its_end(slow: Served
         enter(page, "otto")
         page.get_by_role("button", name="Recalibrate", exact=True).click()
         expect(page.get_by_text("Calibrating", exact=True)).to_be_visible()
+        expect(page.locator("details .steps .now")).to_be_attached()
+        expect(page.locator(".steps .now")).to_be_hidden()
+        page.locator("#live-job summary").click()
         expect(page.locator(".steps .now")).to_be_visible()
         expect(page.get_by_alt_text("What the camera sees now")).to_be_visible()
         expect(page.locator("#live-job")).to_contain_text(" left")
         expect(page.locator(".steps li").nth(1)).to_have_class("done")
+        expect(page.locator(".steps li").nth(1), "it stays unfolded while it is drawn anew").to_be_visible()
+        for name in ("Recalibrate", "Quick recalibration", "Open"):
+            expect(page.get_by_role("button", name=name, exact=True)).to_be_hidden()
         picture(page, "recalibrating")
         expect(page.get_by_text("It ended well.")).to_be_visible()
         expect(page.get_by_role("button", name="Cancel this job")).to_be_hidden()
@@ -97,9 +103,8 @@ def test_two_technicians_see_the_same_job_and_only_one_can_begin_it(slow: Served
         enter(first, "otto")
         enter(second, "tina")
         first.get_by_role("button", name="Recalibrate", exact=True).click()
-        expect(second.locator(".steps .now")).to_be_visible()
-        second.get_by_role("button", name="Quick recalibration").click()
-        expect(second.get_by_role("alert")).to_contain_text("Another job is running or waiting")
+        expect(second.locator(".whole")).to_be_visible()
+        expect(second.get_by_role("button", name="Quick recalibration")).to_be_hidden()
         second.get_by_role("button", name="Cancel this job").click()
         expect(first.get_by_text("It was cancelled.")).to_be_visible()
 
@@ -196,6 +201,7 @@ def test_each_role_sees_only_what_it_may_do(panel: Served, browser: Browser) -> 
 def test_settings_that_are_wrong_are_not_saved_and_not_lost(fresh: Served, browser: Browser) -> None:
     with tab(browser, fresh.address) as page:
         enter(page, "tina")
+        page.get_by_role("link", name="System").click()
         page.get_by_role("link", name="Settings").click()
         page.get_by_label("stage.toml").fill("[stag]\n")
         page.get_by_role("button", name="Check and save").click()
@@ -266,16 +272,66 @@ def test_first_start_leads_from_the_one_time_password_to_a_stage(tmp_path: Path,
 
 
 def test_every_page_of_the_navigation_is_looked_at() -> None:
-    assert {path for path, _, _ in NAVIGATION} <= set(PAGES)
+    assert {path for path, _, _, _ in NAVIGATION} <= set(PAGES)
 
 
-@pytest.mark.parametrize("phone", [True, False])
-def test_no_page_has_a_barrier(panel: Served, browser: Browser, phone: bool) -> None:
+def test_an_appearance_is_switched_by_one_touch_of_its_picture(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address, phone=True) as page:
+        enter(page, "otto")
+        expect(page.get_by_role("button", name="Show marble")).to_have_attribute("aria-pressed", "true")
+        page.get_by_role("button", name="Show warm wood").click()
+        expect(page.locator("p.state")).to_contain_text("warm wood")
+        expect(page.get_by_role("button", name="Show warm wood")).to_have_attribute("aria-pressed", "true")
+        expect(page.get_by_role("button", name="Show marble")).to_have_attribute("aria-pressed", "false")
+        assert page.url.endswith("/"), "the first page again"
+
+
+def test_there_is_one_switch_and_what_is_not_possible_is_not_offered(fresh: Served, browser: Browser) -> None:
+    kiosk = fresh.kiosk
+    assert isinstance(kiosk, MemoryKiosk)
+
+    def offered(page: Page, *names: str) -> None:
+        for name in ("Open", "Close", "Recalibrate", "Quick recalibration"):
+            button = page.get_by_role("button", name=name, exact=True)
+            expect(button).to_be_visible() if name in names else expect(button).to_be_hidden()
+
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        offered(page, "Close", "Recalibrate", "Quick recalibration")
+        kiosk.change(state="off", playing="")
+        offered(page, "Open", "Recalibrate", "Quick recalibration")
+        kiosk.change(bundle=None, grades=())
+        offered(page, "Recalibrate")
+        page.reload()
+        offered(page, "Recalibrate")
+
+
+def test_a_stage_that_can_show_nothing_leads_step_by_step(fresh: Served, browser: Browser) -> None:
+    kiosk = fresh.kiosk
+    assert isinstance(kiosk, MemoryKiosk)
+    kiosk.change(state="ready", playing="", bundle=None, grades=())
+    with tab(browser, fresh.address) as page:
+        enter(page, "tina")
+        expect(page.locator("p.state strong")).to_have_text("Nothing to show yet")
+        expect(page.locator(".todo .done")).to_have_count(1)
+        expect(page.locator(".todo .now a")).to_have_attribute("href", "/aiming")
+        assert not violations(page)
+        kiosk.change(grades=(Grade("run", 1.0, "full", "A", True),))
+        expect(page.locator(".todo .now a")).to_have_attribute("href", "/appearances/new")
+        kiosk.change(bundle=BundleIdentity(1, "ab" * 32, 1.0))
+        expect(page.locator(".todo")).to_have_count(0)
+
+
+@pytest.mark.parametrize(("phone", "light"), [(True, False), (False, True), (False, False)])
+def test_no_page_has_a_barrier(panel: Served, browser: Browser, phone: bool, light: bool) -> None:
     if not panel.kiosk.comparisons():
         panel.kiosk.compare()
     while not panel.kiosk.comparisons():
         time.sleep(0.02)
     with tab(browser, panel.address, phone=phone) as page:
+        page.emulate_media(color_scheme="light" if light else "dark")
+        if phone:
+            page.set_viewport_size({"width": 360, "height": 740})
         page.goto("/login")
         assert not violations(page)
         enter(page, "tina")
@@ -286,4 +342,8 @@ def test_no_page_has_a_barrier(panel: Served, browser: Browser, phone: bool) -> 
                 assert not (found := violations(page)), f"{path}\n{found}"
             wider = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
             assert wider <= 0, f"{path} is wider than the screen by {wider} px"
-            picture(page, ("phone" if phone else "desk") + (path.replace("/", "-") if path != "/" else "-now"))
+            picture(
+                page,
+                ("phone" if phone else "light" if light else "desk")
+                + (path.replace("/", "-") if path != "/" else "-now"),
+            )
