@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, ImageDraw, ImageOps
 
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.interface import (
@@ -128,10 +128,14 @@ class MemoryKiosk:
 
     def _drawn(self, name: str, shade: int = 120) -> Path:
         file = self._folder / f"{len(list(self._folder.iterdir()))}.png"
-        ramp = Image.linear_gradient("L").resize((240, 160)).rotate(37)
-        Image.merge("RGB", (ramp, ramp.point(lambda value: value * shade // 255), ramp.point(lambda v: v // 3))).save(
-            file
-        )
+        # A ball in soft light, of another colour for each name.
+        light = ImageOps.invert(Image.radial_gradient("L")).resize((300, 300)).crop((70, 30, 310, 190))
+        ball = Image.new("L", (240, 160))
+        ImageDraw.Draw(ball).ellipse((50, 10, 190, 150), fill=255)
+        tint = sum(name.encode()) % 3
+        channels = [light, light.point(lambda value: value * shade // 255), light.point(lambda value: value // 3)]
+        picture = Image.merge("RGB", channels[tint:] + channels[:tint])
+        Image.composite(picture, Image.new("RGB", (240, 160), (10, 9, 8)), ball).save(file)
         return file
 
     def snapshot(self) -> KioskState:
