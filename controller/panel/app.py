@@ -159,6 +159,10 @@ class Wrong:
             404: ("This page does not exist.", "Check the address, or begin at the first page."),
             405: ("This page can't be opened like that.", "Begin at the first page."),
         }.get(error.status_code, ("This is not possible.", "Go back, load the page again, and repeat it."))
+        if error.detail.endswith("."):
+            # Words of ours: what happened, and what to do.
+            what, _, remedy = error.detail.partition(". ")
+            what += "." if remedy else ""
         return self._answer(request, error.status_code, error.detail, what, remedy, dict(error.headers or {}))
 
     async def unforeseen(self, request: Request, _: Exception) -> Response:

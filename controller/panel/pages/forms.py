@@ -10,8 +10,9 @@ from typing import Any, Final
 
 import anyio
 from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import RedirectResponse, Response
 
 from controller.core.errors import UsageError
 from controller.kiosk.operations.fields import parse
@@ -156,18 +157,18 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
     async def answer(request: Request, visitor: Visitor) -> Response:
         assert visitor.session is not None
         if not same_origin(request.headers):
-            return refused()
+            raise refused()
         form = await request.form(max_files=1, max_fields=MOST_FIELDS, max_part_size=2 << 20)
         sent = Sent()
         try:
             token = form.get("csrf")
             if not isinstance(token, str) or not visitor.session.matches(token):
-                return refused()
+                raise refused()
             try:
                 await _read(form, sent, panel.options.folder / answers.INCOMING)
             except OSError as error:
                 failure = answers.not_saved(error)
-                return PlainTextResponse(f"{failure.what} {failure.remedy}", answers.status_of(failure))
+                raise HTTPException(answers.status_of(failure), f"{failure.what} {failure.remedy}") from error
             return await handler(request, visitor, sent)
         finally:
             if sent.file is not None:
@@ -177,8 +178,8 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
     return answer
 
 
-def refused() -> Response:
-    return PlainTextResponse("This form is out of date or comes from another site. Load the page again.", 403)
+def refused() -> HTTPException:
+    return HTTPException(403, "This form is out of date or comes from another site. Load the page again.")
 
 
 async def _read(form: FormData, sent: Sent, folder: Path) -> None:

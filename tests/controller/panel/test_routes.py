@@ -110,7 +110,7 @@ def test_an_address_that_is_not_in_the_table_shows_nothing(panel: Served) -> Non
 
 def test_a_person_who_took_a_wrong_address_sees_a_page_and_a_program_one_line(panel: Served) -> None:
     with panel.entered("tina") as client:
-        for method, path, status in (("GET", "/nothing/here", 404), ("PUT", "/login", 405)):
+        for method, path, status in (("GET", "/nothing/here", 404), ("PUT", "/login", 405), ("POST", "/do/play", 403)):
             page = client.request(method, path, headers={"accept": "text/html"})
             assert (page.status_code, page.headers["content-type"]) == (status, "text/html; charset=utf-8")
             assert 'href="/"' in page.text

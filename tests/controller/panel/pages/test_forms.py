@@ -142,6 +142,9 @@ def test_a_disk_that_takes_no_upload_is_told_in_words(fresh: Served) -> None:
         answer = client.post("/do/upload-target", data=form, files={"file": ("a.png", b"x")})
         assert answer.status_code == 507
         assert "Free some space" in answer.text
+        page = client.post("/do/upload-target", data=form, files={"file": ("a.png", b"x")},
+                           headers={"accept": "text/html"})  # fmt: skip
+        assert (page.status_code, "<h1>" in page.text, "Free some space" in page.text) == (507, True, True)
         assert "set-schedule" in sent(client, FORM), "the panel goes on"
     assert len(fresh.kiosk.schedule().rows) == 2
 
