@@ -84,7 +84,7 @@ def read_target(run: Path, name: str) -> Target:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RequestedTarget:
     """A target as it was asked for: radiance (rows, columns, 3); where it is reachable, and where it says something."""
 
     target: FloatImage
@@ -108,18 +108,18 @@ class Solved:
     target: FloatImage
     reachable: Mask
     figures: dict[str, object]
-    asked: Asked | None = None
+    asked: RequestedTarget | None = None
 
     @property
     def exposure(self) -> float:
         return float(str(self.figures["exposure"]))
 
     @property
-    def wish(self) -> Asked:
+    def requested(self) -> RequestedTarget:
         """What results are judged by; of a run from before adaptation was told, all pixels say something."""
         if self.asked is not None:
             return self.asked
-        return Asked(self.target, self.reachable, np.ones_like(self.reachable))
+        return RequestedTarget(self.target, self.reachable, np.ones_like(self.reachable))
 
     def write(self, run: Path, name: str) -> list[Path]:
         frames = {**_named("device", self.frames), **_named("linear", self.linear)}
@@ -206,7 +206,7 @@ def read_solved(run: Path, name: str, projectors: Sequence[str]) -> Solved:
     prefix = "device-" if all(f"device-{projector}" in arrays for projector in projectors) else ""
     target, reachable, asked = arrays["target"], arrays["reachable"], None
     if "asked-target" in arrays:
-        asked = Asked(arrays["asked-target"], arrays["asked-reachable"], arrays["asked-valid"])
+        asked = RequestedTarget(arrays["asked-target"], arrays["asked-reachable"], arrays["asked-valid"])
     if (refining := read_refining(run, name)) is not None:
         arrays, prefix = load_arrays(npz_path(run, StepKind.REFINED, name)), "device-"
         figures = {**figures, "refined": refining}

@@ -7,12 +7,15 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from controller.building import server as building
+from controller.building.protocol import Configured
+from controller.building.protocol import read as read_protocols
 from controller.config.loader import FILE
 from controller.core import kiosk_places
 from controller.core.errors import UsageError, VelaturaError
@@ -76,6 +79,7 @@ def serve(
     if panel is not None:
         _check_panel(panel)
     kiosk = StageKiosk(stage)
+    protocols = _protocols(kiosk, reporter)
     notifier = Notifier()
     with contextlib.ExitStack() as stack:
         stack.callback(notifier.stopping)
@@ -91,6 +95,7 @@ def serve(
                         stack.enter_context(ControlServer(path, socket_table(kiosk.holders())))
                     if first:
                         entrance = _open_panel(stack, kiosk, panel, reporter)
+                        stack.enter_context(building.serving(kiosk, protocols))
                         reporter.say(f"The kiosk {stage.name} is running.")
                         first = False
                         notifier.ready()
@@ -104,12 +109,23 @@ def serve(
                 reporter.say(f"{error.what} {error.remedy}", Level.ERROR)
                 if first:
                     entrance = _open_panel(stack, kiosk, panel, reporter)
+                    stack.enter_context(building.serving(kiosk, protocols))
                     first = False
                     notifier.ready()
                 again_s = time.monotonic() + RETRY_S
                 with _set_up_picture(kiosk, entrance):
                     _wait(kiosk, cancel, notifier.alive, partial(_may_begin, stage, missing=missing, again_s=again_s))
     return {"served": str(stage)}
+
+
+def _protocols(kiosk: StageKiosk, reporter: Reporter) -> Sequence[Configured]:
+    """Those of building.toml. A damaged one must not keep the stage dark, so it is only told."""
+    try:
+        return read_protocols(kiosk.stage)
+    except VelaturaError as error:
+        kiosk.record(error.code, f"{error.what} {error.remedy}", "error")
+        reporter.say(f"{error.what} {error.remedy} The stage runs without show control.", Level.ERROR)
+        return ()
 
 
 def _signature(stage: Path) -> tuple[int, int]:

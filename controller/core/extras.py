@@ -15,6 +15,7 @@ EXTRAS: Final = {
     "bench": "emulated devices (velatura demo, emulate) and velatura plan",
     "gphoto2": "cameras through libgphoto2",
     "mains": "mains by network: PDUs by SNMP, relays by Modbus",
+    "building": "show control by OSC and sACN",
     "cluster": "solve on many machines (--scheduler)",
     "study": "judge a study by FLIP, and light of Mitsuba on the emulated stage",
 }
@@ -27,6 +28,7 @@ _MODULES: Final = {
     "bench": "embreex tifffile",
     "gphoto2": "gphoto2",
     "mains": "pymodbus pysnmp",
+    "building": "pythonosc sacn",
     "cluster": "dask distributed",
     "study": "drjit flip_evaluator mitsuba",
 }

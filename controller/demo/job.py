@@ -34,7 +34,7 @@ from controller.steps.appearance.publishing import (
     publish_step,
 )
 from controller.steps.appearance.refining import RefineOptions, refine_steps
-from controller.steps.appearance.requests import wishes_of
+from controller.steps.appearance.requests import requests_of
 from controller.steps.appearance.solving import device_frames, options_of, solve_steps
 from controller.steps.calibrate.grade import gate_step
 
@@ -72,8 +72,8 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
     """Calibrate, solve, refine, publish, photograph, compare with one projector, swap."""
     stage = checked.stage
     calibrated = Calibrated(run, checked.names)
-    wishes = wishes_of(stage, calibrated)
-    names = [wish.name for wish in wishes]
+    requests = requests_of(stage, calibrated)
+    names = [request.name for request in requests]
     table = stage.tables.solve
     options = options_of(table)
     after = [
@@ -88,8 +88,8 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
         # The objects are emulated: a demo in a hard room is shown with the grade that it has.
         gate_step(worst_grade(checked), accepted=True),
         marker("solving", "Solving", enter=Event.SOLVE),
-        *solve_steps(calibrated, wishes, options, after, costs.scale(p.size_px for p in rig.projectors)),
-        *refine_steps(rig, calibrated, {wish.name: wish.title for wish in wishes}, refining, after=solvings),
+        *solve_steps(calibrated, requests, options, after, costs.scale(p.size_px for p in rig.projectors)),
+        *refine_steps(rig, calibrated, {request.name: request.title for request in requests}, refining, after=solvings),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
         publish_step(
@@ -130,7 +130,7 @@ def _traditional(
         context.advance(number / len(names), name)
         solved = read_solved(context.folder, name, calibrated.projectors)
         frames = device_frames(
-            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.wish.target, best)
+            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.requested.target, best)
         )
         shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
         picture = photograph_hdr(

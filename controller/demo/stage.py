@@ -45,9 +45,9 @@ def prepare(out: Path, *, size: str, object_file: Path | None, seed: int, room: 
     mesh without faces, an unknown size or room) before anything is written.
     """
     stage = out / "stage"
-    wishes = {"size": size, "seed": seed, "object": _object_digest(object_file), "room": room}
+    options = {"size": size, "seed": seed, "object": _object_digest(object_file), "room": room}
     if (mark := stage / MARK).exists():
-        if _read_mark(mark) != wishes:
+        if _read_mark(mark) != options:
             raise UsageError(
                 "demo-folder-taken",
                 what=f"{out} contains a demo with another size, object, seed or room.",
@@ -60,18 +60,18 @@ def prepare(out: Path, *, size: str, object_file: Path | None, seed: int, room: 
             what=f"{stage} is not empty and is not from a demo.",
             remedy="Choose another folder with --out.",
         )
-    _build(out, stage, wishes, object_file)
+    _build(out, stage, options, object_file)
     return stage
 
 
-def _build(out: Path, stage: Path, wishes: Mapping[str, Any], object_file: Path | None) -> None:
+def _build(out: Path, stage: Path, options: Mapping[str, Any], object_file: Path | None) -> None:
     """Write the stage under another name and rename it, so that a stopped demo leaves all of it or nothing."""
     building, there = out / BUILDING, out.exists()
     shutil.rmtree(building, ignore_errors=True)
     try:
-        tables = _write(building, wishes, object_file=object_file)
+        tables = _write(building, options, object_file=object_file)
         write_stage(building / "stage.toml", tables)
-        write_atomically(building / MARK, json.dumps(wishes).encode())
+        write_atomically(building / MARK, json.dumps(options).encode())
         building.rename(stage)
         sync_folder(out)
     except BaseException:
@@ -82,11 +82,11 @@ def _build(out: Path, stage: Path, wishes: Mapping[str, Any], object_file: Path 
         raise
 
 
-def _write(stage: Path, wishes: Mapping[str, Any], *, object_file: Path | None) -> Mapping[str, Any]:
-    size = wishes["size"]
+def _write(stage: Path, options: Mapping[str, Any], *, object_file: Path | None) -> Mapping[str, Any]:
+    size = options["size"]
     try:
-        bench = bench_of(stage, {"room": wishes["room"]})
-        devices = bench.prepare(stage, size=size, object_file=object_file, seed=wishes["seed"])
+        bench = bench_of(stage, {"room": options["room"]})
+        devices = bench.prepare(stage, size=size, object_file=object_file, seed=options["seed"])
     except DeviceError as error:
         kind = UsageError if error.code.startswith(("size-", "object-", "setting-")) else WorkError
         raise kind(error.code, what=error.what, remedy=error.remedy) from error

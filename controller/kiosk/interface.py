@@ -71,7 +71,20 @@ class Kiosk(Protocol):
     def cancel(self) -> None:
         """End the running job at its next safe point. Raises WorkError if none is running."""
 
-    def play(self, name: str) -> None: ...
+    def play(self, name: str, fade_s: float | None = None) -> None:
+        """Show this appearance; it fades in for ``fade_s`` seconds, None: as the bundle's playlist says."""
+
+    def next(self, fade_s: float | None = None) -> None:
+        """Show the next appearance. Raises WorkError("nothing-plays"), as the next three do."""
+
+    def black(self, on: bool, fade_s: float | None = None) -> None:
+        """Show black with the lamps lit, or the picture again."""
+
+    def pause(self, on: bool) -> None:
+        """Stay at the present appearance, or go on from there."""
+
+    def brightness(self, percent: float) -> None:
+        """Show ``percent`` (0 to 100) of the light, until the stage closes."""
 
     def rotate(self) -> None:
         """Show all appearances in turn, as the bundle's playlist says."""

@@ -209,6 +209,8 @@ class Service:
         state = self.reconciler.machine.state
         if state not in (State.PLAYING, State.DEGRADED) or shown is None or not shown.appearance:
             return None
+        if shown.brightness < 1:
+            return None
         views = [supervisor.view for supervisor in self.devices.projectors]
         if any(view.coming or (view.shines and view.stable_left_s > 0) for view in views):
             return None

@@ -149,7 +149,8 @@ class KioskState:
     shown in turn. ``disk_free_bytes``: free space on the stage's disk, in steps of 10 MB, 0 until it is known.
     ``places`` of the projectors, empty until they are calibrated.
     ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
-    has no valid stage.toml.
+    has no valid stage.toml. ``black``, ``paused``, ``brightness`` (percent): what people changed of the picture until
+    the stage closes.
     """
 
     revision: int
@@ -171,6 +172,9 @@ class KioskState:
     in_turn: bool = False
     disk_free_bytes: int = 0
     places: tuple[Place, ...] = ()
+    black: bool = False
+    paused: bool = False
+    brightness: float = 100.0
 
 
 @dataclass(frozen=True, slots=True)

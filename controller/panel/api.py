@@ -171,6 +171,18 @@ class KioskFigures(Collector):
             "velatura_disk_free_bytes", "Free space on the stage's disk", float(now.disk_free_bytes)
         )
         yield GaugeMetricFamily(
+            "velatura_warnings",
+            "Problems that belong to no device, such as light in the room",
+            float(len(now.warnings)),
+        )
+        yield GaugeMetricFamily(
+            "velatura_failures", "Failed jobs that no operator has confirmed", float(len(now.failures))
+        )
+        yield GaugeMetricFamily(
+            "velatura_brightness_ratio", "The share of the light that is shown; 0 for black",
+            0.0 if now.black else now.brightness / 100,
+        )  # fmt: skip
+        yield GaugeMetricFamily(
             "velatura_open_panels", "Open panels with live updates", float(self._panel.hub.listening)
         )
 

@@ -14,6 +14,7 @@ from controller.core.errors import BundleError, UsageError
 from controller.play.cache import DecodedAhead, check_fits
 from controller.play.control import protocol
 from controller.play.control.notify import Notifier, tell
+from controller.play.display.mixing import dimmed
 from controller.play.display.outputs import Output
 from controller.play.frames import FrameSet, OutputSize
 from controller.play.live.stream import LiveStream, open_live
@@ -62,6 +63,7 @@ class Player:
         self._skipped = 0
         self._showing = "black"
         self._appearance: str | None = None
+        self._brightness = 1.0
         self._ending = False
 
     def run(self, serve: Callable[[float], None], *, first: Callable[[], None] = lambda: None) -> None:
@@ -99,8 +101,11 @@ class Player:
         self.withdraw()
         self._coming = PendingPresentation(showing, None, frames, self._presenter.soon(), on_result, fade_s)
 
-    def play(self, playlist: Playlist, on_result: ResultCallback, *, rate_hz: float | None = None) -> None:
-        """Play appearances in turn; ``on_result`` is called for the first. ``rate_hz``: the grid meanwhile.
+    def play(
+        self, playlist: Playlist, on_result: ResultCallback, *, rate_hz: float | None = None, brightness: float = 1.0
+    ) -> None:
+        """Play appearances in turn; ``on_result`` is called for the first. ``rate_hz``: the grid meanwhile;
+        ``brightness``: the share of their light, 0..1.
 
         Raises BundleError if there is no bundle or it has not all of them; then nothing changes.
         """
@@ -109,7 +114,7 @@ class Player:
             decoded.bundle.index.appearance(name)
         self.withdraw()
         self._presenter.begin_sequence(rate_hz or self.rate_hz)
-        self._playlist = playlist
+        self._playlist, self._brightness = playlist, brightness
         playlist.look_ahead = decoded.look_ahead
         self._make_coming(self._presenter.soon(), on_result)
 
@@ -204,6 +209,7 @@ class Player:
             "swaps": presenter.last.sequence,
             "showing": self._showing,
             "appearance": self._appearance,
+            "brightness": self._brightness,
             "live": None if self._live is None else self._live.status(),
             "fading": self._coming is not None and self._coming.share > 0,
             "missing_outputs": list(self._output.missing()),
@@ -243,7 +249,9 @@ class Player:
         assert self._decoded is not None
         assert coming.appearance is not None
         try:
-            coming.frames = self._decoded.take(coming.appearance)
+            taken = self._decoded.take(coming.appearance)
+            # The cache keeps the whole picture: another brightness may be asked for at any time.
+            coming.frames = taken if taken is None or self._brightness >= 1 else dimmed(taken, self._brightness)
         except BundleError as error:
             self._skip(coming, error)
             return False

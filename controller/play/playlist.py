@@ -11,10 +11,16 @@ from controller.core.errors import BundleError
 
 
 class Playlist:
-    """Steps through (appearance, seconds, fade_s) items, ``repeat`` times, or for ever if 0."""
+    """Steps through (appearance, seconds, fade_s) items, ``repeat`` times, or for ever if 0.
 
-    def __init__(self, items: Sequence[tuple[str, float, float]], repeat: int) -> None:
+    ``first_fade_s``: how long the first item comes in at the very beginning, None: as it says.
+    """
+
+    def __init__(
+        self, items: Sequence[tuple[str, float, float]], repeat: int, first_fade_s: float | None = None
+    ) -> None:
         self._items = tuple(items)
+        self._first_fade_s = first_fade_s
         self._rounds_left = repeat if repeat else None
         self._at = 0
         self.look_ahead = 2
@@ -47,7 +53,7 @@ class Playlist:
     @property
     def fade_s(self) -> float:
         """For how long it comes in over the one before; 0: at once."""
-        return self._items[self._at][2]
+        return self._items[self._at][2] if self._first_fade_s is None else self._first_fade_s
 
     @property
     def upcoming(self) -> list[str]:
@@ -60,6 +66,7 @@ class Playlist:
 
     def advance(self) -> bool:
         """Go to the next item; False when there is none."""
+        self._first_fade_s = None
         if self._at + 1 < len(self._items):
             self._at += 1
             return True

@@ -79,7 +79,7 @@ def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]
     crop = crop_around(on_object)
     lit = sum((part.white for part in calibration.projectors), start=calibration.black)
     white = float(np.nanpercentile(lit[on_object], 99)) if on_object.any() else 1.0
-    target = np.where(on_object[..., None], solved.wish.target, calibration.black).astype(np.float32)
+    target = np.where(on_object[..., None], solved.requested.target, calibration.black).astype(np.float32)
     to_xyz = calibration.camera_to_xyz
     drawn = {
         "before": to_screen(lit, to_xyz, white=white),

@@ -101,10 +101,10 @@ def _judge(
     solved = read_solved(run, name, projectors)
     photograph = read_photograph_of(run, StepKind.PHOTOGRAPH, name)
     traditional = read_photograph_of(run, StepKind.TRADITIONAL, name)
-    mask: Mask = solved.wish.reachable & calibration.object_mask
+    mask: Mask = solved.requested.reachable & calibration.object_mask
 
     def against(picture: FloatImage) -> Comparison:
-        return compare(picture, solved.wish.target, calibration.camera_to_xyz, solved.exposure, mask)
+        return compare(picture, solved.requested.target, calibration.camera_to_xyz, solved.exposure, mask)
 
     title = str(solved.figures["title"])
     ours, theirs = against(photograph), against(traditional)
@@ -203,7 +203,7 @@ def _cropped(image: Any, crop: Crop) -> Any:
 
 
 def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration, crop: Crop) -> PictureRow:
-    mask = appearance.solved.wish.reachable & calibration.object_mask
+    mask = appearance.solved.requested.reachable & calibration.object_mask
 
     def screen(image: FloatImage) -> Any:
         return _cropped(to_screen(image, calibration.camera_to_xyz, white=appearance.solved.exposure), crop)
@@ -212,8 +212,8 @@ def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration
         return _cropped(error_picture(comparison.error_map, mask), crop)
 
     outside = ~calibration.object_mask[..., None]
-    wish = appearance.solved.wish.target
-    target = np.where(outside, calibration.black, wish).astype(np.float32)
+    requested = appearance.solved.requested.target
+    target = np.where(outside, calibration.black, requested).astype(np.float32)
     return PictureRow(
         title=appearance.title,
         figures=(

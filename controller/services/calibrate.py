@@ -35,8 +35,8 @@ from controller.stage.session import StageSession
 from controller.steps import costs
 from controller.steps.appearance.cluster_solve import answering_on
 from controller.steps.appearance.publishing import publish_step
-from controller.steps.appearance.rendering import scene_wish
-from controller.steps.appearance.requests import wishes_of
+from controller.steps.appearance.rendering import scene_request
+from controller.steps.appearance.requests import requests_of
 from controller.steps.appearance.solving import base_choice, options_of, solve_steps
 from controller.steps.calibrate.dots import dot_steps
 from controller.steps.calibrate.full import calibration_steps
@@ -127,7 +127,7 @@ def make_appearances(
     keeps refined frames.
 
     Without a refinement it uses no device: the projectors may be off, or playing.
-    Raises what ``usable_calibration``, ``wishes_of``, ``answering_on`` and the steps raise.
+    Raises what ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
     """
     chosen = None if base is None else base_choice(base)
     checked = check_stage(session.stage)
@@ -135,8 +135,8 @@ def make_appearances(
     with session.locked():
         run = usable_calibration(checked, reporter, accept_grade=accept_grade)
         calibrated = Calibrated(run, checked.names)
-        wishes = wishes_of(checked.stage, calibrated, names) if names or not scenes else []
-        wishes += [scene_wish(calibrated, scene, folder=Path.cwd()) for scene in scenes]
+        requests = requests_of(checked.stage, calibrated, names) if names or not scenes else []
+        requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve
         kept = base_choice(table.base)
         options = replace(options_of(table), base=chosen or kept)
@@ -147,23 +147,23 @@ def make_appearances(
         scale = costs.scale(size for _, size in outputs.values())
         with (
             kernels_compiled(reporter) as compiled,
-            answering_on(scheduler, calibrated, wishes) as answering,
+            answering_on(scheduler, calibrated, requests) as answering,
             Journal(run) as journal,
         ):
             steps = [
                 *compiled,
                 *([] if is_graded(run) else [verify_step(calibrated, (), scale)]),
                 gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
-                *solve_steps(calibrated, wishes, options, (), scale, answering=answering),
+                *solve_steps(calibrated, requests, options, (), scale, answering=answering),
             ]
-            names = [wish.name for wish in wishes]
+            names = [request.name for request in requests]
             publish = publish_step(folder, outputs, names, stage=checked.stage.tables.stage.name, calibration=run.name,
                                    key=signing_key(checked))  # fmt: skip
             whole = [*steps, publish] if refinement is None else steps
             Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     refined: Mapping[str, Any] = {}
     if refinement is not None:
-        titles = {wish.name: wish.title for wish in wishes}
+        titles = {request.name: request.title for request in requests}
         refined = refine(session, checked, calibrated, titles, refinement, reporter=reporter, cancel=cancel)
         with session.locked(), Journal(run) as journal:
             Runner([publish], journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))

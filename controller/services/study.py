@@ -174,13 +174,13 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
 
     Raises UsageError("study-folder-taken") for another size or seed, and WorkError if the bench refuses.
     """
-    stage, wishes = out / "stage", {"scene": scene.name, "size": size, "seed": seed}
+    stage, wanted = out / "stage", {"scene": scene.name, "size": size, "seed": seed}
     if stage.exists():
         try:
             known = json.loads((stage / MARK).read_bytes())
         except (OSError, ValueError):
             known = None
-        if known != wishes:
+        if known != wanted:
             raise UsageError(
                 "study-folder-taken",
                 what=f"{stage} does not contain the stage of this study.",
@@ -200,7 +200,7 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
         raise WorkError(error.code, what=error.what, remedy=error.remedy) from error
     named = {"stage": {"name": f"study {scene.name}"}, **tables, "safety": {"power_down_s": POWER_DOWN_S}}
     write_stage(building / "stage.toml", named)
-    write_atomically(building / MARK, json.dumps(wishes).encode())
+    write_atomically(building / MARK, json.dumps(wanted).encode())
     building.rename(stage)
     sync_folder(out)
     return stage

@@ -150,7 +150,15 @@ def scale_frames(transport: LightTransport, base: Base, target: FloatImage, blac
         start, end = transport.span(n).start, transport.span(n).stop
         unmix = np.linalg.inv(M.astype(np.float64)).astype(np.float32)
         scale_base(base.mixed, means, base.coverage, unmix, start, end, out)
+        if transport.segment(n):
+            out[:, start:end] = _saturated(out[:, start:end], transport.segment(n))
     return plane_frames(out, transport.sizes)
+
+
+def _saturated(planes: FloatImage, segment: float) -> FloatImage:
+    """Frames (3, pixels) as a projector with a white segment shows them: saturated colours end earlier."""
+    top = 1 - segment * (1 - planes.min(axis=0))
+    return np.minimum(planes, np.asarray(top, np.float32))
 
 
 def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black: FloatImage) -> float:

@@ -16,7 +16,8 @@ class DriveLevels:
 
     At a pixel, B = sum over n of diag(W_n) M_n is the light of the three channels, all projectors together. A light is
     surely within reach where B^-1 light lies in [0, 1]: brightness and the crosstalk of the colours in one. (Where the
-    primaries of the projectors differ, a little more can be reached by unequal frames.)
+    primaries of the projectors differ, a little more can be reached by unequal frames.) White segments make part of
+    what the three colours have in common: levels are those of the colours' own light.
     """
 
     def __init__(self, transport: LightTransport) -> None:
@@ -24,11 +25,17 @@ class DriveLevels:
         pixels = sum(rows * columns for rows, columns in transport.sizes)
         ones = np.ones((3, pixels), np.float32)
         self._light = np.zeros((3, 3, *transport.camera_shape), np.float32)
+        segment, total = np.zeros(transport.camera_shape, np.float32), np.zeros(transport.camera_shape, np.float32)
         for n, mixing in enumerate(transport.mixing):
             white = transport.forward_planes(ones, projectors=(n, n + 1))
             for channel in range(3):
                 for colour in range(3):
                     self._light[channel, colour] += mixing[channel, colour] * white[channel]
+            if transport.segments:
+                segment += np.float32(transport.segment(n)) * white.sum(axis=0)
+                total += white.sum(axis=0)
+        # projectors of one kind stand together: where they differ, the mean by their light
+        self._segment = np.divide(segment, total, out=segment, where=total > 0) if transport.segments else None
 
     def of(self, light: FloatImage) -> FloatImage:
         """(rows, columns, 3) float32 for a light of that shape, without the black image; 0 outside the object.
@@ -37,11 +44,20 @@ class DriveLevels:
         """
         out = np.zeros((*self.mask.shape, 3), np.float32)
         _solve(self._light, image_planes(light), self.mask, out)
+        if self._segment is not None:
+            share = self._segment[..., None]
+            # what is below none has no white in it
+            out -= share * np.maximum(out.min(axis=2, keepdims=True), 0)
+            out /= 1 - share
         return out
 
     def light(self, levels: FloatImage) -> FloatImage:
         """The light (rows, columns, 3) float32 of such a colour (rows, columns, 3): the inverse of ``of``."""
         out = np.empty(levels.shape, np.float32)
+        if self._segment is not None:
+            share = self._segment[..., None]
+            common = np.maximum(levels.min(axis=2, keepdims=True), 0)
+            levels = np.asarray((1 - share) * levels + share * common, np.float32)
         for channel in range(3):
             out[..., channel] = sum(self._light[channel, colour] * levels[..., colour] for colour in range(3))
         return out

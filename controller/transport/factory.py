@@ -6,6 +6,8 @@ metapixels are, the shares are their Gaussians (``gaussians``).
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from controller.calibrate.values import Calibration, Metapixels
@@ -28,8 +30,11 @@ def build_transport(calibration: Calibration, *, patches: Patches | None = None)
     """
     check_calibration(calibration)
     if patches is None and all(part.phase_map is not None for part in calibration.projectors):
-        return WindowTransport.from_calibration(calibration)
-    return PatchTransport.from_calibration(calibration, patches)
+        made: LightTransport = WindowTransport.from_calibration(calibration)
+    else:
+        made = PatchTransport.from_calibration(calibration, patches)
+    segments = tuple(part.radiometry.segment for part in calibration.projectors)
+    return dataclasses.replace(made, segments=segments) if any(segments) else made
 
 
 def check_calibration(calibration: Calibration) -> None:

@@ -45,17 +45,24 @@ class LightTransport(LinearOperator[np.float32], ABC):
     ``lit`` (projectors, rows, columns) bool: camera pixels on the object with shares of that projector
     ``per_weight`` (pixels,) float32: 1 / sum of a projector pixel's shares over its lit camera pixels, or 0
     ``sizes``: (rows, columns) of each projector's image
+    ``segments``: share of white that each projector's white segment makes (``Radiometry.segment``); T is the same, but
+    its frames end earlier where they are saturated: p_c <= 1 - s + s min(p)
     """
 
     mixing: FloatImage
     lit: Mask
     per_weight: FloatImage
     sizes: tuple[tuple[int, int], ...]
+    segments: tuple[float, ...] = dataclasses.field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         # SciPy's own constructor assigns them, which a frozen class refuses
         object.__setattr__(self, "dtype", np.dtype(np.float32))
         object.__setattr__(self, "shape", (3 * self.lit[0].size, 3 * self.pixels))
+
+    def segment(self, n: int) -> float:
+        """Share of white that projector ``n``'s white segment makes; 0 without one."""
+        return self.segments[n] if self.segments else 0.0
 
     @property
     def camera_shape(self) -> tuple[int, int]:

@@ -219,16 +219,28 @@ class StageKiosk(FolderKiosk):
     def cancel(self) -> None:
         self.service.reconciler.cancel()
 
-    def play(self, name: str) -> None:
+    def play(self, name: str, fade_s: float | None = None) -> None:
         service = self.service
         service.bundles.check_name(name)
-        service.reconciler.choose(name)
+        service.reconciler.choose(name, fade_s)
         service.reconciler.open()
 
     def rotate(self) -> None:
         service = self.service
         service.reconciler.choose(IN_TURN)
         service.reconciler.open()
+
+    def next(self, fade_s: float | None = None) -> None:
+        self.service.reconciler.next(fade_s)
+
+    def black(self, on: bool, fade_s: float | None = None) -> None:
+        self.service.reconciler.black(on, fade_s)
+
+    def pause(self, on: bool) -> None:
+        self.service.reconciler.pause(on)
+
+    def brightness(self, percent: float) -> None:
+        self.service.reconciler.brighten(percent / 100)
 
     def stop(self) -> None:
         self.service.reconciler.shut()

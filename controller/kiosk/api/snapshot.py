@@ -42,6 +42,7 @@ class Snapshots:
         identity = None
         if index is not None and bundle is not None:
             identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
+        live = service.reconciler.live
         return KioskState(
             revision=revision,
             stage=service.checked.stage.tables.stage.name,
@@ -61,6 +62,9 @@ class Snapshots:
             warnings=self._warnings(service),
             failures=service.log.failures,
             places=self._places,
+            black=live.black,
+            paused=bool(live.held),
+            brightness=round(100 * live.brightness, 1),
         )
 
     def _rows(self, service: Service) -> tuple[DeviceRow, ...]:

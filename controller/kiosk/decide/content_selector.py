@@ -6,8 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from controller.kiosk.decide.interfaces import IN_TURN, Bundles, Request, Showing
+from controller.kiosk.decide.interfaces import BLACK, IN_TURN, Bundles, Request, Showing
 from controller.kiosk.decide.job_queue import JobQueue
+from controller.kiosk.decide.live_changes import LiveChangesKept
 from controller.kiosk.decide.operator_overrides import OperatorOverrides
 from controller.kiosk.decide.planner import Plan
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -16,8 +17,11 @@ from controller.kiosk.store.event_log import Decision, EventLog
 class ContentSelector:
     """Call it only with the reconciler's lock held."""
 
-    def __init__(self, bundles: Bundles, overrides: OperatorOverrides, queue: JobQueue, log: EventLog) -> None:
+    def __init__(
+        self, bundles: Bundles, overrides: OperatorOverrides, live: LiveChangesKept, queue: JobQueue, log: EventLog
+    ) -> None:
         self._bundles, self._overrides, self._queue, self._log = bundles, overrides, queue, log
+        self._live = live
         self._empty = False
         self._asked_for: set[tuple[Path | None, frozenset[str]]] = set()
 
@@ -31,7 +35,13 @@ class ContentSelector:
 
     def of(self, plan: Plan, missing: frozenset[str]) -> Showing:
         """What to show without the projectors ``missing``; missing frames are requested once per bundle."""
-        wanted = self._wanted(self._overrides.appearance(plan, self._bundles.names()))
+        live = self._live.now
+        if live.black:
+            return replace(BLACK, fade_s=live.fade_s or 0.0)
+        wanted = self._wanted(self._chosen(plan))
+        wanted = replace(wanted, brightness=live.brightness)
+        if live.fade_s is not None:
+            wanted = replace(wanted, fade_s=live.fade_s)
         if not missing:
             return wanted
         failover = self._without(wanted, missing)
@@ -43,11 +53,28 @@ class ContentSelector:
             self._asked_for.add((wanted.bundle, missing))
         return wanted
 
+    def _chosen(self, plan: Plan) -> str:
+        names = self._bundles.names()
+        held = self._live.now.held
+        return held if held in names else self._overrides.appearance(plan, names)
+
+    def after(self, plan: Plan, shown: str) -> tuple[str, bool]:
+        """The appearance that follows ``shown``, and whether they are shown in turn; empty if nothing is installed."""
+        names = list(self._bundles.names())
+        turns = [name for name, _, _ in self._bundles.playlist()]
+        in_turn = self._overrides.appearance(plan, names) == IN_TURN and len(turns) > 1 and not self._live.now.held
+        order = list(dict.fromkeys(turns)) if shown in turns or in_turn else names
+        if not order:
+            return "", False
+        return order[(order.index(shown) + 1) % len(order) if shown in order else 0], in_turn
+
     def _wanted(self, name: str) -> Showing:
         """``name``, or the bundle's playlist, as the whole stage shows it."""
         bundle, names, turns = self._bundles.bundle(), self._bundles.names(), tuple(self._bundles.playlist())
         if name == IN_TURN and len(turns) > 1:
-            return Showing(bundle, turns[0][0], turns)
+            first = next((at for at, turn in enumerate(turns) if turn[0] == self._live.now.first), 0)
+            turns = turns[first:] + turns[:first]
+            return Showing(bundle, turns[0][0], turns, fade_s=turns[0][2])
         if name == IN_TURN:
             name = turns[0][0] if turns else names[0] if names else ""
         return Showing(bundle, name, fade_s=next((fade_s for other, _, fade_s in turns if other == name), 0.0))

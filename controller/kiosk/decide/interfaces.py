@@ -73,13 +73,14 @@ class Showing:
     """What the player is to show: an appearance of a bundle. ``appearance`` empty: black.
 
     ``in_turn``: what is shown in turn without end; ``appearance`` is the first of them then. ``fade_s``: for how long
-    a single one comes in.
+    a single one, or black, comes in. ``brightness``: the share of the light that is shown, 0..1.
     """
 
     bundle: Path | None
     appearance: str = ""
     in_turn: tuple[Turn, ...] = ()
     fade_s: float = field(default=0.0, compare=False)
+    brightness: float = 1.0
 
 
 BLACK: Final = Showing(None)

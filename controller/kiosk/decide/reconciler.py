@@ -25,14 +25,18 @@ from controller.kiosk.decide.interfaces import (
     ProjectorPort,
     ProjectorView,
     Request,
+    Showing,
 )
 from controller.kiosk.decide.job_queue import JobQueue
+from controller.kiosk.decide.live_changes import LiveChanges, LiveChangesKept
 from controller.kiosk.decide.operator_overrides import OperatorOverrides
 from controller.kiosk.decide.planner import Plan, plan
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.run.state_machine import Event, Machine, State
 
+BRIGHTNESS_FADE_S: Final = 0.25
+"""As long as the player's supervisor waits between two looks, so that a slow change has no steps to see."""
 RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
 """Between attempts to leave FAULT."""
 _ON: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED)
@@ -76,7 +80,8 @@ class Reconciler:
         self._queue = JobQueue(jobs, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
         self.machine = Machine(self._changed)
         self.overrides = OperatorOverrides(log, without_time=without_time)
-        self._content = ContentSelector(bundles, self.overrides, self._queue, log)
+        self._live = LiveChangesKept(log)
+        self._content = ContentSelector(bundles, self.overrides, self._live, self._queue, log)
         self._lock = threading.RLock()
         self._plan = Plan(None)
         self._since_s = monotonic()
@@ -119,10 +124,63 @@ class Reconciler:
             self._lit_until_s = float("-inf")
             self.overrides.override(False, self._plan)
 
-    def choose(self, appearance: str) -> None:
-        """Play this appearance of the bundle from now on."""
+    def choose(self, appearance: str, fade_s: float | None = None) -> None:
+        """Play this appearance of the bundle from now on; it fades in for ``fade_s``, None: as the bundle says."""
         with self._lock:
+            self._live.change(black=False, held="", first="", fade_s=fade_s)
             self.overrides.choose(appearance, self._plan)
+
+    @property
+    def live(self) -> LiveChanges:
+        """What people changed of the picture."""
+        return self._live.now
+
+    def next(self, fade_s: float | None = None) -> None:
+        """Show the appearance that comes after the present one. Raises WorkError("nothing-plays")."""
+        with self._lock:
+            name, in_turn = self._content.after(self._plan, self._shown())
+            if in_turn:
+                self._live.change(black=False, first=name, fade_s=fade_s)
+            elif self._live.now.held:
+                self._live.change(black=False, held=name, fade_s=fade_s)
+            else:
+                self.choose(name, fade_s)
+
+    def black(self, on: bool, fade_s: float | None = None) -> None:
+        """Show black with the lamps lit, or the picture again. Raises WorkError("nothing-plays") while closed."""
+        with self._lock:
+            if on:
+                self._require_open()
+            self._live.change(black=on, fade_s=fade_s)
+
+    def pause(self, on: bool) -> None:
+        """Stay at the present appearance, or go on from there. Raises WorkError("nothing-plays")."""
+        with self._lock:
+            name = self._shown() if on else self._live.now.held
+            self._live.change(held=name if on else "", first=name)
+
+    def brighten(self, share: float) -> None:
+        """Show this share of the light, until the stage closes. Raises WorkError("nothing-plays") while closed."""
+        with self._lock:
+            self._require_open()
+            shown = self._player.view.shown
+            # A list begins anew with another brightness; it goes on where it is.
+            first = self._live.now.first if shown is None or not shown.appearance else shown.appearance
+            self._live.change(brightness=round(share, 3), first=first, fade_s=BRIGHTNESS_FADE_S)
+
+    def _require_open(self) -> None:
+        if not self.overrides.open(self._plan):
+            raise _NOTHING_PLAYS
+
+    def _shown(self) -> str:
+        self._require_open()
+        shown = self._player.view.shown
+        if self._live.now.held or shown is None or not shown.appearance:
+            wanted = self._content.of(self._plan, frozenset())
+            if not (self._live.now.held or wanted.appearance):
+                raise _NOTHING_PLAYS
+            return self._live.now.held or wanted.appearance
+        return shown.appearance
 
     def light_for(self, seconds: float, *, closed_too: bool = False) -> None:
         """Keep the lamps lit, even with nothing to play, while open or ``closed_too``. 0 or ``shut`` ends it."""
@@ -166,6 +224,8 @@ class Reconciler:
             self._queue.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
             views = [supervisor.view for supervisor in self._supervisors]
             open_now = self._content.something(wanted_open)
+            if not wanted_open:
+                self._live.end()
             lit_anyway = (wanted_open or self._lit_closed) and self._monotonic() < self._lit_until_s
             light = open_now or lit_anyway or self._queue.needs_light
             self._move(views, light, open_now)
@@ -297,11 +357,20 @@ class Reconciler:
             return
         # If every lamp is dark, no projector can replace another.
         missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
-        self._player.want = self._content.of(self._plan, missing) if open_now and state in _ON else BLACK
+        want = self._content.of(self._plan, missing) if open_now and state in _ON else BLACK
+        self._player.want = want
+        shown = self._player.view.shown
+        if self._live.now.fade_s is not None and shown is not None and _same_picture(shown, want):
+            # It was for this one change: what comes back after a fault comes as usual.
+            self._live.change(fade_s=None)
 
     @property
     def player(self) -> PlayerView:
         return self._player.view
+
+
+def _same_picture(one: Showing, other: Showing) -> bool:
+    return (one.bundle, one.appearance, one.brightness) == (other.bundle, other.appearance, other.brightness)
 
 
 def _reasons(views: Sequence[ProjectorView]) -> str:
@@ -309,6 +378,9 @@ def _reasons(views: Sequence[ProjectorView]) -> str:
     return " ".join(dict.fromkeys(view.problem.text for view in views if view.problem is not None))
 
 
+_NOTHING_PLAYS: Final = WorkError(
+    "nothing-plays", what="The stage is closed, or nothing is installed.", remedy="Open the stage first."
+)
 _FAULTY: Final = Decision(
     "work-impossible", "The job was cancelled because the stage has a fault.",
     "Correct the fault, then start the job again.", "error",

@@ -79,17 +79,17 @@ def placed(outputs: Sequence[Connected]) -> list[Placed]:
     Where no mode is common, each has the one that it prefers; the player then says what does not fit together.
     """
     common = set.intersection(*({mode.key for mode in one.modes} for one in outputs)) if outputs else set()
-    wishes = [_wish(one).key for one in outputs]
-    best = max(common, key=lambda key: (wishes.count(key), key[0] * key[1], key[2]), default=None)
+    preferred = [_preferred(one).key for one in outputs]
+    best = max(common, key=lambda key: (preferred.count(key), key[0] * key[1], key[2]), default=None)
     found, left_px = [], 0
     for one in outputs:
-        mode = next((mode for mode in one.modes if mode.key == best), _wish(one))
+        mode = next((mode for mode in one.modes if mode.key == best), _preferred(one))
         found.append(Placed(one.name, mode, left_px))
         left_px += mode.key[0]
     return found
 
 
-def _wish(output: Connected) -> Mode:
+def _preferred(output: Connected) -> Mode:
     preferred = [mode for mode in output.modes if mode.preferred] or [mode for mode in output.modes if mode.current]
     return (preferred or output.modes)[0]
 

@@ -31,8 +31,8 @@ from controller.stage.check import Checked, check_stage
 from controller.stage.run import LONGEST_RUN_S
 from controller.stage.session import StageSession
 from controller.steps import costs
-from controller.steps.appearance.requests import wishes_of
-from controller.steps.appearance.solving import Wish, options_of, solve_steps
+from controller.steps.appearance.requests import requests_of
+from controller.steps.appearance.solving import AppearanceRequest, options_of, solve_steps
 from hal.deadline import in_seconds
 
 FOLDER: Final = "without"
@@ -57,7 +57,7 @@ def solve_without(
     """Solve the installed bundle's appearances without these projectors, and install them as a separate bundle.
 
     Finished steps of the same calibration are not repeated. Returns the bundle's file. Raises what
-    ``usable_calibration``, ``wishes_of`` and the solver raise, and UsageError("no-projector-left").
+    ``usable_calibration``, ``requests_of`` and the solver raise, and UsageError("no-projector-left").
     """
     checked = check_stage(session.stage)
     left = tuple(name for name in checked.names if name not in missing)
@@ -86,16 +86,16 @@ def solve_without(
     return bundle
 
 
-def _requests(checked: Checked, survivors: Survivors, names: Sequence[str]) -> list[Wish]:
+def _requests(checked: Checked, survivors: Survivors, names: Sequence[str]) -> list[AppearanceRequest]:
     """Without those that can't be solved, which were reported when they were published.
 
-    Raises as ``wishes_of`` if none can be solved.
+    Raises as ``requests_of`` if none can be solved.
     """
-    solvable: list[Wish] = []
+    solvable: list[AppearanceRequest] = []
     for name in names or [table.name for table in checked.stage.tables.appearances]:
         with contextlib.suppress(VelaturaError):
-            solvable += wishes_of(checked.stage, survivors, (name,))
-    return solvable or wishes_of(checked.stage, survivors, names)
+            solvable += requests_of(checked.stage, survivors, (name,))
+    return solvable or requests_of(checked.stage, survivors, names)
 
 
 def _installed(folder: Path, checked: Checked) -> Sequence[str]:

@@ -65,14 +65,14 @@ def _checked(stage: Path) -> tuple[tuple[str, ...], dict[str, str]]:
     """The appearances of stage.toml that can be solved, and why the others can't."""
     from controller.artefacts.calibrated import Calibrated
     from controller.stage.calibrations import finished_calibration
-    from controller.steps.appearance.requests import wishes_of
+    from controller.steps.appearance.requests import requests_of
 
     checked = check_stage(stage)
     calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
     names, failed = [], {}
     for table in checked.stage.tables.appearances:
         try:
-            wishes_of(checked.stage, calibrated, (table.name,))
+            requests_of(checked.stage, calibrated, (table.name,))
             names.append(table.name)
         except VelaturaError as error:
             failed[table.name] = f"{error.what} {error.remedy}"

@@ -69,6 +69,11 @@ _IDENTIFYING: Final = Field(
     "on", "true or false", "boolean", flag=Flag("--off", "Stop identifying and resume.", False, True)
 )
 
+FADE: Final = Field("fade_s", "seconds of the fade, 0 to 600; default: as the playlist says", "number", False, most=600)
+PERCENT: Final = Field("percent", "share of the light, 0 to 100", "number", most=100)
+_BLACK: Final = Field("on", "true or false", "boolean", flag=Flag("--off", "Show the picture again.", False, True))
+_PAUSE: Final = Field("on", "true or false", "boolean", flag=Flag("--off", "Continue.", False, True))
+
 
 def _after(values: Values) -> Mapping[str, Any]:
     return {"after": values.get("after", 0)}
@@ -127,11 +132,19 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
               said="The stage closes; the lamps cool down.",
               asks="Close the stage? It becomes black, and the lamps have to cool before they can be lit again.",
               more="It stays closed until the next scheduled change."),
-    Operation("play", "Show this appearance now", OPERATOR, SHOWS, (APPEARANCE,), Answer.NOTHING, command="show",
+    Operation("play", "Show this appearance now", OPERATOR, SHOWS, (APPEARANCE, FADE), Answer.NOTHING, command="show",
               said="{name} plays now.", more="A closed stage opens."),
     Operation("rotate", "Show all appearances in turn, with their times and fades", OPERATOR, SHOWS,
               answer=Answer.NOTHING, verb="rotate", said="All appearances are shown in turn.",
               more="Their times are shown_s and fade_s in stage.toml. A closed stage opens."),
+    Operation("next", "Show the next appearance", OPERATOR, SHOWS, (FADE,), Answer.NOTHING,
+              said="The next appearance is shown.", more="The order is that of the playlist, else of the bundle."),
+    Operation("black", "Show black with the lamps lit, or the picture again", OPERATOR, SHOWS, (_BLACK, FADE),
+              Answer.NOTHING, said="Done.", more="It ends when an appearance is chosen, or when the stage closes."),
+    Operation("pause", "Stay at the present appearance, or continue", OPERATOR, SHOWS, (_PAUSE,), Answer.NOTHING,
+              said="Done.", more="It ends when an appearance is chosen, or when the stage closes."),
+    Operation("brightness", "Show a share of the light", OPERATOR, SHOWS, (PERCENT,), Answer.NOTHING,
+              said="The brightness is {percent} %.", more="It is 100 again when the stage closes."),
     Operation("identify", "Show each projector's name on it, or stop that", OPERATOR, SHOWS, (_IDENTIFYING,),
               Answer.NOTHING, said="Look at the projectors."),
     Operation("camera", "What the camera sees", VIEWER, LOOKS, answer=Answer.JPEG, call="camera_picture",

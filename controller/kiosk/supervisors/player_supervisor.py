@@ -185,7 +185,9 @@ class PlayerSupervisor:
     def _follow(self, status: dict[str, Any]) -> None:
         path = self._identities.get(str(status["bundle"]))
         name = status["appearance"] if status["showing"] == "appearance" else ""
-        shown = Showing(path, str(name)) if name else BLACK if status["showing"] == "black" else None
+        shown = BLACK if status["showing"] == "black" else None
+        if name:
+            shown = Showing(path, str(name), brightness=float(status["brightness"]))
         want = self.want
         if name:
             self._dark, self._starts_without_picture = False, 0
@@ -218,6 +220,7 @@ class PlayerSupervisor:
             return shown == want and not (running and self._turns)
         names = {name for name, _, _ in want.in_turn}
         same = shown is not None and shown.bundle == want.bundle and shown.appearance in names
+        same = same and shown is not None and shown.brightness == want.brightness
         return running and same and self._turns in (None, want.in_turn)
 
     def _warning(self, status: dict[str, Any]) -> Decision | None:
@@ -240,7 +243,8 @@ class PlayerSupervisor:
 
     def _put(self, want: Showing, loaded: Path | None) -> None:
         if not want.appearance or want.bundle is None:
-            self._ask({"op": "stop"}, 3.0)
+            with contextlib.suppress(TimeoutError) if want.fade_s > FADE_AWAITED_S else contextlib.nullcontext():
+                self._ask({"op": "stop", "fade_s": want.fade_s}, PUT_S)
             return
         if loaded != want.bundle:
             answer = self._ask({"op": "load-bundle", "path": str(want.bundle)}, 5.0)
@@ -248,10 +252,11 @@ class PlayerSupervisor:
             self._skipped = False
         request: dict[str, Any] = {"op": "play", "appearance": want.appearance, "fade_s": want.fade_s}
         if want.in_turn:
-            request = {"op": "sequence", "items": [list(turn) for turn in want.in_turn], "repeat": 0}
+            items = [list(turn) for turn in want.in_turn]
+            request = {"op": "sequence", "items": items, "repeat": 0, "first_fade_s": want.fade_s}
+        request["brightness"] = want.brightness
         # The answer comes when the picture has faded in; until then the status tells what comes.
-        slow = want.in_turn[0][2] if want.in_turn else want.fade_s
-        with contextlib.suppress(TimeoutError) if slow > FADE_AWAITED_S else contextlib.nullcontext():
+        with contextlib.suppress(TimeoutError) if want.fade_s > FADE_AWAITED_S else contextlib.nullcontext():
             if self._ask(request, PUT_S)["ok"]:
                 self._dark, self._starts_without_picture = False, 0
         self._turns = want.in_turn

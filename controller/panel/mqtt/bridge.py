@@ -7,18 +7,17 @@ import contextlib
 import json
 import logging
 import ssl
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import aiomqtt
 import anyio
 
-from controller.core.errors import UsageError
+from controller.building.verbs import Verbs
 from controller.core.files import read_text
 from controller.kiosk.interface import Kiosk
-from controller.kiosk.operations.fields import parse
-from controller.kiosk.operations.operation import Operation, Values
+from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.panel.answers import FAILURES
 from controller.panel.mqtt.options import BrokerOptions
@@ -37,8 +36,8 @@ class BuildingControl:
     """The connection to a broker; it reconnects without end, with growing pauses.
 
     Topics: ``T/available`` "online" or "offline" (retained; sent by the broker if the connection is lost); ``T/state``
-    JSON (retained); ``T/command/VERB`` for every operation with a ``building_verb`` (open, close, play, identify): the
-    payload is its one value as text, or a JSON object if it has more; ``T/answer``: the result. The broker decides who
+    JSON (retained); ``T/command/VERB`` for every operation with a ``building_verb`` (open, close, play, next,
+    ...): the payload is its first value as text, or a JSON object; ``T/answer``: the result. The broker decides who
     may publish to ``T/command``. It reconnects to a broker that confirms nothing for ``patience_s``.
     """
 
@@ -48,7 +47,7 @@ class BuildingControl:
     ) -> None:  # fmt: skip
         self._kiosk, self._options = kiosk, options
         self._first_pause_s, self._patience_s = first_pause_s, patience_s
-        self._verbs = {operation.building_verb: operation for operation in operations if operation.building_verb}
+        self._verbs = Verbs(kiosk, "Building control", operations=operations)
         self._changed = asyncio.Event()
 
     async def run(self) -> None:
@@ -136,6 +135,10 @@ class BuildingControl:
             "reason": now.reason,
             "since_unix_s": now.since_unix_s,
             "playing": now.playing,
+            "in_turn": now.in_turn,
+            "paused": now.paused,
+            "black": now.black,
+            "brightness": now.brightness,
             "warnings": list(now.warnings),
             "problems": [{"device": row.name, "problem": row.problem} for row in now.devices if row.problem],
         }
@@ -145,12 +148,11 @@ class BuildingControl:
             return  # an old command: a restart must not open a closed stage
         word = str(message.topic).rsplit("/", 1)[-1]
         payload = message.payload if isinstance(message.payload, bytes) else b""
-        command = self._command(word, payload)
-        if command is None:
+        if word not in self._verbs.names:
             answer = {"command": word[:40], "done": False, "code": "command-unknown"}
         else:
             try:
-                await anyio.to_thread.run_sync(command)
+                await anyio.to_thread.run_sync(self._do, word, payload)
                 answer = {"command": word, "done": True}
             except FAILURES as error:
                 answer = {
@@ -165,31 +167,8 @@ class BuildingControl:
                 answer = {"command": word, "done": False, "code": "crash"}
         await client.publish(f"{self._options.topic}/answer", json.dumps(answer), qos=1)
 
-    def _command(self, word: str, payload: bytes) -> Callable[[], object] | None:
-        operation = self._verbs.get(word)
-        if operation is None:
-            return None
-
-        def do() -> None:
-            values = _values(operation, payload[:LONGEST_PAYLOAD])
-            self._kiosk.record("done-by", operation.done_by("Building control", values))
-            operation.of(self._kiosk, values)
-
-        return do
-
-
-def _values(operation: Operation, payload: bytes) -> Values:
-    """Raises UsageError as ``parse``."""
-    text, fields = payload.decode("utf-8", "replace"), operation.fields
-    if len(fields) < 2:
-        return parse(fields, {field.name: text for field in fields}, strings=True)
-    try:
-        sent = json.loads(text)
-    except (ValueError, RecursionError):
-        sent = None
-    if not isinstance(sent, Mapping):
-        raise UsageError("body-wrong", what="The payload is not a JSON object.", remedy="Send one object of fields.")
-    return parse(fields, sent, strings=False)
+    def _do(self, word: str, payload: bytes) -> None:
+        self._verbs.do(word, payload[:LONGEST_PAYLOAD])
 
 
 def _password(file: Path | None) -> str | None:

@@ -84,10 +84,12 @@ class Commands:
             case protocol.Show(sequence):
                 self._player.withdraw()  # the frames of an earlier show, not yet presented, are overwritten here
                 self._player.show(self._read_inbox(sequence), on_result)
-            case protocol.Play(appearance, fade_s):
-                self._player.play(Playlist(((appearance, 0.0, fade_s),), repeat=1), on_result)
-            case protocol.Sequence(items, repeat, rate_hz):
-                self._player.play(Playlist(items, repeat), on_result, rate_hz=rate_hz)
+            case protocol.Play(appearance, fade_s, brightness):
+                playlist = Playlist(((appearance, 0.0, fade_s),), repeat=1)
+                self._player.play(playlist, on_result, brightness=brightness)
+            case protocol.Sequence(items, repeat, rate_hz, brightness, first_fade_s):
+                playlist = Playlist(items, repeat, first_fade_s)
+                self._player.play(playlist, on_result, rate_hz=rate_hz, brightness=brightness)
             case protocol.Suggested(repeat):
                 self._player.play(self._player.suggested(repeat), on_result)
             case protocol.Live(file, white):

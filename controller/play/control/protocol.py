@@ -10,7 +10,7 @@ from typing import Any, Final, TypeAlias
 from controller.core.errors import UsageError, VelaturaError
 
 PROTOCOL: Final = 1
-MINOR: Final = 3
+MINOR: Final = 4
 """Raised when the protocol gets an addition that older clients can ignore."""
 MAX_LINE_BYTES: Final = 256 * 1024
 MAX_ITEMS: Final = 4096
@@ -34,10 +34,14 @@ class Show:
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """Present an appearance of the loaded bundle, ``fade_s`` seconds long over what is shown."""
+    """Present an appearance of the loaded bundle, ``fade_s`` seconds long over what is shown.
+
+    ``brightness``: the share of its light that is shown, 0..1.
+    """
 
     appearance: str
     fade_s: float
+    brightness: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +50,15 @@ class Sequence:
 
     An item lasts ``seconds``, in the first ``fade_s`` of which it comes in over the one before.
     ``rate_hz``: the pictures change at multiples of 1 / rate_hz seconds meanwhile; None: at the player's own.
+    ``brightness``: the share of their light that is shown, 0..1; ``first_fade_s``: for how long the first item comes
+    in at the beginning, None: as it says.
     """
 
     items: tuple[tuple[str, float, float], ...]
     repeat: int
     rate_hz: float | None
+    brightness: float = 1.0
+    first_fade_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,12 +175,16 @@ def _show(*, sequence: Any) -> Show:
     return Show(_whole(sequence, "sequence", 2**64 - 1))
 
 
-def _play(*, appearance: Any, fade_s: Any = 0.0) -> Play:
-    return Play(_text(appearance, "appearance"), _fade(fade_s))
+def _play(*, appearance: Any, fade_s: Any = 0.0, brightness: Any = 1.0) -> Play:
+    return Play(_text(appearance, "appearance"), _fade(fade_s), _share(brightness))
 
 
 def _stop(*, fade_s: Any = 0.0) -> Stop:
     return Stop(_fade(fade_s))
+
+
+def _share(value: Any) -> float:
+    return 0.0 if value == 0 and not isinstance(value, bool) else _number(value, "brightness", 1.0)
 
 
 def _fade(value: Any) -> float:
@@ -183,13 +195,17 @@ def _live(*, file: Any, white: Any = None) -> Live:
     return Live(_text(file, "file"), None if white is None else _number(white, "white", MAX_RADIANCE))
 
 
-def _sequence(*, items: Any, repeat: Any = 0, rate_hz: Any = None) -> Sequence:
+def _sequence(
+    *, items: Any, repeat: Any = 0, rate_hz: Any = None, brightness: Any = 1.0, first_fade_s: Any = None
+) -> Sequence:
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ITEMS:
         raise ValueError(f"items is not a list of 1 to {MAX_ITEMS}")
     return Sequence(
         items=tuple(_item(item) for item in items),
         repeat=_whole(repeat, "repeat", 2**31),
         rate_hz=None if rate_hz is None else _number(rate_hz, "rate_hz", MAX_RATE_HZ),
+        brightness=_share(brightness),
+        first_fade_s=None if first_fade_s is None else _fade(first_fade_s),
     )
 
 

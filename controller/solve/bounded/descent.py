@@ -68,9 +68,9 @@ def block_coordinate_descent(
         for n, (rows, columns) in enumerate(transport.sizes):
             transport.normal_residual(light_y, problem.weights, right_hand_side, residual)
             transport.adjoint_of_buffer(n, residual, step)
-            start = transport.span(n).start
+            start, segment = transport.span(n).start, transport.segment(n)
             smoothness = problem.majoriser, problem.across, problem.down
-            a, b = projected_step(y, x, step, *smoothness, start, rows, columns, new)
+            a, b = projected_step(y, x, step, *smoothness, start, rows, columns, segment, new)
             squared_step, uphill = squared_step + a, uphill + b
             transport.accumulate_forward(n, step, light_y)
         kkt = float(np.sqrt(squared_step / total))

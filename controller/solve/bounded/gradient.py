@@ -51,6 +51,41 @@ def _step_row(
     return float(kkt), float(uphill)
 
 
+@compiled(fastmath=True)
+def within_segment(p: FloatImage, segment: np.float32, majoriser: FloatImage, out: FloatImage) -> None:
+    """The nearest colour to ``p`` (3,) in [0, 1] that a projector with a white segment can show, by majoriser.
+
+    Each p_c <= 1 - s + s min(p): brighter than that a saturated colour can't be, but it may become paler. The darkest
+    colour rises by mu while the others fall by what they are then still above; the best mu is where both pull alike.
+    """
+    least = 0
+    for c in range(1, 3):
+        if p[c] < p[least]:
+            least = c
+    others = (least + 1) % 3, (least + 2) % 3
+    first, second = (others[0], others[1]) if p[others[0]] >= p[others[1]] else (others[1], others[0])
+    top = 1 - segment + segment * p[least]
+    out[0], out[1], out[2] = p[0], p[1], p[2]
+    if p[first] <= top:
+        return
+    own, d = max(majoriser[least], np.float32(1e-30)), majoriser[first]
+    rise = segment * d * (p[first] - top) / (own + segment * segment * d)
+    if p[second] > top + segment * rise:
+        d2 = majoriser[second]
+        pull = segment * (d * (p[first] - top) + d2 * (p[second] - top))
+        rise = pull / (own + segment * segment * (d + d2))
+    if p[least] <= 0:
+        rise = np.float32(0)  # no light of that colour was wanted, and how little is not known here
+    darkest, between = p[least] + rise, p[second]
+    if darkest > between:
+        # both rise together from there
+        d2 = majoriser[second]
+        pull = own * p[least] + d2 * between + segment * d * (p[first] - (1 - segment))
+        darkest = between = max(pull / (own + d2 + segment * segment * d), between)
+    top = 1 - segment + segment * darkest
+    out[least], out[first], out[second] = darkest, min(p[first], top), min(between, top)
+
+
 @compiled(parallel=True, fastmath=True)
 def projected_step(
     y: FloatImage,
@@ -62,6 +97,7 @@ def projected_step(
     start: int,
     rows: int,
     columns: int,
+    segment: float,
     new: FloatImage,
 ) -> tuple[float, float]:
     """Write one projected gradient step from ``y`` to ``new`` for the projector whose pixels start at ``start``.
@@ -69,6 +105,7 @@ def projected_step(
     All arrays (3, pixels of all projectors), each projector row by row. ``gradient`` is that of the data; that of the
     smoothness is added here. It is overwritten with new - y. Returns two sums: majoriser x step^2, whose size measures
     the KKT residual, and majoriser x (y - new) x (new - x), positive where the momentum points uphill.
+    ``segment``: the projector's share of white that only greys get; see ``LightTransport.segments``
     """
     sums = np.zeros((rows, 2), np.float64)
     for v in prange(rows):
@@ -87,6 +124,15 @@ def projected_step(
             kkt, uphill = _step_row(here, x[c, a:e], total, majoriser[c, a:e], new[c, a:e], gradient[c, a:e])
             sums[v, 0] += kkt
             sums[v, 1] += uphill
+        if segment > 0:
+            saturated, share = np.empty(3, np.float32), np.float32(segment)
+            for i in range(a, e):
+                within_segment(new[:, i], share, majoriser[:, i], saturated)
+                for c in range(3):
+                    d, was, to = majoriser[c, i], new[c, i], saturated[c]
+                    sums[v, 0] += d * ((to - y[c, i]) ** 2 - (was - y[c, i]) ** 2)
+                    sums[v, 1] += d * ((y[c, i] - to) * (to - x[c, i]) - (y[c, i] - was) * (was - x[c, i]))
+                    new[c, i], gradient[c, i] = to, to - y[c, i]
     return float(sums[:, 0].sum()), float(sums[:, 1].sum())
 
 

@@ -11,7 +11,7 @@ from controller.cluster.connect import Cluster, connected
 from controller.cluster.tasks import StageData
 from controller.run.runner import Context
 from controller.solve.request import AppearanceResult, SolveOptions
-from controller.steps.appearance.solving import Answering, Wish
+from controller.steps.appearance.solving import Answering, AppearanceRequest
 
 
 class Spreading:
@@ -20,20 +20,20 @@ class Spreading:
     Requests with a step before their solving (Blender's) are submitted when it is their turn.
     """
 
-    def __init__(self, cluster: Cluster, calibrated: Calibrated, wishes: Sequence[Wish]) -> None:
-        self._cluster, self._calibrated, self._wishes = cluster, calibrated, tuple(wishes)
+    def __init__(self, cluster: Cluster, calibrated: Calibrated, requests: Sequence[AppearanceRequest]) -> None:
+        self._cluster, self._calibrated, self._requests = cluster, calibrated, tuple(requests)
         self._spread: SpreadAppearances | None = None
 
-    def __call__(self, wish: Wish, options: SolveOptions, context: Context) -> AppearanceResult:
+    def __call__(self, request: AppearanceRequest, options: SolveOptions, context: Context) -> AppearanceResult:
         """The result of one request."""
         context.advance(0.0, f"{self._cluster.workers} workers")
         spread = self._spread or self._opened()
-        names = [other.name for other in self._wishes]
-        for other in self._wishes[names.index(wish.name) :]:
-            if other.name == wish.name or other.prepare is None:
+        names = [other.name for other in self._requests]
+        for other in self._requests[names.index(request.name) :]:
+            if other.name == request.name or other.prepare is None:
                 context.check()
                 spread.begin(other.name, other.target(), options)
-        return spread.answer(wish.name, context.check)
+        return spread.answer(request.name, context.check)
 
     def _opened(self) -> SpreadAppearances:
         base, calibration = self._calibrated.base, self._calibrated.calibration
@@ -49,7 +49,9 @@ class Spreading:
 
 
 @contextlib.contextmanager
-def answering_on(scheduler: str | None, calibrated: Calibrated, wishes: Sequence[Wish]) -> Iterator[Answering | None]:
+def answering_on(
+    scheduler: str | None, calibrated: Calibrated, requests: Sequence[AppearanceRequest]
+) -> Iterator[Answering | None]:
     """Solves appearances on the cluster of ``scheduler``; None without a scheduler.
 
     Raises what ``cluster.connect.connected`` raises.
@@ -58,7 +60,7 @@ def answering_on(scheduler: str | None, calibrated: Calibrated, wishes: Sequence
         yield None
         return
     with connected(scheduler) as cluster:
-        spreading = Spreading(cluster, calibrated, wishes)
+        spreading = Spreading(cluster, calibrated, requests)
         try:
             yield spreading
         finally:

@@ -58,7 +58,7 @@ def compare_steps(
 
 def compared_mask(calibrated: Calibrated, solved: Solved) -> Mask:
     """Mask of the comparison, (rows, columns): pixels on the object where what was asked for can be reached."""
-    return solved.wish.reachable & calibrated.calibration.object_mask
+    return solved.requested.reachable & calibrated.calibration.object_mask
 
 
 def window_px(shape: tuple[int, ...]) -> int:
@@ -81,7 +81,7 @@ def _compare(
     picture = photograph_hdr(rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of)
     context.advance(0.7, "comparing with the target")
     mask, size_px = compared_mask(calibrated, solved), window_px(picture.shape)
-    asked = solved.wish.target
+    asked = solved.requested.target
     found = compare(picture, asked, calibrated.calibration.camera_to_xyz, solved.exposure, mask)
     local, _ = sharpness_windows(picture, asked, solved.exposure, mask, size_px)
     one = Compared(
@@ -107,7 +107,7 @@ def judged(calibration: Calibration, reflectance: FloatImage, solved: Solved, pi
 
     Raises what ``solve.metrics.compare`` raises.
     """
-    asked, lit, matrix, white = solved.wish, calibration.object_mask, calibration.camera_to_xyz, solved.exposure
+    asked, lit, matrix, white = solved.requested, calibration.object_mask, calibration.camera_to_xyz, solved.exposure
     sets = by_pixels(picture, asked.target, matrix, white, reachable=asked.reachable, valid=asked.valid, lit=lit)
     shown = lit & asked.valid
     ghost = ghosting(picture, asked.target, reflectance, matrix, white, shown, shown & ~asked.reachable)

@@ -17,16 +17,16 @@ from controller.core.storage import sha256_of
 from controller.run.runner import Context
 from controller.solve.targets.files import read_picture
 from controller.solve.targets.values import Target
-from controller.steps.appearance.solving import Wish
+from controller.steps.appearance.solving import AppearanceRequest
 
 PREFIX: Final = "builtin:"
 RENDER_S: Final = 40.0
 """At size small on the reference machine."""
 
 
-def blender_wish(
+def blender_request(
     name: str, calibrated: Calibrated, options: Mapping[str, Any], inputs: Mapping[str, str], *, folder: Path
-) -> Wish:
+) -> AppearanceRequest:
     """A request whose target is rendered from ``options``: ``scene``, ``builtin:NAME`` (default: marble) or a .blend
     file relative to ``folder``; ``samples`` and ``seed``.
 
@@ -52,13 +52,13 @@ def blender_wish(
     def target() -> Target:
         return read_target(calibrated.folder, name)
 
-    return Wish(name, f"{name}, rendered by Blender", target, told, prepare, RENDER_S)
+    return AppearanceRequest(name, f"{name}, rendered by Blender", target, told, prepare, RENDER_S)
 
 
-def scene_wish(calibrated: Calibrated, scene: str, *, folder: Path) -> Wish:
+def scene_request(calibrated: Calibrated, scene: str, *, folder: Path) -> AppearanceRequest:
     """The request for a scene given on the command line; ``builtin:marble`` is called marble, a file by its name."""
     name = scene.removeprefix(PREFIX) if scene.startswith(PREFIX) else Path(scene).stem
-    return blender_wish(name, calibrated, {"scene": scene}, {"kind": "blender", "scene": scene}, folder=folder)
+    return blender_request(name, calibrated, {"scene": scene}, {"kind": "blender", "scene": scene}, folder=folder)
 
 
 def _scene(scene: str, folder: Path) -> tuple[str | None, Path | None]:

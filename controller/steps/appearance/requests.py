@@ -23,8 +23,8 @@ from controller.solve.targets.pieces import on_each
 from controller.solve.targets.relight import gloss, recolour
 from controller.solve.targets.values import Target, through_camera
 from controller.solve.targets.wrap import wrap_photograph
-from controller.steps.appearance.rendering import blender_wish
-from controller.steps.appearance.solving import Wish
+from controller.steps.appearance.rendering import blender_request
+from controller.steps.appearance.solving import AppearanceRequest
 
 TITLES: Mapping[str, str] = {
     "photograph": "A photograph wrapped around the object",
@@ -40,7 +40,7 @@ TITLES: Mapping[str, str] = {
 NEEDS_FILE = ("photograph", "picture")
 
 
-def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -> list[Wish]:
+def requests_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -> list[AppearanceRequest]:
     """The appearances of stage.toml with these names, or all, checked before anything is solved.
 
     Raises UsageError with code "appearance-unknown", "stage-key-value" or "stage-key-unknown" (with the line), and
@@ -56,10 +56,10 @@ def wishes_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -
             if tables
             else 'Add one with name and kind, for example kind = "gloss".',
         )
-    return [_wish(stage, tables[name], calibrated) for name in (names or tables)]
+    return [_request(stage, tables[name], calibrated) for name in (names or tables)]
 
 
-def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
+def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> AppearanceRequest:
     if table.kind not in TITLES:
         raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
     _ = table.hint_ms  # report its errors before an hour of solving
@@ -74,7 +74,7 @@ def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
         _check_picture(table, file, calibrated.camera_px)
     inputs = {"kind": table.kind, "settings": repr(sorted(options.items()))}
     if table.kind == "blender":
-        return blender_wish(table.name, calibrated, options, inputs, folder=stage.folder)
+        return blender_request(table.name, calibrated, options, inputs, folder=stage.folder)
     if file is not None:
         inputs["file"] = sha256_of(file)
 
@@ -82,7 +82,7 @@ def _wish(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Wish:
         arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
         return _make(table.kind, file, arguments, calibrated)
 
-    return Wish(table.name, TITLES[table.kind], target, inputs)
+    return AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
 
 
 _MAKERS: Mapping[str, Callable[..., Target]] = {

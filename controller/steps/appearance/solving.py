@@ -11,7 +11,7 @@ from typing import get_args
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.solved import Asked, Solved, SolvedBase
+from controller.artefacts.solved import RequestedTarget, Solved, SolvedBase
 from controller.calibrate.values import Calibration
 from controller.capture.patterns import Pattern, PatternKind, plan_patterns
 from controller.config.models import SolveTable
@@ -35,7 +35,7 @@ def options_of(table: SolveTable) -> SolveOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class AppearanceRequest:
     """An appearance to solve: ``target`` gives its picture, like reflectance, and a mask of its valid pixels.
 
     ``inputs`` are the hashes of the target's sources; ``prepare``, if given, is a step before
@@ -63,7 +63,7 @@ def base_choice(name: str) -> BaseChoice:
 
 def solve_steps(
     calibrated: Calibrated,
-    wishes: Sequence[Wish],
+    requests: Sequence[AppearanceRequest],
     options: SolveOptions,
     after: Sequence[StepId],
     scale: float = 1.0,
@@ -85,28 +85,28 @@ def solve_steps(
             weight=costs.BASE_S * scale,
         ),
     ]
-    for wish in wishes:
+    for request in requests:
         before = (*after, BASE)
-        if wish.prepare is not None:
-            rendered = StepId(StepKind.TARGET, item=wish.name)
+        if request.prepare is not None:
+            rendered = StepId(StepKind.TARGET, item=request.name)
             steps.append(
                 Step(
                     rendered,
-                    wish.prepare,
-                    inputs=wish.inputs,
+                    request.prepare,
+                    inputs=request.inputs,
                     after=tuple(after),
-                    title=f"Rendering {wish.title}",
-                    weight=wish.prepare_s * scale,
+                    title=f"Rendering {request.title}",
+                    weight=request.prepare_s * scale,
                 )
             )
             before = (*before, rendered)
         steps.append(
             Step(
-                StepId(StepKind.APPEARANCE, item=wish.name),
-                partial(_solve_appearance, calibrated, wish, options, answering),
-                inputs={**options.inputs(), **wish.inputs},
+                StepId(StepKind.APPEARANCE, item=request.name),
+                partial(_solve_appearance, calibrated, request, options, answering),
+                inputs={**options.inputs(), **request.inputs},
                 after=before,
-                title=f"Solving {wish.title}",
+                title=f"Solving {request.title}",
                 weight=costs.APPEARANCE_S * scale,
             )
         )
@@ -137,16 +137,18 @@ def _watched(context: Context) -> Callable[[int, float], None]:
     return progress
 
 
-Answering = Callable[[Wish, SolveOptions, Context], AppearanceResult]
+Answering = Callable[[AppearanceRequest, SolveOptions, Context], AppearanceResult]
 """Solves an appearance, here or elsewhere."""
 
 
-def _answer_here(calibrated: Calibrated, wish: Wish, options: SolveOptions, context: Context) -> AppearanceResult:
+def _answer_here(
+    calibrated: Calibrated, request: AppearanceRequest, options: SolveOptions, context: Context
+) -> AppearanceResult:
     return solve_appearance(
         calibrated.transport,
         calibrated.base,
         calibrated.calibration.black,
-        wish.target(),
+        request.target(),
         options,
         drive=calibrated.drive,
         indirect=calibrated.indirect,
@@ -155,15 +157,19 @@ def _answer_here(calibrated: Calibrated, wish: Wish, options: SolveOptions, cont
 
 
 def _solve_appearance(
-    calibrated: Calibrated, wish: Wish, options: SolveOptions, answering: Answering | None, context: Context
+    calibrated: Calibrated,
+    request: AppearanceRequest,
+    options: SolveOptions,
+    answering: Answering | None,
+    context: Context,
 ) -> Sequence[Path]:
     began_s = time.perf_counter()
-    made = (answering or partial(_answer_here, calibrated))(wish, options, context)
+    made = (answering or partial(_answer_here, calibrated))(request, options, context)
     if made.figures["advice"] is not None:
-        context.reporter.say(f"{wish.title}: {made.figures['advice']}", Level.WARNING)
+        context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
     figures: dict[str, object] = {
-        "name": wish.name,
-        "title": wish.title,
+        "name": request.name,
+        "title": request.title,
         **made.figures,
         "seconds_with_target": time.perf_counter() - began_s,
     }
@@ -173,9 +179,9 @@ def _solve_appearance(
         target=made.target,
         reachable=made.reachable,
         figures=figures,
-        asked=Asked(made.asked, made.asked_reachable, made.valid),
+        asked=RequestedTarget(made.asked, made.asked_reachable, made.valid),
     )
-    return solved.write(context.folder, wish.name)
+    return solved.write(context.folder, request.name)
 
 
 def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dict[str, ByteImage]:
@@ -186,4 +192,4 @@ def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dic
     }
 
 
-__all__ = ["SolveOptions", "Wish", "device_frames", "options_of", "solve_steps"]
+__all__ = ["AppearanceRequest", "SolveOptions", "device_frames", "options_of", "solve_steps"]

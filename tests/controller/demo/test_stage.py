@@ -1,4 +1,4 @@
-"""The demo's stage: whole or not at all, and found again by the same wishes."""
+"""The demo's stage: whole or not at all, and found again by the same options."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ def test_the_same_wishes_find_it_again_and_others_are_refused(bench: ModelBench,
     assert (stage / "keys" / "stage.key").read_bytes() == key
     assert len(bench.prepared) == 1
     assert bench.rooms == [DEFAULT_ROOM]
-    for wishes in ({"seed": 2}, {"size": "medium"}, {"object_file": None}, {"room": "hard"}):
+    for options in ({"seed": 2}, {"size": "medium"}, {"object_file": None}, {"room": "hard"}):
         with pytest.raises(UsageError) as refused:
-            prepared(tmp_path / "out", **{"object_file": mesh, **wishes})  # type: ignore[arg-type]
+            prepared(tmp_path / "out", **{"object_file": mesh, **options})  # type: ignore[arg-type]
         assert refused.value.code == "demo-folder-taken"
     mesh.write_text("v 1 1 1")
     with pytest.raises(UsageError, match="another size, object, seed or room"):

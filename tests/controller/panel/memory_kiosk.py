@@ -211,10 +211,38 @@ class MemoryKiosk:
             raise WorkError("nothing-to-cancel", what="No job is running.", remedy="There is nothing to cancel.")
         self._cancel.set()
 
-    def play(self, name: str) -> None:
+    def play(self, name: str, fade_s: float | None = None) -> None:
         self._known(name)
+        self.asked.append(("play", (name, fade_s)))
+        self._show(name)
+        self.change(in_turn=False, paused=False)
+
+    def _show(self, name: str) -> None:
         self._appearances = {key: replace(one, playing=key == name) for key, one in self._appearances.items()}
-        self.change(playing=name, state="playing", reason="Playing as asked.")
+        self.change(playing=name, state="playing", reason="Playing as asked.", black=False)
+
+    def _require_open(self) -> None:
+        if self._state.state in ("off", "cooling"):
+            raise WorkError("nothing-plays", what="The stage is closed.", remedy="Open the stage first.")
+
+    def next(self, fade_s: float | None = None) -> None:
+        self._require_open()
+        names = list(self._appearances)
+        playing = self._state.playing
+        self._show(names[(names.index(playing) + 1) % len(names) if playing in names else 0])
+
+    def black(self, on: bool, fade_s: float | None = None) -> None:
+        if on:
+            self._require_open()
+        self.change(black=on)
+
+    def pause(self, on: bool) -> None:
+        self._require_open()
+        self.change(paused=on)
+
+    def brightness(self, percent: float) -> None:
+        self._require_open()
+        self.change(brightness=percent)
 
     def rotate(self) -> None:
         self.change(in_turn=True, state="playing", reason="Playing as asked.")
@@ -235,7 +263,8 @@ class MemoryKiosk:
         return self._appearances[name]
 
     def stop(self) -> None:
-        self.change(state="cooling", reason="The stage was closed by hand.", playing="")
+        self.change(state="cooling", reason="The stage was closed by hand.", playing="", black=False, paused=False,
+                    brightness=100.0)  # fmt: skip
 
     def start(self) -> None:
         self.change(state="powering", reason="The stage was opened by hand.")

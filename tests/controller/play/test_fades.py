@@ -137,3 +137,18 @@ def test_every_output_tells_its_number_apart_from_the_others(wire: Wire, folder:
         assert (picture[:, [0, -1]] == 255).all()
     inside = [picture[2:27, 8:31].tobytes() for picture in pictures]
     assert len(set(inside)) == len(inside)
+
+
+def test_a_share_of_the_light_is_shown_and_all_of_it_again(wire: Wire, outputs: Outputs, folder: Path) -> None:
+    shown = Frames(folder / "out.frame")
+    whole = noise(outputs, 1)
+    black = {name: np.zeros_like(picture) for name, picture in whole.items()}
+    wire.ask("play", appearance="1", brightness=0.25)
+    assert abs(share_of(shown.read(), black, whole) - 0.25) < 0.005
+    assert wire.ask("status")["brightness"] == 0.25
+    wire.ask("sequence", items=[["1", 60], ["2", 60]], brightness=0.5, first_fade_s=0.2)
+    assert abs(share_of(shown.read(), black, whole) - 0.5) < 0.005
+    wire.ask("play", appearance="1", brightness=0)
+    assert dark(shown.read())
+    wire.ask("play", appearance="1")
+    assert same(shown.read(), whole)

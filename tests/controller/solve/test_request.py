@@ -64,9 +64,9 @@ def test_reachable_pixels_are_those_where_the_target_says_something(transport: L
 
 def test_adaptation_brings_more_into_reach_and_keeps_what_was_asked_for(transport: LightTransport, base: Base) -> None:
     options = replace(OPTIONS, share=0.6, adapt=1.0)
-    wish = picture(60)
-    found = solve_appearance(transport, base, STAGE.black, wish, options)
-    plain = solve_appearance(transport, base, STAGE.black, wish, replace(options, adapt=0.0))
+    asked = picture(60)
+    found = solve_appearance(transport, base, STAGE.black, asked, options)
+    plain = solve_appearance(transport, base, STAGE.black, asked, replace(options, adapt=0.0))
     values = {key: value for key, value in found.figures.items() if isinstance(value, float)}
     assert values["reachable_share"] < 0.7 < 0.95 < values["adapted_share"]
     np.testing.assert_allclose(found.asked, plain.target)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, WorkError
 from controller.kiosk.decide.hours import WEEKDAYS, check_schedule
-from controller.kiosk.decide.interfaces import IN_TURN, Showing
+from controller.kiosk.decide.interfaces import BLACK, IN_TURN, Showing
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.run.state_machine import State
 from tests.controller.kiosk.model import BUNDLE, Kiosk
@@ -70,3 +70,53 @@ def test_a_playlist_of_one_is_that_one(kiosk: Kiosk) -> None:
     kiosk.bundles.turns = TURNS[1:]
     kiosk.run_until(State.PLAYING)
     assert kiosk.player.want == Showing(BUNDLE, "marble")
+
+
+def test_the_next_one_is_where_the_list_goes_on_and_a_pause_holds_it(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.run(2)
+    kiosk.reconciler.next(4.0)
+    kiosk.run(1)
+    turned = Showing(BUNDLE, "marble", (TURNS[1], TURNS[0]))
+    assert kiosk.player.want == turned
+    assert kiosk.player.want.fade_s == 4.0
+    kiosk.run(2)
+    assert kiosk.player.want.fade_s == 2.0, "the fade was for this change alone"
+    kiosk.reconciler.pause(True)
+    kiosk.run(2)
+    assert kiosk.player.want == Showing(BUNDLE, "marble")
+    kiosk.reconciler.next()
+    kiosk.run(2)
+    assert kiosk.player.want == Showing(BUNDLE, "shine")
+    kiosk.reconciler.pause(False)
+    kiosk.run(2)
+    assert kiosk.player.want == ALL
+
+
+def test_black_and_brightness_last_over_a_restart_and_end_when_the_stage_closes(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.run(2)
+    kiosk.reconciler.brighten(0.4)
+    kiosk.run(2)
+    assert kiosk.player.want == Showing(BUNDLE, "shine", TURNS, brightness=0.4)
+    kiosk.reconciler.black(True, 3.0)
+    kiosk.run(2)
+    assert kiosk.player.want == BLACK
+    assert kiosk.reconciler.machine.state is State.PLAYING, "the lamps stay lit"
+    kiosk.log.close()
+    kiosk.boot()
+    kiosk.run_until(State.PLAYING)
+    kiosk.run(2)
+    assert kiosk.player.want == BLACK
+    kiosk.reconciler.black(False)
+    kiosk.run(2)
+    assert kiosk.player.want == Showing(BUNDLE, "shine", TURNS, brightness=0.4)
+    kiosk.reconciler.black(True)
+    kiosk.reconciler.shut()
+    kiosk.run_until(State.OFF)
+    with pytest.raises(WorkError, match="closed"):
+        kiosk.reconciler.next()
+    kiosk.reconciler.open()
+    kiosk.run_until(State.PLAYING)
+    kiosk.run(2)
+    assert kiosk.player.want == ALL

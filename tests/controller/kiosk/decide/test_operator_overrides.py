@@ -83,7 +83,7 @@ def test_who_closes_or_opens_by_hand_is_heard_until_the_hours_say_something_new(
         ("04T20:00", True, "11T02:00", False),
     ],
 )
-def test_a_power_cut_outlives_no_wish_that_had_ended_meanwhile(
+def test_a_power_cut_outlives_no_override_that_had_ended_meanwhile(
     memory: Memory, asked_at: str, wanted: bool, woken_at: str, is_open: bool
 ) -> None:
     overrides = memory.overrides()
@@ -93,7 +93,7 @@ def test_a_power_cut_outlives_no_wish_that_had_ended_meanwhile(
     assert open_at(memory.overrides(), woken_at, woken_at) == [is_open, is_open]
 
 
-def test_a_wish_is_kept_while_nobody_knows_the_time_after_a_power_cut(memory: Memory) -> None:
+def test_an_override_is_kept_while_nobody_knows_the_time_after_a_power_cut(memory: Memory) -> None:
     overrides = memory.overrides(without_time=True)
     overrides.follow(at("04T15:00"))
     overrides.override(False, at("04T15:00"))
@@ -106,7 +106,7 @@ def test_a_wish_is_kept_while_nobody_knows_the_time_after_a_power_cut(memory: Me
     assert open_at(overrides, "05T11:00") == [True]
 
 
-def test_hours_that_are_edited_end_no_wish_of_the_same_day(memory: Memory) -> None:
+def test_hours_that_are_edited_end_no_override_of_the_same_day(memory: Memory) -> None:
     longer = Schedule("Europe/Vienna", tuple(ScheduleRow(day, "10:00", "20:00") for day in DAYS))
     overrides = memory.overrides()
     overrides.follow(at("04T15:00"))

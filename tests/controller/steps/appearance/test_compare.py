@@ -16,7 +16,7 @@ import pytest
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.comparison import PICTURES, compared_in, history_of, pictures_of
-from controller.artefacts.solved import Asked, Solved, read_solved
+from controller.artefacts.solved import RequestedTarget, Solved, read_solved
 from controller.capture.raw import SRGB_TO_XYZ
 from controller.core.arrays import FloatImage, save_arrays
 from controller.core.errors import UsageError
@@ -175,9 +175,11 @@ def test_each_appearance_is_judged_by_its_photograph_against_its_target(stage: S
 
 def test_what_was_asked_for_counts_and_each_set_of_pixels_is_told(stage: Stage) -> None:
     solved = read_solved(stage.calibrated.folder, "gold", NAMES)
-    wish = Asked(np.asarray(1.5 * solved.target, np.float32), solved.reachable.copy(), np.ones(CAMERA, np.bool_))
-    wish.reachable[:, : CAMERA[1] // 2] = False
-    replace(solved, asked=wish).write(stage.calibrated.folder, "gold")
+    requested = RequestedTarget(
+        np.asarray(1.5 * solved.target, np.float32), solved.reachable.copy(), np.ones(CAMERA, np.bool_)
+    )
+    requested.reachable[:, : CAMERA[1] // 2] = False
+    replace(solved, asked=requested).write(stage.calibrated.folder, "gold")
     run = stage.run(FIRST, names=("gold",))
     (gold,) = compared_in(run)
     assert gold.delta_e00_median > 3, "the photograph shows the adapted target"

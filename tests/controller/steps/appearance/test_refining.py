@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.solved import Asked, Refining, Solved, read_refining, read_solved, remove_refined
+from controller.artefacts.solved import Refining, RequestedTarget, Solved, read_refining, read_solved, remove_refined
 from controller.calibrate.values import Calibration
 from controller.capture.raw import develop
 from controller.core.arrays import FloatImage
@@ -198,13 +198,15 @@ def test_one_photograph_corrects_the_frames_and_says_what_is_expected(stage: Sta
 
 
 def test_it_corrects_towards_the_adapted_target_and_not_towards_what_was_out_of_reach(stage: Stage) -> None:
-    wish = Asked(np.asarray(3 * target(), np.float32), np.zeros(CAMERA, np.bool_), np.ones(CAMERA, np.bool_))
-    replace(stage.solved, asked=wish).write(stage.calibrated.folder, NAME)
+    requested = RequestedTarget(
+        np.asarray(3 * target(), np.float32), np.zeros(CAMERA, np.bool_), np.ones(CAMERA, np.bool_)
+    )
+    replace(stage.solved, asked=requested).write(stage.calibrated.folder, NAME)
     before = stage.error()
     figures = stage.refine(2)
     assert stage.error() < 0.4 * before, "nearer to the adapted target"
     assert figures["before"] == pytest.approx(before, rel=0.25), "judged by it, too"
-    np.testing.assert_array_equal(stage.present().wish.target, wish.target)
+    np.testing.assert_array_equal(stage.present().requested.target, requested.target)
 
 
 def test_it_stops_when_the_rest_is_noise_and_the_last_frames_were_photographed(stage: Stage) -> None:

@@ -142,7 +142,7 @@ def test_a_mode_has_its_own_spacing_unless_one_is_given(mode: str, spacing: str 
         ("paper", "²", "dot-spacing-wrong"),
     ],
 )
-def test_wrong_wishes_are_refused_in_words(mode: str, spacing: str | None, code: str) -> None:
+def test_wrong_options_are_refused_in_words(mode: str, spacing: str | None, code: str) -> None:
     with pytest.raises(UsageError) as refused:
         dot_options(mode, spacing)
     assert refused.value.code == code

@@ -1,0 +1,177 @@
+"""The stage as one PJLink class 2 projector, judged by two clients that nobody here wrote."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from aiopjlink import PJLink, PJLinkERR3, PJLinkPassword
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pypjlink import MUTE_AUDIO, MUTE_VIDEO
+from pypjlink import Projector as PyPjLink
+from pypjlink.projector import ProjectorError
+
+from controller.building import pjlink_lines as lines
+from controller.building.protocol import read
+from controller.building.server import serving
+from controller.kiosk.interface import KioskState
+from hal.codecs.projectors.pjlink import second_level_digest
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.ports import kept_port
+from tests.waiting import wait_for
+
+PASSWORD = "JBMIAProjectorLink"
+
+
+@pytest.fixture
+def kiosk(tmp_path: Path) -> Iterator[MemoryKiosk]:
+    made = MemoryKiosk(tmp_path / "pictures")
+    yield made
+    made.close()
+
+
+@contextlib.contextmanager
+def stage(kiosk: MemoryKiosk, folder: Path, password: str = "", more: str = "") -> Iterator[int]:
+    """The port of the served stage."""
+    (folder / "password").write_text(password + "\n")
+    with kept_port() as port:
+        text = f"[pjlink]\nport = {port}\n{more}"
+        (folder / "building.toml").write_text(text + (f'password_file = "{folder}/password"\n' if password else ""))
+        with serving(kiosk, read(folder)):
+            wait_for(lambda: listens(port))
+            yield port
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as trial:
+        return trial.connect_ex(("127.0.0.1", port)) == 0
+
+
+def talk(port: int, work: Callable[[Any], Awaitable[Any]], password: str | None = None) -> Any:
+    async def session() -> Any:
+        link = PJLink(address="127.0.0.1", port=port, password=password, timeout=20)
+        try:
+            async with link:
+                return await work(link)
+        finally:
+            if link._writer is not None:
+                link._writer.close()
+
+    return asyncio.run(session())
+
+
+def test_aiopjlink_drives_the_stage(kiosk: MemoryKiosk, tmp_path: Path) -> None:
+    async def drive(link: Any) -> None:
+        sources = link.sources
+        assert (await link.power.get()).name == "ON"
+        named = await sources.available_with_names()
+        assert [name for *_, name in named] == ["marble", "warm wood"]
+        assert (await sources.get())[1] == "1"
+        await sources.set(sources.Mode.DIGITAL, 2)
+        assert kiosk.snapshot().playing == "warm wood"
+        await link.mute.both(True)
+        assert kiosk.snapshot().black
+        assert await link.mute.status() == (True, True)
+        await link.mute.both(False)
+        assert not kiosk.snapshot().black
+        await link.freeze.set(True)
+        assert kiosk.snapshot().paused
+        assert await link.freeze.get()
+        lamps = await link.lamps.status()
+        assert [(hours, state.name) for hours, state in lamps] == [(1204, "ON"), (3120, "OFF")]
+        found = {category.name: level.name for category, level in (await link.errors.query()).items()}
+        assert found["LAMP"] == "WARN"
+        assert set(found.values()) == {"OK", "WARN"}
+        assert await link.info.projector_name() == "Head of a boy"
+        assert await link.info.manufacturer_name() == "Velatura"
+        await link.power.turn_off()
+        assert (await link.power.get()).name == "COOLING"
+        with pytest.raises(PJLinkERR3):
+            await link.freeze.set(True)
+
+    with stage(kiosk, tmp_path) as port:
+        talk(port, drive)
+    assert kiosk.recorded[0] == ("done-by", "PJLink (127.0.0.1): Show this appearance now (warm wood).")
+
+
+def test_pypjlink2_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp_path: Path) -> None:
+    with stage(kiosk, tmp_path, PASSWORD) as port:
+        with contextlib.closing(PyPjLink.from_address("127.0.0.1", port, timeout=20)) as link:
+            assert link.authenticate(PASSWORD) is True
+            assert link.get_power() == "on"
+            assert link.get_inputs() == [("DIGITAL", 1), ("DIGITAL", 2)]
+            link.set_input("DIGITAL", 2)
+            assert link.get_input() == ("DIGITAL", 2)
+            link.set_mute(MUTE_VIDEO | MUTE_AUDIO, True)
+            assert link.get_mute() == (True, True)
+            with pytest.raises(ProjectorError):
+                link.set_input("DIGITAL", 7)
+            assert (link.get_manufacturer(), link.get_name()) == ("Velatura", "Head of a boy")
+            assert link.get_lamps() == [(1204, True), (3120, False)]
+            link.set_power("off")
+            assert link.get_power() == "cooling"
+        with contextlib.closing(PyPjLink.from_address("127.0.0.1", port, timeout=20)) as link:
+            assert link.authenticate("wrong") is False
+
+
+def test_a_wrong_password_is_refused_and_changes_nothing(kiosk: MemoryKiosk, tmp_path: Path) -> None:
+    with stage(kiosk, tmp_path, PASSWORD) as port:
+        with pytest.raises(PJLinkPassword):
+            talk(port, lambda link: link.power.turn_off(), "wrong")
+        talk(port, lambda link: link.power.get(), PASSWORD)
+    assert kiosk.snapshot().state == "playing"
+
+
+def test_the_password_check_of_version_two(kiosk: MemoryKiosk, tmp_path: Path) -> None:
+    with stage(kiosk, tmp_path, PASSWORD) as port, socket.create_connection(("127.0.0.1", port), 20) as link:
+        file = link.makefile("rb")
+
+        def line() -> bytes:
+            found = b""
+            while not found.endswith(b"\r"):
+                found += file.read(1)
+            return found
+
+        assert line().startswith(b"PJLINK 1 ")
+        link.sendall(b"PJLINK 2\r")
+        salt = bytes.fromhex(line().split()[2].decode())
+        link.sendall(second_level_digest(salt, bytes(range(16)), PASSWORD) + b"%2POWR ?\rnonsense\r%1FREZ ?\r")
+        assert [line(), line(), line()] == [b"%2POWR=1\r", b"%1ERR1\r", b"%1FREZ=ERR1\r"]
+
+
+def test_a_viewer_may_only_ask(kiosk: MemoryKiosk, tmp_path: Path) -> None:
+    async def drive(link: Any) -> None:
+        with pytest.raises(PJLinkERR3):
+            await link.power.turn_off()
+        assert (await link.power.get()).name == "ON"
+
+    with stage(kiosk, tmp_path, more='role = "viewer"\n') as port:
+        talk(port, drive)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.binary(max_size=160)
+    | st.builds(
+        lambda head, tail: head + tail + b"\r",
+        st.sampled_from([b"%1POWR ", b"%2INNM ?", b"%1INPT ", b"%1AVMT ", b"%2FREZ ", b"%1LAMP "]),
+        st.binary(max_size=12),
+    ),
+    st.text(max_size=80),
+)
+def test_every_line_gets_one_line_that_is_no_more_than_the_longest(line: bytes, name: str) -> None:
+    command = lines.asked(line.removesuffix(b"\r"))
+    if command is None:
+        return
+    now = KioskState(1, name, "playing", "", 0.0, playing=name)
+    told = lines.told(command, now, [name], "0.1") if lines.is_question(command) else lines.meant(command, [name])
+    if isinstance(told, str):
+        answer = command.answer(told)
+        assert answer.count(b"\r") == 1
+        assert len(answer) <= 136
