@@ -32,6 +32,7 @@ def photograph(browser: Browser, folder: Path) -> None:
         with tab(browser, running.address) as page:
             enter(page, "otto")
             page.get_by_role("button", name="Recalibrate", exact=True).click()
+            page.locator("#live-job summary").click()
             expect(page.locator(".steps li").nth(1)).to_have_class("done")
             expect(page.get_by_alt_text("What the camera sees now")).to_be_visible()
             save(page, "panel-recalibrating.png")

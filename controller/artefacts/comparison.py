@@ -53,6 +53,20 @@ class Compared:
     ghosting: Any = None
     adapted: Any = None
 
+    @property
+    def whole(self) -> tuple[float, float] | None:
+        """Median and 95th percentile on the whole visible object; None in runs from before they were measured."""
+        try:
+            seen = self.pixels["visible"]
+            return float(seen["delta_e00_median"]), float(seen["delta_e00_p95"])
+        except (TypeError, KeyError, ValueError):
+            return None
+
+    @property
+    def headline(self) -> tuple[float, float]:
+        """``whole``, or else those of the pixels in reach."""
+        return self.whole or (self.delta_e00_median, self.delta_e00_p95)
+
 
 @dataclass(frozen=True, slots=True)
 class ComparedImages:

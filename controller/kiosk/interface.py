@@ -34,7 +34,9 @@ from controller.kiosk.values import (
     LampDay,
     LiveValue,
     NextEvent,
+    Place,
     ProjectorAim,
+    Reach,
     RecalibrationKind,
     Results,
     Schedule,
@@ -105,9 +107,9 @@ class Kiosk(Protocol):
         The kiosk copies the picture before it returns. An existing appearance is replaced when the solve succeeds.
         """
 
-    def feasibility(self, target: Path) -> Path:
-        """A PNG that shows where the target can't be reached, brighter is worse. Seconds. Raises
-        UsageError without a calibration.
+    def reach(self, target: Path) -> Reach:
+        """How much of the target can be made, and what the object will look like. Seconds. Raises UsageError without
+        a calibration.
         """
 
     def appearances(self) -> Sequence[Appearance]: ...
@@ -130,7 +132,12 @@ class Kiosk(Protocol):
     def schedule(self) -> Schedule: ...
 
     def set_schedule(self, schedule: Schedule) -> None:
-        """Replace the schedule. Raises UsageError with the row's number for a wrong day, time, zone or appearance."""
+        """Replace the schedule. Raises UsageError with the row's number for a wrong day, time, zone or appearance, and
+        for hours that overlap.
+        """
+
+    def effect_of_schedule(self, schedule: Schedule) -> str:
+        """What people will see when it is saved, in sentences; empty if nothing. Raises as ``set_schedule``."""
 
     def identify(self, on: bool) -> None:
         """Show each projector's name and a frame on it, or stop that."""
@@ -214,7 +221,9 @@ __all__ = [
     "LampDay",
     "LiveValue",
     "NextEvent",
+    "Place",
     "ProjectorAim",
+    "Reach",
     "RecalibrationKind",
     "Results",
     "Schedule",

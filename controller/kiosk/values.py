@@ -128,6 +128,18 @@ class Grade:
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Where a projector stands around the object, seen from the camera: ``word`` "left", "right above", "in front";
+    ``aside_deg`` from -180 to 180, 0 is the camera's direction, right is positive; ``up_deg`` from -90 to 90.
+    """
+
+    projector: str
+    word: str
+    aside_deg: float
+    up_deg: float
+
+
+@dataclass(frozen=True, slots=True)
 class KioskState:
     """Everything that the panel's first page shows, as of one moment.
 
@@ -135,6 +147,7 @@ class KioskState:
     it began. ``warnings``: sentences on problems that belong to no device (light in the room); ``failures``: failed
     jobs, as in the event log, until an operator confirms them. ``in_turn``: ``playing`` is one of those that are
     shown in turn. ``disk_free_bytes``: free space on the stage's disk, in steps of 10 MB, 0 until it is known.
+    ``places`` of the projectors, empty until they are calibrated.
     ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
     has no valid stage.toml. ``black``, ``paused``, ``brightness`` (percent): what people changed of the picture until
     the stage closes.
@@ -158,6 +171,7 @@ class KioskState:
     failures: tuple[EventRow, ...] = ()
     in_turn: bool = False
     disk_free_bytes: int = 0
+    places: tuple[Place, ...] = ()
     black: bool = False
     paused: bool = False
     brightness: float = 100.0
@@ -188,9 +202,25 @@ class Appearance:
 
 
 @dataclass(frozen=True, slots=True)
+class Reach:
+    """How much of a target the projectors can make. Shares of the visible object, 0..1: ``share`` in reach;
+    ``too_bright`` for their light; ``too_dark`` for the room and the other projectors; ``too_colourful``. The rest is
+    not lit, or not in the picture. ``pictures`` of the object: "target", "result" (what it will look like), "map".
+    """
+
+    share: float
+    too_bright: float
+    too_dark: float
+    too_colourful: float
+    pictures: dict[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Achieved:
     """How close the photograph of an appearance is to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
-    percentile of the colour difference (CIEDE2000), ``rmse`` of the target's white, ``sharpness`` 0..1.
+    percentile of the colour difference (CIEDE2000) on the whole visible object, ``rmse`` of the target's white,
+    ``sharpness`` 0..1. ``in_reach``: the median where the target can be reached, which is ``in_reach_share`` of the
+    object; None in photographs of an older version, whose ``delta_e`` is of the part in reach.
     """
 
     run: str
@@ -199,6 +229,8 @@ class Achieved:
     delta_e_p95: float
     rmse: float
     sharpness: float
+    in_reach: float | None = None
+    in_reach_share: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from controller.kiosk.interface import Kiosk
@@ -37,7 +37,8 @@ from controller.panel.pages.routes import Pages
 from controller.panel.pages.setup import Setup
 from controller.panel.uploads import Targets
 
-STATIC: Final = ("style.css", "panel.js", "icon.svg")
+FONTS: Final = ("velatura-sans-400.woff", "velatura-sans-700.woff")
+STATIC: Final = ("style.css", "panel.js", "icon.svg", *FONTS)
 
 
 def make_panel(
@@ -79,6 +80,7 @@ def make_panel(
         *api.entries(panel),
         *(Entry("GET", f"/static/{name}", "public", None, _static(name)) for name in STATIC),
     ]
+    wrong = Wrong(drawing)
     guard = Middleware(
         Guard, hosts=options.hosts, body_limits=api.body_limits(panel), tls=options.tls,
         any_address=options.host in EVERYWHERE,
@@ -86,7 +88,7 @@ def make_panel(
     app = Starlette(
         routes=_routes(panel, table),
         middleware=[guard],
-        exception_handlers={BodyTooLarge: _too_large, HTTPException: _http_problem},
+        exception_handlers={BodyTooLarge: wrong.too_large, HTTPException: wrong.http, Exception: wrong.unforeseen},
         lifespan=_lifespan(panel),
     )
     app.state.entries, app.state.panel = table, panel
@@ -132,20 +134,47 @@ def _lifespan(panel: Panel) -> Callable[[Starlette], contextlib.AbstractAsyncCon
 def _static(name: str) -> Endpoint:
     content = resources.files("controller.panel").joinpath("static", name).read_bytes()
     media_type = mimetypes.guess_type(name)[0]
+    # The name of a font changes with it; all else must fit the pages of this version.
+    kept = "max-age=604800" if name in FONTS else "no-cache"
 
     async def answer(_: Request, __: Visitor) -> Response:
-        return Response(content, media_type=media_type, headers={"cache-control": "no-cache"})
+        return Response(content, media_type=media_type, headers={"cache-control": kept})
 
     return answer
 
 
-async def _too_large(_: Request, __: Exception) -> Response:
-    return PlainTextResponse("Too large.", 413, headers={"connection": "close"})
+class Wrong:
+    """Answers for what no route answers: a page for browsers, one line for other clients."""
 
+    def __init__(self, drawing: Drawing) -> None:
+        self._drawing = drawing
 
-async def _http_problem(request: Request, error: Exception) -> Response:
-    """An unknown path: redirect browsers to the first page, and answer other clients with the error."""
-    assert isinstance(error, HTTPException)
-    if error.status_code == 404 and request.method == "GET" and "text/html" in request.headers.get("accept", ""):
-        return RedirectResponse("/", 303)
-    return PlainTextResponse(error.detail, error.status_code, headers=error.headers)
+    async def too_large(self, request: Request, _: Exception) -> Response:
+        what, remedy = "This is too large.", "Send a smaller file: a picture of at most 64 MB."
+        return self._answer(request, 413, "Too large.", what, remedy, {"connection": "close"})
+
+    async def http(self, request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        what, remedy = {
+            404: ("This page does not exist.", "Check the address, or begin at the first page."),
+            405: ("This page can't be opened like that.", "Begin at the first page."),
+        }.get(error.status_code, ("This is not possible.", "Go back, load the page again, and repeat it."))
+        if error.detail.endswith("."):
+            # Words of ours: what happened, and what to do.
+            what, _, remedy = error.detail.partition(". ")
+            what += "." if remedy else ""
+        return self._answer(request, error.status_code, error.detail, what, remedy, dict(error.headers or {}))
+
+    async def unforeseen(self, request: Request, _: Exception) -> Response:
+        """An error of ours. It is logged by the server, too."""
+        what = "Something went wrong in the panel."
+        remedy = "The stage plays on. Repeat it; if it happens again, send the diagnostics file (page Backup)."
+        return self._answer(request, 500, "Internal error.", what, remedy, {})
+
+    def _answer(
+        self, request: Request, status: int, line: str, what: str, remedy: str, headers: dict[str, str]
+    ) -> Response:
+        if "text/html" not in request.headers.get("accept", ""):
+            return PlainTextResponse(line, status, headers=headers)
+        page = self._drawing.page("wrong.html", {"status": status, "what": what, "remedy": remedy})
+        return HTMLResponse(page, status, headers=headers)

@@ -56,7 +56,7 @@ def photograph(
     run = session.run(checked, steps, name=COMPARE, reporter=reporter, cancel=cancel, dark=True)
     html = comparison_report(run, checked)
     rows = [
-        {"name": comparison.name, "delta_e00_median": comparison.delta_e00_median,
+        {"name": comparison.name, "headline": comparison.headline[0], "delta_e00_median": comparison.delta_e00_median,
          "delta_e00_p95": comparison.delta_e00_p95, "rmse": comparison.rmse,
          "sharpness_lambda": comparison.sharpness_lambda}
         for comparison in compared_in(run) if comparison.name in found.names

@@ -68,8 +68,14 @@ def test_an_upload_of_another_size_becomes_a_target_and_an_appearance(kiosk: Sta
     picture = cv2.imread(str(target), cv2.IMREAD_UNCHANGED)
     assert picture is not None
     assert picture.shape == (CAMERA_PX[1], CAMERA_PX[0], 4)
-    assert kiosk.feasibility(target).read_bytes().startswith(b"\x89PNG")
-    assert kiosk.feasibility(tmp_path / "phone.png").read_bytes().startswith(b"\x89PNG")
+    found = kiosk.reach(target)
+    assert 0.2 < found.share <= 1
+    assert found.share + found.too_bright + found.too_dark + found.too_colourful <= 1.001
+    assert {name: cv2.imread(str(file)) is None for name, file in found.pictures.items()} == dict.fromkeys(
+        ("target", "result", "map"), False
+    )
+    assert kiosk.reach(target) == found, "it is kept"
+    assert kiosk.reach(tmp_path / "phone.png").pictures["map"].is_file()
     job = ended(kiosk, kiosk.compute("phone", tmp_path / "phone.png"))
     assert not job.failed, job.outcome
     assert "phone" in [one.name for one in kiosk.appearances()]

@@ -35,7 +35,8 @@ def test_the_kiosk_photographs_an_appearance_and_finds_what_the_demo_found(
         wait_for(lambda: ask(stage, "status")["state"] == "playing")
         assert kiosk.interrupt().code == 0
     newest = found["history"][0]
-    assert newest["delta_e"] == pytest.approx(then["delta_e00_median"], rel=0.1)
+    assert newest["in_reach"] == pytest.approx(then["delta_e00_median"], rel=0.1)
+    assert 0 < newest["in_reach_share"] < 1
     assert newest["sharpness"] == pytest.approx(then["sharpness_lambda"], abs=0.05)
     assert sorted(found["pictures"]) == ["achieved", "before", "error", "resolution", "target"]
     assert Path(report).stat().st_size > 50_000

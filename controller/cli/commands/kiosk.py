@@ -38,7 +38,9 @@ def results(
 
 def _achieved(one: Mapping[str, Any]) -> str:
     newest = one["history"][0]
-    return (f"{one['name']}: colour difference {newest['delta_e']:.2f} (95 %: {newest['delta_e_p95']:.2f}), "
+    inside = newest.get("in_reach")
+    part = "" if inside is None else f", {inside:.2f} on the {newest['in_reach_share']:.0%} in reach"
+    return (f"{one['name']}: colour difference {newest['delta_e']:.2f} (95 %: {newest['delta_e_p95']:.2f}){part}, "
             f"sharpness {newest['sharpness']:.2f}, photographed in {newest['run']}")  # fmt: skip
 
 

@@ -118,9 +118,7 @@ def schedule(
     zone: Annotated[str | None, typer.Option(help="Time zone, e.g. Europe/Vienna.")] = None,
     hours: Annotated[
         list[str] | None,
-        typer.Option(
-            help="DAY=HH:MM-HH:MM or DAY=closed; replaces all rows. DAY is mon to sun, or a date such as 2026-12-24."
-        ),
+        typer.Option(help="DAY=HH:MM-HH:MM or DAY=closed; replaces all rows. DAY is mon, mon-fri, daily, or a date."),
     ] = None,
     drift_check: Annotated[str | None, typer.Option(help="HH:MM of the nightly check;  for none.")] = None,
     as_json: Json = False,

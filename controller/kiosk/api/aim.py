@@ -1,10 +1,8 @@
-"""What the camera sees, how well the projectors cover the object, and where a target can't be reached."""
+"""What the camera sees, and how well the projectors cover the object."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import tempfile
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,13 +13,11 @@ import numpy.typing as npt
 
 from controller.core.arrays import Mask
 from controller.core.errors import VelaturaError
-from controller.core.storage import write_atomically
 from controller.kiosk.interface import Aiming, ProjectorAim
 from controller.kiosk.store.runs import began_s
-from controller.kiosk.store.targets import fitted
 from controller.kiosk.supervisors.devices import Devices
-from controller.stage.calibrations import finished_calibration, finished_calibrations
-from controller.stage.check import Checked, check_stage
+from controller.stage.calibrations import finished_calibrations
+from controller.stage.check import Checked
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import LiveViewCamera
@@ -38,7 +34,6 @@ DARK = 0.1
 """Below this share of the object's median light, a place is too dark."""
 FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
 """Names as in ``controller.steps.capture.aiming``, which is loaded only to photograph."""
-MAPS, MAPS_KEPT = "kiosk/feasibility", 20
 _ANSWER_S = 5.0
 _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
 _measured: dict[Path, Aiming] = {}
@@ -173,43 +168,3 @@ def read_geometry_of(calibrated: Calibrated) -> Geometry:
     from controller.artefacts.geometry import read_geometry
 
     return read_geometry(calibrated.folder, calibrated.projectors)
-
-
-def feasibility_map(stage: Path, target: Path) -> Path:
-    """A PNG that shows how far the target is out of reach; the newest ``MAPS_KEPT`` are kept.
-
-    Raises UsageError("not-calibrated", "target-unreadable"), WorkError("no-space").
-    """
-    import cv2
-
-    from controller.artefacts.calibrated import Calibrated
-    from controller.solve.request import SolveOptions, aim_at
-    from controller.solve.targets.files import load_target
-
-    checked = check_stage(stage)
-    path = checked.stage.folder / MAPS / f"{target.stem[:64]}.png"
-    _keep_newest(path.parent, MAPS_KEPT - 1)
-    calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
-    transport, black = calibrated.transport, calibrated.calibration.black
-    size_px = (black.shape[1], black.shape[0])
-    with tempfile.TemporaryDirectory() as folder:
-        # An EXR is rendered for this view already.
-        whole = target if target.suffix.lower() == ".exr" else Path(folder) / "target.png"
-        if whole != target:
-            whole.write_bytes(fitted(target.read_bytes(), size_px))
-        wanted = load_target(whole, size_px)
-    options = SolveOptions(checked.stage.tables.solve.exposure_share, checked.stage.tables.solve.smoothness)
-    aim = aim_at(transport, black, wanted.image, options, drive=calibrated.drive, indirect=calibrated.indirect)
-    worst = np.maximum(aim.possible.too_bright, aim.possible.too_dark).max(axis=2)
-    grey = np.where(calibrated.calibration.object_mask & wanted.mask, np.clip(worst, 0, 1), 0)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Atomically: another caller may request the same map at the same time.
-    write_atomically(path, cv2.imencode(".png", (255 * grey).astype(np.uint8))[1].tobytes())
-    return path
-
-
-def _keep_newest(folder: Path, most: int) -> None:
-    """Each uploaded target gets its own map, so a kiosk would collect them for months."""
-    with contextlib.suppress(FileNotFoundError):  # another caller may do the same
-        for _, file in sorted((file.stat().st_mtime_ns, file) for file in folder.glob("*.png"))[:-most]:
-            file.unlink()

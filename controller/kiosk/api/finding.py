@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +25,22 @@ from hal.registry import OpenContext, load_drivers, open_device
 LOW_DISK_BYTES: Final = 2 << 30
 _TABLES: Final = {"projector": "projectors", "power_switch": "relays", "button_panel": "key_panel"}
 _LISTS: Final = ("projectors", "relays")
+
+
+class Examinations:
+    """One search of the buses at a time: two would take each other's ports. Who asks meanwhile gets the same answer."""
+
+    def __init__(self, search: Callable[[], Sequence[Finding]]) -> None:
+        self._search, self._lock = search, threading.Lock()
+        self._ended_s, self._found = float("-inf"), tuple[Finding, ...]()
+
+    def findings(self) -> Sequence[Finding]:
+        asked_s = time.monotonic()
+        with self._lock:
+            if self._ended_s < asked_s:
+                self._found = tuple(self._search())
+                self._ended_s = time.monotonic()
+            return self._found
 
 
 def findings(stage: Path, service: Service | None, *, tools: Tools | None = None) -> Sequence[Finding]:

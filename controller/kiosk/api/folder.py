@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from controller.config import load_stage
-from controller.kiosk.interface import Appearance, Comparison, EventRow, LampDay, Results, Schedule
+from controller.kiosk.interface import Appearance, Comparison, EventRow, LampDay, Reach, Results, Schedule
 from controller.kiosk.store import archive, runs, settings
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.store.schedule_file import ScheduleFile
+from controller.kiosk.store.schedule_file import ScheduleFile, check
 from controller.kiosk.supervisors.lamp_history import LampHistory
 from controller.stage.calibrations import stage_trust, worst_grade
 from controller.stage.check import check_stage
@@ -45,16 +45,20 @@ class FolderKiosk:
     def results(self, run: str) -> Results:
         return runs.results(self.stage, run, worst_grade(check_stage(self.stage)))
 
-    def feasibility(self, target: Path) -> Path:
-        from controller.kiosk.api.aim import feasibility_map
+    def reach(self, target: Path) -> Reach:
+        from controller.kiosk.api.reach import reach
 
-        return feasibility_map(self.stage, target)
+        return reach(self.stage, target)
 
     def schedule(self) -> Schedule:
         return self._schedule().now
 
     def set_schedule(self, schedule: Schedule) -> None:
         self._schedule().replace(schedule, self._bundles().names())
+
+    def effect_of_schedule(self, schedule: Schedule) -> str:
+        check(schedule, self._bundles().names())
+        return ""
 
     def settings(self) -> str:
         return settings.text(self.stage)

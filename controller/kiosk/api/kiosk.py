@@ -18,6 +18,7 @@ from controller.kiosk.api import aim, finding
 from controller.kiosk.api.control import plain
 from controller.kiosk.api.folder import FolderKiosk, appearances_of
 from controller.kiosk.api.snapshot import Snapshots
+from controller.kiosk.decide.changed_hours import effect
 from controller.kiosk.decide.interfaces import IN_TURN, Request
 from controller.kiosk.interface import (
     Aiming,
@@ -43,6 +44,7 @@ from controller.kiosk.service import Service
 from controller.kiosk.store import archive, runs, settings, settings_change, targets
 from controller.kiosk.store.accounts import Accounts, stage_accounts
 from controller.kiosk.store.event_log import Decision
+from controller.kiosk.store.schedule_file import check
 from controller.stage.check import check_stage
 
 NOTICE_S: Final = 900.0
@@ -73,6 +75,7 @@ class StageKiosk(FolderKiosk):
         self._last = KioskState(0, stage.name, "off", "The stage is not set up yet.", time.time(), needs_setup=True)
         self._events = 0
         self._snapshots = Snapshots(stage)
+        self._examinations = finding.Examinations(lambda: finding.findings(stage, self._service))
         self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
         self._notice_ends_s = float("inf")
         self._unlogged: deque[Decision] = deque(maxlen=MOST_UNLOGGED)
@@ -294,6 +297,11 @@ class StageKiosk(FolderKiosk):
     def set_schedule(self, schedule: Schedule) -> None:
         self.service.schedule.replace(schedule, self.service.bundles.names())
 
+    def effect_of_schedule(self, schedule: Schedule) -> str:
+        service = self.service
+        check(schedule, service.bundles.names())
+        return effect(schedule, service.reconciler.overrides, service.reconciler.plan, time.time())
+
     def identify(self, on: bool) -> None:
         self.service.player.identifying = on
         with self._lock:
@@ -309,7 +317,7 @@ class StageKiosk(FolderKiosk):
         self._notify()
 
     def doctor(self) -> Sequence[Finding]:
-        return finding.findings(self.stage, self._service)
+        return self._examinations.findings()
 
     def test_alerts(self) -> None:
         self.service.alerts.test()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ from controller.core.errors import UsageError
 from controller.core.text import printable
 from controller.kiosk.api.control import ask, is_running, plain
 from controller.kiosk.api.folder import FolderKiosk
+from controller.kiosk.decide.days import expanded
 from controller.kiosk.decide.hours import check_schedule
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.accounts import AccountActions
@@ -82,7 +84,9 @@ def changed_schedule(
     now: Mapping[str, Any], zone: str | None, hours: Sequence[str] | None, drift_check: str | None
 ) -> dict[str, Any]:
     """The schedule with the changes of a command line. Raises UsageError("schedule-wrong", "schedule-zone")."""
-    rows = list(now["rows"]) if hours is None else [_row(text) for text in hours]
+    rows = list(now["rows"])
+    if hours is not None:
+        rows = [asdict(row) for row in expanded([ScheduleRow(**_row(text)) for text in hours])]
     content: dict[str, Any] = {
         "time_zone": zone if zone is not None else now["time_zone"],
         "rows": rows,

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from controller.kiosk.interface import BundleIdentity, DeviceRow, Grade, Job, KioskState
+from controller.kiosk.api.places import places
+from controller.kiosk.interface import BundleIdentity, DeviceRow, Grade, Job, KioskState, LiveValue, Place
 from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
@@ -21,6 +23,7 @@ class Snapshots:
     def __init__(self, stage: Path) -> None:
         self._stage = stage
         self._grades: tuple[float, tuple[Grade, ...]] = (0.0, ())
+        self._places: tuple[Place, ...] = ()
         self._since = ("", 0.0)
 
     def of(self, service: Service, revision: int) -> KioskState:
@@ -34,6 +37,7 @@ class Snapshots:
         if time.monotonic() - at_s > GRADES_EVERY_S or not at_s:
             grades = runs.grades(self._stage, service.checked.stage.tables.calibration.worst_grade)
             self._grades = time.monotonic(), grades
+            self._places = places(self._stage)
         index = service.bundles.index(bundle := service.bundles.bundle())
         identity = None
         if index is not None and bundle is not None:
@@ -45,7 +49,7 @@ class Snapshots:
             state=state,
             reason=reason,
             since_unix_s=self._since[1],
-            devices=(*service.rows(), self._player_row(service), service.disk.row),
+            devices=(*self._rows(service), self._player_row(service), service.disk.row),
             job=job,
             playing=shown.appearance if shown is not None else "",
             disk_free_bytes=service.disk.free_bytes,
@@ -57,10 +61,20 @@ class Snapshots:
             identifying=service.player.identifying,
             warnings=self._warnings(service),
             failures=service.log.failures,
+            places=self._places,
             black=live.black,
             paused=bool(live.held),
             brightness=round(100 * live.brightness, 1),
         )
+
+    def _rows(self, service: Service) -> tuple[DeviceRow, ...]:
+        """The devices; each projector with the output that feeds it, because cables and windows bear that name."""
+        outputs = {table.name: table.output for table in service.checked.stage.tables.projectors}
+        return tuple(
+            replace(row, values=(LiveValue("Output", outputs[row.name]), *row.values))
+            if row.kind == "projector" and row.name in outputs else row
+            for row in service.rows()
+        )  # fmt: skip
 
     def _job(self, service: Service) -> Job | None:
         """The job that runs, or waits for its lamps; else the last one."""

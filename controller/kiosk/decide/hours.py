@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -69,6 +70,38 @@ def check_schedule(schedule: Schedule, appearances: Collection[str] | None = Non
                 else "none, because the stage has no appearances yet"
             )
             raise _wrong(f"The appearance of row {number}", row.appearance, allowed)
+
+
+def check_overlaps(schedule: Schedule) -> None:
+    """Raises UsageError("schedule-overlap") for hours of which two run at the same time, with day and hours.
+
+    Apart from ``check_schedule``: a stage whose old schedule has such hours must still open.
+    """
+    dates = [date.fromisoformat(row.day) for row in schedule.rows if row.day not in WEEKDAYS]
+    for day in dates:
+        for other in (day - timedelta(days=1), day):
+            _check_day(rows_of(schedule, other), rows_of(schedule, other + timedelta(days=1)), day.isoformat())
+    for number, name in enumerate(WEEKDAYS):
+        today, tomorrow = ([row for row in schedule.rows if row.day == WEEKDAYS[n % 7]] for n in (number, number + 1))
+        _check_day(today, tomorrow, name)
+
+
+def _check_day(today: Sequence[ScheduleRow], tomorrow: Sequence[ScheduleRow], name: str) -> None:
+    spans = [(*_minutes(row, 0), row) for row in today if row.opens]
+    spans += [(*_minutes(row, 1440), row) for row in tomorrow if row.opens]
+    spans.sort(key=lambda span: span[:2])
+    for (first, ends, one), (begins, _, other) in itertools.pairwise(spans):
+        if begins < ends and first < 1440:
+            raise UsageError(
+                "schedule-overlap",
+                what=f"Hours overlap ({name}): {one.opens}-{one.closes} and {other.opens}-{other.closes}.",
+                remedy="Change one of the two rows, so that the first one closes before the other one opens.",
+            )
+
+
+def _minutes(row: ScheduleRow, from_minute: int) -> tuple[int, int]:
+    start, end = (int(text[:2]) * 60 + int(text[3:]) + from_minute for text in (row.opens, row.closes))
+    return start, end if end > start else end + 1440
 
 
 def _wrong(what: str, value: str, allowed: str) -> UsageError:

@@ -38,6 +38,11 @@ class OperatorOverrides:
     def open(self, plan: Plan) -> bool:
         return self._override.wanted if self._override is not None else self._says(plan)
 
+    def would_be_open(self, plan: Plan) -> bool:
+        """As ``open``, if this were the plan: an operator's wish ends when the schedule says something new."""
+        override, says = self._override, self._says(plan)
+        return override.wanted if override is not None and override.said is says else says
+
     def override(self, wanted: bool, plan: Plan) -> None:
         """Open or closed until the next scheduled change."""
         self._set(Override(wanted, self._says(plan), plan.changes_s) if wanted is not self._says(plan) else None)

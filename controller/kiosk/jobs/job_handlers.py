@@ -167,10 +167,10 @@ class JobHandlers:
                 session=BorrowedSession(self._stage, rig), names=request.arguments, reporter=reporter, cancel=cancel
             )
         reporter.job = replace(reporter.job, run=run_name(result))
-        worst = max(result["appearances"], key=lambda row: float(row["delta_e00_median"]))
+        worst = max(result["appearances"], key=lambda row: float(row["headline"]))
         names = ", ".join(row["name"] for row in result["appearances"])
-        text = (f"Photographed: {names}. The largest median colour difference is {worst['delta_e00_median']:.2f},"
-                f" of {worst['name']}.")  # fmt: skip
+        text = (f"Photographed: {names}. The largest median colour difference of a whole object is"
+                f" {worst['headline']:.2f}, of {worst['name']}.")  # fmt: skip
         return Finished(request, Decision("photographed", text, "See the results."))
 
     # -- jobs that do not

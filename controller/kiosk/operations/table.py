@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
+from controller.kiosk.decide.days import expanded
 from controller.kiosk.operations.accounts import ACCOUNT_OPERATIONS
 from controller.kiosk.operations.fields import NAME, Field, Flag
 from controller.kiosk.operations.operation import Answer, Effect, Operation, Values
@@ -21,9 +23,10 @@ NEW_NAME: Final = Field("name", "a name of 1 to 64 letters, digits, - and _; the
                         pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", names="appearance")  # fmt: skip
 """The same rule as in stage.toml."""
 TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9])?$"
-DAY: Final = r"^(mon|tue|wed|thu|fri|sat|sun|20[0-9]{2}-[01][0-9]-[0-3][0-9])$"
+DAY: Final = r"^[A-Za-z0-9][A-Za-z0-9 ,.\u2013-]*$"
+"""Which days it names, ``decide.days`` finds out."""
 ROW: Final = (
-    Field("day", "mon to sun, or a date such as 2026-12-24", pattern=DAY, longest=10),
+    Field("day", ALLOWED_DAYS, pattern=DAY, longest=64),
     Field("opens", "a time such as 10:00; default: closed", pattern=TIME, longest=5, required=False),
     Field("closes", "a time such as 18:00; default: closed", pattern=TIME, longest=5, required=False),
     Field(
@@ -49,6 +52,7 @@ SETTINGS: Final = Field("text", "the text of stage.toml", longest=1 << 20)
 RUN: Final = Field("run", "a run's name", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,95}$", longest=96)
 _KINDS: Final = ("before", "target", "achieved", "error", "resolution")
 PICTURE: Final = Field("picture", "before, target, achieved, error or resolution", choices=_KINDS)
+REACH_PICTURE: Final = Field("picture", "target, result or map", choices=("target", "result", "map"))
 MOST_EVENTS: Final = 2000
 EVENTS: Final = (
     Field("after", "only events after this number", "integer", False, most=1e12),
@@ -85,7 +89,7 @@ def _schedule_of(values: Values) -> Mapping[str, Any]:
         ScheduleRow(row["day"], row.get("opens", ""), row.get("closes", ""), row.get("appearance", ""))
         for row in values["rows"]
     )
-    return {"schedule": Schedule(values["time_zone"], rows, values.get("drift_check", ""))}
+    return {"schedule": Schedule(values["time_zone"], expanded(rows), values.get("drift_check", ""))}
 
 
 def _its_picture(answer: Any, values: Values) -> Any:
@@ -105,6 +109,10 @@ def _nothing(values: Values) -> Mapping[str, Any]:
 
 def _uploaded(values: Values) -> Mapping[str, Any]:
     return {"uploaded": values["file"], "fit": values.get("fit", "fit")}
+
+
+def _only_target(values: Values) -> Mapping[str, Any]:
+    return {"target": values["target"]}
 
 
 def _only_run(values: Values) -> Mapping[str, Any]:
@@ -173,8 +181,14 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
               (Field("target", TARGET.about, pattern=TARGET_KEY, longest=24),), Answer.PICTURE, holder="targets",
               call="path", take=lambda values: {"key": values["target"]}, http=("GET", "/targets/{target}"),
               within="compute"),
-    Operation("feasibility", "Where the target can't be reached", OPERATOR, LOOKS, (TARGET,), Answer.PICTURE,
-              offline=True, http=("GET", "/targets/{target}/feasibility")),
+    Operation("reach", "How much of a target the projectors can make", OPERATOR, LOOKS, (TARGET,), offline=True,
+              http=("GET", "/targets/{target}/reach")),
+    Operation("reach-picture", "The target, what it will look like, or a map of what is out of reach", OPERATOR, LOOKS,
+              (TARGET, REACH_PICTURE), Answer.PICTURE, call="reach", take=_only_target, part=_its_picture,
+              offline=True, http=("GET", "/targets/{target}/reach/{picture}")),
+    Operation("feasibility", "A map of where the target can't be reached", OPERATOR, LOOKS, (TARGET,), Answer.PICTURE,
+              call="reach", part=lambda found, values: found.pictures["map"], offline=True,
+              http=("GET", "/targets/{target}/feasibility")),
     # -- results
     Operation("comparisons", "How close the photographed appearances are to their targets", VIEWER, LOOKS, offline=True,
               within="results"),
@@ -202,6 +216,8 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
     Operation("set-schedule", "Replace the opening hours", OPERATOR, CHANGES, SCHEDULE, Answer.NOTHING,
               take=_schedule_of, offline=True, http=("PUT", "/schedule"), within="schedule",
               said="The schedule is in use."),
+    Operation("effect-of-schedule", "What people see when this schedule is saved", OPERATOR, LOOKS, SCHEDULE,
+              Answer.TEXT, take=_schedule_of, offline=True, http=("POST", "/schedule/effect"), within="schedule"),
     Operation("settings", "The text of stage.toml", TECHNICIAN, LOOKS, answer=Answer.TEXT, offline=True,
               within="settings"),
     Operation("check-settings", "Check a stage.toml without saving it", TECHNICIAN, LOOKS, (SETTINGS,), Answer.NOTHING,

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-from controller.artefacts.comparison import all_compared, history_of, pictures_of
+from controller.artefacts.comparison import Compared, all_compared, history_of, pictures_of
 from controller.artefacts.grade import BEFORE, PICTURE, RESOLUTION, graded, passes, worst_letter, worst_of
 from controller.artefacts.names import REPORT_PAGE, run_kind
 from controller.core.errors import UsageError, VelaturaError
@@ -96,15 +96,19 @@ def comparisons(stage: Path, appearances: Sequence[str]) -> tuple[Comparison, ..
     """The comparisons of the photographed ones of these appearances, in their order."""
     result = []
     for name, history in history_of(stage, appearances).items():
-        rows = [
-            Achieved(
-                row.run, row.photographed_unix_s, row.delta_e00_median, row.delta_e00_p95, row.rmse,
-                row.sharpness_lambda,
-            )
-            for row in reversed(history)
-        ]  # fmt: skip
+        rows = [_achieved(row) for row in reversed(history)]
         result.append(Comparison(name, tuple(rows), pictures_of(stage, history[-1])))
     return tuple(result)
+
+
+def _achieved(row: Compared) -> Achieved:
+    """The whole visible object first: an appearance of which little is in reach must not look well."""
+    median, p95 = row.headline
+    inside, share = None, None
+    if row.whole is not None:
+        found = row.pixels.get("in_reach", {})
+        inside, share = found.get("delta_e00_median"), 1 - found.get("left_out_share", 1.0)
+    return Achieved(row.run, row.photographed_unix_s, median, p95, row.rmse, row.sharpness_lambda, inside, share)
 
 
 def _errors(stage: Path) -> dict[str, float]:
@@ -117,7 +121,7 @@ def _errors(stage: Path) -> dict[str, float]:
         return {}
     for rows in compared.values():
         for row in rows:
-            newest.setdefault(row.calibration, {})[row.name] = row.delta_e00_median
+            newest.setdefault(row.calibration, {})[row.name] = row.headline[0]
     return {calibration: max(medians.values()) for calibration, medians in newest.items()}
 
 

@@ -15,7 +15,7 @@ from controller.config.writer import toml_text
 from controller.core.errors import UsageError
 from controller.core.files import read_text
 from controller.core.storage import write_atomically
-from controller.kiosk.decide.hours import check_schedule
+from controller.kiosk.decide.hours import check_overlaps, check_schedule
 from controller.kiosk.interface import Schedule, ScheduleRow
 
 FILE: Final = "schedule.toml"
@@ -28,6 +28,12 @@ def of_table(table: ScheduleTable) -> Schedule:
     schedule = Schedule(table.time_zone, rows, table.drift_check)
     check_schedule(schedule)
     return schedule
+
+
+def check(schedule: Schedule, appearances: Collection[str]) -> None:
+    """What is refused before it is kept. Raises UsageError as ``check_schedule`` and ``check_overlaps``."""
+    check_schedule(schedule, appearances)
+    check_overlaps(schedule)
 
 
 class ScheduleFile:
@@ -53,8 +59,8 @@ class ScheduleFile:
         return self._without_time == "open"
 
     def replace(self, schedule: Schedule, appearances: Collection[str]) -> None:
-        """Check it, write it, and use it. Raises UsageError as ``check_schedule``, WorkError("no-space")."""
-        check_schedule(schedule, appearances)
+        """Check it, write it, and use it. Raises as ``check``, WorkError("no-space")."""
+        check(schedule, appearances)
         hours = [
             {"day": row.day, "opens": row.opens, "closes": row.closes, "appearance": row.appearance}
             for row in schedule.rows

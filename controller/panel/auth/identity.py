@@ -12,8 +12,9 @@ from typing import Final, Literal
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.responses import JSONResponse, RedirectResponse, Response
 
 from controller.kiosk.store.accounts import Role
 from controller.panel.auth.sessions import Session
@@ -77,7 +78,9 @@ async def guarded(panel: Panel, entry: Entry, request: Request) -> Response:  # 
     who = visitor(panel, request, entry.way)
     if who is None:
         if entry.way == "session":
-            return RedirectResponse("/login", 303) if _navigates(request) else _denied(401)
+            if _navigates(request):
+                return RedirectResponse("/login", 303)
+            raise _denied(401)
         if "authorization" in request.headers:
             # Only wrong ones wait: others behind the same address (a proxy, a router) have good ones.
             if (wait_s := panel.by_token.wait_s(address)) > 0:
@@ -88,12 +91,14 @@ async def guarded(panel: Panel, entry: Entry, request: Request) -> Response:  # 
     # Deny by default: an entry without a role is a mistake in the table, and must not grant access.
     if entry.role is None or who.role < entry.role:
         if entry.way == "session":
-            return _denied(403)
+            raise _denied(403)
         return _api_error(
             403, "not-allowed", "The role of this token does not allow this.", "Use a token with a higher role."
         )
     if who.must_change_password and request.url.path not in OPEN_TO_ONE_TIME:
-        return RedirectResponse("/password", 303) if _navigates(request) else _denied(403)
+        if _navigates(request):
+            return RedirectResponse("/password", 303)
+        raise _denied(403)
     return await entry.endpoint(request, who)
 
 
@@ -101,9 +106,9 @@ def _navigates(request: Request) -> bool:
     return request.method == "GET" and "text/html" in request.headers.get("accept", "*/*").replace("*/*", "text/html")
 
 
-def _denied(status: int) -> Response:
+def _denied(status: int) -> HTTPException:
     text = "Log in first." if status == 401 else "Your role does not allow this. A technician can change your role."
-    return PlainTextResponse(text, status)
+    return HTTPException(status, text)
 
 
 def _api_error(status: int, code: str, what: str, remedy: str) -> Response:

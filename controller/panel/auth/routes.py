@@ -138,10 +138,21 @@ class Entrance:
         visitor.session.notes.append((level, text))
         return RedirectResponse(page, 303)
 
-    async def _apply(self, visitor: Visitor, change: Any, said: str, about: str) -> Response:
+    async def _again(self, visitor: Visitor, error: UsageError, typed: dict[str, str]) -> Response:
+        """The page with what was typed; passwords are not kept."""
+        assert visitor.session is not None
+        visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
+        facts = {**self._pages.accounts(), "here": "/accounts", "typed": typed}
+        return await self._pages.show("accounts.html", visitor, facts, 422)
+
+    async def _apply(
+        self, visitor: Visitor, change: Any, said: str, about: str, typed: dict[str, str] | None = None
+    ) -> Response:
         try:
             await anyio.to_thread.run_sync(change, limiter=self._panel.hashing)
         except UsageError as error:
+            if typed is not None:
+                return await self._again(visitor, error, typed)
             return await self._redirect(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
         self._panel.kiosk.record("done-by", f"{visitor.name}: {about}.")
         return await self._redirect(visitor, "/accounts", "good", said)
@@ -150,7 +161,7 @@ class Entrance:
         name, password, role = (sent.texts.get(key, "") for key in ("name", "password", "role"))
         return await self._apply(
             visitor, lambda: self._panel.accounts.add(name, Role.named(role), password), "The account is added.",
-            f"Add the account {name} ({role})",
+            f"Add the account {name} ({role})", {"name": name, "role": role},
         )  # fmt: skip
 
     async def _role(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
@@ -179,7 +190,8 @@ class Entrance:
         try:
             shown = accounts.add_token(sent.texts.get("name", ""), Role.named(sent.texts.get("role", "")))
         except UsageError as error:
-            return await self._redirect(visitor, "/accounts", "error", f"{error.what} {error.remedy}")
+            typed = {f"token-{key}": sent.texts.get(key, "") for key in ("name", "role")}
+            return await self._again(visitor, error, typed)
         self._panel.kiosk.record(
             "done-by", f"{visitor.name}: Add the token {sent.texts['name']} ({sent.texts['role']})."
         )
@@ -196,5 +208,5 @@ class Entrance:
         return await self._apply(visitor, change, "The token is removed.", f"Remove the token {name}")
 
     async def _ask(self, visitor: Visitor, action: str, question: str, name: str) -> Response:
-        facts = {"question": question, "action": action, "back": "/accounts", "kept": {"name": name}}
-        return await self._pages.show("sure.html", visitor, {**facts, "here": "/accounts"})
+        facts = {"question": question, "action": action, "back": "/accounts", "kept": [("name", name)]}
+        return await self._pages.show("sure.html", visitor, {**facts, "here": "/accounts", "returns": False})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import Any, Final
 
 import anyio
 from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import RedirectResponse, Response
 
 from controller.core.errors import UsageError
 from controller.kiosk.operations.fields import parse
@@ -65,22 +67,21 @@ class Forms:
         async def answer(_: Request, visitor: Visitor, sent: Sent) -> Response:
             assert visitor.session is not None
             values: Values = {}
-            sure = sent.texts.pop("sure", "") == "yes"
+            sure, back = sent.texts.pop("sure", ""), sent.texts.pop("back", "")
             try:
                 values = _values(operation, sent)
                 question = await self._question(operation, values)
-                if question and not sure:
+                if question and sure == "no":
+                    return await self._again(operation, visitor, sent, None)
+                if question and sure != "yes":
                     return await self._ask(operation, visitor, sent, question)
                 result = await answers.run(self._panel, operation, values, visitor.name)
             except answers.FAILURES as error:
-                if operation.name == "save-settings":
-                    return await self._settings(visitor, sent, error)
-                visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
-                return RedirectResponse(_back(operation, sent), 303)
+                return await self._again(operation, visitor, sent, error)
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
             visitor.session.notes.append(("good", operation.sentence(values)))
-            return RedirectResponse(_then(operation, result), 303)
+            return RedirectResponse("/" if back == "/" else _then(operation, result), 303)
 
         return answer
 
@@ -89,10 +90,37 @@ class Forms:
         if operation.name == "save-settings":
             effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_settings(values["text"]))
             return f"Save these settings now? {effect}" if effect else ""
+        if operation.name == "set-schedule":
+            schedule = operation.take(values)["schedule"]
+            effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_schedule(schedule))
+            return f"Save these hours now? {effect}" if effect else ""
         return operation.question(values)
 
+    async def _again(
+        self, operation: Operation, visitor: Visitor, sent: Sent, error: answers.Failure | None
+    ) -> Response:
+        """The form as it was sent, with what is wrong; forms in which nothing is typed lead back to their page."""
+        if operation.name == "save-settings":
+            return await self._settings(visitor, sent, error)
+        assert visitor.session is not None
+        if error is not None:
+            visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
+        back = _back(operation, sent)
+        if (page := self._pages.with_form(operation.name)) is None or back == "/":
+            return RedirectResponse(back, 303)
+        typed = {**sent.texts, "rows": _typed_rows(sent)}
+        try:
+            facts = await self._panel.ask(lambda: page.facts(typed))
+        except answers.FAILURES as gone:
+            shown = {"error": gone, "here": back}
+            return await self._pages.show("problem.html", visitor, shown, answers.status_of(gone))
+        status = 200 if error is None else answers.status_of(error)
+        return await self._pages.show(page.template, visitor, {**facts, "typed": typed, "here": back}, status)
+
     async def _ask(self, operation: Operation, visitor: Visitor, sent: Sent, question: str) -> Response:
-        facts = {"question": question, "action": f"/do/{operation.name}", "back": LEADS_TO[operation.name]}
+        facts: dict[str, Any] = {
+            "question": question, "action": f"/do/{operation.name}", "back": LEADS_TO[operation.name]
+        }  # fmt: skip
         if operation.upload is not None:
             # A file can't be sent on; its own page has the question beside it.
             assert visitor.session is not None
@@ -100,7 +128,10 @@ class Forms:
                 ("error", "Nothing was done. Tick the box to confirm, and choose the file again.")
             )
             return RedirectResponse(LEADS_TO[operation.name], 303)
-        return await self._pages.show("sure.html", visitor, {**facts, "kept": sent.texts, "here": facts["back"]})
+        kept = [(name, value) for name, values in sent.many.items() if name != "sure" for value in values]
+        returns = operation.name in ("set-schedule", "save-settings")
+        facts |= {"kept": kept, "here": facts["back"], "returns": returns}
+        return await self._pages.show("sure.html", visitor, facts)
 
     async def _check(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         text = sent.texts.get("text", "").replace("\r\n", "\n")
@@ -126,18 +157,18 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
     async def answer(request: Request, visitor: Visitor) -> Response:
         assert visitor.session is not None
         if not same_origin(request.headers):
-            return refused()
+            raise refused()
         form = await request.form(max_files=1, max_fields=MOST_FIELDS, max_part_size=2 << 20)
         sent = Sent()
         try:
             token = form.get("csrf")
             if not isinstance(token, str) or not visitor.session.matches(token):
-                return refused()
+                raise refused()
             try:
                 await _read(form, sent, panel.options.folder / answers.INCOMING)
             except OSError as error:
                 failure = answers.not_saved(error)
-                return PlainTextResponse(f"{failure.what} {failure.remedy}", answers.status_of(failure))
+                raise HTTPException(answers.status_of(failure), f"{failure.what} {failure.remedy}") from error
             return await handler(request, visitor, sent)
         finally:
             if sent.file is not None:
@@ -147,8 +178,8 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
     return answer
 
 
-def refused() -> Response:
-    return PlainTextResponse("This form is out of date or comes from another site. Load the page again.", 403)
+def refused() -> HTTPException:
+    return HTTPException(403, "This form is out of date or comes from another site. Load the page again.")
 
 
 async def _read(form: FormData, sent: Sent, folder: Path) -> None:
@@ -187,6 +218,13 @@ def _schedule_values(operation: Operation, sent: Sent) -> Values:
     ]
     others: dict[str, Any] = {name: sent.texts.get(name, "") for name in ("time_zone", "drift_check")}
     return parse(operation.fields, others | {"rows": rows}, strings=True)
+
+
+def _typed_rows(sent: Sent) -> list[dict[str, str]]:
+    """The rows of a table as they were typed, also where a column was cut off."""
+    columns = [sent.many.get(column.name, []) for column in ROW]
+    rows = itertools.zip_longest(*columns, fillvalue="")
+    return [typed for row in rows if any((typed := {f.name: text for f, text in zip(ROW, row, strict=True)}).values())]
 
 
 def _then(operation: Operation, result: Any) -> str:

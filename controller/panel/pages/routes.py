@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response, StreamingResponse
 
+from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
+from controller.kiosk.decide.days import grouped
 from controller.kiosk.operations.fields import parse
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.roles import Role
@@ -18,22 +21,54 @@ from controller.panel.pages import calendar
 from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
 from controller.panel.pages.lamp_days import lamp_reports
 
+GROUPS: Final = ("Show", "Calibration", "System")
 NAVIGATION: Final = (
-    ("/", "Now", Role.VIEWER),
-    ("/appearances", "Appearances", Role.VIEWER),
-    ("/schedule", "Schedule", Role.VIEWER),
-    ("/results", "Results", Role.VIEWER),
-    ("/lamps", "Lamps", Role.VIEWER),
-    ("/events", "Events", Role.VIEWER),
-    ("/doctor", "Doctor", Role.OPERATOR),
-    ("/aiming", "Aiming", Role.TECHNICIAN),
-    ("/settings", "Settings", Role.TECHNICIAN),
-    ("/care", "Backup", Role.TECHNICIAN),
-    ("/accounts", "Accounts", Role.TECHNICIAN),
+    ("/", "Now", Role.VIEWER, "Show"),
+    ("/appearances", "Appearances", Role.VIEWER, "Show"),
+    ("/schedule", "Schedule", Role.VIEWER, "Show"),
+    ("/results", "Results", Role.VIEWER, "Calibration"),
+    ("/aiming", "Aiming", Role.TECHNICIAN, "Calibration"),
+    ("/lamps", "Lamps", Role.VIEWER, "System"),
+    ("/events", "Events", Role.VIEWER, "System"),
+    ("/doctor", "Doctor", Role.OPERATOR, "System"),
+    ("/settings", "Settings", Role.TECHNICIAN, "System"),
+    ("/care", "Backup", Role.TECHNICIAN, "System"),
+    ("/accounts", "Accounts", Role.TECHNICIAN, "System"),
 )
+BELOW: Final = {"/setup": "/settings", "/password": "/accounts"}
+"""Pages that are not in the navigation, and those that they belong to."""
 _SEEN: Final = (Answer.PICTURE, Answer.JPEG, Answer.PAGE)
 
 Facts = Callable[[Request], dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A group of pages: ``path`` of its first one, and ``pages`` (path, label); ``chosen``: the page is one of them."""
+
+    label: str
+    path: str
+    pages: tuple[tuple[str, str], ...]
+    chosen: bool
+
+
+def _navigation(role: Role, here: str) -> list[Group]:
+    allowed = [entry for entry in NAVIGATION if role >= entry[2]]
+    at = here if here in BELOW else "/" + here.split("/")[1]
+    at = BELOW.get(at, at)
+    groups = []
+    for label in GROUPS:
+        pages = tuple((path, name) for path, name, _, group in allowed if group == label)
+        groups.append(Group(label, pages[0][0], pages, any(path == at for path, _ in pages)))
+    return groups
+
+
+@dataclass(frozen=True, slots=True)
+class FormPage:
+    """The page of a form, drawn from what was typed into it."""
+
+    template: str
+    facts: Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
 class Pages:
@@ -53,9 +88,9 @@ class Pages:
             ("/events", Role.VIEWER, "events.html", self._events),
             ("/lamps", Role.VIEWER, "lamps.html", self._lamps),
             ("/password", Role.VIEWER, "password.html", lambda _: {}),
-            ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None}),
+            ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None, "reach": None}),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
-            ("/doctor", Role.OPERATOR, "doctor.html", lambda _: {"findings": list(self._panel.kiosk.doctor())}),
+            ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
             (
                 "/settings",
@@ -73,6 +108,12 @@ class Pages:
             for op in self._panel.operations
             if not op.changes and op.answer in _SEEN
         ]
+        entries += [
+            Entry("GET", "/late/doctor", "session", Role.OPERATOR, self._late("late_doctor.html", self._found)),
+            Entry(
+                "GET", "/late/reach/{target}", "session", Role.OPERATOR, self._late("late_reach.html", self._reached)
+            ),
+        ]
         return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]
 
     async def show(self, template: str, visitor: Visitor, facts: dict[str, Any], status: int = 200) -> Response:
@@ -88,8 +129,9 @@ class Pages:
             "visitor": visitor,
             "csrf": session.csrf,
             "notes": notes,
-            "navigation": [(path, label) for path, label, role in NAVIGATION if visitor.role >= role],
+            "navigation": _navigation(visitor.role, str(facts.get("here", "/"))),
             "may": lambda name: visitor.role >= self._least[name],
+            "typed": {},
         }
         return self._drawing.page(template, common | facts)
 
@@ -102,6 +144,19 @@ class Pages:
                 return await self.show(
                     "problem.html", visitor, {"here": request.url.path, "error": error}, answers.status_of(error)
                 )
+
+        return answer
+
+    def _late(self, template: str, facts: Facts) -> Callable[[Request, Visitor], Awaitable[Response]]:
+        """A part of a page that takes seconds; the page's script asks for it, so that the page is there at once."""
+
+        async def answer(request: Request, _: Visitor) -> Response:
+            try:
+                values, status = await self._panel.ask(lambda: facts(request)), 200
+            except answers.FAILURES as error:
+                values, status = {"error": error}, answers.status_of(error)
+            name = template if status == 200 else "late_problem.html"
+            return HTMLResponse(await self._panel.ask(lambda: self._drawing.page(name, values)), status)
 
         return answer
 
@@ -137,7 +192,12 @@ class Pages:
         return {"text": text, "problem": problem}
 
     def _now(self, _: Request) -> dict[str, Any]:
-        return {"picture": self._panel.kiosk.camera_picture() is not None}
+        """Without the camera's picture, which may wait for the camera: the script asks for it while a job runs."""
+        kiosk = self._panel.kiosk
+        if kiosk.snapshot().needs_setup:
+            return {"appearances": [], "photographed": {}}
+        photographed = {one.name: one.history[0] for one in kiosk.comparisons() if "achieved" in one.pictures}
+        return {"appearances": list(kiosk.appearances()), "photographed": photographed}
 
     def _aiming(self, _: Request) -> dict[str, Any]:
         kiosk = self._panel.kiosk
@@ -150,10 +210,22 @@ class Pages:
         kiosk = self._panel.kiosk
         return {"reports": lamp_reports(kiosk.snapshot().lamps, kiosk.lamp_history(), kiosk.events())}
 
+    def with_form(self, operation: str) -> FormPage | None:
+        """The page whose form sends this operation, if something is typed into it."""
+        return {
+            "set-schedule": FormPage("schedule.html", lambda typed: self._hours(typed["rows"])),
+            "upload-target": FormPage("target.html", lambda typed: {"target": None, "reach": None}),
+            "compute": FormPage("target.html", lambda typed: self._reach(typed["target"])),
+        }.get(operation)
+
     def _schedule(self, _: Request) -> dict[str, Any]:
+        return self._hours(grouped(self._panel.kiosk.schedule().rows))
+
+    def _hours(self, rows: Sequence[Any]) -> dict[str, Any]:
         schedule = self._panel.kiosk.schedule()
         names = [appearance.name for appearance in self._panel.kiosk.appearances()]
-        return {"schedule": schedule, "days": calendar.days(schedule), "names": names, "zones": calendar.zones()}
+        return {"schedule": schedule, "rows": rows, "days": calendar.days(schedule), "names": names,
+                "zones": calendar.zones(), "allowed": ALLOWED_DAYS}  # fmt: skip
 
     def _results(self, request: Request) -> dict[str, Any]:
         runs = list(self._panel.kiosk.runs())
@@ -171,9 +243,28 @@ class Pages:
         ]
         return {"rows": rows[-EVENTS_SHOWN:][::-1], "level": level, "words": words}
 
+    def _doctor(self, request: Request) -> dict[str, Any]:
+        """Without a script the page has to wait for its part."""
+        return self._found(request) if "wait" in request.query_params else {"findings": None}
+
+    def _found(self, _: Request) -> dict[str, Any]:
+        return {"findings": list(self._panel.kiosk.doctor())}
+
     def _target(self, request: Request) -> dict[str, Any]:
-        self._panel.targets.path(request.path_params["target"])
-        return {"target": request.path_params["target"]}
+        target = request.path_params["target"]
+        return self._reached(request) if "wait" in request.query_params else self._reach(target)
+
+    def _reach(self, target: str) -> dict[str, Any]:
+        self._panel.targets.path(target)
+        return {"target": target, "reach": None}
+
+    def _reached(self, request: Request) -> dict[str, Any]:
+        target = request.path_params["target"]
+        file = self._panel.targets.path(target)
+        return {"target": target, "reach": self._panel.kiosk.reach(file)}
 
     def _accounts(self, _: Request) -> dict[str, Any]:
+        return self.accounts()
+
+    def accounts(self) -> dict[str, Any]:
         return {"accounts": self._panel.accounts.all(), "tokens": self._panel.accounts.tokens(), "shown": None}

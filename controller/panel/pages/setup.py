@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
@@ -35,7 +36,14 @@ class Setup:
             tried = await self._panel.ask(lambda: self._tried(devices, chosen))
         except answers.FAILURES as error:
             visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
-            return RedirectResponse("/setup", 303)
+            kept: dict[str, Any] = {
+                "found": None,
+                "tried": {},
+                "name": sent.texts.get("name", ""),
+                "chosen": chosen,
+                "here": "/setup",
+            }
+            return await self._pages.show("setup.html", visitor, kept, answers.status_of(error))
         name = sent.texts.get("name", "")
         facts = {"found": devices, "tried": tried, "name": name, "chosen": chosen, "here": "/setup"}
         return await self._pages.show("setup.html", visitor, facts)

@@ -4,7 +4,6 @@
   const body = document.body;
   const link = document.getElementById("link");
   const camera = document.getElementById("camera");
-  const cancel = document.getElementById("cancel");
   const sees = document.getElementById("sees");
   let running = false;
   const measured = document.querySelector('form[action="/do/test-shots"]');
@@ -16,20 +15,26 @@
     // Reload the aiming page when the test shots are done.
     if (measured && running && !line) location.reload();
     running = Boolean(line);
-    const identifying = Boolean(document.querySelector("[data-identifying]"));
-    for (const [id, hidden] of [["identify-on", identifying], ["identify-off", !identifying]]) {
-      const place = document.getElementById(id);
-      if (place) place.hidden = hidden;
+    // What is not possible now is hidden; without the script the page is drawn so.
+    const told = document.querySelector("[data-flags]");
+    const flags = new Set(told ? told.dataset.flags.split(" ") : []);
+    for (const place of document.querySelectorAll("[data-if]")) {
+      place.hidden = !place.dataset.if.split(" ").every((word) => word[0] === "!" ? !flags.has(word.slice(1)) : flags.has(word));
     }
-    if (cancel) cancel.hidden = !line || line.dataset.running !== "yes";
+    for (const form of document.querySelectorAll("[data-plays]")) {
+      form.querySelector("button").setAttribute("aria-pressed", String(Boolean(told) && told.dataset.playing === form.dataset.plays));
+    }
+    if (sees && !running && !(camera && camera.dataset.always)) sees.hidden = true;
   }
 
   function draw(parts) {
     for (const [name, html] of Object.entries(parts)) {
       const place = document.getElementById("live-" + name);
       if (place && place.dataset.drawn !== html) {
+        const unfolded = [...place.querySelectorAll("details[open]")].map((one) => one.dataset.keep);
         place.innerHTML = html;
         place.dataset.drawn = html;
+        for (const one of place.querySelectorAll("details")) one.open = unfolded.includes(one.dataset.keep);
       }
     }
     follow();
@@ -68,6 +73,19 @@
     next.src = camera.dataset.src + "?t=" + Date.now();
   }
 
+  // What takes seconds comes after the page.
+  async function late(place) {
+    let html = "";
+    try {
+      const answer = await fetch(place.dataset.late, { redirect: "manual" });
+      if (answer.type === "opaqueredirect") { location.assign("/login"); return; }
+      html = await answer.text();
+    } catch { /* not reachable */ }
+    if (html) place.innerHTML = html;
+    else place.querySelector(".waiting").textContent = "No answer. Load the page again.";
+  }
+  for (const place of document.querySelectorAll("[data-late]")) late(place);
+
   // A second press before the first one is answered would start the job twice.
   document.addEventListener("submit", (event) => {
     if (event.target.dataset.sent) { event.preventDefault(); return; }
@@ -75,7 +93,7 @@
     setTimeout(() => delete event.target.dataset.sent, 3000);
   });
 
-  const here = document.querySelector("nav [aria-current]");
+  const here = document.querySelector("nav.pages [aria-current]");
   if (here) here.parentElement.scrollLeft = here.offsetLeft - 24;
 
   if (body.dataset.live) { follow(); listen(); setInterval(look, 2000); }

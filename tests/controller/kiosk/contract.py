@@ -33,8 +33,8 @@ from tests.controller.kiosk import vase
 PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"
 """Every kiosk of these tests plays PLAYING, has OTHER installed as well, and the finished calibration RUN."""
 TEXT = f"{vase.TEXT}\n[bundle]\nallow_unsigned = true\n"
-NEEDS_A_CALIBRATION = {"feasibility"}
-"""What no stage of these tests can do: tests/end_to_end/test_targets.py asks it of a calibrated one."""
+NEEDS_A_CALIBRATION = {"feasibility", "reach", "reach-picture"}
+"""What no stage of these tests can do: tests/end_to_end/test_kiosk_targets.py asks it of a calibrated one."""
 
 
 class Stage(Protocol):
@@ -90,6 +90,15 @@ def names_of(rows: Sequence[Appearance]) -> list[str]:
 def hours(**changes: Any) -> dict[str, Any]:
     row = {"day": "mon", "opens": "10:00", "closes": "18:00", "appearance": OTHER}
     return {"time_zone": "Europe/Vienna", "drift_check": "03:00", "rows": [row | changes]}
+
+
+def overlapping() -> dict[str, Any]:
+    rows = [{"day": day, "opens": opens, "closes": "18:00"} for day, opens in (("mon-fri", "10:00"), ("Tue", "17:59"))]
+    return {"time_zone": "Europe/Vienna", "rows": rows}
+
+
+def days_of(stage: Stage) -> list[str]:
+    return [row.day for row in stage.kiosk.schedule().rows]
 
 
 FULL = ("recalibrate", {"kind": "full"})
@@ -164,6 +173,12 @@ CASES: tuple[Case, ...] = (
     Case("schedule", holds=lambda found, _: type(found) is Schedule),
     Case("seen", {"number": 10**9}, holds=lambda _, stage: stage.kiosk.snapshot().failures == ()),
     Case("set-schedule", hours(), holds=lambda _, stage: stage.kiosk.schedule().rows[0].appearance == OTHER),
+    Case("set-schedule", hours(day="Monday and sat - sun"),
+         holds=lambda _, stage: days_of(stage) == ["mon", "sat", "sun"]),
+    Case("set-schedule", hours(day="someday"), "schedule-wrong"),
+    Case("set-schedule", overlapping(), "schedule-overlap"),
+    Case("effect-of-schedule", hours(), holds=lambda told, _: isinstance(told, str)),
+    Case("effect-of-schedule", overlapping(), "schedule-overlap"),
     Case("set-schedule", hours(appearance="no such"), "schedule-wrong"),
     Case("set-schedule", hours(day="2026-02-31"), "schedule-wrong"),
     Case("set-schedule", hours(closes=""), "schedule-wrong"),

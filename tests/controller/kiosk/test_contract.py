@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.doctor.values import Examination
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
+from controller.kiosk.interface import LiveValue, Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -87,6 +90,19 @@ class TestStageKiosk(Contract):
         yield Real(kiosk, stage)
         service.jobs.close(20)
         log.close()
+
+    def test_each_projector_names_the_output_that_feeds_it(self, stage: Real) -> None:
+        (projector,) = (row for row in stage.kiosk.snapshot().devices if row.kind == "projector")
+        assert (projector.name, LiveValue("Output", "P1") in projector.values) == ("left", True)
+
+    def test_hours_that_close_the_show_say_so_before_they_are_saved(self, stage: Real) -> None:
+        stage.kiosk.service.reconciler.step()
+        hour = datetime.now(UTC) + timedelta(hours=3)
+        later = [f"{(hour + timedelta(minutes=n)):%H:%M}" for n in (0, 10)]
+        rows = tuple(ScheduleRow(day, *later) for day in WEEKDAYS)
+        told = stage.kiosk.effect_of_schedule(Schedule("UTC", rows))
+        assert told.startswith("The stage closes at once")
+        assert stage.kiosk.schedule().rows == ()
 
 
 class TestMemoryKiosk(Contract):

@@ -21,7 +21,7 @@ from controller.services import compare as comparison_services
 from controller.services import recalibrate as drift_services
 from tests.controller.kiosk.vase import graded_run, vase
 
-ROWS = [{"name": "marble", "delta_e00_median": 1.5}, {"name": "glass", "delta_e00_median": 2.25}]
+ROWS = [{"name": "marble", "headline": 1.5}, {"name": "glass", "headline": 2.25}]
 CAMERA = Decision("camera-gone", "No photographs are possible without the camera. It is gone.", "Plug it in.", "error")
 
 
@@ -74,7 +74,7 @@ def kinds_after(stage: Stage, request: Request) -> list[str]:
 def test_what_was_asked_for_is_photographed_and_the_worst_is_told(tmp_path: Path, asked: list[tuple[str, ...]]) -> None:
     finished = Stage(tmp_path).do(Request("compare", light=True, arguments=("marble",)))
     assert asked == [("marble",)]
-    assert "The largest median colour difference is 2.25, of glass" in finished.outcome.reason
+    assert "The largest median colour difference of a whole object is 2.25, of glass" in finished.outcome.reason
 
 
 @pytest.mark.usefixtures("asked")
@@ -129,3 +129,19 @@ def test_the_results_hold_each_appearance_newest_first_and_the_calibrations_colo
     assert marble.pictures == {"error": tmp_path / "runs" / "20260104-100000-compare" / "compared-marble-error.jpg"}
     assert glass.history[0].run == "20260102-100000-compare"
     assert {one.run: one.delta_e for one in runs.grades(tmp_path, 8.0)} == {first.name: 2.0, second.name: 1.5}
+
+
+def test_the_headline_counts_the_whole_object_and_not_only_what_was_in_reach(tmp_path: Path) -> None:
+    calibration = graded_run(tmp_path, "20260101-100000-calibrate", {"left": 0.01})
+    compared_run(tmp_path, "20260102-100000-compare", calibration.name, {"marble": 0.66})
+    path = tmp_path / "runs" / "20260102-100000-compare" / "compared-marble.json"
+    sets = {"in_reach": (0.66, 0.55), "lit": (7.0, 0.1), "visible": (8.5, 0.0)}
+    pixels = {
+        name: {"delta_e00_median": median, "delta_e00_p95": 20.0, "left_out_share": left}
+        for name, (median, left) in sets.items()
+    }
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"pixels": pixels}))
+    (newest,) = runs.comparisons(tmp_path, ["marble"])[0].history
+    assert (newest.delta_e, newest.delta_e_p95, newest.in_reach) == (8.5, 20.0, 0.66)
+    assert newest.in_reach_share == pytest.approx(0.45)
+    assert [one.delta_e for one in runs.grades(tmp_path, 8.0)] == [8.5]

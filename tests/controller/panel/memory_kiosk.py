@@ -12,10 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, ImageDraw, ImageOps
 
 from controller.core.errors import UsageError, WorkError
-from controller.kiosk.decide.hours import check_schedule
 from controller.kiosk.interface import (
     Achieved,
     Aiming,
@@ -36,7 +35,9 @@ from controller.kiosk.interface import (
     LampDay,
     LiveValue,
     NextEvent,
+    Place,
     ProjectorAim,
+    Reach,
     RecalibrationKind,
     Results,
     Schedule,
@@ -45,6 +46,7 @@ from controller.kiosk.interface import (
     Unsubscribe,
 )
 from controller.kiosk.store import settings, targets
+from controller.kiosk.store.schedule_file import check
 from tests.controller.kiosk.vase import TEXT
 
 STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")
@@ -99,6 +101,11 @@ class MemoryKiosk:
             next_event=NextEvent("Closes", BORN + 7200),
             bundle=BundleIdentity(17, "9f2c" * 16, BORN),
             lamps=(Lamp("left", 1204.0, 88, True, 3000), Lamp("right", 3120.0, 203, False, 3000)),
+            places=(
+                Place("left", "left", -32.0, 4.0),
+                Place("middle", "above", 3.0, 25.0),
+                Place("right", "right", 35.0, 0.0),
+            ),
         )
         self._finish(run, "full")
         for number in range(12):
@@ -121,10 +128,14 @@ class MemoryKiosk:
 
     def _drawn(self, name: str, shade: int = 120) -> Path:
         file = self._folder / f"{len(list(self._folder.iterdir()))}.png"
-        ramp = Image.linear_gradient("L").resize((240, 160)).rotate(37)
-        Image.merge("RGB", (ramp, ramp.point(lambda value: value * shade // 255), ramp.point(lambda v: v // 3))).save(
-            file
-        )
+        # A ball in soft light, of another colour for each name.
+        light = ImageOps.invert(Image.radial_gradient("L")).resize((300, 300)).crop((70, 30, 310, 190))
+        ball = Image.new("L", (240, 160))
+        ImageDraw.Draw(ball).ellipse((50, 10, 190, 150), fill=255)
+        tint = sum(name.encode()) % 3
+        channels = [light, light.point(lambda value: value * shade // 255), light.point(lambda value: value // 3)]
+        picture = Image.merge("RGB", channels[tint:] + channels[:tint])
+        Image.composite(picture, Image.new("RGB", (240, 160), (10, 9, 8)), ball).save(file)
         return file
 
     def snapshot(self) -> KioskState:
@@ -272,8 +283,9 @@ class MemoryKiosk:
 
         return self._begin(f"Computing {name}", "solving", finish)
 
-    def feasibility(self, target: Path) -> Path:
-        return self._drawn("feasibility", 200)
+    def reach(self, target: Path) -> Reach:
+        pictures = {name: self._drawn(name, 200 - 60 * at) for at, name in enumerate(("target", "result", "map"))}
+        return Reach(0.45, 0.3, 0.15, 0.05, pictures)
 
     def appearances(self) -> Sequence[Appearance]:
         return list(self._appearances.values())
@@ -284,7 +296,7 @@ class MemoryKiosk:
         def finish(run: str) -> None:
             for one in names:
                 before = self._comparisons[one].history if one in self._comparisons else ()
-                now = Achieved(run, BORN + 86400 * len(before), 1.25 + len(before), 3.5, 0.012, 0.81)
+                now = Achieved(run, BORN + 86400 * len(before), 1.25 + len(before), 3.5, 0.012, 0.81, 0.66, 0.45)
                 kinds = ("before", "target", "achieved", "error", "resolution")
                 pictures = {kind: self._drawn(kind, 60 + 30 * at) for at, kind in enumerate(kinds)}
                 self._comparisons[one] = Comparison(one, (now, *before), pictures)
@@ -310,8 +322,12 @@ class MemoryKiosk:
     def schedule(self) -> Schedule:
         return self._schedule
 
+    def effect_of_schedule(self, schedule: Schedule) -> str:
+        check(schedule, list(self._appearances))
+        return self.effect
+
     def set_schedule(self, schedule: Schedule) -> None:
-        check_schedule(schedule, list(self._appearances))
+        check(schedule, list(self._appearances))
         self._schedule = schedule
         self.change()
 

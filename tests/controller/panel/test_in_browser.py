@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
+from controller.kiosk.interface import BundleIdentity, Finding, Grade
 from controller.kiosk.store.accounts import Accounts
 from controller.panel.pages.routes import NAVIGATION
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, picture, tab
@@ -64,10 +65,16 @@ def test_recalibration_is_one_click_and_is_followed_live_to_its_end(slow: Served
         enter(page, "otto")
         page.get_by_role("button", name="Recalibrate", exact=True).click()
         expect(page.get_by_text("Calibrating", exact=True)).to_be_visible()
+        expect(page.locator("details .steps .now")).to_be_attached()
+        expect(page.locator(".steps .now")).to_be_hidden()
+        page.locator("#live-job summary").click()
         expect(page.locator(".steps .now")).to_be_visible()
         expect(page.get_by_alt_text("What the camera sees now")).to_be_visible()
         expect(page.locator("#live-job")).to_contain_text(" left")
         expect(page.locator(".steps li").nth(1)).to_have_class("done")
+        expect(page.locator(".steps li").nth(1), "it stays unfolded while it is drawn anew").to_be_visible()
+        for name in ("Recalibrate", "Quick recalibration", "Open"):
+            expect(page.get_by_role("button", name=name, exact=True)).to_be_hidden()
         picture(page, "recalibrating")
         expect(page.get_by_text("It ended well.")).to_be_visible()
         expect(page.get_by_role("button", name="Cancel this job")).to_be_hidden()
@@ -96,9 +103,8 @@ def test_two_technicians_see_the_same_job_and_only_one_can_begin_it(slow: Served
         enter(first, "otto")
         enter(second, "tina")
         first.get_by_role("button", name="Recalibrate", exact=True).click()
-        expect(second.locator(".steps .now")).to_be_visible()
-        second.get_by_role("button", name="Quick recalibration").click()
-        expect(second.get_by_role("alert")).to_contain_text("Another job is running or waiting")
+        expect(second.locator(".whole")).to_be_visible()
+        expect(second.get_by_role("button", name="Quick recalibration")).to_be_hidden()
         second.get_by_role("button", name="Cancel this job").click()
         expect(first.get_by_text("It was cancelled.")).to_be_visible()
 
@@ -127,7 +133,9 @@ def test_a_target_is_uploaded_looked_at_and_computed(fresh: Served, browser: Bro
         page.get_by_role("link", name="New appearance").click()
         page.set_input_files("#file", {"name": "t.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()})
         page.get_by_role("button", name="Upload").click()
-        for alt in ("The uploaded target", "Where the target can't be reached: brighter is worse"):
+        expect(page.get_by_text("45 % of the object can look like the picture.")).to_be_visible()
+        expect(page.get_by_text("30 % needs more light than the projectors have")).to_be_visible()
+        for alt in ("What the object will look like, calculated", "Map of what can't be reached"):
             expect(page.get_by_alt_text(alt)).to_have_js_property("complete", True)
             assert page.get_by_alt_text(alt).evaluate("picture => picture.naturalWidth") > 0
         assert not violations(page)
@@ -144,15 +152,39 @@ def test_hours_are_typed_saved_and_stand_in_the_calendar(fresh: Served, browser:
         enter(page, "otto")
         page.get_by_role("link", name="Schedule").click()
         row = page.locator("fieldset.hours").nth(1)
-        row.get_by_label("Day").fill("tue")
+        row.get_by_label("Days").fill("Tuesday - Thursday")
         row.get_by_label("Opens").fill("09:15")
         row.get_by_label("Closes").fill("17:45")
         page.get_by_role("button", name="Save the schedule").click()
         expect(page.get_by_text("The schedule is in use.")).to_be_visible()
         expect(page.get_by_text("09:15 to 17:45").first).to_be_visible()
-        page.locator("fieldset.hours").nth(2).get_by_label("Day").fill("someday")
+        assert [row.day for row in fresh.kiosk.schedule().rows] == ["mon", "tue", "wed", "thu"]
+        page.locator("fieldset.hours").nth(2).get_by_label("Days").fill("someday")
         page.get_by_role("button", name="Save the schedule").click()
-        expect(page.get_by_role("alert")).to_contain_text("The value of 'day' is not valid.")
+        expect(page.get_by_role("alert")).to_contain_text("The day of row 3 is 'someday'.")
+        assert page.locator("fieldset.hours").nth(2).get_by_label("Days").input_value() == "someday"
+
+
+class SlowDoctor(MemoryKiosk):
+    """It examines for longer than a person waits before a white page."""
+
+    def doctor(self) -> Sequence[Finding]:
+        time.sleep(3)
+        return super().doctor()
+
+
+def test_the_doctors_page_is_there_before_its_findings(tmp_path: Path, browser: Browser) -> None:
+    with served(SlowDoctor(tmp_path / "pictures"), tmp_path / "private") as running:
+        with tab(browser, running.address) as page:
+            enter(page, "otto")
+            began_s = time.monotonic()
+            page.goto("/doctor", wait_until="domcontentloaded")
+            expect(page.get_by_text("This takes some seconds.")).to_be_visible()
+            assert time.monotonic() - began_s < 2.5
+            expect(page.get_by_text("Check its mains plug.").first).to_be_visible()
+            assert not violations(page)
+        with running.entered("otto") as client:
+            assert "Check its mains plug." in client.get("/doctor?wait=yes").text, "without a script"
 
 
 def test_each_role_sees_only_what_it_may_do(panel: Served, browser: Browser) -> None:
@@ -169,6 +201,7 @@ def test_each_role_sees_only_what_it_may_do(panel: Served, browser: Browser) -> 
 def test_settings_that_are_wrong_are_not_saved_and_not_lost(fresh: Served, browser: Browser) -> None:
     with tab(browser, fresh.address) as page:
         enter(page, "tina")
+        page.get_by_role("link", name="System").click()
         page.get_by_role("link", name="Settings").click()
         page.get_by_label("stage.toml").fill("[stag]\n")
         page.get_by_role("button", name="Check and save").click()
@@ -239,16 +272,66 @@ def test_first_start_leads_from_the_one_time_password_to_a_stage(tmp_path: Path,
 
 
 def test_every_page_of_the_navigation_is_looked_at() -> None:
-    assert {path for path, _, _ in NAVIGATION} <= set(PAGES)
+    assert {path for path, _, _, _ in NAVIGATION} <= set(PAGES)
 
 
-@pytest.mark.parametrize("phone", [True, False])
-def test_no_page_has_a_barrier(panel: Served, browser: Browser, phone: bool) -> None:
+def test_an_appearance_is_switched_by_one_touch_of_its_picture(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address, phone=True) as page:
+        enter(page, "otto")
+        expect(page.get_by_role("button", name="Show marble")).to_have_attribute("aria-pressed", "true")
+        page.get_by_role("button", name="Show warm wood").click()
+        expect(page.locator("p.state")).to_contain_text("warm wood")
+        expect(page.get_by_role("button", name="Show warm wood")).to_have_attribute("aria-pressed", "true")
+        expect(page.get_by_role("button", name="Show marble")).to_have_attribute("aria-pressed", "false")
+        assert page.url.endswith("/"), "the first page again"
+
+
+def test_there_is_one_switch_and_what_is_not_possible_is_not_offered(fresh: Served, browser: Browser) -> None:
+    kiosk = fresh.kiosk
+    assert isinstance(kiosk, MemoryKiosk)
+
+    def offered(page: Page, *names: str) -> None:
+        for name in ("Open", "Close", "Recalibrate", "Quick recalibration"):
+            button = page.get_by_role("button", name=name, exact=True)
+            expect(button).to_be_visible() if name in names else expect(button).to_be_hidden()
+
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        offered(page, "Close", "Recalibrate", "Quick recalibration")
+        kiosk.change(state="off", playing="")
+        offered(page, "Open", "Recalibrate", "Quick recalibration")
+        kiosk.change(bundle=None, grades=())
+        offered(page, "Recalibrate")
+        page.reload()
+        offered(page, "Recalibrate")
+
+
+def test_a_stage_that_can_show_nothing_leads_step_by_step(fresh: Served, browser: Browser) -> None:
+    kiosk = fresh.kiosk
+    assert isinstance(kiosk, MemoryKiosk)
+    kiosk.change(state="ready", playing="", bundle=None, grades=())
+    with tab(browser, fresh.address) as page:
+        enter(page, "tina")
+        expect(page.locator("p.state strong")).to_have_text("Nothing to show yet")
+        expect(page.locator(".todo .done")).to_have_count(1)
+        expect(page.locator(".todo .now a")).to_have_attribute("href", "/aiming")
+        assert not violations(page)
+        kiosk.change(grades=(Grade("run", 1.0, "full", "A", True),))
+        expect(page.locator(".todo .now a")).to_have_attribute("href", "/appearances/new")
+        kiosk.change(bundle=BundleIdentity(1, "ab" * 32, 1.0))
+        expect(page.locator(".todo")).to_have_count(0)
+
+
+@pytest.mark.parametrize(("phone", "light"), [(True, False), (False, True), (False, False)])
+def test_no_page_has_a_barrier(panel: Served, browser: Browser, phone: bool, light: bool) -> None:
     if not panel.kiosk.comparisons():
         panel.kiosk.compare()
     while not panel.kiosk.comparisons():
         time.sleep(0.02)
     with tab(browser, panel.address, phone=phone) as page:
+        page.emulate_media(color_scheme="light" if light else "dark")
+        if phone:
+            page.set_viewport_size({"width": 360, "height": 740})
         page.goto("/login")
         assert not violations(page)
         enter(page, "tina")
@@ -259,4 +342,8 @@ def test_no_page_has_a_barrier(panel: Served, browser: Browser, phone: bool) -> 
                 assert not (found := violations(page)), f"{path}\n{found}"
             wider = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
             assert wider <= 0, f"{path} is wider than the screen by {wider} px"
-            picture(page, ("phone" if phone else "desk") + (path.replace("/", "-") if path != "/" else "-now"))
+            picture(
+                page,
+                ("phone" if phone else "light" if light else "desk")
+                + (path.replace("/", "-") if path != "/" else "-now"),
+            )

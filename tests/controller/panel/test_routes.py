@@ -13,7 +13,8 @@ from controller.panel.context import PanelOptions
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf, served
 
-PUBLIC = {"/login", "/static/style.css", "/static/panel.js", "/static/icon.svg"}
+PUBLIC = {"/login", "/static/style.css", "/static/panel.js", "/static/icon.svg",
+          "/static/velatura-sans-400.woff", "/static/velatura-sans-700.woff"}  # fmt: skip
 NAMES = {Role.VIEWER: "vera", Role.OPERATOR: "otto", Role.TECHNICIAN: "tina"}
 
 
@@ -107,6 +108,17 @@ def test_an_address_that_is_not_in_the_table_shows_nothing(panel: Served) -> Non
         assert client.delete("/api/v1/state", headers=token).status_code == 405
 
 
+def test_a_person_who_took_a_wrong_address_sees_a_page_and_a_program_one_line(panel: Served) -> None:
+    with panel.entered("tina") as client:
+        for method, path, status in (("GET", "/nothing/here", 404), ("PUT", "/login", 405), ("POST", "/do/play", 403)):
+            page = client.request(method, path, headers={"accept": "text/html"})
+            assert (page.status_code, page.headers["content-type"]) == (status, "text/html; charset=utf-8")
+            assert 'href="/"' in page.text
+            assert "/static/style.css" in page.text
+            line = client.request(method, path, headers={"accept": "application/json"})
+            assert (line.status_code, "<" in line.text) == (status, False)
+
+
 def test_a_form_of_another_session_or_of_another_site_is_refused(panel: Served) -> None:
     with panel.entered("tina") as tina, panel.entered("otto") as otto:
         own, other = csrf(tina.get("/").text), csrf(otto.get("/").text)
@@ -158,6 +170,9 @@ def test_the_first_page_is_small_and_names_no_other_machine(panel: Served) -> No
     with panel.entered("tina") as client:
         texts = [client.get(path).text for path in ("/", "/static/style.css", "/static/panel.js", "/static/icon.svg")]
         assert sum(len(text.encode()) for text in texts) <= 100_000
+        fonts = [client.get(f"/static/velatura-sans-{weight}.woff") for weight in (400, 700)]
+        assert {font.headers["content-type"] for font in fonts} == {"font/woff"}
+        assert sum(len(font.content) for font in fonts) <= 60_000
         for word in ("http", "<script>", "style="):
             assert word not in texts[0]
         assert "//" not in texts[1]

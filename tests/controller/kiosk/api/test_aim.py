@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +15,7 @@ import pytest
 from PIL import Image
 
 from controller.calibrate.values import Geometry, Pinhole
-from controller.core.errors import UsageError
-from controller.kiosk.api.aim import FIGURES, FOLDER, MAPS, aiming, camera_picture, feasibility_map, grazing_share
+from controller.kiosk.api.aim import FIGURES, FOLDER, aiming, camera_picture, grazing_share
 from controller.kiosk.interface import Aiming, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
@@ -88,18 +86,6 @@ def test_a_calibration_that_can_not_be_read_leaves_the_test_shots_or_says_so(tmp
         np.savez(run / name, nonsense=np.zeros(3))
     (stage / FOLDER / FIGURES).unlink()
     assert len(aiming(check_stage(stage)).hints) == 1
-
-
-def test_maps_of_what_can_be_reached_do_not_fill_the_disk_in_months(tmp_path: Path) -> None:
-    stage = vase(tmp_path)
-    (stage / MAPS).mkdir(parents=True)
-    for number in range(30):
-        (stage / MAPS / f"{number:024x}.png").write_bytes(b"a map")
-        os.utime(stage / MAPS / f"{number:024x}.png", (1e9 + number, 1e9 + number))
-    with pytest.raises(UsageError) as caught:
-        feasibility_map(stage, stage / "target.png")
-    assert caught.value.code == "not-calibrated"
-    assert sorted(int(file.stem, 16) for file in (stage / MAPS).iterdir()) == list(range(11, 30))
 
 
 @dataclass

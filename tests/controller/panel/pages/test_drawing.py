@@ -37,13 +37,13 @@ def test_every_state_of_the_machine_has_words() -> None:
 
 def test_times_are_those_of_the_stage() -> None:
     drawing = Drawing()
-    assert "Wed 01 Jul 2026, 10:00:00" in drawing.parts(state(), [])["top"]
+    assert "Wed 01 Jul 2026, 10:00" in drawing.parts(state(), [])["top"]
     drawing.use_zone("Europe/Vienna")
-    assert "Wed 01 Jul 2026, 12:00:00" in drawing.parts(state(), [])["top"]
+    assert "Wed 01 Jul 2026, 12:00" in drawing.parts(state(), [])["top"]
     for name in ("Nowhere/At_All", "", "../etc/passwd", "\x00", "Europe"):
         drawing.use_zone("Europe/Vienna")
         drawing.use_zone(name)
-        assert "10:00:00" in drawing.parts(state(), [])["top"]
+        assert "10:00" in drawing.parts(state(), [])["top"]
 
 
 @pytest.mark.parametrize("moment", [float(2**53), -1e18, math.nan, math.inf, -math.inf, 1e300])

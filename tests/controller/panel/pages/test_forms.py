@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from PIL import Image
 
 from controller.kiosk.interface import Schedule, ScheduleRow
+from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf
 
 KEPT = Schedule("Europe/Vienna", (ScheduleRow("mon", "10:00", "18:00", "marble"),), "03:00")
@@ -22,6 +24,8 @@ def sent(client: httpx.Client, form: dict[str, Any], **files: Any) -> str:
     """Send the schedule; what the page then says."""
     token = csrf(client.get("/schedule").text)
     answer = client.post("/do/set-schedule", data=form | {"csrf": token}, **files)
+    if answer.status_code == 422:
+        return answer.text
     assert (answer.status_code, answer.headers["location"]) == (303, "/schedule")
     return client.get("/schedule").text
 
@@ -54,6 +58,72 @@ def test_hours_that_are_wrong_or_did_not_arrive_whole_change_nothing(fresh: Serv
             (note,) = re.findall(r'class="note[^>]*>(.*?)</', page, re.DOTALL)
             assert word in note
             assert fresh.kiosk.schedule() == KEPT
+            assert "2026-12-24" in page or len(change.get("day", FORM["day"])) != 3, "what was typed is still there"
+
+
+def test_days_are_written_as_people_write_them_and_come_back_in_few_rows(fresh: Served) -> None:
+    with fresh.entered("otto") as client:
+        page = sent(client, FORM | {"day": ["Monday, Tue - Fri", "", "2026-12-24 to 2026-12-26"]})
+    days = [row.day for row in fresh.kiosk.schedule().rows]
+    assert days == ["mon", "tue", "wed", "thu", "fri", "2026-12-24", "2026-12-25", "2026-12-26"]
+    assert 'value="mon-fri"' in page
+    assert 'value="2026-12-24 to 2026-12-26"' in page
+
+
+def test_hours_that_overlap_are_refused_and_stay_in_the_form(fresh: Served) -> None:
+    with fresh.entered("otto") as client:
+        page = sent(client, FORM | {"day": ["mon-fri", "Tue", ""], "opens": ["10:00", "17:30", ""],
+                                    "closes": ["18:00", "22:15", ""]})  # fmt: skip
+    assert "Hours overlap (tue): 10:00-18:00 and 17:30-22:15." in page
+    assert all(f'value="{typed}"' in page for typed in ("mon-fri", "Tue", "17:30", "22:15"))
+    assert fresh.kiosk.schedule() == KEPT
+
+
+def test_hours_that_close_the_running_show_ask_first_and_no_leads_back_to_what_was_typed(fresh: Served) -> None:
+    kiosk = fresh.kiosk
+    assert isinstance(kiosk, MemoryKiosk)
+    kiosk.effect = "The stage closes at once."
+    with fresh.entered("otto") as client:
+        form = FORM | {"csrf": csrf(client.get("/schedule").text)}
+        asked = client.post("/do/set-schedule", data=form).text
+        assert "Save these hours now? The stage closes at once." in asked
+        assert kiosk.schedule() == KEPT
+        kept = re.findall(r'<textarea name="(\w+)"[^>]*>\n(.*?)</textarea>', asked)
+        again = {"csrf": form["csrf"], **{name: [v for n, v in kept if n == name] for name, _ in kept}}
+        back = client.post("/do/set-schedule", data=again | {"sure": "no"})
+        assert (back.status_code, kiosk.schedule()) == (200, KEPT)
+        assert all(f'value="{typed}"' in back.text for typed in ("tue", "2026-12-24", "04:00", "warm wood"))
+        assert client.post("/do/set-schedule", data=again | {"sure": "yes"}).status_code == 303
+    assert [row.day for row in kiosk.schedule().rows] == ["tue", "2026-12-24"]
+
+
+def test_a_wrong_name_stays_beside_its_target_and_the_rule_is_told_before(fresh: Served, tmp_path: Path) -> None:
+    Image.new("RGB", (60, 40), (200, 90, 30)).save(tmp_path / "t.png")
+    with fresh.entered("otto") as client:
+        form = {"csrf": csrf(client.get("/appearances/new").text), "fit": "fill"}
+        refused = client.post("/do/upload-target", data=form, files={"file": ("a.png", b"no picture")})
+        assert refused.status_code == 422
+        assert '<option value="fill" selected>' in refused.text
+        picture = (tmp_path / "t.png").read_bytes()
+        there = client.post("/do/upload-target", data=form, files={"file": ("t.png", picture)})
+        page = client.get(there.headers["location"]).text
+        assert "Letters, digits, - and _." in page
+        target = there.headers["location"].rpartition("/")[2]
+        answer = client.post("/do/compute", data={"csrf": form["csrf"], "name": "two words", "target": target})
+        assert answer.status_code == 422
+        assert 'value="two words"' in answer.text
+        assert f'value="{target}"' in answer.text
+
+
+def test_an_account_that_is_refused_keeps_its_name_and_role_but_no_password(fresh: Served) -> None:
+    with fresh.entered("tina") as client:
+        form = {"csrf": csrf(client.get("/accounts").text), "role": "operator", "password": "a long pass phrase"}
+        answer = client.post("/accounts/add", data=form | {"name": "Nora Two"})
+        assert answer.status_code == 422
+        assert 'value="Nora Two"' in answer.text
+        assert "a long pass phrase" not in answer.text
+        token = client.post("/tokens/add", data=form | {"name": "No Name!"})
+        assert 'value="No Name!"' in token.text
 
 
 def test_a_file_that_nobody_asked_for_is_removed_and_leaves_the_form_as_it_is(fresh: Served) -> None:
@@ -72,6 +142,9 @@ def test_a_disk_that_takes_no_upload_is_told_in_words(fresh: Served) -> None:
         answer = client.post("/do/upload-target", data=form, files={"file": ("a.png", b"x")})
         assert answer.status_code == 507
         assert "Free some space" in answer.text
+        page = client.post("/do/upload-target", data=form, files={"file": ("a.png", b"x")},
+                           headers={"accept": "text/html"})  # fmt: skip
+        assert (page.status_code, "<h1>" in page.text, "Free some space" in page.text) == (507, True, True)
         assert "set-schedule" in sent(client, FORM), "the panel goes on"
     assert len(fresh.kiosk.schedule().rows) == 2
 
@@ -95,7 +168,7 @@ def test_a_form_that_failed_leads_to_no_address_of_its_senders(fresh: Served) ->
             answer = client.post("/do/compute", data=form | {"target": target})
             assert (answer.status_code, answer.headers["location"]) == (303, "/")
         answer = client.post("/do/compute", data=form | {"target": "ab" * 12})
-        assert answer.headers["location"] == "/appearances/new/" + "ab" * 12
+        assert (answer.status_code, "This target no longer exists." in answer.text) == (404, True)
 
 
 def test_settings_that_are_wrong_come_back_as_they_were_typed(fresh: Served) -> None:

@@ -1,0 +1,167 @@
+"""How much of a target the projectors can make, and what the object will look like, before anything is solved."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import threading
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import ByteImage, FloatImage, Mask
+from controller.core.storage import write_atomically
+from controller.kiosk.store.targets import fitted
+from controller.kiosk.values import Reach
+from controller.stage.calibrations import finished_calibration
+from controller.stage.check import Checked, check_stage
+
+if TYPE_CHECKING:
+    from controller.artefacts.calibrated import Calibrated
+    from controller.solve.feasibility import Feasibility
+    from controller.solve.request import Aim
+    from controller.solve.targets.values import Target
+
+FOLDER, KEPT = "kiosk/feasibility", 20
+FIGURES: Final = "reach.json"
+FILES: Final = {"target": "target.jpg", "result": "result.jpg", "map": "map.png"}
+LONGEST_PX: Final = 960
+"""The longer side of the pictures, which are for a screen."""
+MARGIN: Final = 2e-3
+"""As ``solve.feasibility``: so much drive beyond black and white is forgiven."""
+BRIGHT, DARK, COLOURFUL, UNLIT = (240, 179, 90), (90, 140, 255), (216, 96, 190), (58, 60, 66)
+"""Colours of the map, as in the page's legend: too bright, too dark, too saturated, and not lit or not asked for."""
+_one_at_a_time = threading.Lock()
+
+
+def reach(stage: Path, target: Path) -> Reach:
+    """Shares of the visible object, and three pictures of it; kept until target, calibration or settings change.
+
+    Raises UsageError("not-calibrated", "target-unreadable"), WorkError("no-light", "no-space").
+    """
+    checked = check_stage(stage)
+    folder = checked.stage.folder / FOLDER / target.stem[:64]
+    run = finished_calibration(checked.stage.folder)
+    about = {"run": run.name, "changed_ns": target.stat().st_mtime_ns, "solve": repr(checked.stage.tables.solve)}
+    with _one_at_a_time:
+        if (known := _kept(folder, about)) is not None:
+            return known
+        _keep_newest(folder.parent, KEPT - 1)
+        found = _made(checked, run, target, folder)
+        write_atomically(folder / FIGURES, json.dumps({"of": about, "shares": _shares(found)}).encode())
+        return found
+
+
+def _shares(found: Reach) -> dict[str, float]:
+    return {key: value for key, value in asdict(found).items() if key != "pictures"}
+
+
+def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
+    pictures = {name: folder / file for name, file in FILES.items()}
+    try:
+        content = json.loads((folder / FIGURES).read_text())
+        if content["of"] != about or not all(file.is_file() for file in pictures.values()):
+            return None
+        return Reach(**content["shares"], pictures=pictures)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
+    from controller.artefacts.calibrated import Calibrated
+    from controller.solve.judged import visible_object
+    from controller.solve.request import aim_at
+    from controller.steps.appearance.solving import options_of
+
+    calibrated = Calibrated(run, checked.names)
+    wanted = _wanted(calibrated, target)
+    aim = aim_at(
+        calibrated.transport, calibrated.calibration.black, wanted.image, options_of(checked.stage.tables.solve),
+        drive=calibrated.drive, indirect=calibrated.indirect,
+    )  # fmt: skip
+    lit = calibrated.calibration.object_mask
+    seen = visible_object(lit)
+    kinds = kinds_of(aim.asked_possible, lit & wanted.mask)
+    folder.mkdir(parents=True, exist_ok=True)
+    grey = _drawn(folder, calibrated, aim, seen)
+    _write(folder / FILES["map"], map_of(kinds, grey), seen)
+    area = max(1, int(seen.sum()))
+    share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
+    return Reach(**share, pictures={name: folder / file for name, file in FILES.items()})
+
+
+def _wanted(calibrated: Calibrated, target: Path) -> Target:
+    from controller.solve.targets.files import load_target
+
+    black = calibrated.calibration.black
+    size_px = (black.shape[1], black.shape[0])
+    with tempfile.TemporaryDirectory() as scratch:
+        # An EXR is rendered for this view already.
+        whole = target if target.suffix.lower() == ".exr" else Path(scratch) / "target.png"
+        if whole != target:
+            whole.write_bytes(fitted(target.read_bytes(), size_px))
+        return load_target(whole, size_px)
+
+
+def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
+    """Masks (rows, columns) that exclude each other, by the shares of ``Reach``; ``asked``: lit, and in the picture."""
+    bright, dark = (part.max(axis=2) > MARGIN for part in (possible.too_bright, possible.too_dark))
+    out = asked & ~possible.reachable
+    return {
+        "share": asked & possible.reachable,
+        "too_bright": out & bright & ~dark,
+        "too_dark": out & dark & ~bright,
+        "too_colourful": out & (bright == dark),
+    }
+
+
+def _drawn(folder: Path, calibrated: Calibrated, aim: Aim, seen: Mask) -> ByteImage:
+    """Write what was asked for and what will come of it; returns the first one in grey, (rows, columns) uint8."""
+    from controller.report.pictures import to_screen
+
+    black, matrix = calibrated.calibration.black, calibrated.calibration.camera_to_xyz
+    light: FloatImage = np.clip(aim.direct - black, 0, calibrated.transport.reach())
+    made = light if calibrated.indirect is None else light + calibrated.indirect.forward(light)
+    asked, result = (to_screen(image, matrix, white=aim.exposure) for image in (aim.asked, black + made))
+    _write(folder / FILES["target"], asked, seen)
+    _write(folder / FILES["result"], result, seen)
+    return np.asarray(asked.mean(axis=2), np.uint8)
+
+
+def map_of(kinds: dict[str, Mask], grey: ByteImage) -> ByteImage:
+    """(rows, columns, 3) uint8: dimmed where it is in reach, a colour for each reason where it is not."""
+    picture = np.full((*grey.shape, 3), UNLIT, np.uint8)
+    picture[kinds["share"]] = (grey[kinds["share"]] // 2 + 40)[:, None]
+    for name, colour in (("too_bright", BRIGHT), ("too_dark", DARK), ("too_colourful", COLOURFUL)):
+        picture[kinds[name]] = colour
+    return picture
+
+
+def _write(path: Path, rgb: ByteImage, seen: Mask) -> None:
+    """Only the object, with black around it, small enough for a screen."""
+    import cv2
+
+    from controller.report.pictures import crop_around
+
+    box = crop_around(seen)
+    cut: npt.NDArray[np.uint8] = np.where(seen[..., None], rgb, 0).astype(np.uint8)[box.rows, box.columns, ::-1]
+    scale = LONGEST_PX / max(cut.shape[:2])
+    if scale < 1:
+        size_px = (max(1, round(cut.shape[1] * scale)), max(1, round(cut.shape[0] * scale)))
+        cut = np.asarray(cv2.resize(cut, size_px, interpolation=cv2.INTER_AREA), np.uint8)
+    write_atomically(path, cv2.imencode(path.suffix, cut)[1].tobytes())
+
+
+def _keep_newest(folder: Path, most: int) -> None:
+    """Each uploaded target gets its own pictures, so a kiosk would collect them for months."""
+    if not folder.is_dir():
+        return
+    for _, old in sorted((entry.stat().st_mtime_ns, entry) for entry in folder.iterdir())[:-most]:
+        if old.is_dir():
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            old.unlink(missing_ok=True)
