@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
+from controller.kiosk.changes.values import Change, Changes
 from controller.kiosk.values import (
     Achieved,
     Aiming,
@@ -128,6 +129,9 @@ class Kiosk(Protocol):
     def doctor(self) -> Sequence[Finding]:
         """Find problems of the machine, the stage and the devices. Seconds."""
 
+    def changes(self) -> Changes:
+        """What differs from the last day that graded well. Seconds."""
+
     def test_alerts(self) -> None:
         """Send a test alert to everybody that stage.toml names. Seconds. Raises UsageError, WorkError."""
 
@@ -185,6 +189,8 @@ __all__ = [
     "Aiming",
     "Appearance",
     "BundleIdentity",
+    "Change",
+    "Changes",
     "Comparison",
     "DeviceRow",
     "EventLevel",

@@ -201,6 +201,8 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
               said="The settings are in use."),
     # -- maintenance
     Operation("doctor", "Find problems", OPERATOR, LOOKS, http=("POST", "/doctor"), within="doctor"),
+    Operation("changes", "What changed since the last good day", OPERATOR, LOOKS, offline=True,
+              more="Kernel, drivers, packages, outputs, adapters, projectors, camera, settings, clock, network."),
     Operation("test-alerts", "Send a test alert to everybody that stage.toml names", TECHNICIAN, CHANGES,
               answer=Answer.NOTHING, http=("POST", "/alerts/test"), said="The test alert was taken by every server."),
     Operation("backup", "Make a backup of settings, calibration and appearances", TECHNICIAN, LOOKS, answer=Answer.FILE,

@@ -56,6 +56,7 @@ class Pages:
             ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None}),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
             ("/doctor", Role.OPERATOR, "doctor.html", lambda _: {"findings": list(self._panel.kiosk.doctor())}),
+            ("/changes", Role.OPERATOR, "changes.html", lambda _: {"found": self._panel.kiosk.changes()}),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
             (
                 "/settings",

@@ -15,6 +15,7 @@ from controller.core.errors import VelaturaError
 from controller.kiosk.interface import (
     Aiming,
     Appearance,
+    Changes,
     Comparison,
     EventRow,
     Finding,
@@ -166,6 +167,7 @@ CASES: tuple[Case, ...] = (
     Case("save-settings", {"text": TOML}, holds=lambda _, stage: stage.kiosk.settings() == TOML),
     Case("save-settings", {"text": "[stage"}, "stage-syntax"),
     Case("save-settings", {"text": TOML}, "busy", first=(FULL,)),
+    Case("changes", holds=lambda found, _: type(found) is Changes),
     Case("doctor", holds=every(Finding)),
     Case("backup", holds=a_file),
     Case("restore", {"backup": "BACKUP"}, holds=lambda _, stage: stage.kiosk.settings().strip() == TEXT.strip(),
