@@ -135,6 +135,9 @@ class Kiosk(Protocol):
     def test_alerts(self) -> None:
         """Send a test alert to everybody that stage.toml names. Seconds. Raises UsageError, WorkError."""
 
+    def test_backup(self) -> None:
+        """Make a backup at every place that stage.toml names. Minutes. Raises UsageError, WorkError."""
+
     def backup(self) -> Path:
         """A new file with settings, calibration, appearances; without secrets. Seconds."""
 

@@ -15,6 +15,7 @@ from controller.core import kiosk_places
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.alerts.alerts import Alerts
+from controller.kiosk.backup.nightly import NightlyBackup
 from controller.kiosk.changes.inventory import Inventory
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.changes.watch import InventoryWatch, take
@@ -27,7 +28,6 @@ from controller.kiosk.jobs.job_runner import JobRunner
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.nightly_backup import NightlyBackup
 from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.bundle_watch import BundleWatch

@@ -308,6 +308,9 @@ class StageKiosk(FolderKiosk):
     def test_alerts(self) -> None:
         self.service.alerts.test()
 
+    def test_backup(self) -> None:
+        self.service.backups.now()
+
     def restore(self, backup: Path) -> None:
         with self._idle():
             archive.restore(self.stage, backup)

@@ -174,6 +174,7 @@ CASES: tuple[Case, ...] = (
          first=(("save-settings", {"text": TOML}),)),
     Case("restore", {"backup": "target.png"}, "not-a-backup"),
     Case("restore", {"backup": "BACKUP"}, "busy", first=(FULL,)),
+    Case("test-backup", code="backup-nowhere"),
     Case("test-alerts", {}, "alerts-none"),
     Case("diagnostics", holds=a_file),
     Case("find-devices", holds=every(FoundDevice)),

@@ -317,6 +317,9 @@ class MemoryKiosk:
         file.write_bytes(b"diagnostics")
         return file
 
+    def test_backup(self) -> None:
+        raise UsageError("backup-nowhere", what="stage.toml names no place for backups.", remedy="Add one.")
+
     def changes(self) -> Changes:
         change = Change(
             "kernel", "", "6.1.0-28-amd64", "6.1.0-37-amd64",
