@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from controller.config.models import StageTables
 from controller.core.errors import VelaturaError
 from controller.core.text import printable
 from controller.kiosk.changes.inventory import Fact
+from controller.kiosk.install.outputs import Connected, connected
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device, WatchedCamera
@@ -31,23 +33,6 @@ class Asked(Protocol):
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity: ...
     def adjustments(self, *, deadline: Deadline) -> dict[str, str]: ...
-
-
-class Shows(Protocol):
-    """An output of the X server, as ``controller.play.display.x11.Connector``."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def x(self) -> int: ...
-    @property
-    def y(self) -> int: ...
-    @property
-    def width_px(self) -> int: ...
-    @property
-    def height_px(self) -> int: ...
-    @property
-    def rate_hz(self) -> float: ...
 
 
 def projector_facts(name: str, projector: Asked | None) -> Iterator[Fact]:
@@ -96,27 +81,26 @@ def _exif(picture: Path) -> dict[int, Any]:
         return {}
 
 
-def shown_facts(connectors: Callable[[], Sequence[Shows]]) -> Iterator[Fact]:
-    """Mode and place of each output that the X server shows now; none where there is no X server."""
+def shown_facts(outputs: Sequence[Connected]) -> Iterator[Fact]:
+    """Mode and place of each output that the X server shows now."""
+    shown = [(one.left_top_px, one) for one in outputs if one.left_top_px is not None]
+    for _, one in shown:
+        for mode in one.modes:
+            if mode.current:
+                width_px, height_px, rate_hz = mode.key
+                yield Fact("mode", one.name, f"{width_px}x{height_px} at {rate_hz:.1f} Hz")
+    for place, ((left, top), one) in enumerate(sorted(shown, key=lambda item: item[0]), 1):
+        yield Fact("output order", one.name, f"number {place} from the left, at {left} {top}")
+
+
+def outputs_of_x() -> list[Connected]:
+    """The X server's outputs as `xrandr` tells them; none without an X server."""
+    # A library would end this process with the X server.
     try:
-        shown = connectors()
-    except (VelaturaError, OSError):
-        return
-    for one in shown:
-        yield Fact("mode", one.name, f"{one.width_px}x{one.height_px} at {one.rate_hz:.1f} Hz")
-    for place, one in enumerate(sorted(shown, key=lambda one: (one.x, one.y)), 1):
-        yield Fact("output order", one.name, f"number {place} from the left, at {one.x} {one.y}")
-
-
-def connectors_of_x() -> Sequence[Shows]:
-    """The X server's outputs. Raises WorkError("display-gone"), and OSError where its library is missing."""
-    from controller.play.display.x11 import XServer
-
-    server = XServer()
-    try:
-        return server.connectors()
-    finally:
-        server.close()
+        done = subprocess.run(["xrandr", "--verbose"], capture_output=True, text=True, errors="replace", timeout=20)  # noqa: PLW1510, S607
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return connected(done.stdout) if done.returncode == 0 else []
 
 
 def settings_facts(tables: StageTables) -> Iterator[Fact]:

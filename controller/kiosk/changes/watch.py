@@ -16,7 +16,7 @@ from controller.artefacts.names import json_path, read_json, run_kind
 from controller.config.models import StageTables
 from controller.core.errors import VelaturaError
 from controller.kiosk.changes import compare, inventory
-from controller.kiosk.changes.devices import connectors_of_x, lens_facts, settings_facts, shown_facts
+from controller.kiosk.changes.devices import lens_facts, outputs_of_x, settings_facts, shown_facts
 from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.changes.values import Changes
@@ -32,7 +32,7 @@ _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
 
 def take(stage: Path, tables: StageTables | None, devices: tuple[Fact, ...], machine: Machine, run: str) -> Inventory:
     """An inventory now. Seconds. ``tables``: the settings; ``devices``: facts of the opened devices."""
-    shown = tuple(shown_facts(connectors_of_x))
+    shown = tuple(shown_facts(outputs_of_x()))
     settings = () if tables is None else settings_facts(tables)
     facts = chain(machine.facts(), shown, devices, lens_facts(stage), settings)
     return Inventory(time.time(), run, tuple(facts))

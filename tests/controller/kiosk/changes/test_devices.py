@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +18,7 @@ from controller.kiosk.changes.devices import (
     shown_facts,
 )
 from controller.kiosk.changes.inventory import Fact, Inventory
+from controller.kiosk.install.outputs import connected
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
@@ -28,6 +28,7 @@ from plugins.emulated.projectors.boards_text import EpsonBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink_board import PjLinkOddities
 from plugins.ptp.camera import open_camera
+from tests.controller.kiosk.install.test_outputs import LEFT, OFF, RIGHT
 from tests.controller.kiosk.vase import vase
 from tests.plugins.conftest import hasty, open_pjlink, open_serial, wait_for_power
 from tests.plugins.ptp.ptp_rig import Studio
@@ -160,20 +161,16 @@ def test_a_setting_is_named_by_its_key_and_a_secret_is_not_written_down(tmp_path
     assert secret.startswith("In stage.toml, alerts.webhook was secret ")
 
 
-def connector(name: str, x: int, rate_hz: float = 60.0, width_px: int = 1400) -> SimpleNamespace:
-    return SimpleNamespace(name=name, x=x, y=0, width_px=width_px, height_px=1050, rate_hz=rate_hz)
-
-
 def test_mode_and_order_that_the_x_server_shows_now() -> None:
-    def shown(*connectors: SimpleNamespace) -> tuple[Fact, ...]:
-        return tuple(shown_facts(lambda: connectors))
+    def shown(told: str) -> tuple[Fact, ...]:
+        return tuple(shown_facts(connected(told)))
 
-    before = shown(connector("DP-1", 0), connector("DP-2", 1400))
-    assert compared(before, shown(connector("DP-1", 0, 59.0), connector("DP-2", 1400))) == [
-        "The mode of output DP-1 was 1400x1050 at 60.0 Hz, and is now 1400x1050 at 59.0 Hz."
+    told = LEFT + OFF + RIGHT
+    assert compared(shown(told), shown(told.replace("148.500MHz", "146.000MHz"))) == [
+        "The mode of output HDMI-2 was 1920x1080 at 60.0 Hz, and is now 1920x1080 at 59.0 Hz."
     ]
-    moved = compared(before, shown(connector("DP-1", 1400), connector("DP-2", 0)))
+    moved = compared(shown(told), shown(told.replace("+0+0", "+1920+0").replace("+1400+0", "+0+0")))
     assert moved[0] == (
-        "The place of output DP-1 was number 1 from the left, at 0 0, and is now number 2 from the left, at 1400 0."
+        "The place of output HDMI-1 was number 1 from the left, at 0 0, and is now number 2 from the left, at 1920 0."
     )
     assert len(moved) == 2
