@@ -22,7 +22,7 @@ from hal.errors import DeviceError
 from hal.interfaces import Device, WatchedCamera
 from hal.values import DeviceIdentity
 
-ASK_S: Final = 10.0
+ASK_S: Final = 6.0
 _EXIF, _LENS, _FOCAL_MM = 0x8769, 0xA434, 0x920A
 _PICTURES: Final = (".jpg", ".jpeg", ".dng", ".cr2", ".nef", ".arw", ".tif", ".tiff")
 _ADJUSTED: Final = ("input", "keystone", "lamp mode")
