@@ -18,6 +18,7 @@ from hal.annotations import mismatch
 from hal.deadline import Deadline, Stop
 from hal.errors import DeviceError, DriverFault
 from hal.interfaces import (
+    AdjustedProjector,
     BundleDisplay,
     ButtonPanel,
     Camera,
@@ -38,7 +39,7 @@ _URGENT_S: Final = 0.5
 _WITHOUT_DEADLINE_S: Final = 4.0
 """Time for a call without a deadline, such as ``close``, before that."""
 INTERFACES: Final[Mapping[str, tuple[type, ...]]] = {
-    "projector": (Projector, WatchedProjector),
+    "projector": (Projector, WatchedProjector, AdjustedProjector),
     "camera": (Camera, WatchedCamera, LiveViewCamera),
     "display": (Display, BundleDisplay),
     "power_switch": (PowerSwitch,),

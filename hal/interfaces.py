@@ -72,6 +72,17 @@ class WatchedProjector(Projector, Protocol):
 
 
 @runtime_checkable
+class AdjustedProjector(Projector, Protocol):
+    """A projector whose driver can read what people adjust in its menus."""
+
+    def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
+        """What it tells now of "input", "keystone" and "lamp mode", in its own words.
+
+        What its protocol does not have, or what it does not tell now (many answer only while lit), is left out.
+        """
+
+
+@runtime_checkable
 class Camera(Device, Protocol):
     """A still camera that can be triggered and read out over a cable."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -46,6 +47,25 @@ def _lamps(rows: Any, _: Mapping[str, Any], as_json: bool) -> Mapping[str, Any] 
     return {"days": rows} if as_json else "\n".join(lines) or "No lamp has burnt yet."
 
 
+def _changes(found: Any, _: Mapping[str, Any], as_json: bool) -> Mapping[str, Any] | str:
+    if as_json:
+        return dict(found)
+    if found["good_unix_s"] is None:
+        return "There was no good day yet. The first one is after a calibration that graded well, while the kiosk runs."
+    day = _day(found["good_unix_s"])
+    lines = [f"The last good day was {day} ({found['run']})."]
+    for one in found["changes"]:
+        lines += [f"{one['sentence']} (seen on {_day(one['since_unix_s'])})", f"  {one['remedy']}"]
+    if not found["changes"]:
+        lines.append("Nothing has changed since.")
+    lines += [f"Not compared, because it can't be read now: {name}" for name in found["unknown"]]
+    return "\n".join(map(printable, lines))
+
+
+def _day(unix_s: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(unix_s))
+
+
 def _identified(_: Any, arguments: Mapping[str, Any], as_json: bool) -> Mapping[str, Any] | str:
     return {"done": "identify"} if as_json else "The names are shown." if arguments["on"] else "The names are hidden."
 
@@ -74,6 +94,7 @@ def _token(made: Any, _: Mapping[str, Any], as_json: bool) -> Mapping[str, Any] 
 FORMATTERS: Final[Mapping[str, Formatter]] = {
     "appearances": _appearances,
     "lamp-history": _lamps,
+    "changes": _changes,
     "identify": _identified,
     "restore": _restored,
     "diagnostics": _diagnosed,

@@ -28,6 +28,26 @@ class BackupTable(ConfigTable):
         description="the folder that gets a backup every night, best on another disk; relative to the stage's folder; "
         "if omitted: no backup",
     )  # fmt: skip
+    usb: str | None = Field(
+        default=None, min_length=1, max_length=64,
+        description="the label or UUID of the file system of a mounted USB stick that gets a backup every night",
+    )  # fmt: skip
+    ssh: str | None = Field(
+        default=None, max_length=1000,
+        pattern=r"^ssh://[A-Za-z0-9_][A-Za-z0-9._-]{0,63}@(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]{0,252})(:[0-9]{1,5})?/[^\s\"\\*?\[\]]*$",
+        description='a folder on a server that gets a backup every night by SFTP: "ssh://USER@HOST/FOLDER", or with '
+        "HOST:PORT",
+    )  # fmt: skip
+    ssh_key_file: str | None = Field(
+        default=None, min_length=1, pattern=r'^[^"\n]+$',
+        description="a file with the private key for that server, without a passphrase; relative to the stage's "
+        "folder; needed for ssh",
+    )  # fmt: skip
+    ssh_host_key: str | None = Field(
+        default=None, pattern=r"^(ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)) [A-Za-z0-9+/=]{16,2000}$",
+        description='the public key of that server, such as "ssh-ed25519 AAAA...": two words of '
+        "/etc/ssh/ssh_host_ed25519_key.pub there; needed for ssh",
+    )  # fmt: skip
     at: str = Field(
         default="04:30", pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", description='the local time "HH:MM" of the backup'
     )

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
+from controller.kiosk.changes.values import Change, Changes
 from controller.kiosk.values import (
     Achieved,
     Aiming,
@@ -148,8 +149,14 @@ class Kiosk(Protocol):
     def doctor(self) -> Sequence[Finding]:
         """Find problems of the machine, the stage and the devices. Seconds."""
 
+    def changes(self) -> Changes:
+        """What differs from the last day that graded well. Seconds."""
+
     def test_alerts(self) -> None:
         """Send a test alert to everybody that stage.toml names. Seconds. Raises UsageError, WorkError."""
+
+    def test_backup(self) -> None:
+        """Make a backup at every place that stage.toml names. Minutes. Raises UsageError, WorkError."""
 
     def backup(self) -> Path:
         """A new file with settings, calibration, appearances; without secrets. Seconds."""
@@ -205,6 +212,8 @@ __all__ = [
     "Aiming",
     "Appearance",
     "BundleIdentity",
+    "Change",
+    "Changes",
     "Comparison",
     "DeviceRow",
     "EventLevel",

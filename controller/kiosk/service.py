@@ -15,6 +15,10 @@ from controller.core import kiosk_places
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.alerts.alerts import Alerts
+from controller.kiosk.backup.nightly import NightlyBackup
+from controller.kiosk.changes.inventory import Inventory
+from controller.kiosk.changes.machine import Machine
+from controller.kiosk.changes.watch import InventoryWatch, take
 from controller.kiosk.decide.clock import TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Request
 from controller.kiosk.decide.reconciler import Limits, Reconciler
@@ -24,7 +28,6 @@ from controller.kiosk.jobs.job_runner import JobRunner
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.nightly_backup import NightlyBackup
 from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.bundle_watch import BundleWatch
@@ -48,6 +51,7 @@ STEP_S: Final = 0.25
 LOOK_S: Final = 1.0
 DISK_S: Final = 5.0
 BACKUP_S: Final = 20.0
+INVENTORY_S: Final = 30.0
 END_WORK_S: Final = 30.0
 AFTER_CRASH_S: Final = 5.0
 
@@ -98,6 +102,10 @@ class Service:
             stage.folder, lambda: self.checked.stage.tables.backup, lambda: self.schedule.now.time_zone, log,
             busy=lambda: self.jobs.running is not None,
         )  # fmt: skip
+        self.inventories = InventoryWatch(
+            stage.folder, self.inventory, lambda: self.checked.stage.tables.calibration.worst_grade, log,
+            busy=lambda: self.jobs.running is not None,
+        )  # fmt: skip
         self.alerts = Alerts(
             stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log
         )
@@ -121,6 +129,7 @@ class Service:
         self._thread("disk", self.disk.step, DISK_S)
         self._thread("alerts", self.alerts.step, LOOK_S)
         self._thread("backups", self.backups.step, BACKUP_S)
+        self._thread("inventories", self.inventories.step, INVENTORY_S, first_s=INVENTORY_S)
         for projector in self.devices.projectors:
             self._thread(f"projector {projector.name}", projector.step, LOOK_S)
         for supervisor in self.devices.others:
@@ -182,6 +191,10 @@ class Service:
     def rows(self) -> tuple[DeviceRow, ...]:
         """Every device as the panel shows it."""
         return (*self.devices.rows(), *(() if self.keys is None else (self.keys.row,)))
+
+    def inventory(self, run: str = "") -> Inventory:
+        """What the kiosk consists of now; ``run``: what graded well before. Seconds."""
+        return take(self.stage, self.checked.stage.tables, self.devices.facts(), Machine(), run)
 
     def ask(self, *requests: Request) -> None:
         self.reconciler.ask(*requests)

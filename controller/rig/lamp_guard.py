@@ -18,7 +18,7 @@ from controller.rig.lamp_faults import faulty
 from controller.rig.lamp_ledger import Clock, LampLedger, LampRecord, SystemClock
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
-from hal.interfaces import Projector, WatchedProjector
+from hal.interfaces import AdjustedProjector, Projector, WatchedProjector
 from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
 
 SAVE_HOURS_EVERY_S = 60.0
@@ -100,6 +100,11 @@ class LampGuard:
     def troubles(self) -> list[tuple[str, str]]:
         """As ``hal.interfaces.WatchedProjector``; empty if the driver reports none."""
         return self._projector.troubles() if isinstance(self._projector, WatchedProjector) else []
+
+    def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
+        """As ``hal.interfaces.AdjustedProjector``; empty if the driver reads none."""
+        projector = self._projector
+        return projector.adjustments(deadline=deadline) if isinstance(projector, AdjustedProjector) else {}
 
     def switch_on(self, *, deadline: Deadline) -> None:
         """Strike the lamp if the rules allow; no effect if it is lit.

@@ -98,6 +98,14 @@ class PjLinkProjector:
                 max((lamp.hours for lamp in lamps), default=None),
             )
 
+    def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
+        """As ``hal.interfaces.AdjustedProjector.adjustments``: PJLink has only the input."""
+        with self._turn(deadline) as talk:
+            if talk.power(deadline) is not Power.ON:
+                return {}
+            told = talk.optional("INPT", pjlink.parse_input, deadline)
+            return {} if told is None else {"input": told}
+
     def switch_on(self, *, deadline: Deadline) -> None:
         with self._turn(deadline) as talk:
             power = talk.power(deadline)

@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 from hal.codecs.projectors.power_view import PowerView
 from hal.codecs.projectors.profiles import ProjectorProfile
 from hal.codecs.projectors.serial_protocol import Notice, Reply, parse_hours, parse_power
+from hal.codecs.projectors.serial_table import ADJUSTMENTS
 from hal.deadline import Deadline, turn
 from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
@@ -126,6 +127,16 @@ class SerialProjector:
             hours = self._hours(power, deadline)
             unnamed = power is Power.FAULT and not self._view.trouble
             return ProjectorStatus(power, (UNNAMED_FAULT,) if unnamed else self._view.trouble, hours)
+
+    def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
+        """As ``hal.interfaces.AdjustedProjector.adjustments``: what its profile has queries for."""
+        with self._turn(deadline):
+            asked = [name for name in ADJUSTMENTS if name in self._table.queries]
+            if not asked or self._power(deadline) is not Power.ON:
+                return {}
+            # Models of a family differ in their menus, so that a missing answer is nothing to report.
+            told = {name.replace("_", " "): self._told(name, deadline, str, lit=False) for name in asked}
+            return {name: value for name, value in told.items() if value is not None}
 
     def switch_on(self, *, deadline: Deadline) -> None:
         with self._turn(deadline):

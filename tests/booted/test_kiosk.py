@@ -5,7 +5,9 @@ real; the devices are emulated on pseudo-terminals and TCP.
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,8 @@ from tests.campaigns.power_cuts import cut, kept, lost
 
 PICTURE_S = 60.0
 """From the boot of a bare Debian with the package to a picture."""
+RESTORED_S = 900.0
+"""From a blank Debian with the package to the picture of a backup."""
 OBSTACLE = obstacle()
 pytestmark = [
     pytest.mark.slow, pytest.mark.timeout(1500), pytest.mark.skipif(OBSTACLE is not None, reason=str(OBSTACLE))
@@ -168,3 +172,37 @@ def test_uninstalling_leaves_the_stage_and_nothing_that_starts(playing: Kiosk) -
     running = machine.call("sh", "-c", "cat /proc/[0-9]*/cmdline | tr '\\0' ' '")
     assert "emulate" in running
     assert not re.search("serve|controller.play|Xorg :0", running)
+
+
+def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playing: Kiosk) -> None:
+    machine = playing.machine
+    began_s = time.monotonic()
+    # What stands outside the computer: the devices, and the stick with the backup.
+    machine.call("systemctl", "stop", "bench")
+    machine.call("sh", "-c", f"mkdir /opt/devices && cp -a {STAGE}/bench* /opt/devices && mkfifo /opt/answer")
+    machine.call("/opt/velatura/bin/velatura", "backup", STAGE)
+    machine.call("sh", "-c", f"mv {STAGE}/kiosk/archives/backup-* /opt/velatura-20260504.tar.gz")
+    machine.call("/opt/velatura/bin/velatura", "kiosk", "uninstall", "--purge")
+    assert not machine.at(STAGE).exists()
+    assert machine.called("getent", "passwd", "velatura").returncode != 0
+    command = "/opt/velatura/bin/velatura kiosk restore /opt/velatura-20260504.tar.gz < /opt/answer > /opt/told 2>&1"
+    with ThreadPoolExecutor(1) as pool:
+        restoring = pool.submit(machine.called, "sh", "-c", command)
+        # The pipe has to be open at both ends before the command starts.
+        machine.call("sh", "-c", "sleep infinity > /opt/answer 2> /dev/null < /dev/null & echo $! > /opt/holder")
+        machine.wait_for(lambda: b"Type those of" in machine.read(Path("/opt/told")) or restoring.done())
+        screen = machine.screen()
+        code = playing.read_code()
+        machine.call("sh", "-c", "echo '- - -' > /opt/answer; kill $(cat /opt/holder)")
+        done = restoring.result()
+    told = machine.read(Path("/opt/told")).decode()
+    assert done.returncode == 0, told
+    assert told.count("Type those of") == 1
+    assert screen is not None
+    assert screen.any()
+    assert code == "", "the projectors show numbers, not the way to the panel"
+    machine.call("sh", "-c", f"cp -a /opt/devices/bench* {STAGE}; chown -R velatura:velatura {STAGE}/bench*")
+    machine.call("systemctl", "restart", "bench")
+    machine.wait_for(playing.answers)
+    machine.wait_for(playing.shows)
+    assert time.monotonic() - began_s < RESTORED_S

@@ -1,8 +1,9 @@
-"""``velatura kiosk install`` and ``uninstall``."""
+"""``velatura kiosk install``, ``restore`` and ``uninstall``."""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -30,6 +31,24 @@ def install(
         _say("The kiosk runs, and starts with this computer.")
 
 
+def restore(
+    file: Annotated[Path, typer.Argument(help="A backup: velatura-DATE.tar.gz.", exists=True, dir_okay=False)],
+    dry_run: DryRun = False,
+) -> None:
+    """Make this blank computer the kiosk of a backup (as root): installs it, finds the projectors, and plays.
+
+    All projectors must be switched on. Where serial numbers do not tell which is which, they show numbers, and you are
+    asked.
+    """
+    from controller.kiosk.install import restored
+    from controller.kiosk.install.system import System
+
+    _require_root(dry_run)
+    restored.restore(System(_say, dry=dry_run), file.absolute(), ask=lambda text: str(typer.prompt(text)), say=_say)
+    if not dry_run:
+        _say("The backup is in place. `velatura changes` and `velatura doctor` tell what is different here.")
+
+
 def uninstall(
     dry_run: DryRun = False,
     purge: Annotated[bool, typer.Option("--purge", help="Remove the stage, the settings and the user, too.")] = False,
@@ -51,4 +70,4 @@ def _require_root(dry_run: bool) -> None:
         raise UsageError("needs-root", what="Only root can do this.", remedy="Type it as root, or with sudo.")
 
 
-COMMANDS = (install, uninstall)
+COMMANDS = (install, restore, uninstall)

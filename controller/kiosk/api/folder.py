@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from controller.config import load_stage
-from controller.kiosk.interface import Appearance, Comparison, EventRow, LampDay, Reach, Results, Schedule
+from controller.core.errors import VelaturaError
+from controller.kiosk.changes.machine import Machine
+from controller.kiosk.changes.watch import since_good, take
+from controller.kiosk.interface import Appearance, Changes, Comparison, EventRow, LampDay, Reach, Results, Schedule
 from controller.kiosk.store import archive, runs, settings
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
@@ -44,6 +47,13 @@ class FolderKiosk:
 
     def results(self, run: str) -> Results:
         return runs.results(self.stage, run, worst_grade(check_stage(self.stage)))
+
+    def changes(self) -> Changes:
+        try:
+            tables = load_stage(self.stage).tables
+        except VelaturaError:
+            tables = None
+        return since_good(self.stage, take(self.stage, tables, (), Machine(), ""))
 
     def reach(self, target: Path) -> Reach:
         from controller.kiosk.api.reach import reach

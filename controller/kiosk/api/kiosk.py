@@ -18,11 +18,13 @@ from controller.kiosk.api import aim, finding
 from controller.kiosk.api.control import plain
 from controller.kiosk.api.folder import FolderKiosk, appearances_of
 from controller.kiosk.api.snapshot import Snapshots
+from controller.kiosk.changes.watch import since_good
 from controller.kiosk.decide.changed_hours import effect
 from controller.kiosk.decide.interfaces import IN_TURN, Request
 from controller.kiosk.interface import (
     Aiming,
     Appearance,
+    Changes,
     Comparison,
     EventLevel,
     EventRow,
@@ -319,8 +321,15 @@ class StageKiosk(FolderKiosk):
     def doctor(self) -> Sequence[Finding]:
         return self._examinations.findings()
 
+    def changes(self) -> Changes:
+        service = self._service
+        return super().changes() if service is None else since_good(self.stage, service.inventory())
+
     def test_alerts(self) -> None:
         self.service.alerts.test()
+
+    def test_backup(self) -> None:
+        self.service.backups.now()
 
     def restore(self, backup: Path) -> None:
         with self._idle():

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
-_OUTPUT: Final = re.compile(r"^(\S{1,64}) (connected|disconnected)\b")
+from controller.play.display.edid import serial_names
+
+_OUTPUT: Final = re.compile(r"^(\S{1,64}) (connected|disconnected)(?: primary)?(?: (\d+)x(\d+)\+(\d+)\+(\d+))?\b")
+_EDID: Final = re.compile(r"^\t\t([0-9a-f]{32})$")
 _MODE: Final = re.compile(r"^ {2}(\S+) \(0x[0-9a-f]+\) +([\d.]+)MHz(.*)$")
 _LINE: Final = re.compile(r"^ {8}([hv]): (?:width|height) +(\d+) start +(\d+) end +(\d+) total +(\d+)")
 _FLAGS: Final = re.compile(r"[+-][HV]Sync|Interlace|DoubleScan", re.IGNORECASE)
@@ -40,10 +43,20 @@ class Mode:
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """An output with something plugged into it, and what that can show."""
+    """An output with something plugged into it, and what that can show.
+
+    ``left_top_px``: where it is on the screen, None while it shows nothing; ``edid``: its display's description.
+    """
 
     name: str
     modes: list[Mode]
+    left_top_px: tuple[int, int] | None = None
+    edid: bytes = b""
+
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """Names that tell its display from others."""
+        return serial_names(self.edid)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,24 +76,31 @@ def connected(text: str) -> list[Connected]:
         if found := _OUTPUT.match(line):
             modes = []
             if found[2] == "connected":
-                outputs.append(Connected(found[1], modes))
+                place = None if found[5] is None else (int(found[5]), int(found[6]))
+                outputs.append(Connected(found[1], modes, place))
+            of_connected = found[2] == "connected"
+        elif (found := _EDID.match(line)) and outputs and of_connected:
+            outputs[-1] = replace(outputs[-1], edid=outputs[-1].edid + bytes.fromhex(found[1]))
         elif found := _MODE.match(line):
             flags = tuple(flag.lower() for flag in _FLAGS.findall(found[3]))
             modes.append(Mode(float(found[2]), flags, "+preferred" in found[3], "*current" in found[3]))
         elif (found := _LINE.match(line)) and modes:
             modes[-1].timing += [int(found[n]) for n in range(2, 6)]
-    whole = [Connected(one.name, [mode for mode in one.modes if len(mode.timing) == 8]) for one in outputs]
+    whole = [replace(one, modes=[mode for mode in one.modes if len(mode.timing) == 8]) for one in outputs]
     return [one for one in whole if one.modes]
 
 
-def placed(outputs: Sequence[Connected]) -> list[Placed]:
-    """Side by side, in one mode that all of them have: the one that most of them prefer, then the largest.
+def placed(outputs: Sequence[Connected], size_px: tuple[int, int] | None = None) -> list[Placed]:
+    """Side by side, in one mode that all of them have: of ``size_px`` if there is one, then the one that most of them
+    prefer, then the largest.
 
     Where no mode is common, each has the one that it prefers; the player then says what does not fit together.
     """
     common = set.intersection(*({mode.key for mode in one.modes} for one in outputs)) if outputs else set()
     preferred = [_preferred(one).key for one in outputs]
-    best = max(common, key=lambda key: (preferred.count(key), key[0] * key[1], key[2]), default=None)
+    best = max(
+        common, key=lambda key: (key[:2] == size_px, preferred.count(key), key[0] * key[1], key[2]), default=None
+    )
     found, left_px = [], 0
     for one in outputs:
         mode = next((mode for mode in one.modes if mode.key == best), _preferred(one))

@@ -6,21 +6,21 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 from controller.core.errors import UsageError
 from controller.core.kiosk_places import PLAYER_OPTIONS, RUNTIME, STAGE, STATE, USER
 from controller.kiosk.install import files
-from controller.kiosk.install.outputs import connected, placed, player_outputs, x_configuration
+from controller.kiosk.install.outputs import Connected, Placed, connected, placed, player_outputs, x_configuration
 from controller.kiosk.install.system import System
 from controller.kiosk.panel_address import FIRST_LOGIN
 from controller.play.control.launch import PlayerSettings
 
 PACKAGES: Final = (
     "xserver-xorg-core", "xauth", "x11-xserver-utils", "libgl1-mesa-dri", "libgl1", "libxrandr2", "libxext6",
-    "libusb-1.0-0", "libhidapi-libusb0", "openssl",
+    "libusb-1.0-0", "libhidapi-libusb0", "openssl", "openssh-client",
 )  # fmt: skip
 AMD: Final = "xserver-xorg-video-amdgpu"
 GROUPS: Final = ("dialout", "plugdev", "video", "render")
@@ -155,6 +155,17 @@ def _panel(system: System) -> None:
         system.write(files.CONTROLLER_OPTIONS, files.controller_options(host))
 
 
+def outputs(system: System) -> list[Connected]:
+    """What the kiosk's X server has now."""
+    return connected(system.look("xrandr", "--verbose", more=_X) or "")
+
+
+def write_outputs(system: System, found: Sequence[Placed]) -> None:
+    """The X server's settings for these; it is restarted if they differ."""
+    if system.write(files.X_OUTPUTS, x_configuration(found)):
+        system.run("systemctl", "restart", "velatura-x11")
+
+
 def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None:
     """X settings and the player's outputs, from what is plugged in; only once, because a projector that is off later
     looks like one that is gone.
@@ -164,13 +175,12 @@ def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None
     if system.dry:
         say("Then the X server is asked what is plugged in, and its settings and the player's outputs are written.")
         return
-    found = placed(connected(system.look("xrandr", "--verbose", more=_X) or ""))
+    found = placed(outputs(system))
     if not found:
         say("No projector is plugged in and switched on. Type `velatura kiosk install --outputs` once they are.")
     else:
         say("Projectors: " + ", ".join(f"{one.name} with {one.mode.name}" for one in found) + ".")
-        if system.write(files.X_OUTPUTS, x_configuration(found)):
-            system.run("systemctl", "restart", "velatura-x11")
+        write_outputs(system, found)
     # A stage has outputs of its own, which the service writes there.
     if system.read(STAGE / "stage.toml") is None:
         settings = PlayerSettings(player_outputs(found) or NO_OUTPUTS, None, bundle=STAGE / "bundles" / "current")

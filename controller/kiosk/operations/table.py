@@ -230,8 +230,13 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
               said="The settings are in use."),
     # -- maintenance
     Operation("doctor", "Find problems", OPERATOR, LOOKS, http=("POST", "/doctor"), within="doctor"),
+    Operation("changes", "What changed since the last good day", OPERATOR, LOOKS, offline=True,
+              more="Kernel, drivers, packages, outputs, adapters, projectors, camera, settings, clock, network."),
     Operation("test-alerts", "Send a test alert to everybody that stage.toml names", TECHNICIAN, CHANGES,
               answer=Answer.NOTHING, http=("POST", "/alerts/test"), said="The test alert was taken by every server."),
+    Operation("test-backup", "Make a backup now at every place that stage.toml names, and read it back", TECHNICIAN,
+              CHANGES, answer=Answer.NOTHING, http=("POST", "/backup/test"),
+              said="The backup is at every place, and was read back."),
     Operation("backup", "Make a backup of settings, calibration and appearances", TECHNICIAN, LOOKS, answer=Answer.FILE,
               offline=True, http=("POST", "/backup"), more="It does not contain accounts and keys."),
     Operation("restore", "Replace settings, calibration and appearances with a backup", TECHNICIAN, CHANGES,

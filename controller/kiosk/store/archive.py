@@ -26,6 +26,7 @@ from controller.config.loader import FILE, LARGEST_BYTES
 from controller.core.errors import UsageError, WorkError
 from controller.core.files import require_regular
 from controller.core.storage import sync_folder
+from controller.kiosk.changes.devices import outputs_of_x
 from controller.stage.calibrations import finished_calibrations
 from controller.stage.recording import tapes
 from hal.runtime.caches import kept
@@ -52,7 +53,11 @@ def backup(stage: Path) -> Path:
     runs = finished_calibrations(stage)
     parts += runs[:1]
     path = _new(stage, "backup", "tar.gz")
-    mark = json.dumps({"velatura": 1, "made_unix_s": time.time(), "run": runs[0].name if runs else ""})
+    # On another computer the connectors have other names; the displays have not.
+    displays = {one.name: one.serials for one in outputs_of_x()}
+    mark = json.dumps(
+        {"velatura": 1, "made_unix_s": time.time(), "run": runs[0].name if runs else "", "displays": displays}
+    )
 
     def write(archive: tarfile.TarFile) -> None:
         _add(archive, MARK, mark.encode())
@@ -95,6 +100,23 @@ def check_backup(file: Path) -> None:
                 raise _not_ours()
             load_stage(Path(folder))
     except (tarfile.TarError, OSError, EOFError, ValueError) as error:
+        raise _not_ours() from error
+
+
+def displays_of(file: Path) -> dict[str, tuple[str, ...]]:
+    """The serial numbers of the displays by connector, as they were when the backup was made; {} if it does not tell.
+
+    Raises UsageError("not-a-backup").
+    """
+    try:
+        with tarfile.open(file, "r:gz") as archive:
+            first = archive.next()
+            content = None if first is None or first.name != MARK else archive.extractfile(first)
+            if content is None:
+                raise _not_ours()
+            told = json.loads(content.read(LARGEST_BYTES)).get("displays", {})
+            return {str(name): tuple(str(serial) for serial in serials) for name, serials in told.items()}
+    except (tarfile.TarError, OSError, EOFError, ValueError, AttributeError, TypeError) as error:
         raise _not_ours() from error
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Final, cast
 
 from controller.core.text import printable
+from controller.kiosk.changes.devices import camera_facts, projector_facts
+from controller.kiosk.changes.inventory import Fact
 from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
@@ -73,6 +75,16 @@ class Devices:
             projector_row(supervisor.view, driver) for supervisor, driver in zip(self.projectors, drivers, strict=True)
         ]
         return (*projectors, *(supervisor.row for supervisor in self.others))
+
+    def facts(self) -> tuple[Fact, ...]:
+        """What the devices tell of themselves. Seconds; unknown what is missing, or lent to a job."""
+        found = [fact for one in self.projectors for fact in projector_facts(one.name, one.guard)]
+        mine = self.camera.lent.acquire(blocking=False)
+        try:
+            return (*found, *camera_facts(self.camera.device if mine else None))
+        finally:
+            if mine:
+                self.camera.lent.release()
 
     def missing_for_work(self) -> Decision | None:
         """The missing device that photographs need, or None."""

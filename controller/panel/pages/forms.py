@@ -27,7 +27,7 @@ MOST_FIELDS = 2000
 LEADS_TO: Final = {
     **dict.fromkeys(("recalibrate", "cancel", "start", "stop", "identify", "compute", "compare", "seen"), "/"),
     **dict.fromkeys(("play", "rotate", "remove-appearance"), "/appearances"),
-    **dict.fromkeys(("backup", "restore", "diagnostics", "test-alerts"), "/care"),
+    **dict.fromkeys(("backup", "restore", "diagnostics", "test-alerts", "test-backup"), "/care"),
     "upload-target": "/appearances/new/{target}",
     "set-schedule": "/schedule",
     "test-shots": "/aiming",

@@ -91,6 +91,7 @@ class Pages:
             ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None, "reach": None}),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
             ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
+            ("/changes", Role.OPERATOR, "changes.html", lambda _: {"found": self._panel.kiosk.changes()}),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
             (
                 "/settings",

@@ -13,7 +13,9 @@ from hal.values import Power
 COMMANDS: Final = (
     "power_on", "power_off", "shutter_close", "shutter_open", "lens_shutter_close", "lens_shutter_open",
 )  # fmt: skip
-QUERIES: Final = ("power", "lamp_hours", "shutter", "model", "firmware")
+ADJUSTMENTS: Final = ("input", "keystone", "lamp_mode")
+"""Queries of what people set in its menus."""
+QUERIES: Final = ("power", "lamp_hours", "shutter", "model", "firmware", *ADJUSTMENTS)
 MAY_BE_UNKNOWN: Final = ("power_on", "power_off", "power", "lamp_hours")
 POWERS: Final = tuple(power.value for power in Power)
 READS: Final = {"text": "", "hex-digits": "", "ascii": "hex", "little-endian": "hex", "big-endian": "hex"}

@@ -28,6 +28,7 @@ class EpsonBoard:
         self._quirks = quirks or EpsonQuirks()
         self._lines = Lines(ord("\r"))
         self._owes_prompt = False
+        self._menu = {b"SOURCE": b"30", b"VKEYSTONE": b"128", b"LUMINANCE": b"00"}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers = [self._answer(line, busy) for line in self._lines.whole(data)]
@@ -57,6 +58,11 @@ class EpsonBoard:
         reply = {b"PWR?": b"PWR=" + self._power(), b"SNO?": b"SNO=VE0000001", b"": b""}
         if burning:
             reply[b"LAMP?"] = b"LAMP=%d" % self._lamp.hours
+            reply |= {key + b"?": key + b"=" + value for key, value in self._menu.items()}
+            key, _, value = line.partition(b" ")
+            if key in self._menu and value.isalnum():
+                self._menu[key] = value
+                return b""
         return reply.get(line, b"ERR")
 
     def _switch(self, on: bool) -> bytes | None:

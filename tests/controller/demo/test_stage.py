@@ -74,7 +74,7 @@ def test_it_writes_a_stage_that_reads_and_signs_with_a_private_key(bench: ModelB
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["stage"]
 
 
-def test_the_same_wishes_find_it_again_and_others_are_refused(bench: ModelBench, tmp_path: Path) -> None:
+def test_the_same_options_find_it_again_and_others_are_refused(bench: ModelBench, tmp_path: Path) -> None:
     mesh = tmp_path / "mesh.obj"
     mesh.write_text("v 0 0 0")
     stage = prepared(tmp_path / "out", object_file=mesh)

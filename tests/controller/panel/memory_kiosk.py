@@ -20,6 +20,8 @@ from controller.kiosk.interface import (
     Aiming,
     Appearance,
     BundleIdentity,
+    Change,
+    Changes,
     Comparison,
     DeviceRow,
     EventLevel,
@@ -359,6 +361,17 @@ class MemoryKiosk:
         file = self._folder.parent / "diagnostics.zip"
         file.write_bytes(b"diagnostics")
         return file
+
+    def test_backup(self) -> None:
+        raise UsageError("backup-nowhere", what="stage.toml names no place for backups.", remedy="Add one.")
+
+    def changes(self) -> Changes:
+        change = Change(
+            "kernel", "", "6.1.0-28-amd64", "6.1.0-37-amd64",
+            "The kernel was 6.1.0-28-amd64, and is now 6.1.0-37-amd64.",
+            "If the picture is worse than before, install the version of before.", BORN,
+        )  # fmt: skip
+        return Changes(BORN, "20260101-100000-calibrate", (change,), ("The camera",))
 
     def settings(self) -> str:
         return self._toml

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from controller.config.upkeep import BackupTable
-from controller.core.errors import UsageError, VelaturaError
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.kiosk.backup.nightly import AGAIN_S, NightlyBackup, places
+from controller.kiosk.backup.places import copied
 from controller.kiosk.store import archive
-from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.store.nightly_backup import AGAIN_S, NightlyBackup, copied
+from controller.kiosk.store.event_log import Decision, EventLog
 from tests.controller.kiosk.vase import TEXT, vase
 
 NIGHT_S = datetime(2026, 5, 4, 4, 31, tzinfo=UTC).timestamp()
@@ -78,6 +79,54 @@ def test_a_missing_disk_is_a_failure_that_stays_in_sight_until_somebody_has_seen
     assert nights.at(120) == [], "not all the time"
     assert nights.at(60 + AGAIN_S) == ["velatura-20260504.tar.gz"]
     nights.log.close()
+
+
+class Elsewhere:
+    """A place that works, or does not."""
+
+    name = "ssh"
+
+    def __init__(self) -> None:
+        self.stored: list[str] = []
+        self.works = False
+
+    def store(self, source: Path, day: str, keep: int) -> Decision:
+        if not self.works:
+            raise WorkError("backup-unreachable", what="The server is off.", remedy="Switch it on.")
+        self.stored.append(day)
+        return Decision("backup-made", "It was sent.")
+
+
+def test_a_place_that_fails_holds_up_no_other_and_is_tried_again(tmp_path: Path) -> None:
+    nights, elsewhere = Nights(tmp_path), Elsewhere()
+    nights.to.mkdir()
+    nights.backup = NightlyBackup(
+        nights.stage, lambda: nights.table, lambda: "UTC", nights.log, busy=lambda: False, wall=lambda: nights.now_s,
+        places=lambda stage, table: (elsewhere, *places(stage, table)),
+    )  # fmt: skip
+    assert nights.at(0) == ["velatura-20260504.tar.gz"]
+    nights.at(AGAIN_S + 1)
+    assert nights.codes == ["backup-failed", "backup-same-disk"], "one message, however often it is tried"
+    elsewhere.works = True
+    nights.at(2 * AGAIN_S + 2)
+    nights.at(3 * AGAIN_S)
+    assert elsewhere.stored == ["20260504"]
+    nights.at(DAY_S)
+    assert elsewhere.stored == ["20260504", "20260505"]
+    with pytest.raises(UsageError, match="names no place"):
+        NightlyBackup(tmp_path, BackupTable, lambda: "UTC", nights.log, busy=lambda: False).now()
+    nights.log.close()
+
+
+def test_stage_toml_names_the_places(tmp_path: Path) -> None:
+    key = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIExample"
+    table = BackupTable(
+        folder="there", usb="STICK", ssh="ssh://me@nas.local:2222/backups", ssh_key_file="keys/b", ssh_host_key=key
+    )
+    assert [place.name for place in places(tmp_path, table)] == ["folder", "usb", "ssh"]
+    for wrong in ("nas.local:/backups", "ssh://nas.local/backups", 'ssh://me@nas/"', "ssh://me@-oProxyCommand/"):
+        with pytest.raises(ValueError, match="ssh"):
+            BackupTable(ssh=wrong)
 
 
 @pytest.mark.parametrize("how", ["cut", "a flipped bit", "no settings"])

@@ -1,0 +1,136 @@
+"""Facts about the devices of a running kiosk, the X server's outputs, the newest photograph, and the settings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from PIL import Image, UnidentifiedImageError
+
+from controller.config.models import StageTables
+from controller.core.errors import VelaturaError
+from controller.core.text import printable
+from controller.kiosk.changes.inventory import Fact
+from controller.kiosk.install.outputs import Connected, connected
+from hal.deadline import Deadline, in_seconds
+from hal.errors import DeviceError
+from hal.interfaces import Device, WatchedCamera
+from hal.values import DeviceIdentity
+
+ASK_S: Final = 6.0
+_EXIF, _LENS, _FOCAL_MM = 0x8769, 0xA434, 0x920A
+_PICTURES: Final = (".jpg", ".jpeg", ".dng", ".cr2", ".nef", ".arw", ".tif", ".tiff")
+_ADJUSTED: Final = ("input", "keystone", "lamp mode")
+
+
+class Asked(Protocol):
+    """An opened projector, as far as it is asked here."""
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity: ...
+    def adjustments(self, *, deadline: Deadline) -> dict[str, str]: ...
+
+
+def projector_facts(name: str, projector: Asked | None) -> Iterator[Fact]:
+    """Of one projector; all unknown while it is not open, or does not answer."""
+    known = _asked(None if projector is None else projector.identity)
+    model = None if known is None else _joined(known.maker, known.model, known.serial)
+    yield Fact("projector", name, model)
+    yield Fact("projector firmware", name, None if known is None else printable(known.firmware))
+    told = _asked(None if projector is None else projector.adjustments) or {}
+    for kind in _ADJUSTED:
+        yield Fact(kind, name, printable(told[kind]) if kind in told else None)
+
+
+def camera_facts(camera: Device | None) -> Iterator[Fact]:
+    """Body, firmware, and what it complains about; all unknown while it is not open, or does not answer."""
+    known = _asked(None if camera is None else camera.identity)
+    yield Fact("camera body", "", None if known is None else _joined(known.maker, known.model, known.serial))
+    yield Fact("camera firmware", "", None if known is None else printable(known.firmware))
+    if isinstance(camera, WatchedCamera):
+        status = _asked(camera.status)
+        said = None if status is None else ", ".join(sorted(status.warnings)) or "none"
+        yield Fact("camera settings", "warnings", said)
+
+
+def lens_facts(stage: Path) -> Iterator[Fact]:
+    """What the newest photograph tells of the lens; unknown where none does."""
+    for run in sorted((stage / "runs").glob("*"), reverse=True):
+        for picture in sorted((run / "captures").rglob("*"), reverse=True):
+            if picture.suffix.lower() not in _PICTURES:
+                continue
+            tags = _exif(picture)
+            if tags.get(_LENS) or tags.get(_FOCAL_MM):
+                yield Fact("lens", "", printable(str(tags.get(_LENS) or "unnamed")).strip("\0 "))
+                yield Fact("lens", "focal length", f"{float(tags.get(_FOCAL_MM) or 0):g} mm")
+                return
+            # All of one run come from the same camera.
+            break
+
+
+def _exif(picture: Path) -> dict[int, Any]:
+    try:
+        with warnings.catch_warnings(), Image.open(picture) as opened:
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            return dict(opened.getexif().get_ifd(_EXIF))
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return {}
+
+
+def shown_facts(outputs: Sequence[Connected]) -> Iterator[Fact]:
+    """Mode and place of each output that the X server shows now."""
+    shown = [(one.left_top_px, one) for one in outputs if one.left_top_px is not None]
+    for _, one in shown:
+        for mode in one.modes:
+            if mode.current:
+                width_px, height_px, rate_hz = mode.key
+                yield Fact("mode", one.name, f"{width_px}x{height_px} at {rate_hz:.1f} Hz")
+    for place, ((left, top), one) in enumerate(sorted(shown, key=lambda item: item[0]), 1):
+        yield Fact("output order", one.name, f"number {place} from the left, at {left} {top}")
+
+
+def outputs_of_x() -> list[Connected]:
+    """The X server's outputs as `xrandr` tells them; none without an X server."""
+    # A library would end this process with the X server.
+    try:
+        done = subprocess.run(["xrandr", "--verbose"], capture_output=True, text=True, errors="replace", timeout=20)  # noqa: PLW1510, S607
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return connected(done.stdout) if done.returncode == 0 else []
+
+
+def settings_facts(tables: StageTables) -> Iterator[Fact]:
+    """Every value of stage.toml by its key. Passwords and keys are told apart, and not kept."""
+    for key, value in _flat("", tables.model_dump(mode="json")):
+        secret = any(word in key.rpartition(".")[2] for word in ("password", "webhook", "user"))
+        text = json.dumps(value)
+        yield Fact("settings", key, f"secret {hashlib.sha256(text.encode()).hexdigest()[:8]}" if secret else text)
+
+
+def _flat(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for name, one in value.items():
+            yield from _flat(f"{key}.{name}" if key else str(name), one)
+    elif isinstance(value, list) and value and all(isinstance(one, Mapping) for one in value):
+        for number, one in enumerate(value):
+            yield from _flat(f"{key} {one.get('name', number + 1)}", one)
+    else:
+        yield key, value
+
+
+def _asked(question: Callable[..., Any] | None) -> Any:
+    """The device's answer; None without one."""
+    if question is None:
+        return None
+    try:
+        return question(deadline=in_seconds(ASK_S))
+    except (DeviceError, VelaturaError):
+        return None
+
+
+def _joined(*words: str) -> str:
+    return printable(" ".join(word for word in words if word))
