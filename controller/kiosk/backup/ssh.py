@@ -28,8 +28,8 @@ _CAUSES: Final = (
      "If it has a new key, write that as ssh_host_key under [backup]. Otherwise somebody may be in between."),
     (re.compile(r"permission denied \(|too many authentication|bad permissions|invalid format", re.IGNORECASE),
      "backup-login-refused", "refuses the log-in",
-     "Check the user in ssh, and that the server knows the public key of ssh_key_file; only the user velatura may read "
-     "that file."),
+     "Check the user in ssh, and that the server knows the public key of ssh_key_file. Other users "
+     "must not be able to read that file."),
     (re.compile(r"connection (refused|timed out|closed|reset)|could not resolve|no route|unreachable|lost connection"
                 r"|broken pipe|not responding|timed out", re.IGNORECASE),
      "backup-unreachable", "can't be reached, or the connection was lost",
