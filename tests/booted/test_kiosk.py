@@ -181,7 +181,7 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
     machine.call("systemctl", "stop", "bench")
     machine.call("sh", "-c", f"mkdir /opt/devices && cp -a {STAGE}/bench* /opt/devices && mkfifo /opt/answer")
     machine.call("/opt/velatura/bin/velatura", "backup", STAGE)
-    machine.call("sh", "-c", f"mv {STAGE}/kiosk/archives/backup-* /opt/velatura-20260504.tar.gz")
+    machine.call("sh", "-c", f"mv $(ls -t {STAGE}/kiosk/archives/backup-* | head -n 1) /opt/velatura-20260504.tar.gz")
     machine.call("/opt/velatura/bin/velatura", "kiosk", "uninstall", "--purge")
     assert not machine.at(STAGE).exists()
     assert machine.called("getent", "passwd", "velatura").returncode != 0

@@ -6,10 +6,12 @@ import enum
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
-from controller.kiosk.store.event_log import Decision
 from hal.values import Power
+
+if TYPE_CHECKING:  # the log needs SQLite, and `velatura --help` gets here
+    from controller.kiosk.store.event_log import Decision
 
 DISK_FULL: Final = "disk-full"
 """The code of the one problem that several devices may have because nothing can be written."""

@@ -47,7 +47,7 @@ def restore(
 ) -> None:
     """Install the kiosk, find the projectors, and play what the backup has. It can be repeated until it is done.
 
-    Raises UsageError("kiosk-has-stage", "not-a-backup"), WorkError("outputs-not-told"), and as ``steps.install``.
+    Raises UsageError("kiosk-has-stage", "not-a-backup"), WorkError("outputs-not-named"), and as ``steps.install``.
     """
     if system.read(STAGE / FILE) is not None:
         raise UsageError("kiosk-has-stage", what="This kiosk has a stage already.",
@@ -146,7 +146,7 @@ def _asked(
                 pairs = zip(left, words, strict=True)
                 return {one.output: numbers[word] for one, word in pairs if word != "-"}
             say(f"That is not {len(left)} different ones of {', '.join(numbers)}.")
-    raise WorkError("outputs-not-told", what="Which projector is at which output stays unknown.",
+    raise WorkError("outputs-not-named", what="Which projector is at which output stays unknown.",
                     remedy="Type the same command again.")  # fmt: skip
 
 

@@ -136,8 +136,8 @@ def test_a_target_is_uploaded_looked_at_and_computed(fresh: Served, browser: Bro
         expect(page.get_by_text("45 % of the object can look like the picture.")).to_be_visible()
         expect(page.get_by_text("30 % needs more light than the projectors have")).to_be_visible()
         for alt in ("What the object will look like, calculated", "Map of what can't be reached"):
-            expect(page.get_by_alt_text(alt)).to_have_js_property("complete", True)
-            assert page.get_by_alt_text(alt).evaluate("picture => picture.naturalWidth") > 0
+            # a picture that was put into the page a moment ago says that it is complete before it is fetched
+            expect(page.get_by_alt_text(alt)).not_to_have_js_property("naturalWidth", 0)
         assert not violations(page)
         picture(page, "feasibility")
         page.get_by_label("Name").fill("bronze")
