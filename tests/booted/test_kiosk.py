@@ -179,7 +179,9 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
     began_s = time.monotonic()
     # What stands outside the computer: the devices, and the stick with the backup.
     machine.call("systemctl", "stop", "bench")
-    machine.call("sh", "-c", f"mkdir /opt/devices && cp -a {STAGE}/bench* /opt/devices && mkfifo /opt/answer")
+    machine.call(
+        "sh", "-c", f"mkdir /opt/devices && cp -a {STAGE}/bench* /opt/devices && mkfifo /opt/answer && touch /opt/told"
+    )
     machine.call("/opt/velatura/bin/velatura", "backup", STAGE)
     machine.call("sh", "-c", f"mv $(ls -t {STAGE}/kiosk/archives/backup-* | head -n 1) /opt/velatura-20260504.tar.gz")
     machine.call("/opt/velatura/bin/velatura", "kiosk", "uninstall", "--purge")
@@ -190,10 +192,12 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
         restoring = pool.submit(machine.called, "sh", "-c", command)
         # The pipe has to be open at both ends before the command starts.
         machine.call("sh", "-c", "sleep infinity > /opt/answer 2> /dev/null < /dev/null & echo $! > /opt/holder")
-        machine.wait_for(lambda: b"Type those of" in machine.read(Path("/opt/told")) or restoring.done())
-        screen = machine.screen()
-        code = playing.read_code()
-        machine.call("sh", "-c", "echo '- - -' > /opt/answer; kill $(cat /opt/holder)")
+        try:
+            machine.wait_for(lambda: b"Type those of" in machine.read(Path("/opt/told")) or restoring.done())
+            screen = machine.screen()
+            code = playing.read_code()
+        finally:  # or the command waits for an answer, and the test for the command
+            machine.call("sh", "-c", "echo '- - -' > /opt/answer; kill $(cat /opt/holder)")
         done = restoring.result()
     told = machine.read(Path("/opt/told")).decode()
     assert done.returncode == 0, told
