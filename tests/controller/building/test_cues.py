@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
 from zoneinfo import ZoneInfo
@@ -30,13 +29,6 @@ LIST = """time,verb,values
 +1:30,play,"{""name"": ""warm wood"", ""fade_s"": 4}"
 2026-12-24 19:00:05,brightness,40
 """
-
-
-@pytest.fixture
-def kiosk(tmp_path: Path) -> Iterator[MemoryKiosk]:
-    made = MemoryKiosk(tmp_path / "pictures")
-    yield made
-    made.close()
 
 
 @pytest.fixture

@@ -32,13 +32,6 @@ liblo = pytest.mark.skipif(
 
 
 @pytest.fixture
-def kiosk(tmp_path: Path) -> Iterator[MemoryKiosk]:
-    made = MemoryKiosk(tmp_path / "pictures")
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def port() -> Iterator[int]:
     with kept_port() as number:
         yield number

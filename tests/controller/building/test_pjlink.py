@@ -29,13 +29,6 @@ from tests.waiting import wait_for
 PASSWORD = "JBMIAProjectorLink"
 
 
-@pytest.fixture
-def kiosk(tmp_path: Path) -> Iterator[MemoryKiosk]:
-    made = MemoryKiosk(tmp_path / "pictures")
-    yield made
-    made.close()
-
-
 @contextlib.contextmanager
 def stage(kiosk: MemoryKiosk, folder: Path, password: str = "", more: str = "") -> Iterator[int]:
     """The port of the served stage."""

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sacn import DataPacket, sACNsender
@@ -26,13 +25,6 @@ from tests.waiting import wait_for
 NAMES = ("marble", "warm wood")
 OPEN = KioskState(1, "hall", "playing", "", 0.0, playing="marble")
 CID = tuple(range(16))
-
-
-@pytest.fixture
-def kiosk(tmp_path: Path) -> Iterator[MemoryKiosk]:
-    made = MemoryKiosk(tmp_path / "pictures")
-    yield made
-    made.close()
 
 
 @contextlib.contextmanager

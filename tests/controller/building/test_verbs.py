@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,13 +11,6 @@ from controller.building.verbs import Rate, Verbs
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.roles import Role
 from tests.controller.panel.memory_kiosk import MemoryKiosk
-
-
-@pytest.fixture
-def kiosk(tmp_path: Path) -> Iterator[MemoryKiosk]:
-    made = MemoryKiosk(tmp_path / "pictures")
-    yield made
-    made.close()
 
 
 def code_of(verbs: Verbs, verb: str, sent: object = "", source: str = "") -> str:
