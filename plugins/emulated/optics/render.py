@@ -1,8 +1,4 @@
-"""From projector frames to linear light in the camera: a look-up per cast sample, no rays.
-
-Each projector pixel is a square with a fill factor, blurred by a Gaussian that is narrow in focus and wider away from
-the focal surface. Both separate into x and y, so a pixel's light at a point is a product of two differences of erf.
-"""
+"""From projector frames to linear light in the camera: sums over cast samples, no rays."""
 
 from __future__ import annotations
 
@@ -13,23 +9,18 @@ from collections.abc import Iterator, Sequence
 from typing import Final, Protocol, TypeAlias
 
 import cv2
-import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erf
 
 from hal.runtime.jit import compiled
 from plugins.emulated.optics.flaws import veiled
-from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX, Samples
+from plugins.emulated.optics.footprints import KEPT_BYTES, Footprints, Lit
+from plugins.emulated.optics.rays import Samples
 from plugins.emulated.optics.truth import BenchTruth, LightTruth, ProjectorTruth
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
 
-SUBPIXELS: Final = 128
-REACH_SIGMAS: Final = 3.2
-LARGEST_RADIUS: Final = 13
-MARGIN_PX: Final = LARGEST_RADIUS + int(BEYOND_PX) + 1
 LAYERS_KEPT: Final = 3
 
 
@@ -56,40 +47,26 @@ def emitted(light: LightTruth, frame: ByteImage) -> FloatImage:
     return veiled(channels(light, frame) @ np.asarray(light.mixing, dtype=np.float32).T, light.glare)
 
 
-def sent_by_panels(
-    projector: ProjectorTruth, frame: ByteImage, at_px: FloatImage
-) -> Iterator[tuple[FloatImage, FloatImage]]:
-    """What is sent out, in parts that lie alike: each with where it lies at points whose pixels are ``at_px``."""
-    light, panels = projector.light, projector.panels
-    if panels.aligned:
-        yield emitted(light, frame), at_px
+def sent_by_panels(projector: ProjectorTruth, frame: ByteImage) -> Iterator[FloatImage]:
+    """Linear light (rows, columns, 3) that is sent out, in parts that lie alike: one for each of ``panel_places``."""
+    light = projector.light
+    if projector.panels.aligned:
+        yield emitted(light, frame)
         return
     each, mixing = channels(light, frame), np.asarray(light.mixing, dtype=np.float32)
-    centre = np.asarray(projector.lens.centre_px)
     for c in range(3):
-        at = (at_px - np.asarray(panels.shift_px[c]) - centre) / (1.0 + panels.magnified[c]) + centre
-        yield veiled(each[..., c : c + 1] * mixing[:, c], light.glare), at.astype(np.float32)
+        yield veiled(each[..., c : c + 1] * mixing[:, c], light.glare)
 
 
-@functools.lru_cache(maxsize=4)
-def pixel_profiles(fill_factor: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-    """Cross-sections of a blurred pixel: weights (256, SUBPIXELS, 2 * LARGEST_RADIUS + 1), and radius (256,).
-
-    The first index is the blur in SIGMA_STEP_PX, the second the position between two half pixels. The weights of
-    an evenly lit image sum to 1 on average over positions; between narrow pixels the gap shows.
-    """
-    side = np.sqrt(fill_factor)
-    sigma = np.maximum(np.arange(256), 1) * SIGMA_STEP_PX
-    offset = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
-    far = np.arange(-2 * LARGEST_RADIUS, 2 * LARGEST_RADIUS + 1)
-    distance = offset[None, :, None] - far[None, None, :]
-    scale = np.sqrt(2.0) * sigma[:, None, None]
-    whole = (erf((distance + 0.5 * side) / scale) - erf((distance - 0.5 * side) / scale)) / (2.0 * side)
-    radius = np.minimum(np.ceil(REACH_SIGMAS * sigma + 0.5 * side - 0.5), LARGEST_RADIUS).astype(np.int32)
-    near = np.where(np.abs(far) <= radius[:, None, None], whole, 0.0)
-    # What the cut takes from the tails goes back to the rest, so that an even image is not darker where blurred.
-    near *= (whole.sum(axis=2) / np.maximum(near.sum(axis=2), 1e-30))[..., None]
-    return np.ascontiguousarray(near[..., LARGEST_RADIUS:-LARGEST_RADIUS], dtype=np.float32), radius
+def panel_places(projector: ProjectorTruth, at_px: FloatImage) -> list[FloatImage]:
+    """Where each part of ``sent_by_panels`` lies at points whose projector pixels are ``at_px`` (N, 2)."""
+    panels, centre = projector.panels, np.asarray(projector.lens.centre_px)
+    if panels.aligned:
+        return [at_px]
+    return [
+        ((at_px - np.asarray(shift) - centre) / (1.0 + magnified) + centre).astype(np.float32)
+        for shift, magnified in zip(panels.shift_px, panels.magnified, strict=True)
+    ]
 
 
 class Returning(Protocol):
@@ -106,7 +83,7 @@ class Renderer:
         self._truth = truth
         self._transfer = transfer
         self._samples = samples
-        self._profiles = [pixel_profiles(p.light.fill_factor) for p in truth.projectors]
+        self._footprints: list[list[Footprints] | None] = [None] * len(truth.projectors)
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
         self._vignette = _vignette(truth)
         self._albedo = _pixel_sums(samples.albedo, samples.starts)
@@ -150,22 +127,30 @@ class Renderer:
         if digest in kept:
             kept.move_to_end(digest)
             return kept[digest]
-        samples, (profiles, radii) = self._samples, self._profiles[index]
-        gloss = samples.gloss[index]
-        albedo = samples.albedo + gloss[:, None] if gloss.size else samples.albedo
-        layer: FloatImage | None = None
-        for sent, at_px in sent_by_panels(self._truth.projectors[index], frame, samples.at_px[index]):
-            padded = cv2.copyMakeBorder(sent, *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0)
-            part = _lit_pixels(
-                np.ascontiguousarray(padded), at_px, samples.gain[index], samples.blur[index],
-                albedo, samples.starts, profiles, radii,
-            )  # fmt: skip
-            layer = part if layer is None else layer + part
-        assert layer is not None
+        sent = sent_by_panels(self._truth.projectors[index], frame)
+        parts = [lit.light(one) for lit, one in zip(self._footprints_of(index), sent, strict=True)]
+        layer = functools.reduce(np.add, parts)
         kept[digest] = layer
         if len(kept) > LAYERS_KEPT:
             kept.popitem(last=False)
         return layer
+
+    def _footprints_of(self, index: int) -> list[Footprints]:
+        """Of each part of ``sent_by_panels``; made when the projector shows its first frame."""
+        made = self._footprints[index]
+        if made is None:
+            samples, projector, gloss = self._samples, self._truth.projectors[index], self._samples.gloss[index]
+            albedo = samples.albedo + gloss[:, None] if gloss.size else samples.albedo
+            places = panel_places(projector, samples.at_px[index])
+            made = self._footprints[index] = [
+                Footprints.of(
+                    Lit(samples.starts, at_px, samples.gain[index], samples.blur[index], albedo),
+                    projector.light.fill_factor,
+                    most_bytes=KEPT_BYTES // len(places),
+                )
+                for at_px in places
+            ]
+        return made
 
     def _through_lens(self, total: FloatImage) -> FloatImage:
         width, height = self._truth.camera.lens.size_px
@@ -189,45 +174,6 @@ def _vignette(truth: BenchTruth) -> FloatImage:
     square = (x[None, :] ** 2 * width**2 + y[:, None] ** 2 * height**2) / (width**2 + height**2)
     loss = truth.camera.vignetting
     return (1.0 - loss * square * (1.6 - 0.6 * square)).astype(np.float32)
-
-
-@compiled(parallel=True, fastmath=True)
-def _lit_pixels(
-    frame: FloatImage,
-    at_px: FloatImage,
-    gain: FloatImage,
-    blur: npt.NDArray[np.uint8],
-    albedo: FloatImage,
-    starts: npt.NDArray[np.int32],
-    profiles: FloatImage,
-    radii: npt.NDArray[np.int32],
-) -> FloatImage:
-    """Light (P, 3) of each camera pixel: the sum over its samples of albedo x gain x the blurred frame."""
-    pixels = len(starts) - 1
-    out = np.zeros((pixels, 3), dtype=np.float32)
-    for pixel in numba.prange(pixels):
-        for n in range(starts[pixel], starts[pixel + 1]):
-            if gain[n] <= 0.0:
-                continue
-            column, row = int(np.floor(at_px[n, 0] + 0.5)), int(np.floor(at_px[n, 1] + 0.5))
-            across = profiles[blur[n], min(int((at_px[n, 0] - column + 0.5) * SUBPIXELS), SUBPIXELS - 1)]
-            down = profiles[blur[n], min(int((at_px[n, 1] - row + 0.5) * SUBPIXELS), SUBPIXELS - 1)]
-            radius = radii[blur[n]]
-            red = green = blue = np.float32(0.0)
-            for j in range(-radius, radius + 1):
-                r = g = b = np.float32(0.0)
-                for i in range(-radius, radius + 1):
-                    weight = across[LARGEST_RADIUS + i]
-                    r += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 0]
-                    g += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 1]
-                    b += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 2]
-                red += down[LARGEST_RADIUS + j] * r
-                green += down[LARGEST_RADIUS + j] * g
-                blue += down[LARGEST_RADIUS + j] * b
-            out[pixel, 0] += gain[n] * albedo[n, 0] * red
-            out[pixel, 1] += gain[n] * albedo[n, 1] * green
-            out[pixel, 2] += gain[n] * albedo[n, 2] * blue
-    return out
 
 
 @compiled()

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from plugins.emulated.optics.footprints import LARGEST_RADIUS, pixel_profiles
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import SIGMA_STEP_PX, Samples, cast, project, samples_of
-from plugins.emulated.optics.render import LARGEST_RADIUS, Renderer, emitted, pixel_profiles, response
+from plugins.emulated.optics.render import Renderer, emitted, response
 from plugins.emulated.optics.truth import BenchTruth, Pose
 
 

@@ -1,0 +1,236 @@
+"""Which panel pixels light a camera pixel, and how much of each of them it sees.
+
+Each projector pixel is a square with a fill factor, blurred by a Gaussian that is narrow in focus and wider away from
+the focal surface. Both separate into x and y, so a pixel's light at a point is a product of two differences of erf.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Final, Self
+
+import cv2
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy.special import erf
+
+from hal.runtime.jit import compiled
+from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX
+
+Floats = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int32]
+
+SUBPIXELS: Final = 128
+REACH_SIGMAS: Final = 3.2
+LARGEST_RADIUS: Final = 13
+MARGIN_PX: Final = LARGEST_RADIUS + int(BEYOND_PX) + 1
+KEPT_BYTES: Final = 256 << 20
+"""A projector's summed weights may take so much memory. Pixels beyond it are summed again for each frame."""
+
+
+@functools.lru_cache(maxsize=4)
+def pixel_profiles(fill_factor: float) -> tuple[Floats, Integers]:
+    """Cross-sections of a blurred pixel: weights (256, SUBPIXELS, 2 * LARGEST_RADIUS + 1), and radius (256,).
+
+    The first index is the blur in SIGMA_STEP_PX, the second the position between two half pixels. The weights of
+    an evenly lit image sum to 1 on average over positions; between narrow pixels the gap shows.
+    """
+    side = np.sqrt(fill_factor)
+    sigma = np.maximum(np.arange(256), 1) * SIGMA_STEP_PX
+    offset = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+    far = np.arange(-2 * LARGEST_RADIUS, 2 * LARGEST_RADIUS + 1)
+    distance = offset[None, :, None] - far[None, None, :]
+    scale = np.sqrt(2.0) * sigma[:, None, None]
+    whole = (erf((distance + 0.5 * side) / scale) - erf((distance - 0.5 * side) / scale)) / (2.0 * side)
+    radius = np.minimum(np.ceil(REACH_SIGMAS * sigma + 0.5 * side - 0.5), LARGEST_RADIUS).astype(np.int32)
+    near = np.where(np.abs(far) <= radius[:, None, None], whole, 0.0)
+    # What the cut takes from the tails goes back to the rest, so that an even image is not darker where blurred.
+    near *= (whole.sum(axis=2) / np.maximum(near.sum(axis=2), 1e-30))[..., None]
+    return np.ascontiguousarray(near[..., LARGEST_RADIUS:-LARGEST_RADIUS], dtype=np.float32), radius
+
+
+@dataclass(frozen=True, slots=True)
+class Lit:
+    """What a projector lights: for N samples in P camera pixels, in camera pixel order.
+
+    ``starts`` (P + 1,) int32: a camera pixel's first sample; ``at_px`` (N, 2) float32: x, y in projector pixels;
+    ``gain`` (N,) float32: light for each linear light 1; ``blur`` (N,) uint8: in SIGMA_STEP_PX;
+    ``albedo`` (N, 3) float32: what the camera sees of that light
+    """
+
+    starts: Integers
+    at_px: Floats
+    gain: Floats
+    blur: npt.NDArray[np.uint8]
+    albedo: Floats
+
+    def from_pixel(self, first: int) -> Self:
+        """A copy of what the camera pixels from ``first`` on see."""
+        n = self.starts[first]
+        return type(self)(
+            self.starts[first:] - n, self.at_px[n:].copy(), self.gain[n:].copy(), self.blur[n:].copy(),
+            self.albedo[n:].copy(),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Footprints:
+    """What a projector lights, with its weights summed over the samples of each camera pixel, as far as memory allows.
+
+    A camera pixel's weights are those of a rectangle of panel pixels for each colour, which lie one behind the other
+    in ``weights``. Summing them costs as much as a frame; showing a frame through them costs a tenth of it.
+
+    ``boxes`` (K, 4) int32: first row, first column, rows, columns; ``offsets`` (K + 1,) int64: into ``weights``;
+    ``weights`` float32: (rows, columns, 3) of each of the first K camera pixels; ``rest``: the others' samples
+    """
+
+    boxes: Integers
+    offsets: npt.NDArray[np.int64]
+    weights: Floats
+    rest: Lit
+    fill_factor: float
+
+    @classmethod
+    def of(cls, lit: Lit, fill_factor: float, *, most_bytes: int = KEPT_BYTES) -> Self:
+        """Sum the weights of as many camera pixels as ``most_bytes`` have room for."""
+        profiles, radii = pixel_profiles(fill_factor)
+        boxes = _boxes(lit.starts, lit.at_px, lit.gain, lit.blur, radii)
+        ends = np.cumsum(boxes[:, 2].astype(np.int64) * boxes[:, 3] * 3)
+        kept = int(np.searchsorted(4 * ends, most_bytes, side="right"))
+        offsets = np.concatenate([[0], ends[:kept]]).astype(np.int64)
+        weights = np.zeros(int(offsets[-1]), dtype=np.float32)
+        _sum_weights(
+            lit.starts, lit.at_px, lit.gain, lit.blur, lit.albedo, profiles, radii, boxes[:kept], offsets, weights
+        )
+        return cls(boxes[:kept], offsets, weights, lit.from_pixel(kept), fill_factor)
+
+    def light(self, sent: Floats) -> Floats:
+        """Light (P, 3) of each camera pixel for what the panel's pixels (rows, columns, 3) send out."""
+        framed = cv2.copyMakeBorder(sent, *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0)
+        frame = np.ascontiguousarray(framed, dtype=np.float32)
+        kept, rest = len(self.boxes), self.rest
+        out = np.empty((kept + len(rest.starts) - 1, 3), dtype=np.float32)
+        _through_weights(frame, self.boxes, self.offsets, self.weights, out[:kept])
+        _through_samples(
+            frame, rest.starts, rest.at_px, rest.gain, rest.blur, rest.albedo, *pixel_profiles(self.fill_factor),
+            out[kept:],
+        )  # fmt: skip
+        return out
+
+
+@compiled()
+def _place(at_px: float) -> tuple[int, int]:
+    """The pixel at a coordinate, and which of its SUBPIXELS."""
+    pixel = int(np.floor(at_px + 0.5))
+    return pixel, min(int((at_px - pixel + 0.5) * SUBPIXELS), SUBPIXELS - 1)
+
+
+@compiled(parallel=True)
+def _boxes(starts: Integers, at_px: Floats, gain: Floats, blur: npt.NDArray[np.uint8], radii: Integers) -> Integers:
+    """For each camera pixel first row, first column, rows and columns (P, 4) of the panel pixels that light it."""
+    boxes = np.zeros((len(starts) - 1, 4), dtype=np.int32)
+    for pixel in numba.prange(len(boxes)):
+        top = left = 1 << 30
+        bottom = right = -(1 << 30)
+        for n in range(starts[pixel], starts[pixel + 1]):
+            if gain[n] > 0.0:
+                radius = radii[blur[n]]
+                column, row = _place(at_px[n, 0])[0], _place(at_px[n, 1])[0]
+                top, bottom = min(top, row - radius), max(bottom, row + radius + 1)
+                left, right = min(left, column - radius), max(right, column + radius + 1)
+        if bottom > top:
+            boxes[pixel, 0], boxes[pixel, 1] = top, left
+            boxes[pixel, 2], boxes[pixel, 3] = bottom - top, right - left
+    return boxes
+
+
+@compiled(parallel=True, fastmath=True)
+def _sum_weights(
+    starts: Integers,
+    at_px: Floats,
+    gain: Floats,
+    blur: npt.NDArray[np.uint8],
+    albedo: Floats,
+    profiles: Floats,
+    radii: Integers,
+    boxes: Integers,
+    offsets: npt.NDArray[np.int64],
+    weights: Floats,
+) -> None:
+    """Fill ``weights`` (see ``Footprints``) of the camera pixels in ``boxes``."""
+    for pixel in numba.prange(len(boxes)):
+        for n in range(starts[pixel], starts[pixel + 1]):
+            if gain[n] <= 0.0:
+                continue
+            column, x = _place(at_px[n, 0])
+            row, y = _place(at_px[n, 1])
+            across, down, radius = profiles[blur[n], x], profiles[blur[n], y], radii[blur[n]]
+            red, green, blue = gain[n] * albedo[n, 0], gain[n] * albedo[n, 1], gain[n] * albedo[n, 2]
+            for j in range(-radius, radius + 1):
+                line = (row + j - boxes[pixel, 0]) * boxes[pixel, 3] + column - radius - boxes[pixel, 1]
+                at = offsets[pixel] + 3 * line
+                for i in range(-radius, radius + 1):
+                    weight = down[LARGEST_RADIUS + j] * across[LARGEST_RADIUS + i]
+                    weights[at] += red * weight
+                    weights[at + 1] += green * weight
+                    weights[at + 2] += blue * weight
+                    at += 3
+
+
+@compiled(parallel=True, fastmath=True)
+def _through_weights(
+    frame: Floats, boxes: Integers, offsets: npt.NDArray[np.int64], weights: Floats, out: Floats
+) -> None:
+    """Light (K, 3) of the camera pixels in ``boxes`` for a frame with MARGIN_PX of black around it."""
+    for pixel in numba.prange(len(boxes)):
+        red = green = blue = np.float32(0.0)
+        at = offsets[pixel]
+        for j in range(boxes[pixel, 2]):
+            row = boxes[pixel, 0] + j + MARGIN_PX
+            for i in range(boxes[pixel, 3]):
+                column = boxes[pixel, 1] + i + MARGIN_PX
+                red += weights[at] * frame[row, column, 0]
+                green += weights[at + 1] * frame[row, column, 1]
+                blue += weights[at + 2] * frame[row, column, 2]
+                at += 3
+        out[pixel, 0], out[pixel, 1], out[pixel, 2] = red, green, blue
+
+
+@compiled(parallel=True, fastmath=True)
+def _through_samples(
+    frame: Floats,
+    starts: Integers,
+    at_px: Floats,
+    gain: Floats,
+    blur: npt.NDArray[np.uint8],
+    albedo: Floats,
+    profiles: Floats,
+    radii: Integers,
+    out: Floats,
+) -> None:
+    """Light (P, 3) of each camera pixel: the sum over its samples of albedo x gain x the blurred frame."""
+    for pixel in numba.prange(len(starts) - 1):
+        total_red = total_green = total_blue = np.float32(0.0)
+        for n in range(starts[pixel], starts[pixel + 1]):
+            if gain[n] <= 0.0:
+                continue
+            column, x = _place(at_px[n, 0])
+            row, y = _place(at_px[n, 1])
+            across, down, radius = profiles[blur[n], x], profiles[blur[n], y], radii[blur[n]]
+            red = green = blue = np.float32(0.0)
+            for j in range(-radius, radius + 1):
+                r = g = b = np.float32(0.0)
+                for i in range(-radius, radius + 1):
+                    weight = across[LARGEST_RADIUS + i]
+                    r += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 0]
+                    g += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 1]
+                    b += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 2]
+                red += down[LARGEST_RADIUS + j] * r
+                green += down[LARGEST_RADIUS + j] * g
+                blue += down[LARGEST_RADIUS + j] * b
+            total_red += gain[n] * albedo[n, 0] * red
+            total_green += gain[n] * albedo[n, 1] * green
+            total_blue += gain[n] * albedo[n, 2] * blue
+        out[pixel, 0], out[pixel, 1], out[pixel, 2] = total_red, total_green, total_blue
