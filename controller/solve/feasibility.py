@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from controller.core.errors import UsageError, WorkError
 from controller.solve.bounded.solver import check_target
 from controller.solve.drive_levels import DriveLevels
 from controller.transport import LightTransport
+
+FORGIVEN_DRIVE: Final = 2e-3
+"""So much drive beyond black and white still counts as in reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +38,7 @@ def feasibility(
     target: FloatImage,
     black: FloatImage,
     *,
-    margin: float = 2e-3,
+    margin: float = FORGIVEN_DRIVE,
     drive: DriveLevels | None = None,
 ) -> Feasibility:
     """Compare ``target`` (rows, columns, 3), linear radiance, with the light that the projectors can make.

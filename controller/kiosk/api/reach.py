@@ -31,8 +31,6 @@ FIGURES: Final = "reach.json"
 FILES: Final = {"target": "target.jpg", "result": "result.jpg", "map": "map.png"}
 LONGEST_PX: Final = 960
 """The longer side of the pictures, which are for a screen."""
-MARGIN: Final = 2e-3
-"""As ``solve.feasibility``: so much drive beyond black and white is forgiven."""
 BRIGHT, DARK, COLOURFUL, UNLIT = (240, 179, 90), (90, 140, 255), (216, 96, 190), (58, 60, 66)
 """Colours of the map, as in the page's legend: too bright, too dark, too saturated, and not lit or not asked for."""
 _one_at_a_time = threading.Lock()
@@ -109,7 +107,9 @@ def _wanted(calibrated: Calibrated, target: Path) -> Target:
 
 def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
     """Masks (rows, columns) that exclude each other, by the shares of ``Reach``; ``asked``: lit, and in the picture."""
-    bright, dark = (part.max(axis=2) > MARGIN for part in (possible.too_bright, possible.too_dark))
+    from controller.solve.feasibility import FORGIVEN_DRIVE
+
+    bright, dark = (part.max(axis=2) > FORGIVEN_DRIVE for part in (possible.too_bright, possible.too_dark))
     out = asked & ~possible.reachable
     return {
         "share": asked & possible.reachable,

@@ -211,6 +211,19 @@ def show(
 
 
 @compiled()
+def _half_window(sigma: np.float32) -> np.float32:
+    """How far a Gaussian of this standard deviation counts."""
+    return min(max(_REACH * sigma, np.float32(0.5)), _RADIUS)
+
+
+@compiled()
+def _height(shape: FloatImage, u: int, v: int) -> np.float32:
+    """A Gaussian's height at a column and row; ``shape`` as for ``_shares_in``."""
+    dx, dy, r = (u - shape[0]) / shape[2], (v - shape[1]) / shape[3], shape[4]
+    return np.float32(np.exp(np.float32(-0.5) * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r)))
+
+
+@compiled()
 def _shares_in(
     shape: FloatImage, left: int, top: int, block: int, present: ByteImage, found: FloatImage, lit: FloatImage
 ) -> None:
@@ -218,16 +231,13 @@ def _shares_in(
 
     ``shape``: middle x, y, standard deviations x, y, correlation
     """
-    x, y, sx, sy, r = shape[0], shape[1], shape[2], shape[3], shape[4]
-    reach_x = min(max(_REACH * sx, np.float32(0.5)), _RADIUS)
-    reach_y = min(max(_REACH * sy, np.float32(0.5)), _RADIUS)
+    x, y, reach_x, reach_y = shape[0], shape[1], _half_window(shape[2]), _half_window(shape[3])
     found[:], lit[:] = 0, 0
     first_row = max(top * block, int(np.ceil(y - reach_y)), 0)
     first_column = max(left * block, int(np.ceil(x - reach_x)), 0)
     for v in range(first_row, min((top + SIDE) * block, int(np.floor(y + reach_y)) + 1, present.shape[0])):
         for u in range(first_column, min((left + SIDE) * block, int(np.floor(x + reach_x)) + 1, present.shape[1])):
-            dx, dy = (u - x) / sx, (v - y) / sy
-            share = np.exp(np.float32(-0.5) * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r))
+            share = _height(shape, u, v)
             k = (v // block - top) * SIDE + u // block - left
             found[k] += share
             lit[k] += share * present[v, u]
@@ -236,14 +246,11 @@ def _shares_in(
 @compiled()
 def _brightest(shape: FloatImage, present: ByteImage) -> tuple[int, int]:
     """The (row, column) with base light at which a Gaussian is highest; (-1, -1) if it reaches none."""
-    x, y, sx, sy, r = shape[0], shape[1], shape[2], shape[3], shape[4]
-    reach_x = min(max(_REACH * sx, np.float32(0.5)), _RADIUS)
-    reach_y = min(max(_REACH * sy, np.float32(0.5)), _RADIUS)
+    x, y, reach_x, reach_y = shape[0], shape[1], _half_window(shape[2]), _half_window(shape[3])
     row, column, most = -1, -1, np.float32(0)
     for v in range(max(int(np.ceil(y - reach_y)), 0), min(int(np.floor(y + reach_y)) + 1, present.shape[0])):
         for u in range(max(int(np.ceil(x - reach_x)), 0), min(int(np.floor(x + reach_x)) + 1, present.shape[1])):
-            dx, dy = (u - x) / sx, (v - y) / sy
-            share = np.exp(np.float32(-0.5) * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r)) * present[v, u]
+            share = _height(shape, u, v) * present[v, u]
             if share > most:
                 row, column, most = v, u, share
     return row, column

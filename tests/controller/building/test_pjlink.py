@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import socket
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from aiopjlink import PJLink, PJLinkERR3, PJLinkPassword
+from aiopjlink import PJLinkERR3, PJLinkPassword
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pypjlink import MUTE_AUDIO, MUTE_VIDEO
@@ -22,6 +21,7 @@ from controller.building.protocol import read
 from controller.building.server import serving
 from controller.kiosk.interface import KioskState
 from hal.codecs.projectors.pjlink import second_level_digest
+from tests.aiopjlink_client import talk
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.ports import kept_port
 from tests.waiting import wait_for
@@ -44,19 +44,6 @@ def stage(kiosk: MemoryKiosk, folder: Path, password: str = "", more: str = "") 
 def listens(port: int) -> bool:
     with socket.socket() as trial:
         return trial.connect_ex(("127.0.0.1", port)) == 0
-
-
-def talk(port: int, work: Callable[[Any], Awaitable[Any]], password: str | None = None) -> Any:
-    async def session() -> Any:
-        link = PJLink(address="127.0.0.1", port=port, password=password, timeout=20)
-        try:
-            async with link:
-                return await work(link)
-        finally:
-            if link._writer is not None:
-                link._writer.close()
-
-    return asyncio.run(session())
 
 
 def test_aiopjlink_drives_the_stage(kiosk: MemoryKiosk, tmp_path: Path) -> None:
@@ -89,7 +76,7 @@ def test_aiopjlink_drives_the_stage(kiosk: MemoryKiosk, tmp_path: Path) -> None:
             await link.freeze.set(True)
 
     with stage(kiosk, tmp_path) as port:
-        talk(port, drive)
+        talk(f"127.0.0.1:{port}", drive)
     assert kiosk.recorded[0] == ("done-by", "PJLink (127.0.0.1): Show this appearance now (warm wood).")
 
 
@@ -116,8 +103,8 @@ def test_pypjlink2_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp_path
 def test_a_wrong_password_is_refused_and_changes_nothing(kiosk: MemoryKiosk, tmp_path: Path) -> None:
     with stage(kiosk, tmp_path, PASSWORD) as port:
         with pytest.raises(PJLinkPassword):
-            talk(port, lambda link: link.power.turn_off(), "wrong")
-        talk(port, lambda link: link.power.get(), PASSWORD)
+            talk(f"127.0.0.1:{port}", lambda link: link.power.turn_off(), "wrong")
+        talk(f"127.0.0.1:{port}", lambda link: link.power.get(), PASSWORD)
     assert kiosk.snapshot().state == "playing"
 
 
@@ -145,7 +132,7 @@ def test_a_viewer_may_only_ask(kiosk: MemoryKiosk, tmp_path: Path) -> None:
         assert (await link.power.get()).name == "ON"
 
     with stage(kiosk, tmp_path, more='role = "viewer"\n') as port:
-        talk(port, drive)
+        talk(f"127.0.0.1:{port}", drive)
 
 
 @settings(max_examples=300, deadline=None)

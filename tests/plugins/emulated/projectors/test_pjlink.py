@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
-from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
 from aiopjlink import Lamp as PjLamp
-from aiopjlink import PJLink, PJLinkERR3, PJLinkPassword
+from aiopjlink import PJLinkERR3, PJLinkPassword
 
 from hal.errors import DeviceError
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
-
-
-def talk(emulator: EmulatedPjLinkProjector, work: Callable[[Any], Awaitable[Any]], password: str | None = None) -> Any:
-    """Run ``work`` with a connected aiopjlink client."""
-    host, port = emulator.address.split(":")
-
-    async def session() -> Any:
-        link = PJLink(address=host, port=int(port), password=password, timeout=20)
-        try:
-            async with link:
-                return await work(link)
-        finally:
-            # The client leaves its connection open when the password is wrong.
-            if link._writer is not None:
-                link._writer.close()
-                await link._writer.wait_closed()
-
-    return asyncio.run(session())
+from tests.aiopjlink_client import talk
 
 
 def test_an_independent_client_switches_it_on_and_off() -> None:
@@ -48,7 +29,7 @@ def test_an_independent_client_switches_it_on_and_off() -> None:
         return seen
 
     with EmulatedPjLinkProjector(lamp) as emulator:
-        assert talk(emulator, cycle) == ["OFF", "ON", "COOLING"]
+        assert talk(emulator.address, cycle) == ["OFF", "ON", "COOLING"]
     assert lamp.strikes == 1
 
 
@@ -72,7 +53,7 @@ def test_an_independent_client_reads_everything_it_knows() -> None:
         )
 
     with EmulatedPjLinkProjector(lamp, name="left") as emulator:
-        muted, lamps, source, sources, maker, name, serial, errors = talk(emulator, read, None)
+        muted, lamps, source, sources, maker, name, serial, errors = talk(emulator.address, read, None)
     assert muted == (True, False)
     assert lamps == [(321, PjLamp.State.ON)]
     assert (source[0].name, source[1]) == ("DIGITAL", "2")
@@ -87,11 +68,11 @@ def test_an_independent_client_passes_the_password_and_fails_without() -> None:
         return str((await link.power.get()).name)
 
     with EmulatedPjLinkProjector(EmulatedLamp(LampTiming(0.0, 0.0)), password="JBMIAProjectorLink") as emulator:
-        assert talk(emulator, power, "JBMIAProjectorLink") == "OFF"
+        assert talk(emulator.address, power, "JBMIAProjectorLink") == "OFF"
         with pytest.raises(PJLinkPassword):
-            talk(emulator, power, "wrong")
+            talk(emulator.address, power, "wrong")
         with pytest.raises(PJLinkPassword):
-            talk(emulator, power, None)
+            talk(emulator.address, power, None)
 
 
 def test_a_port_in_use_is_named() -> None:
