@@ -4,6 +4,7 @@
 # make docs   this documentation as a website in build/docs; fails on a broken link
 # make blender   Blender, for targets that it renders
 # make campaign NAME=camera_faults COUNT=10000   a test of hours that has a short version in `make test` (tests/campaigns/)
+# make deb DEBIAN=bookworm   the Debian package of a kiosk in build/; trixie too, with DEBIAN_ROOT=the root folder of a Debian 13
 # All do their own set-up.
 
 SIZE ?= small
@@ -15,6 +16,8 @@ ROOM ?=
 OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))$(if $(ROOM),-$(ROOM))
 SEED ?= 1
 OBJECT ?=
+DEBIAN ?= bookworm
+DEBIAN_ROOT ?=
 NAME ?=
 COUNT ?=
 CORES := $(shell nproc 2>/dev/null || echo 2)
@@ -26,7 +29,7 @@ FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture 
 	tests/plugins/ptp tests/test_architecture.py
 DOCS_PYTHON ?= .venv/bin/python
 
-.PHONY: demo docs blender test test-setup fast check lint style types contracts website bench campaign lock clean
+.PHONY: deb demo docs blender test test-setup fast check lint style types contracts website bench campaign lock clean
 
 demo:
 	@.ci/setup demo
@@ -83,6 +86,10 @@ campaign:
 	@.ci/setup test
 	@.ci/system-packages
 	.venv/bin/python -m tests.campaigns.$(NAME) $(COUNT)
+
+deb:
+	@.ci/setup demo
+	@.venv/bin/python .ci/debian_package.py $(DEBIAN) --out build $(if $(DEBIAN_ROOT),--debian $(call quoted,$(DEBIAN_ROOT)))
 
 lock:
 	.ci/lock

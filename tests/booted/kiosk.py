@@ -19,8 +19,9 @@ import numpy as np
 
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.kiosk.install.steps import PYTHON
 from tests.booted.machine import STAGE, Machine
-from tests.booted.trees import ROOT, SUITES, tree
+from tests.booted.trees import ROOT, built_package, tree
 from tests.controller.play.wire import noise
 from tests.end_to_end.kernel_copy import kernels_of_the_tables
 
@@ -88,10 +89,13 @@ class Kiosk:
 
 
 @contextmanager
-def installed(suite: str, wheel: Path, folder: Path) -> Iterator[Kiosk]:
+def installed(suite: str, folder: Path) -> Iterator[Kiosk]:
     """A kiosk without a stage, right after its installation on a bare Debian."""
-    with Machine(tree(suite), wheel, folder) as machine:
+    debian = tree(suite)
+    package = built_package(suite, folder / "package", version="1")
+    with Machine(debian, folder) as machine:
         machine.switch_on()
+        machine.install(package)
         dry = machine.call("/opt/velatura/bin/velatura", "kiosk", "install", "--dry-run")
         assert not machine.at(STAGE).exists()
         told = machine.call("/opt/velatura/bin/velatura", "kiosk", "install")
@@ -101,25 +105,12 @@ def installed(suite: str, wheel: Path, folder: Path) -> Iterator[Kiosk]:
 
 def _compile_kernels(machine: Machine, suite: str) -> None:
     """What `python -m hal.runtime.kernels compile` does in minutes: the set-up's machine code fits the same Python."""
-    if SUITES[suite] == f"{sys.version_info.major}.{sys.version_info.minor}":
+    if PYTHON[suite] == f"{sys.version_info.major}.{sys.version_info.minor}":
         kernels = STAGE.parent / ".cache" / "velatura" / "kernels"
         machine.at(kernels).mkdir(parents=True)
         kernels_of_the_tables(machine.at(kernels), shutil.copy)
         machine.call("chown", "--recursive", "velatura:velatura", STAGE.parent / ".cache")
         machine.call("chmod", "--recursive", "u+rwX,go=", STAGE.parent / ".cache")
-
-
-def built_wheel(folder: Path) -> Path:
-    """Velatura as it is released, built from a copy."""
-    source, out = folder / "source", folder / "wheel"
-    for name in ("controller", "hal", "plugins", "firmware_configs"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*build, "--wheel-dir", out, source], check=True)
-    (found,) = out.glob("*.whl")
-    return found
 
 
 def prepared_stage(folder: Path) -> Path:

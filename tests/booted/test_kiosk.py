@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.booted.kiosk import SERVICES, Kiosk, built_wheel, installed, prepared_stage
+from controller.kiosk.install.steps import DEBIAN
+from tests.booted.kiosk import SERVICES, Kiosk, installed, prepared_stage
 from tests.booted.machine import ADDRESS, STAGE
-from tests.booted.trees import SUITES, obstacle
+from tests.booted.trees import built_package, obstacle
 from tests.campaigns.power_cuts import cut, kept, lost
 
 PICTURE_S = 60.0
@@ -30,19 +31,14 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return built_wheel(tmp_path_factory.mktemp("build"))
-
-
-@pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return prepared_stage(tmp_path_factory.mktemp("demo"))
 
 
-@pytest.fixture(scope="module", params=SUITES)
-def bare(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kiosk]:
+@pytest.fixture(scope="module", params=DEBIAN)
+def bare(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kiosk]:
     """Installed, without a stage; the projectors show the way to the panel."""
-    with installed(request.param, wheel, tmp_path_factory.mktemp(request.param)) as kiosk:
+    with installed(request.param, tmp_path_factory.mktemp(request.param)) as kiosk:
         assert kiosk.machine.wait_for(lambda: kiosk.read_code() != "") < PICTURE_S
         yield kiosk
 
@@ -145,6 +141,22 @@ def test_after_a_power_cut_the_picture_is_back_by_itself_and_nothing_is_lost(pla
     playing.machine.wait_for(lambda: playing.state == "playing")
     assert lost(playing, before) == []
     assert {playing.machine.restarts(name) for name in SERVICES} == {0}
+
+
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kiosk, tmp_path: Path) -> None:
+    machine = playing.machine
+    version = ("dpkg-query", "--show", "--showformat=${Version}", "velatura")
+    (first,) = machine.at(Path("/opt")).glob("velatura_1-*.deb")
+    second = built_package("bookworm", tmp_path, version="2")
+    before = kept(playing)
+    for package, wanted in ((second, "2-1~deb12"), (first, "1-1~deb12")):
+        machine.install(package)
+        assert machine.call(*version) == wanted
+        machine.wait_for(playing.shows)
+        machine.wait_for(lambda: playing.state == "playing")
+        assert lost(playing, before) == []
+        assert {machine.restarts(name) for name in SERVICES[1:]} == {0}
 
 
 @pytest.mark.parametrize("bare", ["bookworm"], indirect=True)

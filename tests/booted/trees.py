@@ -1,6 +1,7 @@
-"""Debian as it is after its installation, with what Velatura needs of others: made once, kept in Velatura's cache.
+"""Debian as it is after its installation, with the Debian packages that Velatura needs: made once, kept in its cache.
 
-``python -m tests.booted.trees`` makes what is missing (`make test-setup`), where a Debian can be booted.
+``python -m tests.booted.trees`` (`make test-setup`) makes what is missing, and loads what Velatura's package is made
+of, where a Debian can be booted.
 """
 
 from __future__ import annotations
@@ -14,23 +15,16 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from packaging.requirements import Requirement
-
-from controller.kiosk.install.steps import PACKAGES
+from controller.kiosk.install.steps import DEBIAN, PACKAGES
 from hal.runtime.caches import cache_folder
 
 ROOT: Final = Path(__file__).parents[2]
-LOCK: Final = ROOT / "requirements-demo.lock"
-SUITES: Final = {"bookworm": "3.11", "trixie": "3.13"}
-"""With the version of their Python."""
 BOOTED: Final = (
-    "systemd", "systemd-sysv", "dbus", "udev", "kmod", "iproute2", "python3", "python3-venv",
+    "systemd", "systemd-sysv", "dbus", "udev", "kmod", "iproute2", "python3",
     "xserver-xorg-video-dummy",
 )  # fmt: skip
 """What a Debian on a computer has without us, and outputs without graphics hardware."""
 _LEFT_OUT: Final = ("/usr/share/doc/*", "/usr/share/man/*", "/usr/share/locale/*")
-_GLIBC: Final = (17, 24, 27, 28, 31, 34)
-"""Of the wheels that either Debian runs (manylinux_2_N)."""
 
 
 def obstacle() -> str | None:
@@ -53,7 +47,7 @@ def obstacle() -> str | None:
 
 def tree(suite: str) -> Path:
     """The folder of this Debian, made if it is not there. Raises CalledProcessError."""
-    digest = hashlib.sha256(repr((BOOTED, PACKAGES, _LEFT_OUT)).encode() + LOCK.read_bytes())
+    digest = hashlib.sha256(repr((BOOTED, PACKAGES, _LEFT_OUT)).encode())
     folder = cache_folder() / "tests" / f"{suite}-{digest.hexdigest()[:12]}"
     if not folder.exists():
         part = folder.with_name(f".{folder.name}.part")
@@ -61,7 +55,6 @@ def tree(suite: str) -> Path:
             shutil.rmtree(cut_off)
         part.mkdir(parents=True)
         _bootstrap(suite, part)
-        _environment(suite, part)
         for old in folder.parent.glob(f"{suite}-*"):
             shutil.rmtree(old)
         part.rename(folder)
@@ -77,49 +70,19 @@ def _bootstrap(suite: str, folder: Path) -> None:
     )
 
 
-def _environment(suite: str, folder: Path) -> None:
-    """/opt/velatura with the pinned packages, without Velatura itself. Their wheels are loaded with this Python's pip,
-    which has the network's certificates.
-    """
-    wheels = folder / "wheels"
-    wheels.mkdir()
-    wanted = wheels / "lock"
-    wanted.write_text(_lock_for(SUITES[suite]))
-    platforms = [f"--platform=manylinux_2_{number}_x86_64" for number in _GLIBC]
-    subprocess.run(
-        [
-            sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--require-hashes",
-            "--only-binary=:all:", "--implementation=cp", f"--python-version={SUITES[suite]}",
-            *platforms, "--platform=manylinux2014_x86_64", "--platform=manylinux1_x86_64",
-            f"--requirement={wanted}", f"--dest={wheels}",
-        ],
-        check=True,
-    )  # fmt: skip
-    pip = "/opt/velatura/bin/pip install --quiet --disable-pip-version-check --no-index --find-links /wheels"
-    script = f"python3 -m venv /opt/velatura && {pip} --require-hashes -r /wheels/lock"
-    inside = ["chroot", str(folder), "env", "-i", "PATH=/usr/bin:/bin", "sh", "-c", script]
-    subprocess.run(inside, check=True)
-    shutil.rmtree(wheels)
+def built_package(suite: str, out: Path, *, version: str) -> Path:
+    """Velatura's Debian package, as it is released but not compressed. Raises CalledProcessError."""
+    return Path(_package_script(suite, "--out", str(out), "--version", version, "--fast").strip())
 
 
-def _lock_for(version: str) -> str:
-    """The lock's lines for another Python: pip asks the markers about the Python that it runs on."""
-    environment = {"python_version": version, "python_full_version": f"{version}.0"}
-    lines = []
-    for line in LOCK.read_text().replace("\\\n", " ").splitlines():
-        what, *hashes = line.split("--hash=")
-        if what.strip() and not what.lstrip().startswith("#"):
-            requirement = Requirement(what)
-            if requirement.marker is None or requirement.marker.evaluate(environment):
-                lines.append(
-                    " ".join([f"{requirement.name}{requirement.specifier}", *(f"--hash={one}" for one in hashes)])
-                )
-    return "\n".join(lines) + "\n"
+def _package_script(suite: str, *words: str) -> str:
+    building = [sys.executable, str(ROOT / ".ci" / "debian_package.py"), suite, "--debian", str(tree(suite)), *words]
+    return subprocess.run(building, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 if __name__ == "__main__":
     if (why := obstacle()) is None:
-        for name in SUITES:
-            tree(name)
+        for name in DEBIAN:
+            _package_script(name)
     else:
         print(f"The tests that boot a Debian are skipped: {why}.")

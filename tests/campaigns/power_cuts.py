@@ -17,9 +17,9 @@ import time
 from pathlib import Path
 from typing import Final
 
-from tests.booted.kiosk import Kiosk, built_wheel, installed, prepared_stage
+from controller.kiosk.install.steps import DEBIAN
+from tests.booted.kiosk import Kiosk, installed, prepared_stage
 from tests.booted.machine import STAGE
-from tests.booted.trees import SUITES
 
 LATEST_S: Final = 20.0
 KEPT: Final = ("stage.toml", "keys/stage.key")
@@ -57,9 +57,9 @@ def main(cuts: int, seed: int, suite: str) -> int:
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        wheel, stage = built_wheel(folder), prepared_stage(folder)
+        stage = prepared_stage(folder)
         (folder / "machine").mkdir()
-        with installed(suite, wheel, folder / "machine") as kiosk:
+        with installed(suite, folder / "machine") as kiosk:
             kiosk.put_stage(stage)
             before, took_s = kept(kiosk), list[float]()
             for number in range(cuts):
@@ -76,6 +76,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cuts", type=int, nargs="?", default=100)
     parser.add_argument("seed", type=int, nargs="?", default=1)
-    parser.add_argument("suite", choices=SUITES, nargs="?", default="bookworm")
+    parser.add_argument("suite", choices=DEBIAN, nargs="?", default="bookworm")
     options = parser.parse_args()
     sys.exit(main(options.cuts, options.seed, options.suite))

@@ -20,13 +20,17 @@ def install(
     outputs: Annotated[
         bool, typer.Option("--outputs", help="Look again which projectors are plugged in; all must be switched on.")
     ] = False,
+    restart: Annotated[
+        bool,
+        typer.Option("--restart", help="Start controller and player again, for a new version. Lamps stay lit."),
+    ] = False,
 ) -> None:
     """Set up user, services, X server and panel on Debian 12 or 13, and start the kiosk (as root)."""
     from controller.kiosk.install import steps
     from controller.kiosk.install.system import System
 
     _require_root(dry_run)
-    steps.install(System(_say, dry=dry_run), outputs_again=outputs, say=_say)
+    steps.install(System(_say, dry=dry_run), outputs_again=outputs, restart=restart, say=_say)
     if not dry_run:
         _say("The kiosk runs, and starts with this computer.")
 

@@ -53,7 +53,7 @@ def restore(
         raise UsageError("kiosk-has-stage", what="This kiosk has a stage already.",
                          remedy=f"Replace it: runuser -u {USER} -- velatura restore {STAGE} FILE")  # fmt: skip
     archive.check_backup(file)
-    steps.install(system, outputs_again=True, say=say, prefix=prefix)
+    steps.install(system, outputs_again=True, restart=False, say=say, prefix=prefix)
     if system.dry:
         say("Then the projectors are found by their serial numbers, or asked for, and the backup is put in place.")
         return

@@ -26,7 +26,9 @@ AMD: Final = "xserver-xorg-video-amdgpu"
 GROUPS: Final = ("dialout", "plugdev", "video", "render")
 SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
 TARGET: Final = "velatura.target"
-DEBIAN: Final = ("12", "13")
+DEBIAN: Final = {"bookworm": "12", "trixie": "13"}
+PYTHON: Final = {"bookworm": "3.11", "trixie": "3.13"}
+"""Of each Debian."""
 NO_OUTPUTS: Final = [("projector", 1024, 768)]
 """For the player, while nothing is plugged in."""
 READY_S: Final = 60.0
@@ -34,10 +36,15 @@ _X: Final = {"DISPLAY": ":0", "XAUTHORITY": "/run/velatura-x11/cookie"}
 
 
 def install(
-    system: System, *, outputs_again: bool, say: Callable[[str], None], prefix: Path = Path(sys.prefix)
+    system: System,
+    *,
+    outputs_again: bool,
+    restart: bool,
+    say: Callable[[str], None],
+    prefix: Path = Path(sys.prefix),
 ) -> None:
     """Make this computer a kiosk, and start it. ``outputs_again``: look which projectors are plugged in, also where
-    that was done before.
+    that was done before. ``restart``: the program is another version; controller and player start again.
 
     Raises UsageError("kiosk-system-unknown", "kiosk-has-desktop" or "kiosk-place-hidden"), and
     WorkError("kiosk-step-failed").
@@ -57,7 +64,7 @@ def install(
     system.run("systemctl", "enable", "--quiet", TARGET)
     system.run("systemctl", "start", "velatura-x11")
     _outputs(system, again=outputs_again, say=say)
-    if any(changed):
+    if restart or any(changed):
         system.run("systemctl", "restart", *SERVICES[1:])
     system.run("systemctl", "start", TARGET)
     if not system.dry:
@@ -87,7 +94,7 @@ def check(system: System, prefix: Path) -> None:
     here = dict(
         re.findall(r'^(ID|VERSION_ID)="?([^"\n]*)"?$', system.read(Path("/etc/os-release")) or "", re.MULTILINE)
     )
-    if here.get("ID") != "debian" or here.get("VERSION_ID") not in DEBIAN:
+    if here.get("ID") != "debian" or here.get("VERSION_ID") not in DEBIAN.values():
         raise UsageError(
             "kiosk-system-unknown",
             what=f"This is {here.get('ID', 'an unknown system')} {here.get('VERSION_ID', '')}, not Debian 12 or 13.",

@@ -84,11 +84,17 @@ def test_the_extra_named_brings_the_module(module: str) -> None:
     assert (f"velatura[{extra}]" if extra else "pip install velatura") in error.remedy
 
 
-def test_the_demos_environment_has_what_the_readme_names() -> None:
-    lock = set(re.findall(r"^([\w.-]+)==", (ROOT / "requirements-demo.lock").read_text(), re.MULTILINE))
-    extras = PROJECT["optional-dependencies"]
-    for extra in ("controller", "panel", "bench"):
-        assert distributions(extras[extra]) <= lock
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [
+        ("demo", ("controller", "panel", "bench")),
+        ("kiosk", ("controller", "panel", "bench", "building", "gphoto2", "mains")),
+    ],
+)
+def test_an_environment_has_what_its_commands_use(name: str, wanted: Sequence[str]) -> None:
+    lock = set(re.findall(r"^([\w.-]+)==", (ROOT / f"requirements-{name}.lock").read_text(), re.MULTILINE))
+    for extra in wanted:
+        assert distributions(PROJECT["optional-dependencies"][extra]) <= lock
     assert distributions(PROJECT["dependencies"]) <= lock
 
 

@@ -50,9 +50,11 @@ FRESH = {"xrandr": LEFT, "hostname": "vase\n", "systemctl": ""}
 THERE = {**FRESH, "dpkg-query": INSTALLED, "getent": "velatura", "id": " ".join(("velatura", *steps.GROUPS))}
 
 
-def installed(root: Path, answers: Mapping[str, str], *, again: bool = False, dry: bool = False) -> Recorded:
+def installed(
+    root: Path, answers: Mapping[str, str], *, again: bool = False, restart: bool = False, dry: bool = False
+) -> Recorded:
     system = Recorded(root, answers, dry=dry)
-    steps.install(system, outputs_again=again, say=system.told.append, prefix=PREFIX)
+    steps.install(system, outputs_again=again, restart=restart, say=system.told.append, prefix=PREFIX)
     return system
 
 
@@ -75,6 +77,12 @@ def test_once_more_it_changes_nothing(debian: Path) -> None:
     again = installed(debian, THERE)
     assert {path: path.read_bytes() for path in debian.rglob("*") if path.is_file()} == before
     assert [line for line in again.ran if not line.startswith(("systemctl enable", "systemctl start", "ln "))] == []
+
+
+def test_another_version_starts_controller_and_player_again_and_not_the_x_server(debian: Path) -> None:
+    installed(debian, FRESH)
+    ran = installed(debian, THERE, restart=True).ran
+    assert [line for line in ran if "restart" in line] == ["systemctl restart velatura-player velatura-controller"]
 
 
 def test_a_dry_run_writes_nothing_and_tells_all_of_it(debian: Path) -> None:
@@ -127,7 +135,7 @@ def test_a_computer_on_which_it_would_not_work_is_refused(
     (debian / "etc/os-release").write_text(release)
     system = Recorded(debian, {**FRESH, "systemctl": active})
     with pytest.raises(VelaturaError) as caught:
-        steps.install(system, outputs_again=False, say=system.told.append, prefix=prefix)
+        steps.install(system, outputs_again=False, restart=False, say=system.told.append, prefix=prefix)
     assert isinstance(caught.value, UsageError)
     assert (caught.value.code, system.ran) == (code, [])
 
