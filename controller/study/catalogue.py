@@ -44,6 +44,12 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
 _ALL: Final = (
     Scene("painted", "a painted vase and bust, three projectors"),
     Scene("curved", "a pale curved shell, three projectors", curved_object),
+    Scene(
+        "grazing",
+        "a pale curved shell, two projectors at grazing angles to its right half, then one from the right",
+        curved_object,
+        {"projectors": ("far-left", "left", "right")},
+    ),
     Scene("curved-six", "a pale curved shell, six projectors", curved_object, {"projectors": 6}),
     Scene(
         "planned", "the shell, three projectors where they were planned", planned_object, {"stands": "../stands.toml"}
