@@ -33,7 +33,7 @@ PAPER: Final = {1: 0.051, 2: 0.014, 3: 0.007}
 COUNTS: Final = (1, 2, 3, 4, 6)
 PLAIN: Final = 0.01
 """Standard deviation of the target in a region without an edge, of white."""
-BRIGHT, DIM = "all reach it", "one reaches it"
+BRIGHT, DIM = "all can make it", "one can make it"
 """The two exposures: as bright as all projectors together can be, and as the first can be alone."""
 
 

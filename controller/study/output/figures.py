@@ -1,27 +1,17 @@
-"""Figures in sentences, taken from kept results, so that no sentence holds a number of its own.
-
-``{TABLE | ROW | COLUMN | FORMAT}`` in a text stands for a cell of a table: ROW is a row's first cell, or several of its
-first cells with commas and spaces between them; FORMAT is Python's, as ".2f". Over seeds it is "least to most".
-"""
+"""Figures for sentences, taken from kept results, so that no document holds a number of its own."""
 
 from __future__ import annotations
-
-import re
-from typing import Final
 
 from controller.study.output.keeping import StoredStudy
 from controller.study.values import Cell
 
-_MARK: Final = re.compile(r"\{([^{}|]+)\|([^{}|]+)\|([^{}|]+)\|([^{}|]+)\}")
-
-
-def filled(text: str, kept: StoredStudy) -> str:
-    """``text`` with its figures. Raises KeyError for one that is in no table."""
-    return _MARK.sub(lambda mark: figure(kept, *(part.strip() for part in mark.groups())), text)
-
 
 def figure(kept: StoredStudy, table: str, row: str, column: str, form: str) -> str:
-    """One figure over all seeds, as text. Raises KeyError if there is no such table, row or column."""
+    """A cell over all seeds, as text; over seeds that differ it is "least to most".
+
+    ``row``: a row's first cell, or several of its first cells with a comma and a space between them; ``form`` is
+    Python's, as ".2f". Raises KeyError if there is no such table, row or column.
+    """
     found = kept.table(table)
     try:
         place = found.columns.index(column)

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from controller.core.storage import write_atomically
-from controller.study.output.figures import filled
 from controller.study.output.keeping import (
     SEEDS,
     JudgedCriterion,
@@ -23,6 +22,11 @@ from controller.study.values import Cell, Experiment, ResultTable
 
 DATA, PICTURES, INDEX = "data", "pictures", "README.md"
 HOLDS = {True: "yes", False: "**no**", None: "open"}
+
+EARLIER = (
+    "> **Note.** These results are of an earlier version of the experiment. Where the text differs from them, it is "
+    "of the present one. The command at the end of the page makes them again."
+)
 
 
 def publish(made: Iterable[Path], pages: Path, experiments: Sequence[Experiment]) -> Path:
@@ -68,6 +72,11 @@ def write_pages(pages: Path, experiments: Sequence[Experiment]) -> Path:
     return index
 
 
+def up_to_date(experiment: Experiment, kept: StoredStudy) -> bool:
+    """Whether the results are of the experiment as it is now."""
+    return bool(kept.results[0].facts.get("code") == experiment.code_sha256())
+
+
 def page(experiment: Experiment, kept: StoredStudy) -> str:
     """The page of one experiment, its pictures those of the lowest seed."""
     first = kept.results[0]
@@ -76,7 +85,8 @@ def page(experiment: Experiment, kept: StoredStudy) -> str:
         f"# {experiment.title}",
         f"{experiment.paper}. Must show: {experiment.shows}",
         _facts(kept),
-        filled(description(kept.name), kept),
+        "" if up_to_date(experiment, kept) else EARLIER,
+        description(kept.name),
         first.text,
         "## Criteria and results",
         _criteria(kept),
@@ -100,7 +110,8 @@ def index_page(rows: Sequence[tuple[Experiment, StoredStudy | None]]) -> str:
             lines.append((experiment.title, experiment.paper, "not done", "", ""))
             continue
         lines.append((
-            f"[{experiment.title}]({experiment.name}.md)", experiment.paper, _counted(kept),
+            f"[{experiment.title}]({experiment.name}.md)", experiment.paper,
+            _counted(kept) + ("" if up_to_date(experiment, kept) else "; earlier version"),
             str(kept.results[0].facts.get("size", "")), ", ".join(map(str, kept.seeds)),
         ))  # fmt: skip
     missed = [
@@ -158,7 +169,7 @@ def _facts(kept: StoredStudy) -> str:
 def _criteria(kept: StoredStudy) -> str:
     rows = []
     for one in kept.criteria:
-        reason = "" if one.holds is not False else f"{one.reason} {filled(miss_reason(kept.name, one.asked), kept)}"
+        reason = "" if one.holds is not False else f"{one.reason} {miss_reason(kept.name, one.asked)}"
         each = [one.reached.get(seed, "") for seed in kept.seeds]
         rows.append((one.asked, *each, HOLDS[one.holds], reason.strip()))
     reached = ["reached"] if len(kept.seeds) == 1 else [f"seed {seed}" for seed in kept.seeds]

@@ -1,6 +1,6 @@
 """Texts of the pages: what an experiment shows and what it does not, and why it misses a criterion.
 
-No text holds a measured number: it names the cell of a table (``output.figures``), which is of the same run.
+No text holds a measured number: it would be of another run than the page. An experiment tells those itself.
 
 Apart from the experiments, so that a better sentence does not make an experiment be done again.
 """
@@ -88,9 +88,7 @@ next cannot make it better. That is what the median region shows, and the mean h
 The fifth and sixth projector light the shell from similar directions as others. By the model they reduce the
 residual a little more, but the errors of their own calibration add as much.""",
     ("frequency", "F_3 / F_1"): """\
-The projectors' blur: the calibration measures a standard deviation of {blur | narrowest | measured (px) | .2f} to
-{blur | widest | measured (px) | .2f} projector pixels on this shell. Superposition adds positions of light, not
-contrast, and smoothness takes a little of it.""",
+The projectors' blur: superposition adds positions of light, not contrast, and smoothness takes a little of it.""",
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
 well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) lose less;
