@@ -5,6 +5,7 @@
 # make figures   measured figures into the documents that name them, and the pages of the study from their data
 # make blender   Blender, for targets that it renders
 # make campaign NAME=camera_faults COUNT=10000   a test of hours that has a short version in `make test` (tests/campaigns/)
+# make nightly COUNT=3   every experiment of the study at size small, for so many seeds; about an hour for each
 # All do their own set-up.
 
 SIZE ?= small
@@ -27,7 +28,7 @@ FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture 
 	tests/plugins/ptp tests/test_architecture.py
 DOCS_PYTHON ?= .venv/bin/python
 
-.PHONY: demo docs figures blender test test-setup fast check lint style types contracts website bench campaign lock clean
+.PHONY: demo docs figures blender test test-setup fast check lint style types contracts website bench campaign nightly lock clean
 
 demo:
 	@.ci/setup demo
@@ -84,6 +85,11 @@ docs:
 bench:
 	@.ci/setup test
 	.venv/bin/python -m benchmarks $(NAME) --size $(SIZE)
+
+nightly:
+	@.ci/setup test
+	@.ci/setup-blender
+	.venv/bin/python -m tests.campaigns.study $(COUNT)
 
 campaign:
 	@.ci/setup test

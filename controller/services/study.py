@@ -208,7 +208,7 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
     thing = None
     if scene.write_object is not None:
         thing = out / "object.ply"
-        scene.write_object(thing)
+        scene.write_object(thing, seed)
     try:
         tables = bench_of(building, scene.settings).prepare(building, size=size, object_file=thing, seed=seed)
     except DeviceError as error:
