@@ -21,7 +21,7 @@ from controller.study.output.pages import DATA
 def faults(kept: StoredStudy) -> list[str]:
     """What is wrong with the results of one experiment."""
     found = [f"{kept.name}: {one.asked}: not judged" for result in kept.results for one in result.criteria
-             if one.holds is None]  # fmt: skip
+             if one.holds is None and not one.reason]  # fmt: skip
     found += [f"{kept.name}: the table {table.name} is empty" for table in kept.tables if not table.rows]
     return found if kept.criteria else [f"{kept.name}: asks nothing"]
 

@@ -28,7 +28,7 @@ from controller.study.values import Result, column
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.program import run_of
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = pytest.mark.timeout(1200)
 
 
 @dataclass
