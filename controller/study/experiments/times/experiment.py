@@ -224,7 +224,8 @@ The calibration's seconds are wall times from this run's journal. The bench, whi
 the machine with it, and the load at that time was not recorded. The later stages were repeated for this table with
 compiled code: the least of nine for the new appearance, one for the others, as wall time and processor time. The paper
 calibrated with a real camera and 256 dots a projector, on eight cores of 3 GHz. An emulated camera does not show how
-long a real one takes, so photographs and total are not judged. The paper avoids a full solve for each new appearance and gives no time for one."""
+long a real one takes, so photographs and total are not judged. The paper avoids a full solve for
+each new appearance and gives no time for one."""
 
 TIMES = Experiment(
     name="times",
