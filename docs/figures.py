@@ -45,6 +45,13 @@ def study(root: Path, name: str) -> StoredStudy:
     return read_study(root / STUDY / DATA / f"{name}.json")
 
 
+def _stages(root: Path, name: str) -> str:
+    """Of which size and seeds an experiment's results are."""
+    kept = study(root, name)
+    several = "s" * (len(kept.seeds) > 1)
+    return f"size {kept.results[0].facts['size']}, seed{several} {', '.join(map(str, kept.seeds))}"
+
+
 def _times(root: Path, asked: str) -> str:
     """Least to most "N times" in what the criteria of the appearances reached that ask so."""
     found: list[float] = []
@@ -87,6 +94,8 @@ def _residual(root: Path, projectors: int) -> str:
 
 
 FIGURES: Final[Mapping[str, Figure]] = {
+    "appearances-stages": Figure(lambda root: _stages(root, "appearances")),
+    "residual-stages": Figure(lambda root: _stages(root, "residual")),
     "photographs": Figure(_photographs, (rf"{NUMBER} photographs per projector of the paper's size",)),
     "nearer-at-our-exposure": Figure(lambda root: _times(root, "nearer than one projector at the same exposure")),
     "nearer-at-its-exposure": Figure(lambda root: _times(root, "at the exposure that this one can reach")),
