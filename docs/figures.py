@@ -161,7 +161,7 @@ def _told(root: Path, texts: Mapping[Path, str], name: str, pattern: str) -> Ite
         if told[1] != value:
             yield path, f"says {told[0]!r}, and {name} is {value}", ""
     if not found:
-        yield root / "docs" / "figures.py", f"nothing is told as {pattern!r}", ""
+        yield root / "docs" / "figures.py", f"nothing is said as {pattern!r}", ""
 
 
 def _plain(text: str) -> str:

@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> int:
         pages = Path(folder) / "pages"
         study(
             names=[one.name for one in EXPERIMENTS], size="small", out=Path(folder), pages=pages, seeds=seeds,
-            reporter=PlainReporter(), cancel=threading.Event(),
+            reporter=PlainReporter(sys.stdout), cancel=threading.Event(),
         )  # fmt: skip
         for one in EXPERIMENTS:
             kept = read_study(pages / DATA / f"{one.name}.json")

@@ -64,7 +64,7 @@ def test_a_name_that_is_not_known_and_a_figure_that_nobody_tells_are_found(copy:
     assert "figures.py its-exposure is in no document" in told(copy)
     (copy / "README.md").write_text(text.replace("photographs per projector of", "pictures per projector of"))
     (copy / "CHANGELOG.md").write_text("")
-    assert "nothing is told as" in told(copy)
+    assert "nothing is said as" in told(copy)
 
 
 def test_texts_of_the_pages_hold_no_measured_number() -> None:

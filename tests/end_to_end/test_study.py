@@ -46,7 +46,7 @@ class BenchLight:
         sensor = self.truth.bench.camera.sensor
         steps = sensor.white_level - sensor.black_level
         unit = np.float32(sensor.electrons_per_light_s / (sensor.electrons_per_step * steps))
-        light = unit * self.truth.picture(shown)
+        light = unit * self.truth.picture([shown[name] for name in self.calibrated.projectors])
         return developed(light, float(light.max()))
 
     def dots(self, n: int) -> Dots:
