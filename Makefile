@@ -2,9 +2,11 @@
 # make test   every test; WORKERS=3 chooses how many run side by side
 # make check  lint, types, import contracts, documentation and the fast tests, side by side, in under two minutes
 # make docs   this documentation as a website in build/docs; fails on a broken link
+# make figures   measured figures into the documents that name them, and the pages of the study from their data
 # make blender   Blender, for targets that it renders
 # make campaign NAME=camera_faults COUNT=10000   a test of hours that has a short version in `make test` (tests/campaigns/)
 # make deb DEBIAN=bookworm   the Debian package of a kiosk in build/; trixie too, with DEBIAN_ROOT=the root folder of a Debian 13
+# make nightly COUNT=3   every experiment of the study at size small, for so many seeds; about an hour for each
 # All do their own set-up.
 
 SIZE ?= small
@@ -29,7 +31,7 @@ FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture 
 	tests/plugins/ptp tests/test_architecture.py
 DOCS_PYTHON ?= .venv/bin/python
 
-.PHONY: deb demo docs blender test test-setup fast check lint style types contracts website bench campaign lock clean
+.PHONY: deb demo docs figures blender test test-setup fast check lint style types contracts website bench campaign nightly lock clean
 
 demo:
 	@.ci/setup demo
@@ -68,11 +70,16 @@ contracts:
 	.venv/bin/lint-imports
 
 website:
+	$(DOCS_PYTHON) -m docs.figures
 	$(DOCS_PYTHON) -m sphinx --jobs auto --quiet --fail-on-warning --keep-going docs build/docs
 
 lint:
 	@.ci/setup test
 	@$(MAKE) --no-print-directory style types contracts
+
+figures:
+	@.ci/setup test
+	$(DOCS_PYTHON) -m docs.figures write
 
 docs:
 	@.ci/setup test
@@ -81,6 +88,11 @@ docs:
 bench:
 	@.ci/setup test
 	.venv/bin/python -m benchmarks $(NAME) --size $(SIZE)
+
+nightly:
+	@.ci/setup test
+	@.ci/setup-blender
+	.venv/bin/python -m tests.campaigns.study $(COUNT)
 
 campaign:
 	@.ci/setup test

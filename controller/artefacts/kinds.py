@@ -45,6 +45,7 @@ class StepKind(enum.StrEnum):
     PUBLISH = "publish"
     PHOTOGRAPH = "photograph"
     TRADITIONAL = "traditional"
+    DIMMED = "dimmed"
     PLAYBACK = "playback"
     COMPARE = "compare"
     PICTURES = "pictures"

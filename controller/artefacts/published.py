@@ -12,7 +12,7 @@ import numpy as np
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.names import json_path, npz_path, read_json, write_json
 from controller.artefacts.solved import solved_figures_path
-from controller.core.arrays import FloatImage, load_arrays, save_arrays
+from controller.core.arrays import FloatImage, Mask, load_arrays, save_arrays
 from controller.core.storage import sha256_of, write_atomically
 
 BUNDLE: Final = "bundle.vel"
@@ -63,6 +63,35 @@ def read_photograph_of(run: Path, kind: StepKind, name: str) -> FloatImage:
     """(camera rows, columns, 3) float32, as ``write_photograph`` wrote it."""
     picture: FloatImage = load_arrays(npz_path(run, kind, name))["photograph"]
     return picture
+
+
+@dataclass(frozen=True, slots=True)
+class Dimmed:
+    """``dimmed-NAME.npz``: an appearance by one projector alone, as bright as this projector can make it.
+
+    ``photograph``, ``target`` (camera rows, columns, 3) float32 radiance; ``reachable`` (rows, columns): where that
+    projector can make the target; ``exposure``: radiance of the target's white
+    """
+
+    photograph: FloatImage
+    target: FloatImage
+    reachable: Mask
+    exposure: float
+
+    def write(self, run: Path, name: str) -> Path:
+        path = npz_path(run, StepKind.DIMMED, name)
+        save_arrays(path, {"photograph": self.photograph, "target": self.target, "reachable": self.reachable,
+                           "exposure": np.array(self.exposure)})  # fmt: skip
+        return path
+
+    @classmethod
+    def read(cls, run: Path, name: str) -> Dimmed | None:
+        """None for a run from before there was such a photograph."""
+        path = npz_path(run, StepKind.DIMMED, name)
+        if not path.exists():
+            return None
+        arrays = load_arrays(path)
+        return cls(arrays["photograph"], arrays["target"], arrays["reachable"], float(arrays["exposure"]))
 
 
 def read_thumbnail(run: Path, name: str) -> bytes | None:

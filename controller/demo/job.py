@@ -8,10 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.published import write_photograph
+from controller.artefacts.published import Dimmed, write_photograph
 from controller.artefacts.solved import read_solved
+from controller.core.arrays import FloatImage
 from controller.demo.stage import DEFAULT_ROOM, prepare
 from controller.report.demo import write_demo_report
 from controller.rig.rig import Rig
@@ -20,7 +23,8 @@ from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
 from controller.services.calibrate import calibrating, output_sizes, signing_key, worst_grade
-from controller.solve.traditional import traditional_compensation
+from controller.solve.feasibility import target_radiance
+from controller.solve.traditional import exposed_for_one, traditional_compensation
 from controller.stage.bench import BenchProcess
 from controller.stage.check import Checked, check_stage
 from controller.stage.run import marker
@@ -103,39 +107,87 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
         marker("published", "Published", leave=Event.PUBLISHED),
         marker("playing", "Playing", enter=Event.PLAY),
         photograph_step(rig, names, longest_exposure_s=longest_s),
-        _traditional_step(rig, calibrated, names, longest_s),
+        *_one_projector_steps(rig, calibrated, names, longest_s, options.share),
         playback_step(rig, names, seconds=PLAYBACK_S),
         marker("played", "Played", leave=Event.PAUSE),
     ]
 
 
-def _traditional_step(rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float) -> Step:
-    """For comparison: the targets shown by one projector, with division at each pixel."""
-    return Step(
-        StepId(StepKind.TRADITIONAL),
-        partial(_traditional, rig, calibrated, tuple(names), longest_s),
-        after=tuple(StepId(StepKind.APPEARANCE, item=name) for name in names),
-        title="Photographing the traditional method for comparison",
-        weight=photographs_s(rig, names),
-    )
+def _one_projector_steps(
+    rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float, share: float
+) -> list[Step]:
+    """For comparison: the targets shown by one projector with division at each pixel, at two exposures.
+
+    At ours, and at the one that this projector can reach, so that the comparison is not about brightness alone.
+    """
+    after = tuple(StepId(StepKind.APPEARANCE, item=name) for name in names)
+    weight = photographs_s(rig, names)
+    return [
+        Step(
+            StepId(StepKind.TRADITIONAL),
+            partial(_traditional, rig, calibrated, tuple(names), longest_s),
+            after=after,
+            title="Photographing one projector for comparison",
+            weight=weight,
+        ),
+        Step(
+            StepId(StepKind.DIMMED),
+            partial(_dimmed, rig, calibrated, tuple(names), longest_s, share),
+            inputs={"share": repr(share)},
+            after=after,
+            title="Photographing one projector at its own exposure",
+            weight=weight,
+        ),
+    ]
 
 
 def _traditional(
     rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float, context: Context
 ) -> Sequence[Path]:
     paths = []
-    lit = calibrated.transport.lit
-    best = int(lit.reshape(len(lit), -1).sum(axis=1).argmax())
     for number, name in enumerate(names):
         context.advance(number / len(names), name)
         solved = read_solved(context.folder, name, calibrated.projectors)
-        frames = device_frames(
-            calibrated.calibration, traditional_compensation(calibrated.calibration, solved.requested.target, best)
+        picture = _by_one(
+            rig, calibrated, StepKind.TRADITIONAL, name, solved.requested.target, solved.exposure, longest_s, context
         )
-        shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
-        picture = photograph_hdr(
-            rig, context, StepKind.TRADITIONAL, name, solved.exposure, longest_s,
-            shown_at_s=shown.at_s, of={"appearance": name, "projector": str(best)},
-        )  # fmt: skip
         paths.append(write_photograph(context.folder, StepKind.TRADITIONAL, name, picture))
     return paths
+
+
+def _dimmed(
+    rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float, share: float, context: Context
+) -> Sequence[Path]:
+    paths = []
+    for number, name in enumerate(names):
+        context.advance(number / len(names), name)
+        asked = read_solved(context.folder, name, calibrated.projectors)
+        picture = np.asarray(asked.requested.target / np.float32(asked.exposure), np.float32)
+        found = exposed_for_one(
+            calibrated.calibration, picture, _best(calibrated), share=share, indirect=calibrated.indirect
+        )
+        target = target_radiance(found.wanted, calibrated.calibration.black, 1.0)
+        photograph = _by_one(rig, calibrated, StepKind.DIMMED, name, target, found.exposure, longest_s, context)
+        dimmed = Dimmed(photograph, target, found.possible.reachable & asked.requested.valid, found.exposure)
+        paths.append(dimmed.write(context.folder, name))
+    return paths
+
+
+def _best(calibrated: Calibrated) -> int:
+    """The projector that lights most of the object."""
+    lit = calibrated.transport.lit
+    return int(lit.reshape(len(lit), -1).sum(axis=1).argmax())
+
+
+def _by_one(
+    rig: Rig, calibrated: Calibrated, kind: StepKind, name: str, target: FloatImage, exposure: float, longest_s: float,
+    context: Context,
+) -> FloatImage:  # fmt: skip
+    """A photograph of ``target`` (rows, columns, 3), made by the best projector alone."""
+    best = _best(calibrated)
+    frames = device_frames(calibrated.calibration, traditional_compensation(calibrated.calibration, target, best))
+    shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
+    return photograph_hdr(
+        rig, context, kind, name, exposure, longest_s, shown_at_s=shown.at_s,
+        of={"appearance": name, "projector": str(best)},
+    )  # fmt: skip

@@ -31,7 +31,7 @@ from controller.study.lab.photographing import RigPhotographer, dot_steps
 from controller.study.lab.scenes import Scene
 from controller.study.lab.subject import SessionParts
 from controller.study.output.keeping import save_result
-from controller.study.output.pages import publish
+from controller.study.output.pages import INDEX, publish
 from controller.study.values import Experiment
 from hal.errors import DeviceError
 
@@ -48,11 +48,13 @@ def study(
     size: str,
     out: Path,
     pages: Path | None,
-    seed: int,
+    seeds: Sequence[int],
     reporter: Reporter,
     cancel: threading.Event,
 ) -> Mapping[str, Any]:
-    """Run the experiments, continuing what is in ``out``; write their pages; return the path of the index.
+    """Run the experiments for each seed, continuing what is in ``out``; write their pages; return the index's path.
+
+    A page judges a criterion over all seeds that it holds: those of now, and those of earlier studies of this size.
 
     Raises UsageError("experiment-unknown", "size-unknown", "study-folder-taken"), and what the devices, the calibration
     and the experiments raise; the lamps are safe by then.
@@ -64,15 +66,27 @@ def study(
         )
     out = out.resolve()
     pages = (out / "pages" if pages is None else pages).resolve()
+    index = pages / INDEX
+    for seed in dict.fromkeys(seeds):
+        index = _one_seed(wanted, out / f"seed-{seed}", pages, (size, seed), reporter, cancel)
+    return {"index": str(index)}
+
+
+def _one_seed(
+    wanted: Sequence[Experiment], out: Path, pages: Path, what: tuple[str, int], reporter: Reporter,
+    cancel: threading.Event,
+) -> Path:  # fmt: skip
+    """All experiments on the stages of one size and seed; the index of their pages."""
+    size, seed = what
     free = [experiment for experiment in wanted if experiment.scene is None]
     index = publish([_without_stage(experiment, out, size, seed, reporter) for experiment in free], pages,
                     EXPERIMENTS)  # fmt: skip
     for scene in dict.fromkeys(experiment.scene for experiment in wanted if experiment.scene is not None):
         here = [experiment for experiment in wanted if experiment.scene == scene]
-        reporter.say(f"On {SCENES[scene].title}: {', '.join(experiment.name for experiment in here)}.")
+        reporter.say(f"On {SCENES[scene].title}, seed {seed}: {', '.join(experiment.name for experiment in here)}.")
         # After each stage, so that a failing one does not cost the pages of the previous ones.
         index = publish(_on_scene(SCENES[scene], here, out, size, seed, reporter, cancel), pages, EXPERIMENTS)
-    return {"index": str(index)}
+    return index
 
 
 def _without_stage(one: Experiment, out: Path, size: str, seed: int, reporter: Reporter) -> Path:
@@ -80,7 +94,7 @@ def _without_stage(one: Experiment, out: Path, size: str, seed: int, reporter: R
     reporter.say(f"{one.title}.")
     began_s = time.perf_counter()
     result = one.run(None)  # type: ignore[arg-type]
-    facts = {"size": size, "seed": seed, "seconds": round(time.perf_counter() - began_s)}
+    facts = {"size": size, "seed": seed, "code": one.code_sha256(), "seconds": round(time.perf_counter() - began_s)}
     folder = out / RESULTS
     folder.mkdir(parents=True, exist_ok=True)
     return save_result(folder, one, result, facts)[0]
@@ -160,6 +174,7 @@ def _experiment(
         disturb(())
     facts = {
         **told,
+        "code": one.code_sha256(),
         # Photographs of an earlier run count, too; those of an experiment itself are not in ``used``.
         "photographs": max(len(light.used), context.journal.shot_count() - before),
         "seconds": round(time.perf_counter() - began_s),
@@ -193,7 +208,7 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
     thing = None
     if scene.write_object is not None:
         thing = out / "object.ply"
-        scene.write_object(thing)
+        scene.write_object(thing, seed)
     try:
         tables = bench_of(building, scene.settings).prepare(building, size=size, object_file=thing, seed=seed)
     except DeviceError as error:

@@ -5,12 +5,17 @@ Superimposed projectors are compared with it (paper 6). It ignores neighbours, o
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
+from controller.solve.exposed import Exposed, exposed
+from controller.transport import build_transport
+from controller.transport.indirect import IndirectLight
 
 
 def traditional_compensation(calibration: Calibration, target: FloatImage, n: int) -> list[FloatImage]:
@@ -54,6 +59,18 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
     unmixed = ratio @ np.linalg.inv(projector.radiometry.mixing).T
     frames[n][usable] = np.clip(unmixed, 0, 1)
     return frames
+
+
+def exposed_for_one(
+    calibration: Calibration, picture: FloatImage, n: int, *, share: float, indirect: IndirectLight | None = None
+) -> Exposed:
+    """``picture`` (rows, columns, 3), like reflectance, as bright as projector ``n`` can make it alone.
+
+    By the same rule as for all projectors: ``share`` of the pixels that it lights are in reach. At a higher exposure
+    the comparison would only show that one lamp is darker than several. Raises what ``solve.exposed.exposed`` raises.
+    """
+    alone = build_transport(dataclasses.replace(calibration, projectors=(calibration.projectors[n],)))
+    return exposed(alone, picture, calibration.black, share=share, indirect=indirect)
 
 
 def _sampled(

@@ -20,7 +20,7 @@ from controller.study.experiments.residual import RESIDUAL, RESIDUAL_SIX
 from controller.study.experiments.robustness import ROBUSTNESS
 from controller.study.experiments.sharpness import SHARPNESS
 from controller.study.experiments.times.experiment import TIMES
-from controller.study.lab.scenes import Scene, curved_object
+from controller.study.lab.scenes import Scene, same_object
 from controller.study.values import Experiment
 
 EXPERIMENTS: Final[tuple[Experiment, ...]] = (
@@ -43,8 +43,14 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
 
 _ALL: Final = (
     Scene("painted", "a painted vase and bust, three projectors"),
-    Scene("curved", "a pale curved shell, three projectors", curved_object),
-    Scene("curved-six", "a pale curved shell, six projectors", curved_object, {"projectors": 6}),
+    Scene("curved", "a pale curved shell, three projectors", same_object),
+    Scene(
+        "grazing",
+        "a pale curved shell, two projectors at grazing angles to its right half, then one from the right",
+        same_object,
+        {"projectors": ("far-left", "left", "right")},
+    ),
+    Scene("curved-six", "a pale curved shell, six projectors", same_object, {"projectors": 6}),
     Scene(
         "planned", "the shell, three projectors where they were planned", planned_object, {"stands": "../stands.toml"}
     ),

@@ -22,7 +22,10 @@ def study(
     size: Annotated[str, typer.Option(help="small, medium or paper.")] = "small",
     out: Annotated[Path, typer.Option(help="Folder for the stages and their calibrations.")] = Path("study"),
     pages: Annotated[Path | None, typer.Option(help="Folder for the pages (default: OUT/pages).")] = None,
-    seed: Annotated[int, typer.Option(help="Random seed of the stages.", min=0, max=2**32 - 1)] = 1,
+    seed: Annotated[
+        list[int] | None,
+        typer.Option(help="Random seed of the stages; repeat it for more seeds (default: 1).", min=0, max=2**32 - 1),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Repeat the paper's experiments on emulated stages and write a page for each. Continues unfinished experiments."""
@@ -31,7 +34,13 @@ def study(
         from controller.services.study import study
 
         return study(
-            names=tuple(names or ()), size=size, out=out, pages=pages, seed=seed, reporter=reporter, cancel=cancel
+            names=tuple(names or ()),
+            size=size,
+            out=out,
+            pages=pages,
+            seeds=seed or [1],
+            reporter=reporter,
+            cancel=cancel,
         )
 
     work(do, as_json=as_json)

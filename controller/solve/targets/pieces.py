@@ -34,8 +34,10 @@ def on_each(mask: Mask, make: Callable[[Mask], Target]) -> Target:
     """The targets that ``make`` gives for each object of ``mask``, side by side in one."""
     image: FloatImage = np.zeros((*mask.shape, 3), np.float32)
     said: Mask = np.zeros(mask.shape, np.bool_)
+    softened = ""
     for piece in pieces(mask):
         part = make(piece)
         image[piece] = part.image[piece]
         said |= part.mask & piece
-    return Target(image, said)
+        softened = part.softened or softened
+    return Target(image, said, softened)

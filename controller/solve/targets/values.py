@@ -18,10 +18,12 @@ class Target:
 
     ``image`` (rows, columns, 3) float32, linear, finite, >= 0: 1 is a white object in uniform light; 0 outside ``mask``
     ``mask`` (rows, columns) bool: valid pixels of the target
+    ``softened``: what made it softer than it was asked for, in words; empty where nothing did
     """
 
     image: FloatImage
     mask: Mask
+    softened: str = ""
 
 
 def srgb_to_linear(values: npt.NDArray[Any]) -> FloatImage:
@@ -59,4 +61,4 @@ def through_camera(target: Target, *, sigma_px: float = CAMERA_FILTER_PX) -> Tar
         np.where(target.mask[..., None], target.image, 0), (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT
     )
     image = np.where(target.mask[..., None], blurred / np.maximum(weight, 1e-6)[..., None], 0)
-    return Target(np.asarray(image, np.float32), target.mask)
+    return Target(np.asarray(image, np.float32), target.mask, f"by the camera's own blur, {sigma_px:g} px")

@@ -31,7 +31,7 @@ def ablation(subject: Subject) -> Result:
     target = photograph_target(subject)
     wanted = subject.wanted(target)
     steps = photograph_variants(subject, wanted, _ways(subject, wanted))
-    table = quality_table("steps", steps, ways="step", seconds="seconds, model and solve")
+    table = quality_table("steps", steps, wanted, ways="step", seconds="seconds, model and solve")
     return Result(_criteria(steps), (table,), _figures(subject, wanted, steps))
 
 

@@ -115,7 +115,7 @@ def _criteria(results: Sequence[AdaptationResult]) -> tuple[Criterion, ...]:
         reason = "What is left goes along with the pattern in reach, too: errors of the calibration and of edges."
         found.append(
             Criterion(f"ghosting is at most a third of cutting off's, {share:.0%} in reach", reached, holds,
-                      "" if holds is not False else reason)
+                      "" if holds else reason if holds is False else "Nothing is out of reach.")
         )  # fmt: skip
         lost = 1 - adapted[share].lightness / cut[share].lightness
         found.append(

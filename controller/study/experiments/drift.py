@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from controller.calibrate.verify.drift import Drift, DriftCause
+from controller.study.lab.measuring import SET_COLUMNS, set_cells
 from controller.study.lab.subject import BenchChange, Recalibration, StageControl, Subject
-from controller.study.lab.trial import shown, trial
+from controller.study.lab.trial import Trial, shown, trial
 from controller.study.output.drawing import Line, plotted
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
 
@@ -39,6 +40,8 @@ class BumpResult:
     quick_photographs: int = 0
     full: float | None = None
     full_photographs: int = 0
+    unnoticed_p95: float | None = None
+    cells: tuple[str, ...] = ("",) * len(SET_COLUMNS)
 
 
 def drifting(subject: Subject) -> Result:
@@ -53,21 +56,30 @@ def drifting(subject: Subject) -> Result:
         subject.advance(number / len(jobs), f"{what} by {level:g} px")
         key = f"{what.split()[1]}-{level:g}"
         hand.disturb(change_of(subject, what, name, level))
-        unnoticed = None
+        seen: Trial | None = None
         if what != CAMERA:
             # Who looks on does not stand where the camera stands: a moved camera changes nothing on the object.
-            unnoticed = shown(subject, f"{key}-unnoticed", before.wanted, before.frames).quality.delta_e
+            seen = shown(subject, f"{key}-unnoticed", before.wanted, before.frames)
         drift = hand.drift(key)
         recalibrated = level in RECALIBRATED_LEVELS[what]
         quick = hand.quickly(key) if recalibrated else None
         full = hand.again(key) if recalibrated and what == PROJECTOR and level == LEVELS_PX[-1] else None
         bumps.append(
             BumpResult(
-                what, level, unnoticed, not drift.nothing, _named(drift, what, name), _measured_px(drift, what, name),
-                _error(quick, f"{key}-quick"), quick.photographs if quick else 0,
-                _error(full, f"{key}-full"), full.photographs if full else 0,
+                what=what,
+                moved_px=level,
+                unnoticed=None if seen is None else seen.quality.delta_e,
+                noticed=not drift.nothing,
+                named=_named(drift, what, name),
+                measured_px=_measured_px(drift, what, name),
+                quick=_error(quick, f"{key}-quick"),
+                quick_photographs=quick.photographs if quick else 0,
+                full=_error(full, f"{key}-full"),
+                full_photographs=full.photographs if full else 0,
+                unnoticed_p95=None if seen is None else seen.quality.delta_e_p95,
+                cells=set_cells({} if seen is None else seen.quality.pixels, before.wanted),
             )
-        )  # fmt: skip
+        )
         hand.disturb()
     return Result(
         _criteria(before.quality.delta_e, quiet, bumps), (_table(bumps),), _figures(before.quality.delta_e, bumps), TEXT
@@ -135,7 +147,8 @@ def _criteria(before: float, quiet: Drift, bumps: Sequence[BumpResult]) -> tuple
 def _table(bumps: Sequence[BumpResult]) -> ResultTable:
     columns = (
         "moved", "by (px)", "CIEDE2000 unnoticed", "noticed", "right one named", "measured (px)",
-        "CIEDE2000 after quick", "photographs", "CIEDE2000 after full", "photographs in full",
+        "CIEDE2000 after quick", "photographs", "CIEDE2000 after full", "photographs in full", "95 %, unnoticed",
+        *SET_COLUMNS,
     )  # fmt: skip
 
     def rounded(value: float | None) -> Cell:
@@ -145,6 +158,7 @@ def _table(bumps: Sequence[BumpResult]) -> ResultTable:
         (
             bump.what, bump.moved_px, rounded(bump.unnoticed), bump.noticed, bump.named, round(bump.measured_px, 3),
             rounded(bump.quick), bump.quick_photographs or None, rounded(bump.full), bump.full_photographs or None,
+            rounded(bump.unnoticed_p95), *bump.cells,
         )
         for bump in bumps
     )  # fmt: skip

@@ -42,7 +42,7 @@ def earlier_systems(subject: Subject) -> Result:
     alone = build_transport(subject.with_projectors([best]))
     wanted = subject.wanted(target, transport=alone)
     variants = photograph_variants(subject, wanted, _ways(subject, wanted, best))
-    table = quality_table("systems", variants, ways="system")
+    table = quality_table("systems", variants, wanted, ways="system")
     return Result(_criteria(variants), (table,), _figures(subject, wanted, variants))
 
 

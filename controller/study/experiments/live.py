@@ -26,7 +26,7 @@ def live_pictures(subject: Subject) -> Result:
     for kind in BASES:
         asked = f"base {kind}: {OURS} are better than {PAPERS}"
         criteria.append(better(asked, quality[_named(kind, OURS)], quality[_named(kind, PAPERS)]))
-    table = quality_table("ways", variants, ways="way", seconds="seconds, first time")
+    table = quality_table("ways", variants, wanted, ways="way", seconds="seconds, first time")
     return Result(tuple(criteria), (table,), side_by_side(subject, wanted, variants))
 
 

@@ -13,11 +13,11 @@ from controller.solve.bounded.solver import solve_bounded
 from controller.solve.bounded.weights import appearance_weights
 from controller.study.experiments.ablation import paper_model, raw_transport
 from controller.study.experiments.residual import brightest_first
-from controller.study.lab.measuring import sharpness_map, unbounded_inverse
+from controller.study.lab.measuring import SET_COLUMNS, pixel_sets, set_cells, sharpness_map, unbounded_inverse
 from controller.study.lab.subject import ReachableTarget, Subject
 from controller.study.lab.trial import photograph_target
 from controller.study.output.drawing import LabelledPicture, maps, screen, strip
-from controller.study.values import Criterion, Experiment, Figure, Result, ResultTable
+from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
 from controller.transport import build_transport
 
 TIE = 0.02
@@ -31,6 +31,7 @@ class SharpnessResult:
     photograph: FloatImage
     local: FloatImage
     overall: float
+    cells: tuple[Cell, ...] = ("",) * len(SET_COLUMNS)
 
 
 def local_sharpness(subject: Subject) -> Result:
@@ -48,7 +49,8 @@ def local_sharpness(subject: Subject) -> Result:
         subject.advance(number / len(ways), name)
         frames = subject.frames_of(which, _frames(subject, which, wanted, naive=naive))
         picture = subject.light.photograph(f"{len(which)}-{'naive' if naive else 'full'}", frames, white=wanted.white)
-        results.append(SharpnessResult(name, picture, *sharpness_map(picture, wanted, wanted.mask, window_px)))
+        cells = set_cells(pixel_sets(subject, picture, wanted), wanted)
+        results.append(SharpnessResult(name, picture, *sharpness_map(picture, wanted, wanted.mask, window_px), cells))
     return Result(_criteria(results), (_table(results),), _figures(subject, wanted, results, window_px))
 
 
@@ -87,7 +89,7 @@ def _criteria(results: Sequence[SharpnessResult]) -> tuple[Criterion, ...]:
             reason,
         ),
         Criterion(
-            "its lambda over the whole object is the highest",
+            "its lambda over all that is in reach is the highest",
             ", ".join(f"{name} {value:.3f}" for name, value in overall.items()),
             all_full > most,
         ),
@@ -99,11 +101,18 @@ def _criteria(results: Sequence[SharpnessResult]) -> tuple[Criterion, ...]:
 
 
 def _table(results: Sequence[SharpnessResult]) -> ResultTable:
-    columns = ("way", "lambda, whole", "lambda, median window", "lambda, lowest tenth of windows", "windows")
+    columns = (
+        "way",
+        "lambda, in reach",
+        "lambda, median window",
+        "lambda, lowest tenth of windows",
+        "windows",
+        *SET_COLUMNS,
+    )
     rows = tuple(
         (
             result.name, result.overall, float(np.nanmedian(result.local)), float(np.nanpercentile(result.local, 10)),
-            int(np.isfinite(result.local).sum()),
+            int(np.isfinite(result.local).sum()), *result.cells,
         )
         for result in results
     )  # fmt: skip

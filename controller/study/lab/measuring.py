@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, lsmr
@@ -12,11 +13,12 @@ from skimage.metrics import structural_similarity
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.report.pictures import Crop, crop_around
+from controller.solve.judged import TITLES, PixelSet, by_pixels
 from controller.solve.metrics import compare, sharpness_windows
 from controller.solve.targets.values import linear_to_srgb
 from controller.study.lab.subject import ReachableTarget, Subject
 from controller.study.output.drawing import LabelledPicture, detail, screen, strip
-from controller.study.values import Criterion, Figure, ResultTable
+from controller.study.values import Cell, Criterion, Figure, ResultTable
 from controller.transport import LightTransport
 from controller.transport.planes import image_planes, plane_frames
 
@@ -33,7 +35,7 @@ class Quality:
 
     ``delta_e`` median CIEDE2000 and ``delta_e_p95`` its 95th percentile; ``rmse`` of the target's white, linear light;
     ``ssim`` mean structural similarity of the pictures as a screen shows them (sRGB, 11 px Gaussian window);
-    ``sharpness``: lambda of eq. 9
+    ``sharpness``: lambda of eq. 9; ``pixels``: CIEDE2000 by sets of pixels (``solve.judged``), whatever the mask
     """
 
     delta_e: float
@@ -41,6 +43,7 @@ class Quality:
     rmse: float
     ssim: float
     sharpness: float
+    pixels: Mapping[str, PixelSet] = field(default_factory=dict)
 
 
 def quality(subject: Subject, achieved: FloatImage, wanted: ReachableTarget, mask: Mask | None = None) -> Quality:
@@ -61,8 +64,40 @@ def quality(subject: Subject, achieved: FloatImage, wanted: ReachableTarget, mas
         full=True,
     )
     return Quality(
-        found.delta_e00_median, found.delta_e00_p95, found.rmse, float(local[mask].mean()), found.sharpness_lambda
-    )
+        found.delta_e00_median, found.delta_e00_p95, found.rmse, float(local[mask].mean()), found.sharpness_lambda,
+        pixel_sets(subject, achieved, wanted),
+    )  # fmt: skip
+
+
+def pixel_sets(subject: Subject, achieved: FloatImage, wanted: ReachableTarget) -> dict[str, PixelSet]:
+    """CIEDE2000 in reach, of all lit pixels and of the whole visible object, and what each leaves out."""
+    return by_pixels(
+        achieved, wanted.radiance, subject.calibration.camera_to_xyz, wanted.white,
+        reachable=wanted.mask, valid=wanted.valid, lit=subject.mask,
+    )  # fmt: skip
+
+
+SET_COLUMNS: Final = (
+    "in reach leaves out", "all lit pixels: CIEDE2000, 95 %", "all lit pixels leave out",
+    "whole visible object: CIEDE2000, 95 %", "target",
+)  # fmt: skip
+"""Of every table of errors, after the figures in reach: so that nothing is hidden by what is left out."""
+
+
+def set_cells(pixels: Mapping[str, PixelSet], wanted: ReachableTarget) -> tuple[str, ...]:
+    """The cells of ``SET_COLUMNS``."""
+    if not pixels:
+        return ("",) * len(SET_COLUMNS)
+    reach, lit, visible = (pixels[name] for name in TITLES)
+    return (_left_out(reach), _both(lit), _left_out(lit), _both(visible), wanted.as_asked)
+
+
+def _left_out(one: PixelSet) -> str:
+    return f"{one.left_out_share:.1%}"
+
+
+def _both(one: PixelSet) -> str:
+    return "" if one.delta_e00_median is None else f"{one.delta_e00_median:.2f}, {one.delta_e00_p95:.1f}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,14 +141,17 @@ def better(asked: str, after: Quality, before: Quality, *, with_p95: bool = Fals
     return Criterion(asked, reached, not missed, f"{' and '.join(missed)} not better." if missed else "")
 
 
-def quality_table(name: str, variants: Sequence[Variant], *, ways: str, seconds: str = "seconds") -> ResultTable:
+def quality_table(
+    name: str, variants: Sequence[Variant], wanted: ReachableTarget, *, ways: str, seconds: str = "seconds"
+) -> ResultTable:
     """A row for each way; ``ways`` and ``seconds``: what the first and the last column are called."""
-    columns = (ways, "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda", seconds)
-    rows = []
+    columns = (ways, "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda", *SET_COLUMNS, seconds)
+    rows: list[tuple[Cell, ...]] = []
     for variant in variants:
         q = variant.quality
-        rows.append((variant.name, q.delta_e, q.delta_e_p95, q.rmse, q.ssim, q.sharpness, variant.seconds))
-    return ResultTable(name, "Photographed errors", columns, tuple(rows))
+        figures = (q.delta_e, q.delta_e_p95, q.rmse, q.ssim, q.sharpness)
+        rows.append((variant.name, *figures, *set_cells(q.pixels, wanted), variant.seconds))
+    return ResultTable(name, "Photographed errors in reach, and by sets of pixels", columns, tuple(rows))
 
 
 def side_by_side(subject: Subject, wanted: ReachableTarget, variants: Sequence[Variant]) -> tuple[Figure, Figure]:

@@ -17,14 +17,19 @@ from controller.core.storage import write_atomically
 class Scene:
     """A stage that a bench can set up.
 
-    ``write_object``: writes the mesh (.ply, y up, facing +z) that stands on it; None: the bench's own painted vase and
-    bust; ``settings``: of the bench's driver, for instance ``{"projectors": 6}``
+    ``write_object``: writes the mesh (.ply, y up, facing +z) that stands on it, for a seed; None: the bench's own
+    painted vase and bust; ``settings``: of the bench's driver, for instance ``{"projectors": 6}``
     """
 
     name: str
     title: str
-    write_object: Callable[[Path], None] | None = None
+    write_object: Callable[[Path, int], None] | None = None
     settings: Mapping[str, Any] = ()  # type: ignore[assignment]
+
+
+def same_object(path: Path, seed: int) -> None:
+    """``curved_object``: the same for every seed."""
+    curved_object(path)
 
 
 def curved_object(path: Path, *, columns: int = 121, rows: int = 101) -> None:

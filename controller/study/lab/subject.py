@@ -123,7 +123,7 @@ class Subject:
         found = exposed(transport, target.image, black, share=share, drive=drive, indirect=self.indirect)
         mask: Mask = found.possible.reachable & target.mask
         radiance, direct = (target_radiance(image, black, 1.0) for image in (found.wanted, found.needed))
-        return ReachableTarget(radiance, mask, found.exposure, direct)
+        return ReachableTarget(radiance, mask, found.exposure, direct, target.mask, target.softened)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +132,24 @@ class ReachableTarget:
 
     ``radiance`` (rows, columns, 3) float32, at least the black image; ``direct``: what of it projectors are to make
     directly, with the black image; ``mask`` (rows, columns): where it says something that is in reach; ``white``:
-    radiance of a perfect white
+    radiance of a perfect white; ``valid``: where it says something; ``softened``: as of ``Target``
     """
 
     radiance: FloatImage
     mask: Mask
     white: float
     _direct: FloatImage | None = None
+    _valid: Mask | None = None
+    softened: str = ""
+
+    @property
+    def valid(self) -> Mask:
+        return self.mask if self._valid is None else self._valid
+
+    @property
+    def as_asked(self) -> str:
+        """Of a table's row: whether this is what was asked for."""
+        return f"softened {self.softened}" if self.softened else "as asked"
 
     @property
     def direct(self) -> FloatImage:

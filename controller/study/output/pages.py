@@ -5,16 +5,28 @@ from __future__ import annotations
 import csv
 import io
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from controller.core.storage import write_atomically
-from controller.study.output.keeping import StoredResult, read_result
+from controller.study.output.keeping import (
+    SEEDS,
+    JudgedCriterion,
+    StoredStudy,
+    read_result,
+    read_study,
+    with_seed,
+)
 from controller.study.output.words import description, miss_reason
 from controller.study.values import Cell, Experiment, ResultTable
 
 DATA, PICTURES, INDEX = "data", "pictures", "README.md"
-HOLDS = {True: "yes", False: "**no**", None: "not known"}
+HOLDS = {True: "yes", False: "**no**", None: "open"}
+
+EARLIER = (
+    "> **Note.** These results are of an earlier version of the experiment. Where the text differs from them, it is "
+    "of the present one. The command at the end of the page makes them again."
+)
 
 
 def publish(made: Iterable[Path], pages: Path, experiments: Sequence[Experiment]) -> Path:
@@ -25,15 +37,19 @@ def publish(made: Iterable[Path], pages: Path, experiments: Sequence[Experiment]
     for folder in (pages / DATA, pages / PICTURES):
         folder.mkdir(parents=True, exist_ok=True)
     for path in made:
-        kept = read_result(path)
+        new = read_result(path)
+        place = pages / DATA / path.name
+        kept = with_seed(read_study(place) if place.exists() else None, new)
         for old in [*(pages / PICTURES).iterdir(), *(pages / DATA).glob("*.csv")]:
-            if _owner(old.name, experiments) == kept.name:
+            superseded = old.suffix == ".csv" or kept.seeds[0] == new.seed
+            if _owner(old.name, experiments) == kept.name and superseded:
                 old.unlink()
-        for file, _ in kept.figures:
-            shutil.copyfile(path.with_name(file), pages / PICTURES / file)
+        if kept.seeds[0] == new.seed:
+            for file, _ in new.figures:
+                shutil.copyfile(path.with_name(file), pages / PICTURES / file)
         for table in kept.tables:
             write_atomically(pages / DATA / f"{kept.name}-{table.name}.csv", _csv(table).encode())
-        write_atomically(pages / DATA / path.name, path.read_bytes())
+        write_atomically(place, kept.encoded())
     return write_pages(pages, experiments)
 
 
@@ -47,7 +63,7 @@ def write_pages(pages: Path, experiments: Sequence[Experiment]) -> Path:
     rows = []
     for experiment in experiments:
         path = pages / DATA / f"{experiment.name}.json"
-        kept = read_result(path) if path.exists() else None
+        kept = read_study(path) if path.exists() else None
         rows.append((experiment, kept))
         if kept is not None:
             write_atomically(pages / f"{experiment.name}.md", page(experiment, kept).encode())
@@ -56,42 +72,50 @@ def write_pages(pages: Path, experiments: Sequence[Experiment]) -> Path:
     return index
 
 
-def page(experiment: Experiment, kept: StoredResult) -> str:
-    """The page of one experiment."""
+def up_to_date(experiment: Experiment, kept: StoredStudy) -> bool:
+    """Whether the results are of the experiment as it is now."""
+    return bool(kept.results[0].facts.get("code") == experiment.code_sha256())
+
+
+def page(experiment: Experiment, kept: StoredStudy) -> str:
+    """The page of one experiment, its pictures those of the lowest seed."""
+    first = kept.results[0]
+    size = first.facts.get("size", "small")
     parts = [
         f"# {experiment.title}",
         f"{experiment.paper}. Must show: {experiment.shows}",
-        _facts(kept.facts),
+        _facts(kept),
+        "" if up_to_date(experiment, kept) else EARLIER,
         description(kept.name),
-        kept.text,
+        first.text,
         "## Criteria and results",
         _criteria(kept),
     ]
-    for file, caption in kept.figures:
-        parts.append(f"![{_plain(caption)}]({PICTURES}/{file})\n\n*{caption}*")
+    seed = f" Seed {first.seed}." if len(kept.seeds) > 1 else ""
+    for file, caption in first.figures:
+        parts.append(f"![{_plain(caption)}]({PICTURES}/{file})\n\n*{caption}{seed}*")
     for table in kept.tables:
         parts += [f"## {table.title}", _markdown(table.columns, table.rows)]
         parts.append(f"[{DATA}/{kept.name}-{table.name}.csv]({DATA}/{kept.name}-{table.name}.csv)")
-    parts.append(
-        f"Made by `velatura study {kept.name} --size {kept.facts.get('size', 'small')}`; all pages: [index]({INDEX})."
-    )
+    seeds = " ".join(f"--seed {one}" for one in kept.seeds)
+    parts.append(f"Made by `velatura study {kept.name} --size {size} {seeds}`; all pages: [index]({INDEX}).")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def index_page(rows: Sequence[tuple[Experiment, StoredResult | None]]) -> str:
+def index_page(rows: Sequence[tuple[Experiment, StoredStudy | None]]) -> str:
     """The index: each experiment with what it asks and how much of it holds."""
     lines = []
     for experiment, kept in rows:
         if kept is None:
-            lines.append((experiment.title, experiment.paper, "not done", ""))
+            lines.append((experiment.title, experiment.paper, "not done", "", ""))
             continue
-        decided = [criterion.holds for criterion in kept.criteria if criterion.holds is not None]
         lines.append((
             f"[{experiment.title}]({experiment.name}.md)", experiment.paper,
-            f"{sum(decided)} of {len(decided)} hold", str(kept.facts.get("size", "")),
+            _counted(kept) + ("" if up_to_date(experiment, kept) else "; earlier version"),
+            str(kept.results[0].facts.get("size", "")), ", ".join(map(str, kept.seeds)),
         ))  # fmt: skip
     missed = [
-        f"- [{experiment.title}]({experiment.name}.md): {one.asked}: {one.reached}."
+        f"- [{experiment.title}]({experiment.name}.md): {one.asked}: {_reached(one)}."
         for experiment, kept in rows
         if kept is not None
         for one in kept.criteria
@@ -101,36 +125,55 @@ def index_page(rows: Sequence[tuple[Experiment, StoredResult | None]]) -> str:
         "`velatura study` repeats the paper's evaluation on emulated stages whose optics share no code with "
         "the controller. Everything uses a calibration and is judged by photographs; nothing uses the true "
         "values of a stage. Each experiment has a page, with its tables under `data/`. The command writes "
-        "the pages; `docs/study/adding.md` describes how to add an experiment."
+        "the pages; `docs/study/adding.md` describes how to add an experiment.\n\n"
+        f"A criterion holds only if it holds for {SEEDS} seeds: each seed is another stage, with other lenses, "
+        "lamps, positions and noise. One that fails for a seed is missed. One that held so far, for fewer seeds, is "
+        "*open*."
     )
     parts = [
         "# The paper's experiments, repeated",
         head,
-        _markdown(("experiment", "after", "criteria", "size"), lines),
+        _markdown(("experiment", "after", "criteria", "size", "seeds"), lines),
     ]
     if missed:
         parts += ["## Missed criteria", "\n".join(missed)]
     return "\n\n".join(parts) + "\n"
 
 
-def _facts(facts: Mapping[str, object]) -> str:
-    words = {
-        "scene": "Stage: {}",
-        "size": "size {}",
-        "seed": "seed {}",
-        "photographs": "{} photographs",
-        "seconds": "{} s of work",
-    }
-    decided = [text.format(facts[key]) for key, text in words.items() if key in facts]
-    return "; ".join(decided) + "." if decided else ""
+def _counted(kept: StoredStudy) -> str:
+    holds = [one.holds for one in kept.criteria]
+    parts = [f"{holds.count(True)} of {len(holds)} hold"]
+    parts += [f"{holds.count(value)} {word}" for value, word in ((False, "missed"), (None, "open"))
+              if holds.count(value)]  # fmt: skip
+    return ", ".join(parts)
 
 
-def _criteria(kept: StoredResult) -> str:
+def _reached(one: JudgedCriterion) -> str:
+    if len(one.reached) == 1:
+        return next(iter(one.reached.values()))
+    return "; ".join(f"seed {seed}: {text}" for seed, text in one.reached.items())
+
+
+def _facts(kept: StoredStudy) -> str:
+    words = {"scene": "Stage: {}", "size": "size {}", "photographs": "{} photographs", "seconds": "{} s of work"}
+    facts = kept.results[0].facts
+    told = [text.format(facts[key]) for key, text in words.items() if key in facts]
+    if "seed" in facts:
+        several = len(kept.seeds) > 1
+        told.append(f"seed{'s' * several} {', '.join(map(str, kept.seeds))}")
+        if several and len(told) > 2:
+            told.append("photographs and seconds of the first")
+    return "; ".join(told) + "." if told else ""
+
+
+def _criteria(kept: StoredStudy) -> str:
     rows = []
     for one in kept.criteria:
-        reason = "" if one.holds else f"{one.reason} {miss_reason(kept.name, one.asked)}".strip()
-        rows.append((one.asked, one.reached, HOLDS[one.holds], reason))
-    return _markdown(("asked", "reached", "holds", "why not"), rows)
+        reason = "" if one.holds is not False else f"{one.reason} {miss_reason(kept.name, one.asked)}"
+        each = [one.reached.get(seed, "") for seed in kept.seeds]
+        rows.append((one.asked, *each, HOLDS[one.holds], reason.strip()))
+    reached = ["reached"] if len(kept.seeds) == 1 else [f"seed {seed}" for seed in kept.seeds]
+    return _markdown(("asked", *reached, "holds", "why not"), rows)
 
 
 def _markdown(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:

@@ -1,5 +1,7 @@
 """Texts of the pages: what an experiment shows and what it does not, and why it misses a criterion.
 
+No text holds a measured number: it would be of another run than the page. An experiment tells those itself.
+
 Apart from the experiments, so that a better sentence does not make an experiment be done again.
 """
 
@@ -22,19 +24,20 @@ A piece of the camera's picture of one target, solved in four phases of regions 
 times of this piece on a busy machine. They show which variant is slower, not how long the paper's would take here;
 `benchmarks/README.md` has times of the whole picture.""",
     "residual": """\
-A checkerboard on a pale curved shell, at an exposure that one projector alone can reach, so that more
-projectors add resolution and degrees of freedom, not only light. *Normalised residual*: rms difference of photograph
-and target in a region of 16x16 camera pixels, over the target's white; the mean is over regions. The paper
-says neither what it normalises by nor whether its figures are from the solve or from photographs; both are given here.
-Pixels that one projector cannot make bright enough are left out for all. With smaller squares, more regions contain
-an edge, and every figure is larger.""",
+A checkerboard on a pale curved shell, as the paper describes it: the first two projectors stand to the left, and light
+the right half at grazing angles or not at all; the third stands to the right. Everything is compared over the whole
+object that any of the three lights, at two exposures: as bright as all three can make 95 % of it, and as bright as
+the first can make 95 % of what it lights. *Normalised residual*: rms difference of photograph and target in a region
+of 16x16 camera pixels, over the target's white; the mean is over regions. The paper says neither what it normalises
+by nor whether its figures are from the solve or from photographs; both are given here. Its shape and angles are not
+known to the degree either: places and squares were chosen before anything was measured, and not changed after. With
+smaller squares, more regions contain an edge, and every figure is larger.""",
     "sharpness": """\
 lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels
 (eq. 9), in windows; edges are Canny's, at the target's own threshold. *Naive* is the light of photographed
 dots, inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated
 shares. All four make the same target at an exposure that one projector can reach. The number of windows that
-count as best varies: at size small and seed 1, two solves with the same residual gave 86 % and 92 %, and 0.825 and
-0.843 over the whole object.""",
+count as best varies by some percent between two solves of the same residual.""",
     "frequency": """\
 Bands of upright waves around a grey, faint and bold, their frequency rising downwards, over the middle of a
 pale shell, at an exposure that one projector can reach. *Contrast kept* is the amplitude in phase with the
@@ -58,10 +61,11 @@ the object's own pattern at full resolution; *minimum* leaves that to the scale.
 speckles where it has almost no light itself, mostly at depth edges. The seconds include work that is done once: maps
 and compiled code.""",
 }
-SIX_PROJECTORS_DESCRIPTION: Final = f"""\
-{DESCRIPTIONS["residual"]} The projectors are ordered by how much of the picture they light, so the first three are not
-those of the other page. Six projectors are no better than four, at size small (0.01688 and 0.01686, seed 1) and at
-medium."""
+SIX_PROJECTORS_DESCRIPTION: Final = """\
+As the page of three projectors, on the same shell with six round it: left, right, above, far left, far right, high.
+Three of them light all of it about evenly, so the first three are not those of the other page. Everything is compared
+over the whole object that any of the six lights, at two exposures: as bright as all six can make 95 % of it, and as
+bright as the first can make 95 % of what it lights."""
 
 MISS_REASONS: Final[Mapping[tuple[str, str], str]] = {
     ("ablation", "+ Gaussian metapixels"): """\
@@ -77,20 +81,18 @@ Smoothness removes noise from the frames, and a little detail, too. This calibra
     ("earlier", "ours is better than: bounded, no pixel model"): """\
 Dots photographed as well as here are as good a light transport as our shares, at the price of 49 and more
 photographs a projector (see the ablation); the smoothness of ours costs a little SSIM.""",
-    ("residual-six", "falls with each projector"): """\
+    ("residual", "mean, median region"): """\
+Each projector adds the errors of its own calibration and its own noise; where one already reaches a region well, the
+next cannot make it better. That is what the median region shows, and the mean hides.""",
+    ("residual-six", "mean, median region"): """\
 The fifth and sixth projector light the shell from similar directions as others. By the model they reduce the
-residual by 0.0001 (size medium, seed 1), but the errors of their own calibration add more than that: in regions
-without an edge it rises from 0.0043 to 0.0046.""",
+residual a little more, but the errors of their own calibration add as much.""",
     ("frequency", "F_3 / F_1"): """\
-The projectors' blur. At size medium and seed 1, the calibration measures a standard deviation of 0.53, 0.58 and
-0.64 projector pixels on this shell (medians; 0.60 to 0.70 at size small); such pixels carry 13 to 25 % of a wave's
-contrast at 0.5 cycles a pixel and 2 to 7 % at 0.7, where F_3 would have to be, and superposition adds positions
-of light, not contrast. Smoothness reduces it, too: without it the model gives F_3 = 0.60 instead of 0.57 for faint
-waves (size small).""",
+The projectors' blur: superposition adds positions of light, not contrast, and smoothness takes a little of it.""",
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
-well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) reach
-0.52 of it at size medium, seed 1; with the base's limit at a quarter of F_1 nothing is lost.""",
+well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) lose less;
+with the base's limit at a quarter of F_1 nothing is lost.""",
 }
 """Why a criterion of an experiment is missed, by the experiment's name and the beginning of what is asked."""
 

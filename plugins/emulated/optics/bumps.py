@@ -10,8 +10,12 @@ dim = 0.1               # share of the light that is lost
 dim_channels = [0, 0, 0.2]  # and of its red, green and blue
 defocus_mm = 20.0       # its focus lies that much farther away
 gamma = 1.05            # its response's exponents are so many times as large
+white_segment = 0.25    # its colour wheel has a white segment, see ``truth``
+misconverged_px = 0.5   # its red lies that many pixels to the right, its blue as many below
+flicker = 0.02          # spread of its light in short exposures
+shadow = 0.15           # a visitor stands in that share of its picture's width
 
-More for the others: ``noise`` times the camera's read noise, ``gloss`` of the object, ``factor`` times the ambient
+More for the others: ``noise`` times all noise of the camera, ``gloss`` of the object, ``factor`` times the ambient
 light and ``indirect`` for the share of all light that comes back from object and room (see ``truth``).
 
 The file holds everything that is otherwise than in ``bench.toml``; without it, all is as it was set up.
@@ -57,8 +61,10 @@ class Bump:
     ``shift_px``: where a point of the object lies in the device's image, the image's middle exactly, moves by that;
     ``turn_deg``, ``move_mm``: about and along the device's own axes, the object's are the world's; ``dim``,
     ``dim_channels``: shares of a projector's light that are lost; ``defocus_mm``: how much farther away its focus lies;
-    ``gamma``: factor of its response's exponents; ``noise``: of the camera's read noise; ``factor``: of the ambient
-    light; ``indirect``, ``gloss``: as in ``truth``, of the stage where ``what`` is "ambient", and of the "object".
+    ``gamma``: factor of its response's exponents; ``white_segment``, ``flicker``, ``shadow``: as in ``truth``;
+    ``misconverged_px``: how far its red is shifted to the right and its blue down; ``noise``: factor of all noise of
+    the camera; ``factor``: of the ambient light; ``indirect``, ``gloss``: as in ``truth``, of the stage where ``what``
+    is "ambient", and of the "object".
     """
 
     what: str
@@ -74,6 +80,10 @@ class Bump:
     noise: Annotated[float, Between(0.0, 1e3)] = 1.0
     indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
     gloss: Annotated[float, Between(0.0, 1.0)] = 0.0
+    white_segment: Annotated[float, Between(0.0, 2.0)] = 0.0
+    misconverged_px: Annotated[float, Between(-3.0, 3.0)] = 0.0
+    flicker: Annotated[float, Between(0.0, 0.3)] = 0.0
+    shadow: Annotated[float, Between(0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +156,7 @@ def _bumped(truth: BenchTruth, bump: Bump) -> BenchTruth:
         return dataclasses.replace(truth, ambient=ambient, indirect=truth.indirect + bump.indirect)
     if bump.what == "camera":
         camera = truth.camera
-        sensor = dataclasses.replace(camera.sensor, read_noise_e=camera.sensor.read_noise_e * bump.noise)
+        sensor = dataclasses.replace(camera.sensor, noise=camera.sensor.noise * bump.noise)
         camera = dataclasses.replace(camera, pose=_device(camera.pose, camera.lens, bump), sensor=sensor)
         return dataclasses.replace(truth, camera=camera)
     if bump.what == "object":
@@ -166,12 +176,23 @@ def _projector(projector: ProjectorTruth, bump: Bump) -> ProjectorTruth:
         brightness=light.brightness * (1.0 - bump.dim),
         mixing=rows,
         gamma=_three(bump.gamma * np.asarray(light.gamma)),
+        white_segment=light.white_segment + bump.white_segment,
+        shadow=max(light.shadow, bump.shadow),
     )
     focus = dataclasses.replace(
         projector.focus, distance_m=max(0.01, projector.focus.distance_m + 1e-3 * bump.defocus_mm)
     )
     pose = _device(projector.pose, projector.lens, bump)
-    return dataclasses.replace(projector, light=light, focus=focus, pose=pose)
+    red, green, blue = projector.panels.shift_px
+    shifted = ((red[0] + bump.misconverged_px, red[1]), green, (blue[0], blue[1] + bump.misconverged_px))
+    return dataclasses.replace(
+        projector,
+        light=light,
+        focus=focus,
+        pose=pose,
+        panels=dataclasses.replace(projector.panels, shift_px=shifted),
+        lamp=dataclasses.replace(projector.lamp, flicker=projector.lamp.flicker + bump.flicker),
+    )
 
 
 def _device(pose: Pose, lens: Lens, bump: Bump) -> Pose:

@@ -22,6 +22,8 @@ FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
 
 LAYERS_KEPT: Final = 3
+SHADOW_EDGE: Final = 0.04
+"""Width of a shadow's soft edge, in picture widths: who stands near the lens is far out of its focus."""
 
 
 def response(light: LightTruth) -> npt.NDArray[np.float64]:
@@ -39,6 +41,9 @@ def channels(light: LightTruth, frame: ByteImage) -> FloatImage:
     each = np.stack([table[:, c].astype(np.float32)[frame[..., c]] for c in range(3)], axis=-1)
     if light.white_segment > 0.0:
         each += np.float32(light.white_segment) * each.min(axis=-1, keepdims=True)
+    if light.shadow > 0.0:
+        across = (np.arange(frame.shape[1], dtype=np.float32) + 0.5) / frame.shape[1]
+        each *= np.clip((across - light.shadow) / SHADOW_EDGE + 0.5, 0.0, 1.0)[:, None].astype(np.float32)
     return each
 
 

@@ -38,7 +38,7 @@ def mosaic(
         electrons += np.float32(exposure_s) * flaws.dark_e_per_s
     np.minimum(electrons, np.float32(sensor.full_well_e), out=electrons)
     noise = rng.standard_normal(electrons.shape, dtype=np.float32)
-    electrons += noise * np.sqrt(electrons + np.float32(sensor.read_noise_e**2))
+    electrons += np.float32(sensor.noise) * noise * np.sqrt(electrons + np.float32(sensor.read_noise_e**2))
     electrons *= np.float32(iso / 100.0 / sensor.electrons_per_step)
     electrons += np.float32(sensor.black_level)
     return np.clip(np.rint(electrons), 0, sensor.white_level).astype(np.uint16)

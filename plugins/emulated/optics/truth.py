@@ -54,7 +54,8 @@ class Sensor:
 
     ``electrons_per_step``: of one raw step at ISO 100; ``contrast``: how far the JPEG tone curve leaves sRGB;
     ``response_spread``: of pixels, relative; ``hot_pixels``: their share; ``shutter_spread``: of exposure times round
-    what the camera says, relative, the same at each time for the same speed.
+    what the camera says, relative, the same at each time for the same speed; ``noise``: factor on all of the noise,
+    shot noise and read noise alike.
     """
 
     electrons_per_light_s: Annotated[float, Between(1.0, 1e9)]
@@ -67,6 +68,7 @@ class Sensor:
     response_spread: Annotated[float, Between(0.0, 0.3)] = 0.0
     hot_pixels: Annotated[float, Between(0.0, 0.1)] = 0.0
     shutter_spread: Annotated[float, Between(0.0, 0.3)] = 0.0
+    noise: Annotated[float, Between(0.0, 1e3)] = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +107,8 @@ class LightTruth:
     ``mixing``: camera channel (row) by projector channel (column), lamp colour included;
     ``gamma``, ``s_curve``: response per channel, see ``render.response``; ``black_level``: share of white at value 0;
     ``glare``: share of the light that the lens spreads over the whole picture; ``white_segment``: of a colour wheel,
-    which adds so many times the least of the three channels to each of them, so that colours do not add up to white
+    which adds so many times the least of the three channels to each of them, so that colours do not add up to white;
+    ``shadow``: share of the picture's width, from its left, in which a visitor's body keeps the light
     """
 
     brightness: Annotated[float, Between(0.0, 1e3)]
@@ -118,6 +121,7 @@ class LightTruth:
     mixing: Annotated[Matrix, Between(0.0, 2.0)]
     glare: Annotated[float, Between(0.0, 0.5)] = 0.0
     white_segment: Annotated[float, Between(0.0, 2.0)] = 0.0
+    shadow: Annotated[float, Between(0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,17 +133,29 @@ def test_photographs_are_counted_for_every_way_to_calibrate() -> None:
     assert result.criteria[1].holds
 
 
-def test_every_trouble_is_met_at_every_level_and_one_that_can_not_be_calibrated_is_told() -> None:
+def test_every_disturbance_grows_until_the_error_has_doubled_and_one_that_cannot_be_calibrated_is_shown() -> None:
     subject, hand = stage()
     result = robustness(subject)
-    (table,) = result.tables
-    assert len(table.rows) == 1 + sum(len(trouble.levels) for trouble in DISTURBANCES)
-    by = {(row[0], row[1]): row for row in table.rows}
-    assert by["highlights", 0.05][6] == "The object mirrors."
-    assert by["highlights", 0.05][3] is None
-    gamma = [float(by["gamma error", level][3] or 0) for level in (1.02, 1.05, 1.1)]
-    assert gamma == sorted(gamma)
-    assert float(by["quantisation", 4.0][3] or 0) > float(by["quantisation", 7.0][3] or 0)
+    breaking, table = result.tables
+    by = {(row[0], row[1]): dict(zip(table.columns, row, strict=True)) for row in table.rows}
+    assert by["highlights", 0.05]["why not"] == "The object mirrors."
+    assert by["highlights", 0.05]["95 %"] is None
+    assert ("highlights", 0.15) not in by, "it had broken before"
+    base = by["none", None]
+    median, most = (float(str(base[name])) for name in ("CIEDE2000 median", "95 %"))
+    for one in DISTURBANCES:
+        levels = [level for name, level in by if name == one.name]
+        assert one.limit in levels
+        last = by[one.name, levels[-1]]
+        if levels[-1] != one.levels[-1] and last["95 %"] is not None:
+            assert float(str(last["CIEDE2000 median"])) > 1.9 * median
+            assert float(str(last["95 %"])) > 1.9 * most
+    doubles = dict(zip(column(breaking, "disturbance"), column(breaking, "the median doubles at"), strict=True))
+    assert 1.0 < float(str(doubles["gamma error"])) <= 1.2
+    assert doubles["lamp flicker"] == "not at 0.3", "the stage in arrays knows no lamps"
+    holds = {one.asked.split(" of ")[0]: one.holds for one in result.criteria}
+    assert holds["lamp flicker"]
+    assert holds["highlights"] is False
     assert hand.changes == ()
 
 

@@ -16,38 +16,48 @@ from controller.capture.dots import dot_patterns
 from controller.study.catalogue import EXPERIMENTS, SCENES
 from controller.study.experiments import ablation, earlier, live
 from controller.study.experiments.earlier import feathered
-from controller.study.experiments.residual import PAPER, ResidualResult, _criteria, residual
+from controller.study.experiments.residual import BRIGHT, DIM, PAPER, ResidualResult, _criteria, residual
 from controller.study.experiments.sharpness import local_sharpness
 from controller.study.lab.measuring import Quality, Variant, unbounded_inverse
 from controller.study.lab.photographing import dots_as_shares
+from controller.study.lab.subject import ReachableTarget
 from controller.study.output.words import description
 from controller.study.values import Experiment, column
 from tests.controller.study.array_stage import ArrayLight, array_subject
 
 
-def test_the_residual_falls_with_projectors_and_each_count_is_photographed() -> None:
+def test_the_residual_is_photographed_at_both_exposures_over_all_that_is_lit() -> None:
     subject = array_subject()
     result = residual(subject)
     (table,) = result.tables
-    assert column(table, "projectors") == [1, 2, 3]
-    photographed = [float(value or 0) for value in column(table, "photographed, mean")]
-    assert photographed[2] < 0.8 * photographed[0]
-    assert result.criteria[-1].holds == (photographed[0] > photographed[1] > photographed[2])
+    assert column(table, "as bright as") == [BRIGHT] * 3 + [DIM] * 3
+    assert column(table, "projectors") == [1, 2, 3] * 2
+    photographed = [float(str(value)) for value in column(table, "photographed, mean")]
+    # Where three reach it, one projector lacks light: that is what the figure is about.
+    assert photographed[0] > 3 * photographed[2]
+    assert photographed[5] < photographed[3]
+    assert column(table, "all lit pixels leave out") == ["0.0%"] * 6
+    assert all("softened by the camera's own blur" in str(cell) for cell in column(table, "target"))
     assert isinstance(subject.light, ArrayLight)
-    assert subject.light.names == ["1", "1-again", "2", "2-again", "3", "3-again"]
+    assert subject.light.names == [f"{way}-{n}" for way in ("bright", "dim") for n in (1, 2, 3, "3-again")]
 
 
-def test_a_figure_above_the_papers_is_a_miss_with_its_reason() -> None:
-    nothing = np.zeros((2, 2, 3), np.float32)
-    made = [
-        ResidualResult(count, nothing, np.full((3, 3), model, np.float32), np.full((3, 3), shown, np.float32), 0.004,
-             Quality(0, 0, 0, 1, 1))
-        for count, model, shown in ((1, 0.02, 0.03), (2, 0.012, 0.02), (3, 0.009, 0.01))
-    ]  # fmt: skip
-    one, two, three, falls = _criteria(made, 0.004)
-    assert [one.holds, two.holds, three.holds, falls.holds] == [True, False, False, True]
+def made(exposure: str, count: int, model: float, shown: float, delta_e: float = 1.0) -> ResidualResult:
+    picture = np.zeros((2, 2, 3), np.float32)
+    wanted = ReachableTarget(picture, np.ones((2, 2), np.bool_), 1.0)
+    by_model, by_photograph = (np.full((3, 3), value, np.float32) for value in (model, shown))
+    return ResidualResult(exposure, count, wanted, picture, by_model, by_photograph, 0.004,
+                          Quality(delta_e, 0, 0, 1, 1), 0.003)  # fmt: skip
+
+
+def test_a_figure_above_the_papers_or_one_that_does_not_fall_is_a_miss_with_its_reason() -> None:
+    bright = [made(BRIGHT, 1, 0.02, 0.03, 3.0), made(BRIGHT, 2, 0.012, 0.02, 2.0), made(BRIGHT, 3, 0.009, 0.01, 1.0)]
+    dim = [made(DIM, 1, 0.005, 0.007, 0.3), made(DIM, 2, 0.004, 0.006, 0.4), made(DIM, 3, 0.003, 0.005, 0.2)]
+    one, two, three, falls, rises = _criteria([*bright, *dim])
+    assert [one.holds, two.holds, three.holds, falls.holds, rises.holds] == [True, False, False, True, False]
     assert "the calibration's error and noise" in two.reason
-    assert "finer than these projectors' pixels" in three.reason
+    assert "The solve itself is above 0.007" in three.reason
+    assert rises.reason == "Does not fall each time: CIEDE2000."
     assert PAPER[3] == 0.007
 
 
@@ -110,7 +120,7 @@ def test_sharpness_is_measured_for_one_and_for_all_naive_and_full(monkeypatch: p
     subject = array_subject(2)
     result = local_sharpness(subject)
     (table,) = result.tables
-    overall = [float(value or 0) for value in column(table, "lambda, whole")]
+    overall = [float(value or 0) for value in column(table, "lambda, in reach")]
     assert len(overall) == 4
     assert overall[3] > overall[2]
     assert overall[3] > overall[0]

@@ -18,7 +18,7 @@ from controller.study.values import Criterion, Experiment, Result, ResultTable
 
 
 def run(out: Path, *names: str, size: str = "small") -> Path:
-    told = study(names=names, size=size, out=out, pages=None, seed=3, reporter=Silent(), cancel=threading.Event())
+    told = study(names=names, size=size, out=out, pages=None, seeds=(3,), reporter=Silent(), cancel=threading.Event())
     return Path(told["index"])
 
 
@@ -33,8 +33,8 @@ def test_an_experiment_without_a_stage_is_done_and_gets_its_page(
     for module in (catalogue, study_services):
         monkeypatch.setattr(module, "EXPERIMENTS", (toy,))
     index = run(tmp_path)
-    assert "[A toy](toy.md) | Beyond | 1 of 1 hold | small" in index.read_text()
-    assert "size small; seed 3" in (index.parent / "toy.md").read_text()
+    assert "[A toy](toy.md) | Beyond | 0 of 1 hold, 1 open | small | 3 |" in index.read_text()
+    assert "size small; 0 s of work; seed 3" in (index.parent / "toy.md").read_text()
 
 
 def test_unknown_names_and_sizes_are_refused_before_anything_is_written(tmp_path: Path) -> None:

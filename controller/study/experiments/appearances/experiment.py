@@ -206,7 +206,7 @@ def _rounded(value: float | None) -> float | None:
 def _tables(shown: Sequence[PhotographedLook], left_out: Sequence[LeftOut]) -> tuple[ResultTable, ...]:
     columns = (
         "appearance", "made by", "way", "compared", "exposure", "CIEDE2000 median", "95 %", "RMSE", "SSIM", "lambda",
-        "left out of the visible object",
+        "left out of the visible object", "target",
     )  # fmt: skip
     rows: list[tuple[Cell, ...]] = []
     for one in shown:
@@ -214,7 +214,7 @@ def _tables(shown: Sequence[PhotographedLook], left_out: Sequence[LeftOut]) -> t
         visible, name = one.pixels["visible"], TITLES["visible"]
         rows.append(
             (one.look.title, one.look.made_by, "ours", name, 1.0, _rounded(visible.delta_e00_median),
-             _rounded(visible.delta_e00_p95), None, None, None, missing[name])
+             _rounded(visible.delta_e00_p95), None, None, None, missing[name], one.wanted.as_asked)
         )  # fmt: skip
         for way, compared, exposure, found in (
             ("ours", "in reach", 1.0, one.ours),
@@ -228,7 +228,7 @@ def _tables(shown: Sequence[PhotographedLook], left_out: Sequence[LeftOut]) -> t
                 (
                     one.look.title, one.look.made_by, way, compared, round(exposure, 3), round(found.delta_e, 2),
                     round(found.delta_e_p95, 2), round(found.rmse, 4), round(found.ssim, 4), round(found.sharpness, 3),
-                    missing.get(compared),
+                    missing.get(compared), one.wanted.as_asked,
                 )
             )  # fmt: skip
     looks: list[tuple[Cell, ...]] = [

@@ -103,7 +103,7 @@ def _leaved(subject: Subject, _: ProgressCallback) -> Target:
             through_camera(painted(space, partial(leaves, cell_m=cell_m, coloured=coloured)))
             for coloured in (False, True)
         )
-        return Target(np.asarray(bare * (1 - share.image) + colour.image, np.float32), share.mask)
+        return Target(np.asarray(bare * (1 - share.image) + colour.image, np.float32), share.mask, share.softened)
 
     return on_each(subject.mask, added)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Final
@@ -37,12 +37,36 @@ STANDS: Final = "stands.toml"
 IOU, SIZE_OFF, LIGHT_OFF, BLUR_OFF_PX = 0.95, 0.03, 0.10, 0.1
 
 
-def planned_object(path: Path) -> None:
-    """Write the curved shell, plan for it, and write beside it where the bench is to put the projectors."""
+def planned_object(path: Path, seed: int) -> None:
+    """Write the curved shell, plan for it, and write beside it where the bench is to put the projectors.
+
+    No stage is set up as exactly as a plan says: see ``set_up``.
+    """
     curved_object(path)
-    best = planned(path)[1]
-    stands = [_stand(number, one.placement) for number, one in enumerate(best.candidates, start=1)]
+    best, rng = planned(path)[1], np.random.default_rng([seed, 4])
+    stands = [set_up(_stand(number, one.placement), rng) for number, one in enumerate(best.candidates, start=1)]
     write_atomically(path.parent / STANDS, toml_text({"stands": stands}).encode())
+
+
+def set_up(stand: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """A planned position as people with a tape measure reach it, and a lens as it differs from its data sheet.
+
+    Each by a uniform deviation: 10 mm along each axis, half a degree round each, 1 % of the throw ratio, half a percent
+    of the lens shift, 30 mm of the focus, 10 % of the lumens and a fifth of the pupil.
+    """
+    position = np.asarray(stand["position_m"]) + rng.uniform(-0.010, 0.010, 3)
+    turn = Rotation.from_rotvec(np.deg2rad(rng.uniform(-0.5, 0.5, 3)))
+    rotation = turn * Rotation.from_rotvec(stand["rotation_vector"])
+    return {
+        **stand,
+        "position_m": [float(v) for v in position],
+        "rotation_vector": [float(v) for v in rotation.as_rotvec()],
+        "throw_ratio": stand["throw_ratio"] * float(rng.uniform(0.99, 1.01)),
+        "centre_share": [float(v) for v in np.asarray(stand["centre_share"]) + rng.uniform(-0.005, 0.005, 2)],
+        "focus_m": stand["focus_m"] + float(rng.uniform(-0.03, 0.03)),
+        "lumens": stand["lumens"] * float(rng.uniform(0.9, 1.1)),
+        "pupil_m": stand["pupil_m"] * float(rng.uniform(0.8, 1.2)),
+    }
 
 
 def planned(mesh: Path) -> tuple[TargetObject, Chosen, Surface]:
@@ -231,13 +255,15 @@ def _figures(subject: Subject, names: Sequence[str], found: Sequence[PlacementCo
 
 TEXT = """\
 `velatura plan` was given the shell's mesh, a data sheet and 156 places round it; the emulated stage then put three
-projectors at the planned positions, and was calibrated as usual. At each camera pixel that two projectors light, the
+projectors near the planned positions, and was calibrated as usual. At each camera pixel that two projectors light, the
 surface point follows from the measured pixel of one and its planned position. There the other's predicted values are
-compared with its measured ones, where its light is not flatter than 75 degrees. So positions, poses and lenses are
-those of the plan; on a real stage, errors of setting them up with a tape measure come in addition. Light is compared up
-to one factor for all projectors, since the camera's exposure and the paint are not part of a plan. The vignetting of
-projectors and camera is in the measured values but not in the predicted ones. Blur in the plan is that of a thin lens;
-on the stage it grows with depth from the focus."""
+compared with its measured ones, where its light is not flatter than 75 degrees. The stage differs from the plan as one
+does that people set up: positions by up to 10 mm along each axis, directions by half a degree round each, the throw by
+1 %, the lens shift by half a percent, the focus by 30 mm, the light by 10 % and the pupil by a fifth, each drawn from
+the seed; the camera stands where the bench puts it. Light is compared up to one factor for all projectors, since the
+camera's exposure and the paint are not part of a plan. The vignetting of projectors and camera is in the measured
+values but not in the predicted ones. Blur in the plan is that of a thin lens; on the stage it grows with depth from the
+focus."""
 
 PLACEMENT = Experiment(
     name="placement",

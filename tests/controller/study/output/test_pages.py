@@ -12,7 +12,8 @@ from controller.core.errors import UsageError
 from controller.study.catalogue import EXPERIMENTS, SCENES, chosen
 from controller.study.lab.scenes import curved_object
 from controller.study.output.drawing import LARGEST_BYTES, LabelledPicture, Line, encoded_webp, maps, plotted, strip
-from controller.study.output.keeping import read_result, save_result
+from controller.study.output.figures import figure
+from controller.study.output.keeping import StoredStudy, read_result, read_study, save_result
 from controller.study.output.pages import publish
 from controller.study.output.words import DESCRIPTIONS, MISS_REASONS, description, miss_reason
 from controller.study.values import Criterion, Experiment, Figure, Result, ResultTable
@@ -56,8 +57,8 @@ def test_pages_hold_tables_pictures_and_what_is_missed(tmp_path: Path) -> None:
     assert "| a \\| b | 3 | **no** | because \\| of this |" in page
     assert "![Some dots.](pictures/alpha-dots.webp)" in page
     assert (tmp_path / "pages/pictures/alpha-dots.webp").stat().st_size > 0
-    assert (tmp_path / "pages/data/alpha-rows.csv").read_text() == "name,value\none,0.5\ntwo,\n"
-    assert "1 of 2 hold" in index.read_text()
+    assert (tmp_path / "pages/data/alpha-rows.csv").read_text() == "seed,name,value\n1,one,0.5\n1,two,\n"
+    assert "0 of 2 hold, 1 missed, 1 open" in index.read_text()
     assert "not done" in index.read_text()
     assert not (tmp_path / "pages/beta.md").exists()
 
@@ -72,6 +73,66 @@ def test_a_second_study_keeps_the_pages_of_the_first(tmp_path: Path) -> None:
     assert "[Title of alpha](alpha.md)" in text
     assert "[Title of beta](beta.md)" in text
     assert "not done" not in text
+
+
+def published(folder: Path, one: Experiment, seed: int, made: Result, **facts: object) -> StoredStudy:
+    """The experiment as kept after this seed's result came, in a folder for each seed."""
+    own = folder / f"seed-{seed}"
+    own.mkdir(exist_ok=True)
+    told = {"size": "small", "seed": seed, "code": "1", **facts}
+    publish(save_result(own, one, made, told)[:1], folder / "pages", [one])
+    return read_study(folder / f"pages/data/{one.name}.json")
+
+
+def test_a_criterion_holds_only_if_it_holds_for_three_seeds(tmp_path: Path) -> None:
+    alpha = experiment("alpha")
+    for seed, holds in ((2, None), (1, None), (3, True)):
+        kept = published(tmp_path, alpha, seed, result(0.1 * seed))
+        assert kept.criteria[0].holds is holds
+    assert kept.seeds == (1, 2, 3)
+    assert kept.criteria[1].holds is False
+    page = (tmp_path / "pages/alpha.md").read_text()
+    assert "| at most 1 | 0.1 | 0.2 | 0.30000000000000004 | yes |" in page
+    assert "seeds 1, 2, 3" in page
+    assert "*Some dots. Seed 1.*" in page
+    assert (tmp_path / "pages/data/alpha-rows.csv").read_text().splitlines()[0] == "seed,name,value"
+    kept = published(tmp_path, alpha, 2, result(5.0))
+    assert kept.criteria[0].holds is False
+    assert "1 missed" not in (tmp_path / "pages/README.md").read_text()
+    assert "at most 1: seed 1: 0.1; seed 2: 5.0; seed 3" in (tmp_path / "pages/README.md").read_text()
+
+
+def test_one_seed_that_asks_less_than_the_others_leaves_a_criterion_open(tmp_path: Path) -> None:
+    less = Result((Criterion("a | b", "3", False),), result().tables)
+    for seed in (1, 2):
+        published(tmp_path, experiment("alpha"), seed, result())
+    kept = published(tmp_path, experiment("alpha"), 3, less)
+    assert [one.holds for one in kept.criteria] == [None, False]
+
+
+@pytest.mark.parametrize("other", [{"size": "medium"}, {"code": "2"}])
+def test_results_of_another_size_or_version_are_not_mixed(tmp_path: Path, other: dict[str, str]) -> None:
+    published(tmp_path, experiment("alpha"), 1, result())
+    assert published(tmp_path, experiment("alpha"), 2, result(), **other).seeds == (2,)
+
+
+def test_a_page_of_an_earlier_version_of_the_experiment_says_so(tmp_path: Path) -> None:
+    alpha = experiment("alpha")
+    published(tmp_path, alpha, 1, result())
+    assert "earlier version" in (tmp_path / "pages/alpha.md").read_text()
+    assert "; earlier version |" in (tmp_path / "pages/README.md").read_text()
+    published(tmp_path, alpha, 1, result(), code=alpha.code_sha256())
+    assert "earlier version" not in (tmp_path / "pages/alpha.md").read_text()
+
+
+def test_a_figure_for_a_sentence_is_one_number_or_the_least_and_the_most_of_all_seeds(tmp_path: Path) -> None:
+    kept = published(tmp_path, experiment("alpha"), 1, result(0.5))
+    assert figure(kept, "rows", "one", "value", ".2f") == "0.50"
+    kept = published(tmp_path, experiment("alpha"), 2, result(0.75))
+    assert figure(kept, "rows", "one", "value", ".2f") == "0.50 to 0.75"
+    for table, row, column in (("rows", "three", "value"), ("rows", "one", "weight"), ("columns", "one", "value")):
+        with pytest.raises(KeyError):
+            figure(kept, table, row, column, ".2f")
 
 
 def test_an_experiment_done_again_leaves_the_files_of_one_with_a_longer_name(tmp_path: Path) -> None:
@@ -135,7 +196,7 @@ def test_words_stand_apart_from_results_and_are_about_known_experiments() -> Non
     names = {one.name for one in EXPERIMENTS}
     assert set(DESCRIPTIONS) <= names
     assert {name for name, _ in MISS_REASONS} <= names
-    assert description("residual-six").startswith(description("residual"))
+    assert "six" in description("residual-six")
     assert description("residual") != ""
     (name, begins), text = next(iter(MISS_REASONS.items()))
     assert miss_reason(name, f"{begins} and more") == text

@@ -120,6 +120,15 @@ def test_a_white_segment_adds_white_and_leaves_colours_alone(truth: BenchTruth) 
     np.testing.assert_allclose(added, 0.4 * 51 / 255 * picture(truth, white), rtol=1e-3, atol=1e-6)
 
 
+def test_a_shadow_keeps_the_light_of_its_part_of_the_picture_and_ends_softly(truth: BenchTruth) -> None:
+    frame = blank(truth, 255)
+    plain, dark = (emitted(one.projectors[0].light, frame)[0, :, 1] for one in (truth, with_light(truth, shadow=0.25)))
+    width = len(dark)
+    assert dark[: round(0.22 * width)].max() == 0
+    assert (dark[round(0.28 * width) :] == plain[round(0.28 * width) :]).all()
+    assert (np.diff(dark) >= 0).all()
+
+
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_panels_shift_and_magnify_the_picture_of_their_colour(truth: BenchTruth, channel: int) -> None:
     """A ramp of light shows by its height where it lies."""

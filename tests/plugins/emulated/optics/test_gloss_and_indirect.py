@@ -94,7 +94,8 @@ def test_a_bench_is_disturbed_and_mended(tmp_path: Path) -> None:
 
     truth = read_truth(tmp_path)
     changes: Changes = [
-        {"what": "projector", "name": "left", "gamma": 1.1, "defocus_mm": 30.0},
+        {"what": "projector", "name": "left", "gamma": 1.1, "defocus_mm": 30.0, "flicker": 0.02, "shadow": 0.15},
+        {"what": "projector", "name": "left", "white_segment": 0.25, "misconverged_px": 0.5},
         {"what": "camera", "noise": 3.0},
         {"what": "object", "gloss": 0.05},
         {"what": "ambient", "indirect": 0.01},
@@ -104,8 +105,10 @@ def test_a_bench_is_disturbed_and_mended(tmp_path: Path) -> None:
     before, after = truth.projectors[0], now.projectors[0]
     assert after.light.gamma == pytest.approx([1.1 * value for value in before.light.gamma])
     assert after.focus.distance_m == pytest.approx(before.focus.distance_m + 0.03)
+    assert (after.lamp.flicker, after.light.shadow, after.light.white_segment) == (0.02, 0.15, 0.25)
+    assert after.panels.shift_px == ((0.5, 0.0), (0.0, 0.0), (0.0, 0.5))
     assert now.projectors[1:] == truth.projectors[1:]
-    assert now.camera.sensor.read_noise_e == 3.0 * truth.camera.sensor.read_noise_e
+    assert now.camera.sensor.noise == 3.0
     assert (now.object.gloss, now.indirect) == (0.05, 0.01)
     bench.disturb(tmp_path, ())
     assert bumped(truth, read_bumps(tmp_path / FILE, truth)) == truth

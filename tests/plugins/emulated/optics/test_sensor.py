@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from pathlib import Path
 
@@ -30,6 +31,18 @@ FACTS = PictureFacts(1 / 60, 200, 5.6, 48.0, "2024:05:06 07:08:09", "VE0000001")
 def shot(level: float, *, exposure_s: float = 0.1, iso: int = 100, aperture_f: float = 8.0) -> npt.NDArray[np.uint16]:
     light = np.full((200, 300, 3), level, np.float32)
     return mosaic(light, SENSOR, np.random.default_rng(4), exposure_s=exposure_s, iso=iso, aperture_f=aperture_f)
+
+
+def test_a_factor_of_the_noise_is_on_all_of_it_in_the_dark_as_in_the_light() -> None:
+    noisy = dataclasses.replace(SENSOR, noise=4.0)
+    for level in (0.0, 0.5):
+        light = np.full((200, 300, 3), level, np.float32)
+        plain, more = (
+            float(mosaic(light, one, np.random.default_rng(4), exposure_s=0.1, iso=1600, aperture_f=8.0).std())
+            for one in (dataclasses.replace(SENSOR, full_well_e=1e7, white_level=4095, electrons_per_step=90.0),
+                        dataclasses.replace(noisy, full_well_e=1e7, white_level=4095, electrons_per_step=90.0))
+        )  # fmt: skip
+        assert more == pytest.approx(4 * plain, rel=0.03)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.05, 0.5, 2.0])

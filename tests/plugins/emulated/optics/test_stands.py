@@ -42,6 +42,20 @@ def test_six_projectors_stand_in_six_places_and_the_first_three_are_those_of_thr
     assert len({projector.port for projector in six.projectors}) == 6
 
 
+def test_projectors_stand_at_places_that_are_named_in_that_order(tmp_path: Path) -> None:
+    truth = prepared(tmp_path, projectors=["far-left", "left", "right"])
+    assert [one.name for one in truth.projectors] == ["far-left", "left", "right"]
+    across = [one.pose.position_m[0] for one in truth.projectors]
+    assert across[0] < across[1] < 0 < across[2]
+
+
+@pytest.mark.parametrize("names", [[], ["left", "left"], ["left", "behind"]])
+def test_places_that_are_unknown_or_named_twice_are_refused(tmp_path: Path, names: list[str]) -> None:
+    with pytest.raises(PluginError) as caught:
+        prepared(tmp_path, projectors=names)
+    assert caught.value.code == "setting-wrong"
+
+
 def test_a_projector_stands_and_shines_as_it_is_told(tmp_path: Path) -> None:
     file = tmp_path / "stands.toml"
     file.write_text(TABLE.format(name="one", lumens=2000.0) + TABLE.format(name="two", lumens=4000.0))

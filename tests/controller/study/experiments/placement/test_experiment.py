@@ -14,7 +14,7 @@ from controller.core.arrays import Float64, Mask
 from controller.plan.optics import lit_by, pixels_of
 from controller.plan.target_object import AFTER_M, TargetObject
 from controller.plan.values import Placement, Surface
-from controller.study.experiments.placement.experiment import CAMERA_M, STANDS, at_size, planned, planned_object
+from controller.study.experiments.placement.experiment import CAMERA_M, STANDS, at_size, planned, planned_object, set_up
 from controller.study.experiments.placement.measuring import compare_placement, seen_by
 from plugins.emulated.optics.stands import read_stands
 
@@ -24,7 +24,7 @@ SIZE = (280, 210)
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TargetObject, list[Placement]]:
     mesh = tmp_path_factory.mktemp("planned") / "object.ply"
-    planned_object(mesh)
+    planned_object(mesh, 1)
     target_object, best, _ = planned(mesh)
     return mesh, target_object, [at_size(one.placement, SIZE) for one in best.candidates]
 
@@ -88,7 +88,7 @@ def test_a_projector_that_stands_elsewhere_or_is_zoomed_otherwise_is_told(
     assert np.nanmedian(zoomed.size_mm[1] / zoomed.size_mm[0]) == pytest.approx(1 / 1.1, rel=0.02)
 
 
-def test_the_bench_is_told_the_same_stands_at_its_own_resolution(
+def test_the_bench_is_set_up_near_the_plan_and_never_exactly_so(
     plan: tuple[Path, TargetObject, list[Placement]],
 ) -> None:
     mesh, _, placements = plan
@@ -96,9 +96,18 @@ def test_the_bench_is_told_the_same_stands_at_its_own_resolution(
     assert len(stands) == len(placements)
     for stand, placement in zip(stands, placements, strict=True):
         lens = stand.lens(SIZE)
-        assert lens.focal_px == pytest.approx(placement.focal_px)
-        np.testing.assert_allclose(lens.centre_px, placement.centre_px)
-        np.testing.assert_allclose(
-            Rotation.from_rotvec(stand.rotation_vector).as_matrix(), placement.rotation, atol=1e-9
-        )
-        np.testing.assert_allclose(stand.position_m, placement.position_m)
+        assert lens.focal_px == pytest.approx(placement.focal_px, rel=0.0101)
+        assert lens.focal_px != pytest.approx(placement.focal_px, rel=1e-5)
+        off = np.abs(np.asarray(stand.position_m) - placement.position_m)
+        assert 1e-4 < off.max() <= 0.010
+        turn = Rotation.from_rotvec(stand.rotation_vector) * Rotation.from_matrix(placement.rotation).inv()
+        assert 0.02 < np.rad2deg(turn.magnitude()) < 0.9
+
+
+def test_each_seed_is_another_stage_and_the_same_one_each_time() -> None:
+    stand = {"name": "one", "position_m": [0.0, 0.0, -1.0], "rotation_vector": [0.0, 0.0, 0.0], "throw_ratio": 2.0,
+             "centre_share": [0.5, 1.0], "focus_m": 1.0, "lumens": 3000.0, "pupil_m": 0.03}  # fmt: skip
+    one, again, other = (set_up(stand, np.random.default_rng([seed, 4])) for seed in (1, 1, 2))
+    assert one == again
+    assert one != other
+    assert one["name"] == "one"
