@@ -31,6 +31,8 @@ REACH_SIGMAS: Final = 3.2
 LARGEST_RADIUS: Final = 13
 MARGIN_PX: Final = LARGEST_RADIUS + int(BEYOND_PX) + 1
 LAYERS_KEPT: Final = 3
+LAYERS_BYTES: Final = 1 << 30
+"""Of all projectors; at least one layer of each is kept."""
 
 
 def response(light: LightTruth) -> npt.NDArray[np.float64]:
@@ -108,6 +110,8 @@ class Renderer:
         self._samples = samples
         self._profiles = [pixel_profiles(p.light.fill_factor) for p in truth.projectors]
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
+        of_all = 12 * max(len(samples.pixels), 1) * len(truth.projectors)
+        self._layers_kept = max(1, min(LAYERS_KEPT, LAYERS_BYTES // of_all))
         self._vignette = _vignette(truth)
         self._albedo = _pixel_sums(samples.albedo, samples.starts)
         self._ambient = self._albedo * np.asarray(truth.ambient, dtype=np.float32)
@@ -163,7 +167,7 @@ class Renderer:
             layer = part if layer is None else layer + part
         assert layer is not None
         kept[digest] = layer
-        if len(kept) > LAYERS_KEPT:
+        if len(kept) > self._layers_kept:
             kept.popitem(last=False)
         return layer
 

@@ -61,16 +61,19 @@ class Stand:
 
 @dataclass(frozen=True, slots=True)
 class Stands:
-    """How many projectors, or where each of them; ``placed`` empty: the first ``count`` of ``PLACES``."""
+    """How many projectors, or where each of them; ``placed`` empty: the first ``count`` of ``PLACES``.
 
-    count: int = DEFAULT
+    ``count`` None: as many as stages of the size have
+    """
+
+    count: int | None = None
     placed: tuple[Stand, ...] = ()
 
-    @property
-    def places(self) -> Sequence[tuple[str, float, float]]:
+    def places(self, usual: int) -> Sequence[tuple[str, float, float]]:
+        """Name and two angles of each; ``usual``: how many stages of the size have."""
         if self.placed:
             return [(stand.name, *PLACES[0][1:]) for stand in self.placed]
-        return PLACES[: self.count]
+        return PLACES[: usual if self.count is None else self.count]
 
     def put(self, index: int, projector: ProjectorTruth) -> ProjectorTruth:
         """``projector`` (of this index) at its given position; unchanged where none was given."""
@@ -92,7 +95,8 @@ class Stands:
 
 
 SETTINGS: Final = {
-    "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}; if omitted: {DEFAULT}",
+    "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}; if omitted: {DEFAULT}, or 4"
+    " at size uhd",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
     " throw_ratio, centre_share, focus_m, lumens and pupil_m",
     "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
@@ -109,8 +113,8 @@ def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
 
     Raises PluginError("setting-wrong"), DeviceError as ``tables.load``.
     """
-    count, file = settings.get("projectors", DEFAULT), settings.get("stands")
-    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(PLACES):
+    count, file = settings.get("projectors"), settings.get("stands")
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(PLACES)):
         raise _wrong("projectors", count)
     if file is None:
         return Stands(count)
