@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one area's ``measure`` and report its rows."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure one area.")
     parser.add_argument("name", choices=areas(), help="what to measure")
-    parser.add_argument("--size", default="small", help=f"one of {', '.join(SIZES)}; memory and player have more")
+    parser.add_argument("--size", default="small", help=f"one of {', '.join(SIZES)}; memory has more")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
     options = parser.parse_args(arguments)
     area = importlib.import_module(f"benchmarks.{options.name}")
