@@ -175,9 +175,9 @@ def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) 
     majoriser += data
     wanted: FloatImage = theirs["tgt"]
     tie = float(max(across.max(), down.max())) / TIE_STEPS
-    ties = (np.rint(part / np.float32(tie)).astype(np.uint16) for part in (across, down))
+    right, below = (np.rint(part / np.float32(tie)).astype(np.uint16) for part in (across, down))
     weights = np.ones(transport.camera_shape, np.float32)
-    problem = Problem(transport, wanted, np.zeros_like(wanted), weights, *ties, tie, majoriser)
+    problem = Problem(transport, wanted, np.zeros_like(wanted), weights, right, below, tie, majoriser)
     start = _start(transport, wanted, reach)
     block_coordinate_descent(problem, start.copy(), IterationControl(0, 1))
     seen: list[tuple[int, float, float]] = []

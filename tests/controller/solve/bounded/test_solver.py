@@ -251,7 +251,8 @@ def test_the_weights_of_the_smoothness_equations_are_those_of_the_paper(stage: S
     for n, size in enumerate(transport.sizes):
         white = transport.forward_part(n, np.ones((*size, 3), np.float32))
         edges = smoothness_weights(transport.gaussian_mean(wanted, n), transport.gaussian_mean(white, n))
-        right, below = (plane_frames(part[:, transport.span(n)], [size])[0] for part in (across, down))
+        kept = (part[:, transport.span(n)].astype(np.float32) for part in (across, down))
+        right, below = (plane_frames(part, [size])[0] for part in kept)
         np.testing.assert_allclose(right[:, :-1] / TIE_STEPS, edges.across**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
         np.testing.assert_allclose(below[:-1] / TIE_STEPS, edges.down**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
         assert not right[:, -1].any()
