@@ -21,10 +21,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one area's ``measure`` and report its rows."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure one area.")
     parser.add_argument("name", choices=areas(), help="what to measure")
-    parser.add_argument("--size", choices=SIZES, default="small")
+    parser.add_argument("--size", default="small", help=f"one of {', '.join(SIZES)}; memory has more")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
     options = parser.parse_args(arguments)
-    rows: list[Row] = importlib.import_module(f"benchmarks.{options.name}").measure(options.size)
+    area = importlib.import_module(f"benchmarks.{options.name}")
+    sizes = getattr(area, "SIZES", SIZES)
+    if options.size not in sizes:
+        parser.error(f"{options.name} has no size {options.size}; choose one of {', '.join(sizes)}")
+    rows: list[Row] = area.measure(options.size)
     print_table(options.name, options.size, rows)
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)

@@ -1,18 +1,31 @@
-"""A calibration made from formulas, at any size: a curved, coloured object under rotated, foreshortened projectors."""
+"""A calibration made from formulas, at any size: a curved, coloured object under rotated, foreshortened projectors.
+
+``python -m benchmarks._synthetic FOLDER SIZE`` writes it as a run does, one projector at a time, and prints the names.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import sys
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from controller.artefacts.projectors import Light, Pixels
 from controller.calibrate.values import Calibration, Metapixels, PhaseMap, ProjectorCalibration, Radiometry
 from controller.core.arrays import FloatImage, Mask
 
-PROJECTOR: Final = {"small": (210, 280), "medium": (526, 700), "paper": (1050, 1400)}
-CAMERA: Final = {"small": (520, 776), "medium": (1296, 1944), "paper": (2592, 3888)}
+PROJECTOR: Final = {
+    "small": (210, 280), "medium": (526, 700), "paper": (1050, 1400), "hd": (1200, 1920), "uhd": (2160, 3840),
+}  # fmt: skip
+CAMERA: Final = {
+    "small": (520, 776), "medium": (1296, 1944), "paper": (2592, 3888), "hd": (2880, 4320), "uhd": (5464, 8192),
+}  # fmt: skip
 """(rows, columns)"""
+COUNT: Final = {"hd": 4, "uhd": 4}
+"""Projectors, where they are not three."""
+NAMES: Final = ("left", "middle", "right", "above")
 MARGIN_PX: Final = 6
 """Of a crop, in projector pixels."""
 
@@ -20,17 +33,52 @@ MARGIN_PX: Final = 6
 def synthetic_calibration(
     size: str | None = None, *, projector: tuple[int, int] = (210, 280), camera: tuple[int, int] = (520, 776)
 ) -> Calibration:
-    """Three projectors of one of the named sizes, or of the given (rows, columns)."""
+    """Projectors of one of the named sizes, or three of the given (rows, columns)."""
     if size is not None:
         projector, camera = PROJECTOR[size], CAMERA[size]
+    u, v, mask, albedo, black = _scene(camera)
+    projectors = tuple(
+        _projector(n, projector, camera, u, v, albedo * mask[..., None], mask) for n in range(COUNT.get(size or "", 3))
+    )
+    return Calibration(projectors, black, mask, TO_XYZ, mosaic=MOSAIC)
+
+
+def write_synthetic_run(
+    folder: Path,
+    size: str | None = None,
+    *,
+    projector: tuple[int, int] = (210, 280),
+    camera: tuple[int, int] = (520, 776),
+) -> list[str]:
+    """Write what a run of ``synthetic_calibration`` would have left, one projector at a time; returns the names."""
+    if size is not None:
+        projector, camera = PROJECTOR[size], CAMERA[size]
+    u, v, mask, albedo, black = _scene(camera)
+    albedo *= mask[..., None]
+    names = list(NAMES[: COUNT.get(size or "", 3)])
+    for n, name in enumerate(names):
+        made = _projector(n, projector, camera, u, v, albedo, mask)
+        Light(made.radiometry.response, made.radiometry.mixing, made.white, black, TO_XYZ).write(folder, name)
+        found = made.phase_map
+        assert found is not None
+        seen = np.isfinite(found.projector_px[..., 0])
+        pixels = made.metapixels
+        Pixels(found.projector_px, seen.astype(np.float32), seen, pixels.centre_px, pixels.covariance_px2, pixels.valid,
+               found.projector_px, found.spread_px2, MOSAIC).write(folder, name)  # fmt: skip
+    return names
+
+
+TO_XYZ: Final = np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]])
+MOSAIC: Final = np.array([[0, 1], [1, 2]])
+
+
+def _scene(camera: tuple[int, int]) -> tuple[FloatImage, FloatImage, Mask, FloatImage, FloatImage]:
+    """Places (u, v) in [-1, 1], the object's mask and albedo, and the black image."""
     y, x = np.mgrid[0 : camera[0], 0 : camera[1]].astype(np.float32)
     u, v = x / camera[1] * 2 - 1, y / camera[0] * 2 - 1
     mask: Mask = (u / 0.8) ** 2 + (v / 0.85) ** 2 < 1
     albedo = _albedo(u, v)
-    projectors = tuple(_projector(n, projector, camera, u, v, albedo * mask[..., None], mask) for n in range(3))
-    black = (0.002 * albedo + 0.0005).astype(np.float32)
-    to_xyz = np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]])
-    return Calibration(projectors, black, mask, to_xyz, mosaic=np.array([[0, 1], [1, 2]]))
+    return u, v, mask, albedo, (0.002 * albedo + 0.0005).astype(np.float32)
 
 
 def crop_calibration(calibration: Calibration, top: int, left: int, side: int) -> Calibration:
@@ -89,7 +137,7 @@ def _projector(
     rows, columns = size
     row, column = np.mgrid[0:rows, 0:columns].astype(np.float64)
     p, q = (column + 0.5) / columns * 2 - 1, (row + 0.5) / rows * 2 - 1
-    foreshortening, angle = (0.0, 0.25, -0.25)[n], (0.0, 0.12, -0.1)[n]
+    foreshortening, angle = (0.0, 0.25, -0.25, 0.15)[n], (0.0, 0.12, -0.1, 0.06)[n]
     a, b = p + 0.6 * foreshortening * (p * p - 1), q + 0.03 * np.sin(3 * p + n)
     aspect = camera[1] / camera[0]
     c, s = np.cos(angle), np.sin(angle)
@@ -104,21 +152,19 @@ def _projector(
     inside = (x >= 0) & (y >= 0) & (x < camera[1]) & (y < camera[0])
     at_x, at_y = np.clip(x.astype(int), 0, camera[1] - 1), np.clip(y.astype(int), 0, camera[0] - 1)
     valid: Mask = inside & (albedo[at_y, at_x, 0] > 0)
-    falloff = (0.5 + 0.1 * n) * np.clip(1 - 0.5 * (u - (0.0, 0.5, -0.5)[n]) ** 2 - 0.3 * v**2, 0, None)
-    spill = (0.0, 0.05, 0.08)[n]
+    falloff = (0.5 + 0.1 * n) * np.clip(1 - 0.5 * (u - (0.0, 0.5, -0.5, 0.25)[n]) ** 2 - 0.3 * v**2, 0, None)
+    spill = (0.0, 0.05, 0.08, 0.03)[n]
     mixing = (1 - spill) * np.eye(3) + spill / 3
     response = np.tile(np.linspace(0, 1, 256) ** 2.2, (3, 1))
     metapixels = Metapixels(centre.astype(np.float32), packed.astype(np.float32), valid)
     white = (albedo * falloff[..., None]).astype(np.float32)
     phase_map = _phase_map(n, size, camera, mask)
-    return ProjectorCalibration(
-        ("left", "middle", "right")[n], metapixels, Radiometry(response, mixing), white, phase_map
-    )
+    return ProjectorCalibration(NAMES[n], metapixels, Radiometry(response, mixing), white, phase_map)
 
 
 def _phase_map(n: int, size: tuple[int, int], camera: tuple[int, int], mask: Mask) -> PhaseMap:
     """The inverse of the centres of ``_projector``, in closed form."""
-    foreshortening, angle = (0.0, 0.25, -0.25)[n], (0.0, 0.12, -0.1)[n]
+    foreshortening, angle = (0.0, 0.25, -0.25, 0.15)[n], (0.0, 0.12, -0.1, 0.06)[n]
     y, x = np.mgrid[0 : camera[0], 0 : camera[1]].astype(np.float32)
     aspect = camera[1] / camera[0]
     c, s = np.cos(angle), np.sin(angle)
@@ -131,3 +177,7 @@ def _phase_map(n: int, size: tuple[int, int], camera: tuple[int, int], mask: Mas
     position[~mask] = np.nan
     spread = np.broadcast_to(np.array([0.19, 0.01 * n, 0.2], np.float32), (*size, 3))
     return PhaseMap(position, np.ascontiguousarray(spread))
+
+
+if __name__ == "__main__":
+    print(" ".join(write_synthetic_run(Path(sys.argv[1]), sys.argv[2])))

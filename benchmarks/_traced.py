@@ -12,9 +12,8 @@ from benchmarks import Timing
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
-from controller.solve.bounded.gradient import weighted_residual
 from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.solver import SMOOTHNESS, build_problem, initial_point, smoothness_term
+from controller.solve.bounded.solver import SMOOTHNESS, build_problem, initial_point, objective_of
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes
 
@@ -103,4 +102,4 @@ def _descend(problem: Problem, x: FloatImage, control: IterationControl) -> None
 
 def _objective(problem: Problem, x: FloatImage, light: FloatImage) -> float:
     problem.transport.forward_planes(x, out=light)
-    return weighted_residual(light, problem.target, problem.weights, light) + smoothness_term(problem, x)
+    return objective_of(problem, x, light)

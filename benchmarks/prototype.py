@@ -32,9 +32,11 @@ from controller.core.errors import WorkError
 from controller.solve.appearance import base_image
 from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
 from controller.solve.bounded.problem import Problem
+from controller.solve.bounded.smoothness import TIE_STEPS
 from controller.solve.bounded.solver import smoothness_term
 from controller.transport import LightTransport, build_transport
 from controller.transport.camera_box import CameraBox
+from controller.transport.planes import plane_image
 
 VARIABLE: Final = "VELATURA_REFERENCE"
 FACTORS: Final = {"small": 0.2, "medium": 0.5, "paper": 1.0}
@@ -135,7 +137,7 @@ class _Theirs(LightTransport):
         np.subtract(buffer, right_hand_side, out=out)
 
     def right_hand_side(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
-        return picture.reshape(-1)
+        return plane_image(picture).reshape(-1)
 
     def forward_planes(
         self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
@@ -172,7 +174,10 @@ def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) 
         transport.adjoint_of_buffer(n, light, data)
     majoriser += data
     wanted: FloatImage = theirs["tgt"]
-    problem = Problem(transport, wanted, np.ones(transport.camera_shape, np.float32), across, down, majoriser)
+    tie = float(max(across.max(), down.max())) / TIE_STEPS
+    right, below = (np.rint(part / np.float32(tie)).astype(np.uint16) for part in (across, down))
+    weights = np.ones(transport.camera_shape, np.float32)
+    problem = Problem(transport, wanted, np.zeros_like(wanted), weights, right, below, tie, majoriser)
     start = _start(transport, wanted, reach)
     block_coordinate_descent(problem, start.copy(), IterationControl(0, 1))
     seen: list[tuple[int, float, float]] = []

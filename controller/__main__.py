@@ -75,7 +75,7 @@ def states(
 
 
 def demo(
-    size: Annotated[str, typer.Option(help="small, medium or paper.")] = "small",
+    size: Annotated[str, typer.Option(help="small, medium, paper or uhd.")] = "small",
     object: Annotated[  # noqa: A002 - the option's name is fixed
         Path | None, typer.Option(help="Mesh of the object, .obj or .ply (default: a vase and a bust).")
     ] = None,

@@ -21,8 +21,9 @@ from controller.calibrate.values import (
 )
 from controller.capture.brackets import merge_brackets
 from controller.capture.raw import CAMERA_BLUR_PX
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, array_in_file
 
+ROWS_AT_ONCE = 256
 LIT_SHARE = 0.004
 """A camera pixel counts as lit if a projector's white is above this share of the brightest white."""
 
@@ -60,18 +61,29 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     for number, name in enumerate(projectors):
         light = Light.read(folder, name)
         phase_map, mosaic = read_phase_map(folder, name)
-        white, indirect, radiometry = np.nan_to_num(light.white), None, light.radiometry
+        # in place: of a mapped file, only the pages with saturated pixels become memory of this process
+        white, indirect, radiometry = np.nan_to_num(light.white, copy=False), None, light.radiometry
         if found is not None:
-            indirect, radiometry = found[number].share * white, found[number].radiometry
-            white = white - indirect
+            radiometry = found[number].radiometry
+            white, indirect = _parted(white, found[number].share, folder)
         parts.append(ProjectorCalibration(name, read_metapixels(folder, name), radiometry, white, phase_map, indirect))
-    black = np.nan_to_num(light.black)
+    black = np.nan_to_num(light.black, copy=False)
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)
     mask = object_mask(parts)
     if (points_m := known_points_m(folder)) is not None:
         mask &= ~room_pixels(points_m)
     return Calibration(tuple(parts), black, mask, light.camera_to_xyz, camera_blur_px, mosaic)
+
+
+def _parted(white: FloatImage, share: npt.NDArray[np.floating], folder: Path) -> tuple[FloatImage, FloatImage]:
+    """The direct and the indirect part of a white image, in nameless files of the run's disk where they are large."""
+    direct, indirect = (array_in_file(folder, white.shape) for _ in range(2))
+    for first in range(0, len(white), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        np.multiply(share[rows].astype(np.float32), white[rows], out=indirect[rows])
+        np.subtract(white[rows], indirect[rows], out=direct[rows])
+    return direct, indirect
 
 
 def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.NDArray[np.int64] | None]:

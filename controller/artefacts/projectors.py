@@ -214,10 +214,11 @@ LEAST_P95: Final = 0.02
 class Indirect:
     """``indirect-PROJECTOR.npz``: the share of its white that is indirect, and its radiometry in direct light.
 
-    ``share`` (camera rows, columns, 3) float32, 0 to 1; ``response``, ``mixing``, ``segment``: as of ``Light``
+    ``share`` (camera rows, columns, 3), 0 to 1, float16 in the file; ``response``, ``mixing``, ``segment``: as of
+    ``Light``
     """
 
-    share: FloatImage
+    share: npt.NDArray[np.floating]
     response: Float64
     mixing: Float64
     segment: Float64 | None = None
@@ -236,7 +237,7 @@ class Indirect:
     @classmethod
     def read(cls, run: Path, projector: str) -> Self:
         arrays = load_arrays(npz_path(run, StepKind.INDIRECT, projector))
-        return cls(arrays["share"].astype(np.float32), arrays["response"], arrays["mixing"], arrays.get("segment"))
+        return cls(arrays["share"], arrays["response"], arrays["mixing"], arrays.get("segment"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,26 @@
 """Array types, and the container for arrays on disk.
 
-The container is NumPy's published ``.npz`` format (a zip of ``.npy`` members), never with pickled objects.
+The container is NumPy's published ``.npz`` format (a zip of ``.npy`` members), never with pickled objects. Members are
+not packed and begin at multiples of 64 bytes, so that a large file can be used where it is (docs/decisions/0055).
 """
 
 from __future__ import annotations
 
+import math
+import mmap
+import os
+import struct
+import tempfile
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import IO, Any, BinaryIO, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib import format as npy
 
 from controller.core.errors import UsageError
 from controller.core.storage import stream_atomically
@@ -24,21 +33,106 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 """(rows, columns)."""
 Float64: TypeAlias = npt.NDArray[np.float64]
 
+ALIGNMENT: Final = 64
+MAPPED_FROM: Final = 32 * 1024 * 1024
+"""Bytes from which a file is mapped instead of read, and an array worth a file."""
+_LOCAL: Final = struct.Struct("<26xHH")
+"""Of a member's local header: the lengths of its name and of what follows the name."""
+_ZIP64_EXTRA: Final = 20
+_PADDING: Final = struct.Struct("<HH")
+_PADDING_ID: Final = 0xD935
+"""The extra field that Android's zipalign uses for the same purpose."""
+_BLOCK: Final = 1 << 24
+_DAMAGED: Final = (
+    OSError, ValueError, KeyError, EOFError, RuntimeError, struct.error, zlib.error, tokenize.TokenError,
+    zipfile.BadZipFile,
+)  # fmt: skip
+"""What the libraries raise for a file that is not what it should be."""
+
 
 def save_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """Write named arrays atomically; the same arrays give the same bytes."""
-    stream_atomically(path, lambda file: np.savez(file, **arrays))  # type: ignore[arg-type]
+    stream_atomically(path, lambda file: _write(file, arrays))
 
 
-def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read a file of ``save_arrays``. Raises UsageError("array-file-unreadable") for any other file."""
+def _write(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        for name, values in arrays.items():
+            member = zipfile.ZipInfo(f"{name}.npy")
+            begins = file.tell() + _LOCAL.size + len(member.filename.encode()) + _ZIP64_EXTRA
+            padding = -(begins + _PADDING.size) % ALIGNMENT
+            member.extra = _PADDING.pack(_PADDING_ID, padding) + bytes(padding)
+            with archive.open(member, "w", force_zip64=True) as to:
+                npy.write_array(to, np.asanyarray(values), allow_pickle=False)
+
+
+def load_arrays(path: Path, *, mapped_from: int = MAPPED_FROM) -> dict[str, npt.NDArray[Any]]:
+    """Read a file of ``save_arrays``. Raises UsageError("array-file-unreadable") for any other file.
+
+    Arrays of a file of at least ``mapped_from`` bytes stay in the file, checked, and are read as they are used. They
+    may be written to: what changes then is memory of this process alone.
+    """
     try:
+        if path.stat().st_size >= mapped_from:
+            return _mapped(path)
         with np.load(path, allow_pickle=False) as archive:
             # Use the members' full names: without the suffix, "a" and "a.npy" would both mean the first.
             return {name: archive[f"{name}.npy"] for name in archive.files}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except _DAMAGED as error:
         raise UsageError(
             "array-file-unreadable",
             what=f"{path} is not a readable array file ({error}).",
             remedy="Delete it and run the command that made it again.",
         ) from error
+
+
+def _mapped(path: Path) -> dict[str, npt.NDArray[Any]]:
+    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        return {
+            member.filename.removesuffix(".npy"): _member(file, whole, archive, member) for member in archive.infolist()
+        }
+
+
+def _member(file: IO[bytes], whole: mmap.mmap, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    """One array: in the file if it is neither packed nor at an odd place, else read."""
+    file.seek(member.header_offset)
+    name, extra = _LOCAL.unpack(file.read(_LOCAL.size))
+    first = member.header_offset + _LOCAL.size + name + extra
+    if member.compress_type == zipfile.ZIP_STORED and first + member.file_size <= len(whole):
+        _check(memoryview(whole)[first : first + member.file_size], member)
+        file.seek(first)
+        read = npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0
+        shape, columns_first, dtype = read(file)
+        at, count = file.tell(), math.prod(shape)
+        if count and not (dtype.hasobject or columns_first or at % dtype.itemsize):
+            if at - first + count * dtype.itemsize != member.file_size:
+                raise ValueError(f"{member.filename} does not have the size of its array")
+            return np.frombuffer(whole, dtype, count, at).reshape(shape)
+    with archive.open(member) as packed:
+        return np.asarray(npy.read_array(packed, allow_pickle=False))
+
+
+def _check(data: memoryview, member: zipfile.ZipInfo) -> None:
+    found = 0
+    for begin in range(0, len(data), _BLOCK):
+        found = zlib.crc32(data[begin : begin + _BLOCK], found)
+    if found != member.CRC:
+        raise zipfile.BadZipFile(f"{member.filename} does not match its checksum")
+
+
+def array_in_file(folder: Path, shape: tuple[int, ...], *, from_bytes: int = MAPPED_FROM) -> FloatImage:
+    """An empty float32 array that need not stay in memory: in a nameless file of ``folder``, which ends with it.
+
+    Below ``from_bytes``, or where no file can be had, it is in memory.
+    """
+    size = math.prod(shape) * 4
+    if size >= max(from_bytes, 1):
+        try:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+                return np.frombuffer(mmap.mmap(file.fileno(), size), np.float32).reshape(shape)
+        except OSError:
+            # a full or read-only disk: memory will do, or say that it does not
+            pass
+    return np.empty(shape, np.float32)

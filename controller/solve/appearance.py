@@ -19,7 +19,7 @@ from controller.core.arrays import FloatImage, Mask
 from controller.solve.bounded.gradient import scale_base
 from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
 from controller.transport import LightTransport
-from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
+from controller.transport.planes import frame_planes, plane_frames, plane_image, planes_above
 
 BaseKind = Literal["minimum", "white"]
 BaseChoice = Literal["minimum", "white", "high-pass"]
@@ -72,17 +72,32 @@ def base_image(calibration: Calibration, kind: BaseKind = "white") -> FloatImage
     keeps the object's own pattern (paper 3.1, 5). ``"white"``: even light over the object, so that its pattern is
     cancelled in the base, at full resolution, and the scale has only the target's detail.
     """
-    whites = np.stack([p.white for p in calibration.projectors])
-    mask = calibration.object_mask & (whites.max(axis=(0, 3)) > 0)
+    # one projector after the other: their white images are in files, and together larger than all else
+    first, *others = (p.white for p in calibration.projectors)
+    brightest = first.max(axis=2)
+    for white in others:
+        np.maximum(brightest, white.max(axis=2), out=brightest)
+    mask = calibration.object_mask & (brightest > 0)
     if kind == "minimum":
-        faint = 1e-3 * whites.max(axis=(1, 2, 3), keepdims=True)
-        light = np.where(whites.max(axis=3, keepdims=True) > faint, whites, np.inf).min(axis=0)
+        light = _where_lit(first)
+        for white in others:
+            np.minimum(light, _where_lit(white), out=light)
         light[~np.isfinite(light)] = 0
         light[~mask] = 0
         return np.asarray(light + calibration.black, np.float32)
-    reach = (whites.sum(axis=0) + calibration.black)[mask].min(axis=1)
+    whole = first[mask]
+    for white in others:
+        whole += white[mask]
+    whole += calibration.black[mask]
+    reach = whole.min(axis=1)
     level = HEADROOM * float(np.quantile(reach, 0.05)) if reach.size else 0.0
     return np.where(mask[..., None], np.maximum(calibration.black, np.float32(level)), calibration.black)
+
+
+def _where_lit(white: FloatImage) -> FloatImage:
+    """A white image, infinite where the projector hardly shines."""
+    faint = np.float32(1e-3) * white.max(initial=0)
+    return np.where(white.max(axis=2, keepdims=True) > faint, white, np.float32(np.inf))
 
 
 def high_pass_base(transport: LightTransport, level: FloatImage, target: FloatImage, black: FloatImage) -> FloatImage:
@@ -121,17 +136,20 @@ def solve_base(
 
 def prepare_base(transport: LightTransport, image: FloatImage, black: FloatImage, solution: Solution) -> Base:
     """A Base from frames that were solved before for ``image``."""
-    light = image_planes(np.maximum(image - black, 0))
+    light = planes_above(image, black)
     mask = transport.object_mask
     faint = FAINTEST_BASE * light[:, mask].mean() if mask.any() else 0.0
     present = mask & (light > max(faint, np.finfo(np.float32).tiny))
-    inverse = np.divide(1, light, out=np.zeros_like(light), where=present)
-    share = transport.gaussian_mean_planes(present.astype(np.float32))
-    coverage = np.divide(1, share, out=np.zeros_like(share), where=share > 0)
-    mixed = np.empty_like(share)
-    p = frame_planes(solution.frames)
+    # made again after the means: both together would be the peak of the whole solve
+    del light
+    coverage = transport.gaussian_mean_planes(present.astype(np.float32))
+    np.divide(1, coverage, out=coverage, where=coverage > 0)
+    inverse = planes_above(image, black)
+    np.divide(1, inverse, out=inverse, where=present)
+    inverse[~present] = 0
+    mixed = np.empty_like(coverage)
     for n, M in enumerate(transport.mixing):
-        mixed[:, transport.span(n)] = M @ p[:, transport.span(n)]
+        mixed[:, transport.span(n)] = M @ frame_planes([solution.frames[n]])
     return Base(image, solution, inverse, coverage, mixed)
 
 
@@ -142,10 +160,10 @@ def scale_frames(transport: LightTransport, base: Base, target: FloatImage, blac
     Raises UsageError("image-wrong-size", "target-not-finite").
     """
     check_target(transport, target)
-    scale = image_planes(np.maximum(target - black, 0))
+    scale = planes_above(target, black)
     scale *= base.inverse
     means = transport.gaussian_mean_planes(scale)
-    out = np.empty_like(means)
+    out = means
     for n, M in enumerate(transport.mixing):
         start, end = transport.span(n).start, transport.span(n).stop
         unmix = np.linalg.inv(M.astype(np.float64)).astype(np.float32)

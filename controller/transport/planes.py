@@ -26,6 +26,21 @@ def _join(planes: FloatImage, pixels: FloatImage) -> None:
             pixels[i, c] = planes[c, i]
 
 
+@compiled(parallel=True)
+def _split_above(pixels: FloatImage, black: FloatImage, planes: FloatImage) -> None:
+    for i in prange(pixels.shape[0]):
+        for c in range(3):
+            planes[c, i] = max(pixels[i, c] - black[i, c], np.float32(0))
+
+
+def planes_above(image: npt.NDArray[np.floating], black: npt.NDArray[np.floating]) -> FloatImage:
+    """(3, rows, columns) float32 from two finite images (rows, columns, 3): image - black, 0 where it is negative."""
+    planes = np.empty((3, *image.shape[:2]), np.float32)
+    pixels, dark = (np.ascontiguousarray(part, np.float32).reshape(-1, 3) for part in (image, black))
+    _split_above(pixels, dark, planes.reshape(3, -1))
+    return planes
+
+
 def image_planes(image: npt.NDArray[np.floating]) -> FloatImage:
     """(rows, columns, 3) to (3, rows, columns) float32."""
     pixels = np.ascontiguousarray(image, np.float32)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hal.runtime.caches import cache_folder, temporary
+from hal.runtime.control_groups import GROUPS, MEMBERSHIP, groups_of
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("controller", "plugins", "hal", "benchmarks", "tests")
@@ -27,7 +28,7 @@ _IMPORT: Final = re.compile(
 )
 
 
-def usable_cpus(groups: Path = Path("/sys/fs/cgroup"), membership: Path = Path("/proc/self/cgroup")) -> int:
+def usable_cpus(groups: Path = GROUPS, membership: Path = MEMBERSHIP) -> int:
     """Number of CPUs that this process may use, at least 1: by its affinity and the quotas of its control groups.
 
     Args:
@@ -164,23 +165,8 @@ def _file_of(module: str) -> Path | None:
 
 def _quotas(groups: Path, membership: Path) -> list[float]:
     """CPUs that each control group of this process, and each group above it, may use."""
-    try:
-        lines = membership.read_text().splitlines()
-    except OSError:
-        return []
-    found = []
-    for controllers, name in (line.split(":", 2)[1:] for line in lines if line.count(":") >= 2):
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        mount = groups if not controllers else groups / controllers
-        path = mount / name.lstrip("/")
-        for group in (path, *path.parents):
-            if not group.is_relative_to(mount):
-                break
-            quota = _quota_of(group)
-            if quota is not None:
-                found.append(quota)
-    return found
+    found = (_quota_of(group) for group in groups_of("cpu", groups, membership))
+    return [quota for quota in found if quota is not None]
 
 
 def _quota_of(group: Path) -> float | None:

@@ -48,11 +48,11 @@ def block_coordinate_descent(
 ) -> tuple[FloatImage, float, int]:
     """Sweep from ``x`` (3, pixels), which is overwritten; returns the last point, its KKT residual and the sweeps."""
     transport = problem.transport
-    right_hand_side = transport.right_hand_side(problem.target, problem.weights)
+    right_hand_side = transport.right_hand_side(problem.target(), problem.weights)
     # buffers of light: of the point x, of the extrapolated point y, of y before the sweep
     light, light_y, before = (transport.sensor_buffer() for _ in range(3))
     residual = np.empty_like(right_hand_side)
-    y, new, step = x.copy(), np.empty_like(x), np.empty_like(x)
+    y, step = x.copy(), np.empty_like(x)
     total = max(float(problem.majoriser.sum(dtype=np.float64)), np.finfo(np.float64).tiny)
     inertia, kkt, least, iteration = 1.0, np.inf, np.inf, 0
     for iteration in range(1, control.most_iterations + 1):
@@ -69,8 +69,8 @@ def block_coordinate_descent(
             transport.normal_residual(light_y, problem.weights, right_hand_side, residual)
             transport.adjoint_of_buffer(n, residual, step)
             start, segment = transport.span(n).start, transport.segment(n)
-            smoothness = problem.majoriser, problem.across, problem.down
-            a, b = projected_step(y, x, step, *smoothness, start, rows, columns, segment, new)
+            smoothness = problem.majoriser, problem.across, problem.down, problem.tie
+            a, b = projected_step(y, x, step, *smoothness, start, rows, columns, segment)
             squared_step, uphill = squared_step + a, uphill + b
             transport.accumulate_forward(n, step, light_y)
         kkt = float(np.sqrt(squared_step / total))
@@ -80,10 +80,9 @@ def block_coordinate_descent(
         least = min(least, kkt)
         if uphill > 0 or kkt > MOST_GROWTH * least:
             momentum, overrelaxation, inertia = 0.0, 0.0, 1.0
+        extrapolate(y, x, step, momentum, overrelaxation)
         if control.on_iterate is not None:
-            control.on_iterate(iteration, new)
-        extrapolate(new, x, step, momentum, overrelaxation, y)
-        x, new = new, x
+            control.on_iterate(iteration, x)
         # the buffers follow: ``light_y`` is the light of the new point by now, and becomes that of y
         extrapolate_buffer(light_y, light, before, momentum, overrelaxation)
         if control.progress is not None:

@@ -7,13 +7,14 @@ from numba import prange
 
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
+from controller.solve.bounded.problem import Ties
 
 
 @compiled(parallel=True, fastmath=True)
 def weighted_residual(light: FloatImage, target: FloatImage, weights: FloatImage, out: FloatImage) -> float:
     """Write weights (light - target) to ``out``; return the sum of weights (light - target)^2.
 
-    ``light``, ``target``, ``out`` (3, rows, columns), ``out`` may be ``light``; ``weights`` (rows, columns)
+    ``light``, ``target``, ``out`` (3, rows, columns), ``out`` may be one of the others; ``weights`` (rows, columns)
     """
     rows, columns = weights.shape
     sums = np.zeros(rows, np.float64)
@@ -29,14 +30,14 @@ def weighted_residual(light: FloatImage, target: FloatImage, weights: FloatImage
 
 
 @compiled(fastmath=True)
-def _add_differences(into: FloatImage, here: FloatImage, there: FloatImage, weight: FloatImage) -> None:
+def _add_differences(into: FloatImage, here: FloatImage, there: FloatImage, weight: Ties, tie: np.float32) -> None:
     for i in range(into.size):
-        into[i] += weight[i] * (here[i] - there[i])
+        into[i] += tie * np.float32(weight[i]) * (here[i] - there[i])
 
 
 @compiled(fastmath=True)
 def _step_row(
-    y: FloatImage, x: FloatImage, gradient: FloatImage, majoriser: FloatImage, new: FloatImage, step: FloatImage
+    y: FloatImage, x: FloatImage, gradient: FloatImage, majoriser: FloatImage, step: FloatImage
 ) -> tuple[float, float]:
     kkt = uphill = np.float32(0)
     for i in range(y.size):
@@ -44,7 +45,6 @@ def _step_row(
         to = y[i] - gradient[i] / max(d, np.float32(1e-30))
         to = min(max(to, np.float32(0)), np.float32(1))
         to = to if d > 0 else np.float32(0)
-        new[i] = to
         step[i] = to - y[i]
         kkt += d * (to - y[i]) * (to - y[i])
         uphill += d * (y[i] - to) * (to - x[i])
@@ -92,22 +92,24 @@ def projected_step(
     x: FloatImage,
     gradient: FloatImage,
     majoriser: FloatImage,
-    across: FloatImage,
-    down: FloatImage,
+    across: Ties,
+    down: Ties,
+    tie: float,
     start: int,
     rows: int,
     columns: int,
     segment: float,
-    new: FloatImage,
 ) -> tuple[float, float]:
-    """Write one projected gradient step from ``y`` to ``new`` for the projector whose pixels start at ``start``.
+    """Overwrite ``gradient`` by a projected gradient step from ``y``; the projector's pixels start at ``start``.
 
     All arrays (3, pixels of all projectors), each projector row by row. ``gradient`` is that of the data; that of the
-    smoothness is added here. It is overwritten with new - y. Returns two sums: majoriser x step^2, whose size measures
-    the KKT residual, and majoriser x (y - new) x (new - x), positive where the momentum points uphill.
+    smoothness is added here. Returns two sums: majoriser x step^2, whose size measures the KKT residual, and
+    majoriser x (y - new) x (new - x), positive where the momentum points uphill; new is y + step.
+    ``across``, ``down``: in steps of ``tie``
     ``segment``: the projector's share of white that only greys get; see ``LightTransport.segments``
     """
     sums = np.zeros((rows, 2), np.float64)
+    unit = np.float32(tie)
     for v in prange(rows):
         a = start + v * columns
         e = a + columns
@@ -115,36 +117,41 @@ def projected_step(
         for c in range(3):
             here, edges = y[c, a:e], across[c, a : e - 1]
             total[:] = gradient[c, a:e]
-            _add_differences(total[:-1], here[:-1], here[1:], edges)
-            _add_differences(total[1:], here[1:], here[:-1], edges)
+            _add_differences(total[:-1], here[:-1], here[1:], edges, unit)
+            _add_differences(total[1:], here[1:], here[:-1], edges, unit)
             if v > 0:
-                _add_differences(total, here, y[c, a - columns : a], down[c, a - columns : a])
+                _add_differences(total, here, y[c, a - columns : a], down[c, a - columns : a], unit)
             if v < rows - 1:
-                _add_differences(total, here, y[c, e : e + columns], down[c, a:e])
-            kkt, uphill = _step_row(here, x[c, a:e], total, majoriser[c, a:e], new[c, a:e], gradient[c, a:e])
+                _add_differences(total, here, y[c, e : e + columns], down[c, a:e], unit)
+            kkt, uphill = _step_row(here, x[c, a:e], total, majoriser[c, a:e], gradient[c, a:e])
             sums[v, 0] += kkt
             sums[v, 1] += uphill
         if segment > 0:
-            saturated, share = np.empty(3, np.float32), np.float32(segment)
+            new, saturated, share = np.empty(3, np.float32), np.empty(3, np.float32), np.float32(segment)
             for i in range(a, e):
-                within_segment(new[:, i], share, majoriser[:, i], saturated)
                 for c in range(3):
-                    d, was, to = majoriser[c, i], new[c, i], saturated[c]
+                    new[c] = min(max(y[c, i] + gradient[c, i], np.float32(0)), np.float32(1))
+                within_segment(new, share, majoriser[:, i], saturated)
+                for c in range(3):
+                    d, was, to = majoriser[c, i], new[c], saturated[c]
                     sums[v, 0] += d * ((to - y[c, i]) ** 2 - (was - y[c, i]) ** 2)
                     sums[v, 1] += d * ((y[c, i] - to) * (to - x[c, i]) - (y[c, i] - was) * (was - x[c, i]))
-                    new[c, i], gradient[c, i] = to, to - y[c, i]
+                    gradient[c, i] = to - y[c, i]
     return float(sums[:, 0].sum()), float(sums[:, 1].sum())
 
 
 @compiled(parallel=True, fastmath=True)
-def extrapolate(
-    new: FloatImage, x: FloatImage, step: FloatImage, momentum: float, overrelaxation: float, y: FloatImage
-) -> None:
-    """Write new + momentum (new - x) + overrelaxation step to ``y``; all (3, pixels)."""
+def extrapolate(y: FloatImage, x: FloatImage, step: FloatImage, momentum: float, overrelaxation: float) -> None:
+    """Write new = y + step, in [0, 1], to ``x``, and new + momentum (new - x) + overrelaxation step to ``y``.
+
+    All (3, pixels)
+    """
     beta, gamma = np.float32(momentum), np.float32(overrelaxation)
-    for i in prange(new.shape[1]):
+    for i in prange(x.shape[1]):
         for c in range(3):
-            y[c, i] = new[c, i] + beta * (new[c, i] - x[c, i]) + gamma * step[c, i]
+            new = min(max(y[c, i] + step[c, i], np.float32(0)), np.float32(1))
+            y[c, i] = new + beta * (new - x[c, i]) + gamma * step[c, i]
+            x[c, i] = new
 
 
 @compiled(parallel=True, fastmath=True)
@@ -182,34 +189,36 @@ def scale_base(
 @compiled(parallel=True, fastmath=True)
 def add_smoothness(
     data: FloatImage,
-    across: FloatImage,
-    down: FloatImage,
-    strength: float,
+    across: Ties,
+    down: Ties,
+    tie: float,
     start: int,
     rows: int,
     columns: int,
-    majoriser: FloatImage,
 ) -> None:
-    """Scale one projector's smoothness weights, 0 beside dark pixels; write data + twice their sums to ``majoriser``.
+    """Make one projector's smoothness weights 0 beside dark pixels; add twice their sums to ``data``.
 
-    All (3, pixels of all projectors); dark is a pixel without ``data``. ``start``, ``rows``, ``columns``: the projector
+    All (3, pixels of all projectors); dark is a pixel without ``data``, and stays so. ``start``, ``rows``,
+    ``columns``: the projector; ``across``, ``down``: in steps of ``tie``
     """
-    s = np.float32(strength)
+    twice = np.float32(2 * tie)
     for v in prange(rows):
         for c in range(3):
             for x in range(columns):
                 i = start + v * columns + x
                 lit = data[c, i] > 0
-                across[c, i] *= s if lit and x + 1 < columns and data[c, i + 1] > 0 else np.float32(0)
-                down[c, i] *= s if lit and v + 1 < rows and data[c, i + columns] > 0 else np.float32(0)
+                if not (lit and x + 1 < columns and data[c, i + 1] > 0):
+                    across[c, i] = 0
+                if not (lit and v + 1 < rows and data[c, i + columns] > 0):
+                    down[c, i] = 0
     for v in prange(rows):
         for c in range(3):
             for x in range(columns):
                 i = start + v * columns + x
-                edges = across[c, i] + down[c, i]
-                edges += across[c, i - 1] if x > 0 else np.float32(0)
-                edges += down[c, i - columns] if v > 0 else np.float32(0)
-                majoriser[c, i] = data[c, i] + np.float32(2) * edges
+                edges = np.int64(across[c, i]) + np.int64(down[c, i])
+                edges += np.int64(across[c, i - 1]) if x > 0 else 0
+                edges += np.int64(down[c, i - columns]) if v > 0 else 0
+                data[c, i] += twice * np.float32(edges)
 
 
 @compiled(parallel=True, fastmath=True)

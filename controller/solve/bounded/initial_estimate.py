@@ -28,19 +28,22 @@ LEAST_DETERMINANT: Final = 1e-3
 
 
 def initial_estimate(transport: LightTransport, target_light: FloatImage) -> FloatImage:
-    """(3, pixels of all projectors) in [0, 1] for ``target_light`` (3, camera rows, columns), the light to be made."""
+    """(3, pixels of all projectors) in [0, 1] for ``target_light`` (3, camera rows, columns), the light to be made.
+
+    The latter is overwritten.
+    """
     count = len(transport.sizes)
     blocks = tuple(-(-side // BLOCK_PX) for side in transport.camera_shape)
     white = np.empty((count, 3, *blocks), np.float32)
     target = np.empty((3, *blocks), np.float32)
-    ones = np.ones((3, transport.pixels), np.float32)
-    light = np.empty((3, *transport.camera_shape), np.float32)
+    _block_means(target_light, target)
+    ones, light = np.ones((3, transport.pixels), np.float32), target_light
     for n in range(count):
         transport.forward_planes(ones, projectors=(n, n + 1), out=light)
         _block_means(light, white[n])
-    _block_means(target_light, target)
+    del ones
     _solve_blocks(white, transport.mixing.astype(np.float64), target)
-    found = np.zeros_like(ones)
+    found = np.zeros((3, transport.pixels), np.float32)
     for n in range(count):
         _upsample(white[n], light)
         found[:, transport.span(n)] = transport.gaussian_mean_planes(light, projectors=(n, n + 1))[:, transport.span(n)]

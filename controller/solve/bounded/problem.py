@@ -4,22 +4,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from controller.core.arrays import FloatImage
 from controller.transport import LightTransport
+from controller.transport.planes import planes_above
+
+Ties = npt.NDArray[np.uint16]
+"""Squared smoothness weights (3, pixels) in steps of ``Problem.tie``: half a step off at most (decision 55)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
     """Data of one solve on planes; smoothness is already scaled by its strength.
 
-    ``target`` (3, camera rows, columns): the picture less black; ``weights`` (camera rows, columns): 0 off the object;
-    ``across``, ``down``, ``majoriser`` (3, pixels of all projectors): squared smoothness weights to the right and lower
-    neighbour, and the diagonal that bounds each projector's own Hessian, 0 where a pixel lights nothing
+    ``picture``, ``black`` (camera rows, columns, 3): what is wanted, and the black image; not copies
+    ``weights`` (camera rows, columns): 0 off the object
+    ``across``, ``down`` (3, pixels of all projectors) uint16: squared smoothness weights to the right and lower
+    neighbour, in steps of ``tie``
+    ``majoriser`` (3, pixels): the diagonal that bounds each projector's own Hessian, 0 where a pixel lights nothing
     """
 
     transport: LightTransport
-    target: FloatImage
+    picture: FloatImage
+    black: FloatImage
     weights: FloatImage
-    across: FloatImage
-    down: FloatImage
+    across: Ties
+    down: Ties
+    tie: float
     majoriser: FloatImage
+
+    def target(self) -> FloatImage:
+        """(3, camera rows, columns): the light to be made. A new array each time: a sweep does not need it."""
+        return planes_above(self.picture, self.black)

@@ -11,9 +11,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
@@ -21,9 +22,9 @@ from controller.solve.bounded.descent import IterationControl, block_coordinate_
 from controller.solve.bounded.gradient import add_smoothness, inner, weighted_residual
 from controller.solve.bounded.initial_estimate import initial_estimate
 from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.smoothness import squared_edge_weights
+from controller.solve.bounded.smoothness import TIE_STEPS, squared_edge_weights
 from controller.transport import LightTransport
-from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
+from controller.transport.planes import frame_planes, plane_frames, plane_image, planes_above
 
 SMOOTHNESS: Final = 0.001
 """Default strength of smoothness, relative to the mean diagonal of the data's majoriser. On a disturbed synthetic stage
@@ -113,9 +114,8 @@ def solve_bounded(
         problem, x, IterationControl(tolerance, most_iterations, progress, cancelled)
     )
     light = transport.forward_planes(x)
-    objective = weighted_residual(light, problem.target, problem.weights, np.empty_like(light)) + smoothness_term(
-        problem, x
-    )
+    objective = objective_of(problem, x, light)
+    del problem
     frames = tuple(plane_frames(x, transport.sizes))
     seconds = time.perf_counter() - began
     return Solution(frames, plane_image(light), objective, kkt, iterations, seconds, kkt <= tolerance)
@@ -138,19 +138,12 @@ def build_problem(
         if weights.shape != counted.shape or not np.isfinite(weights).all() or weights.min(initial=0) < 0:
             raise _wrong("the weights are not finite numbers of at least 0, one for each camera pixel")
         counted *= weights
-    return build_problem_from_planes(transport, image_planes(np.maximum(target - black, 0)), counted, smoothness)
-
-
-def build_problem_from_planes(
-    transport: LightTransport, target: FloatImage, counted: FloatImage, smoothness: float
-) -> Problem:
-    """The equations for planes ``target`` (3, rows, columns) and weights (rows, columns) that are 0 off the object."""
+    across, down = squared_edge_weights(transport, planes_above(target, black))
     diagonal, scale = _majoriser(transport, counted)
-    across, down = squared_edge_weights(transport, target)
-    data = diagonal.copy()
+    tie = smoothness * scale / TIE_STEPS
     for n, (rows, columns) in enumerate(transport.sizes):
-        add_smoothness(data, across, down, smoothness * scale, transport.span(n).start, rows, columns, diagonal)
-    return Problem(transport, target, counted, across, down, diagonal)
+        add_smoothness(diagonal, across, down, tie, transport.span(n).start, rows, columns)
+    return Problem(transport, target, black, counted, across, down, tie, diagonal)
 
 
 def _majoriser(transport: LightTransport, counted: FloatImage) -> tuple[FloatImage, float]:
@@ -172,22 +165,29 @@ def _majoriser(transport: LightTransport, counted: FloatImage) -> tuple[FloatIma
     return diagonal, inner(reach, weighted) / pixels
 
 
-def _frame_view(transport: LightTransport, n: int, planes: FloatImage) -> FloatImage:
+def _frame_view(transport: LightTransport, n: int, planes: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return planes[:, transport.span(n)].reshape(3, *transport.sizes[n])
 
 
 def initial_point(problem: Problem) -> FloatImage:
     """(3, pixels): the best frames for light that is smooth (``initial_estimate``); 0 where a pixel lights nothing."""
-    x = initial_estimate(problem.transport, problem.target)
+    x = initial_estimate(problem.transport, problem.target())
     x[problem.majoriser == 0] = 0
     return x
+
+
+def objective_of(problem: Problem, x: FloatImage, light: FloatImage) -> float:
+    """The objective at ``x`` (3, pixels), whose light T x is ``light`` (3, rows, columns)."""
+    target = problem.target()
+    return weighted_residual(light, target, problem.weights, target) + smoothness_term(problem, x)
 
 
 def smoothness_term(problem: Problem, x: FloatImage) -> float:
     """The smoothness term of the objective at ``x`` (3, pixels)."""
     total = 0.0
     for n in range(len(problem.transport.sizes)):
-        frame, across, down = (_frame_view(problem.transport, n, v) for v in (x, problem.across, problem.down))
-        total += float((across[:, :, :-1] * np.diff(frame, axis=2) ** 2).sum(dtype=np.float64))
-        total += float((down[:, :-1] * np.diff(frame, axis=1) ** 2).sum(dtype=np.float64))
-    return total
+        planes = (x, problem.across, problem.down)
+        for frame, across, down in zip(*(_frame_view(problem.transport, n, v) for v in planes), strict=True):
+            total += float((across[:, :-1] * np.diff(frame, axis=1) ** 2).sum(dtype=np.float64))
+            total += float((down[:-1] * np.diff(frame, axis=0) ** 2).sum(dtype=np.float64))
+    return problem.tie * total

@@ -15,6 +15,7 @@ from controller.solve.bounded.problem import Problem
 from controller.solve.regions.box_solvers import BoxProblem
 from controller.transport import LightTransport
 from controller.transport.camera_box import CameraBox
+from controller.transport.planes import planes_above
 
 Pixels = npt.NDArray[np.int64]
 
@@ -40,7 +41,8 @@ def box_problem(
     start = x[list(channels)][:, unknown].astype(np.float64).ravel()
     A = problem.transport.submatrix(box, unknown, channels)
     window = (list(channels), *box.window)
-    missing = (problem.target[window] - light[window]).astype(np.float64).ravel()
+    wanted = planes_above(problem.picture[box.window], problem.black[box.window])[list(channels)]
+    missing = (wanted - light[window]).astype(np.float64).ravel()
     data_side = missing + A @ start
     scale = np.tile(weights, len(channels))
     rows = np.flatnonzero(scale)
@@ -66,7 +68,7 @@ def _smoothness(
         pairs = np.unique(pairs, axis=1)
         for index, c in enumerate(channels):
             here = pairs[:, edges[c, pairs[0]] > 0]
-            alpha = np.sqrt(edges[c, here[0]].astype(np.float64))
+            alpha = np.sqrt(problem.tie * edges[c, here[0]].astype(np.float64))
             known = np.zeros(alpha.size)
             for pixel, sign in ((here[0], 1.0), (here[1], -1.0)):
                 at = np.minimum(np.searchsorted(unknown, pixel), unknown.size - 1)

@@ -21,9 +21,8 @@ import numpy.typing as npt
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, WorkError
-from controller.solve.bounded.gradient import weighted_residual
 from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.solver import SMOOTHNESS, build_problem, check_target, initial_point, smoothness_term
+from controller.solve.bounded.solver import SMOOTHNESS, build_problem, check_target, initial_point, objective_of
 from controller.solve.regions.box_solvers import BoxProblem, BoxSolver, solve_box
 from controller.solve.regions.equations import Pixels, box_problem, channel_groups
 from controller.transport import LightTransport
@@ -165,9 +164,7 @@ def solve_regions(
             if cancelled is not None and cancelled():
                 raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again to repeat it.")
     light = transport.forward_planes(x)
-    objective = weighted_residual(light, problem.target, problem.weights, np.empty_like(light)) + smoothness_term(
-        problem, x
-    )
+    objective = objective_of(problem, x, light)
     frames = tuple(plane_frames(x, transport.sizes))
     return RegionSolution(frames, plane_image(light), objective, done, unknowns, time.perf_counter() - began)
 

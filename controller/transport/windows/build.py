@@ -34,32 +34,32 @@ def build_windows(
     sizes = np.array([m.spread_px2.shape[:2] for m in maps], np.int64).reshape(-1, 2)
     halo = max((_halo(m.spread_px2, tables[0]) for m in maps), default=NEAR)
     place, cell_first = place_cells(sizes)
-    counts, parts, other = [], [], False
-    for n, phase_map in enumerate(maps):
+    walks = [
+        (phase_map.projector_px, phase_map.spread_px2, white[n], colours, use[n], *tables, halo)
+        for n, phase_map in enumerate(maps)
+    ]
+    # all are counted first, so that there is one array of each kind from the beginning
+    counts, rooms = [], []
+    for n, arguments in enumerate(walks):
         count = np.zeros(SORTS * int(cell_first[n + 1] - cell_first[n]), np.int64)
-        arguments = (phase_map.projector_px, phase_map.spread_px2, white[n], colours, use[n], *tables, halo)
         walk(*arguments, count, True, *_empty(0))
         small = np.arange(count.size) % SORTS != OTHER
-        room = np.where(small, -(-count // GROUP) * GROUP, count)
-        first = np.concatenate([[0], np.cumsum(room)])
-        filled = _empty(int(first[-1]))
-        walk(*arguments, first[:-1].copy(), False, *filled)
-        settle(first, count, *filled)
-        counts.append(room)
-        other = other or bool(room[OTHER::SORTS].any())
-        parts.append(filled)
-    room = np.concatenate(counts)
+        counts.append(count)
+        rooms.append(np.where(small, -(-count // GROUP) * GROUP, count))
+    room = np.concatenate(rooms)
     first = np.concatenate([[0], np.cumsum(room)])
+    filled = _empty(int(first[-1]))
+    for n, arguments in enumerate(walks):
+        cells = slice(SORTS * int(cell_first[n]), SORTS * int(cell_first[n + 1]) + 1)
+        own = first[cells] - first[cells.start]
+        part = slice(int(first[cells.start]), int(first[cells.stop - 1]))
+        mine = _part(filled, part)
+        walk(*arguments, own[:-1].copy(), False, *mine)
+        settle(own, counts[n], *mine)
     turn, turn_first = take_turns(place, sizes, room.reshape(-1, SORTS).sum(axis=1), cell_first)
     start = np.cumsum([0, *(int(rows * columns) for rows, columns in sizes)]).astype(np.int64)
-    site, at, across, down, skew, gain = (np.concatenate(of_all) for of_all in zip(*parts, strict=True))
     return Windows(
-        site,
-        at,
-        across,
-        down,
-        skew,
-        gain,
+        *filled,
         first,
         place,
         turn,
@@ -68,7 +68,7 @@ def build_windows(
         sizes,
         cell_first,
         # small windows reach no farther
-        np.array([halo if other else NEAR], np.int64),
+        np.array([halo if room[OTHER::SORTS].any() else NEAR], np.int64),
     )
 
 
@@ -81,6 +81,11 @@ def _empty(count: int) -> _Filled:
         np.empty(count, np.int8),
         np.empty(count, np.float32),
     )
+
+
+def _part(filled: _Filled, part: slice) -> _Filled:
+    site, at, across, down, skew, gain = filled
+    return site[part], at[part], across[part], down[part], skew[part], gain[part]
 
 
 def _halo(spread_px2: FloatImage, table: Profiles) -> int:

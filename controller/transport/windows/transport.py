@@ -85,9 +85,10 @@ class WindowTransport(LightTransport):
         for n, white in enumerate(whites):
             made._products(ones, plain, (n, n + 1), light)
             lit[n] = mask & bright[n] & np.all(light >= np.float32(WHOLE) * made._sampled(white), axis=0)
+        del ones
         light[:] = 1
-        total = made._sums(light, (0, len(maps)))
-        per_sum = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
+        per_sum = made._sums(light, (0, len(maps)))
+        np.divide(1, per_sum, out=per_sum, where=per_sum > 0)
         return cls(mixing, lit, per_sum.max(axis=0), sizes, windows, made.table, made.small, colours, per_sum)
 
     def _products(self, p: FloatImage, mixing: FloatImage, projectors: tuple[int, int], out: FloatImage) -> None:
@@ -171,8 +172,11 @@ class WindowTransport(LightTransport):
         return out.reshape(-1)
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
-        means = self._sums(np.ascontiguousarray(image), projectors or (0, len(self.sizes)))
-        means *= self.per_sum
+        chosen = projectors or (0, len(self.sizes))
+        means = self._sums(np.ascontiguousarray(image), chosen)
+        # the other projectors' pixels are 0 and have no memory yet
+        span = slice(self.span(chosen[0]).start, self.span(chosen[1] - 1).stop)
+        means[:, span] *= self.per_sum[:, span]
         return means
 
     def submatrix(

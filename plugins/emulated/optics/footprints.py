@@ -28,6 +28,7 @@ LARGEST_RADIUS: Final = 13
 MARGIN_PX: Final = LARGEST_RADIUS + int(BEYOND_PX) + 1
 KEPT_BYTES: Final = 256 << 20
 """A projector's summed weights may take so much memory. Pixels beyond it are summed again for each frame."""
+BOX_BYTES: Final = 16
 
 
 @functools.lru_cache(maxsize=4)
@@ -67,12 +68,11 @@ class Lit:
     albedo: Floats
 
     def from_pixel(self, first: int) -> Self:
-        """A copy of what the camera pixels from ``first`` on see."""
+        """What the camera pixels from ``first`` on see; holds no memory if there are none."""
         n = self.starts[first]
-        return type(self)(
-            self.starts[first:] - n, self.at_px[n:].copy(), self.gain[n:].copy(), self.blur[n:].copy(),
-            self.albedo[n:].copy(),
-        )  # fmt: skip
+        starts = np.asarray(self.starts[first:] - n, dtype=np.int32)
+        parts = [part[n:] for part in (self.at_px, self.gain, self.blur, self.albedo)]
+        return type(self)(starts, *(part if part.size else part.copy() for part in parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Footprints:
     def of(cls, lit: Lit, fill_factor: float, *, most_bytes: int = KEPT_BYTES) -> Self:
         """Sum the weights of as many camera pixels as ``most_bytes`` have room for."""
         profiles, radii = pixel_profiles(fill_factor)
-        boxes = _boxes(lit.starts, lit.at_px, lit.gain, lit.blur, radii)
+        boxes = _boxes(lit.starts[: 1 + most_bytes // BOX_BYTES], lit.at_px, lit.gain, lit.blur, radii)
         ends = np.cumsum(boxes[:, 2].astype(np.int64) * boxes[:, 3] * 3)
         kept = int(np.searchsorted(4 * ends, most_bytes, side="right"))
         offsets = np.concatenate([[0], ends[:kept]]).astype(np.int64)

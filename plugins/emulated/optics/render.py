@@ -22,6 +22,8 @@ FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
 
 LAYERS_KEPT: Final = 3
+LAYERS_BYTES: Final = 1 << 30
+"""Of all projectors; at least one layer of each is kept."""
 SHADOW_EDGE: Final = 0.04
 """Width of a shadow's soft edge, in picture widths: who stands near the lens is far out of its focus."""
 
@@ -90,6 +92,8 @@ class Renderer:
         self._samples = samples
         self._footprints: list[list[Footprints] | None] = [None] * len(truth.projectors)
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
+        of_all = 12 * max(len(samples.pixels), 1) * len(truth.projectors)
+        self._layers_kept = max(1, min(LAYERS_KEPT, LAYERS_BYTES // of_all))
         self._vignette = _vignette(truth)
         self._albedo = _pixel_sums(samples.albedo, samples.starts)
         self._ambient = self._albedo * np.asarray(truth.ambient, dtype=np.float32)
@@ -136,7 +140,7 @@ class Renderer:
         parts = [lit.light(one) for lit, one in zip(self._footprints_of(index), sent, strict=True)]
         layer = functools.reduce(np.add, parts)
         kept[digest] = layer
-        if len(kept) > LAYERS_KEPT:
+        if len(kept) > self._layers_kept:
             kept.popitem(last=False)
         return layer
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hal.errors import DeviceError
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import project
-from plugins.emulated.optics.stands import Stands
+from plugins.emulated.optics.stands import DEFAULT, Stands
 from plugins.emulated.optics.truth import (
     BenchTruth,
     CameraTruth,
@@ -34,17 +34,20 @@ Floats = npt.NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Size:
-    """Image sizes (width, height) of a stage, and camera subsamples a side."""
+    """Image sizes (width, height) of a stage, camera subsamples a side, and how many projectors it usually has."""
 
     projector_px: tuple[int, int]
     camera_px: tuple[int, int]
     subsamples: int
+    projectors: int = DEFAULT
 
 
 SIZES: Final[Mapping[str, Size]] = {
     "small": Size((280, 210), (776, 520), 3),
     "medium": Size((700, 526), (1944, 1296), 2),
     "paper": Size((1400, 1050), (3888, 2592), 2),
+    # one ray a camera pixel: with four, the rays alone would take 6 GB
+    "uhd": Size((3840, 2160), (8192, 5464), 1, 4),
 }
 INTRINSICS: Final = "camera-intrinsics.toml"
 FOCAL_REL_SIGMA, CENTRE_SIGMA_PX, K1_SIGMA = 0.001, 3.0, 0.01
@@ -84,7 +87,9 @@ def random_truth(
     points = stage_object.vertices[:: max(1, len(stage_object.vertices) // 6000)].astype(np.float64)
     camera = _camera(sizes, rng, points, ports)
     stands = stands or Stands()
-    drawn = (_projector(index, *place, sizes, rng, points) for index, place in enumerate(stands.places))
+    drawn = (
+        _projector(index, *place, sizes, rng, points) for index, place in enumerate(stands.places(sizes.projectors))
+    )
     projectors = tuple(stands.put(index, projector) for index, projector in enumerate(drawn))
     return BenchTruth(
         size=size,

@@ -61,20 +61,25 @@ class Stand:
 
 @dataclass(frozen=True, slots=True)
 class Stands:
-    """Where projectors are: ``placed``; else at the ``PLACES`` of ``names``; else at the first ``count`` of them."""
+    """How many projectors, or where each of them: ``placed``; else at the ``PLACES`` of ``names``; else at the first
+    ``count`` of them.
 
-    count: int = DEFAULT
+
+    ``count`` None: as many as stages of the size have
+    """
+
+    count: int | None = None
     placed: tuple[Stand, ...] = ()
     names: tuple[str, ...] = ()
 
-    @property
-    def places(self) -> Sequence[tuple[str, float, float]]:
+    def places(self, usual: int) -> Sequence[tuple[str, float, float]]:
+        """Name and two angles of each; ``usual``: how many stages of the size have."""
         if self.placed:
             return [(stand.name, *PLACES[0][1:]) for stand in self.placed]
         if self.names:
             by_name = {place[0]: place for place in PLACES}
             return [by_name[name] for name in self.names]
-        return PLACES[: self.count]
+        return PLACES[: usual if self.count is None else self.count]
 
     def put(self, index: int, projector: ProjectorTruth) -> ProjectorTruth:
         """``projector`` (of this index) at its given position; unchanged where none was given."""
@@ -97,7 +102,7 @@ class Stands:
 
 SETTINGS: Final = {
     "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}, or a list of places, each"
-    f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}",
+    f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}, or 4 at size uhd",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
     " throw_ratio, centre_share, focus_m, lumens and pupil_m",
     "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
@@ -114,13 +119,13 @@ def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
 
     Raises PluginError("setting-wrong"), DeviceError as ``tables.load``.
     """
-    count, file = settings.get("projectors", DEFAULT), settings.get("stands")
+    count, file = settings.get("projectors"), settings.get("stands")
     if isinstance(count, list | tuple):
         known = [place[0] for place in PLACES]
         if not count or len(set(map(str, count))) != len(count) or any(name not in known for name in count):
             raise _wrong("projectors", count)
         return Stands(len(count), names=tuple(count))
-    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(PLACES):
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(PLACES)):
         raise _wrong("projectors", count)
     if file is None:
         return Stands(count)

@@ -15,14 +15,15 @@ from hypothesis import strategies as st
 
 from controller.calibrate.values import Calibration, Metapixels
 from controller.core.errors import UsageError, WorkError
-from controller.solve.bounded.smoothness import squared_edge_weights
-from controller.solve.bounded.solver import Solution, solve_bounded
+from controller.solve.bounded.smoothness import TIE_STEPS, squared_edge_weights
+from controller.solve.bounded.solver import SMOOTHNESS, Solution, build_problem, smoothness_term, solve_bounded
 from controller.transport import LightTransport, build_transport
 from controller.transport.planes import frame_planes, image_planes, plane_frames
 from tests.controller.solve.bounded.smoothness_reference import smoothness_weights
 
 Stage = Callable[..., Calibration]
 Matrix = npt.NDArray[np.float64]
+HALF_A_STEP = 0.5 / TIE_STEPS
 few = settings(
     max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
 )
@@ -250,9 +251,10 @@ def test_the_weights_of_the_smoothness_equations_are_those_of_the_paper(stage: S
     for n, size in enumerate(transport.sizes):
         white = transport.forward_part(n, np.ones((*size, 3), np.float32))
         edges = smoothness_weights(transport.gaussian_mean(wanted, n), transport.gaussian_mean(white, n))
-        right, below = (plane_frames(part[:, transport.span(n)], [size])[0] for part in (across, down))
-        np.testing.assert_allclose(right[:, :-1], edges.across**2, rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose(below[:-1], edges.down**2, rtol=1e-4, atol=1e-6)
+        kept = (part[:, transport.span(n)].astype(np.float32) for part in (across, down))
+        right, below = (plane_frames(part, [size])[0] for part in kept)
+        np.testing.assert_allclose(right[:, :-1] / TIE_STEPS, edges.across**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
+        np.testing.assert_allclose(below[:-1] / TIE_STEPS, edges.down**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
         assert not right[:, -1].any()
         assert not below[-1].any()
 
@@ -267,3 +269,28 @@ def test_the_reference_lets_go_where_the_target_has_an_edge_or_a_shadow() -> Non
     np.testing.assert_allclose(edges.across[1:, 2], 0.2, rtol=1e-5)
     assert not edges.across[0].any()
     assert not edges.down[0].any()
+
+
+@few
+@given(seed=st.integers(0, 2**31))
+def test_weights_in_steps_change_the_objective_by_half_a_step_of_each_difference(stage: Stage, seed: int) -> None:
+    calibration = stage(seed % 7)
+    transport = build_transport(calibration)
+    wanted = random_target(transport, seed)
+    problem = build_problem(transport, wanted, calibration.black, SMOOTHNESS, None)
+    x = np.random.default_rng(seed).random((3, transport.pixels), np.float32)
+    light = np.maximum(wanted - calibration.black, 0)
+    exact = most = 0.0
+    for n, size in enumerate(transport.sizes):
+        white = transport.forward_part(n, np.ones((*size, 3), np.float32))
+        edges = smoothness_weights(transport.gaussian_mean(light, n), transport.gaussian_mean(white, n))
+        (frame,) = plane_frames(x[:, transport.span(n)], [size])
+        own = (problem.majoriser[:, transport.span(n)] > 0).astype(np.float32)
+        (lights,) = plane_frames(own, [size])
+        for alpha, axis in ((edges.across, 1), (edges.down, 0)):
+            apart = np.diff(frame.astype(np.float64), axis=axis) ** 2
+            lit = (np.delete(lights, 0, axis) > 0) & (np.delete(lights, -1, axis) > 0)
+            exact += float((lit * alpha.astype(np.float64) ** 2 * apart).sum())
+            most += float(apart.sum())
+    strength = problem.tie * TIE_STEPS
+    assert abs(smoothness_term(problem, x) - strength * exact) <= strength * (HALF_A_STEP * most + 1e-5 * exact)

@@ -33,7 +33,7 @@ def equations(problem: Problem) -> tuple[sp.csr_matrix[np.float64], Float64]:
             (problem.down, index[:-1], index[1:]),
         ):
             for c in range(3):
-                weight = np.sqrt(ties[c, a.ravel()].astype(np.float64))
+                weight = np.sqrt(problem.tie * ties[c, a.ravel()].astype(np.float64))
                 k = np.arange(a.size)
                 shape = (a.size, 3 * transport.pixels)
                 offset = c * transport.pixels
@@ -41,7 +41,7 @@ def equations(problem: Problem) -> tuple[sp.csr_matrix[np.float64], Float64]:
                 rows.append(one - sp.csr_matrix((weight, (k, b.ravel() + offset)), shape=shape))
     matrix = sp.csr_matrix(sp.vstack(rows))
     right = np.zeros(matrix.shape[0])
-    right[: root.size] = root * problem.target.ravel()
+    right[: root.size] = root * problem.target().ravel()
     return matrix, right
 
 

@@ -26,11 +26,11 @@ pupil_m = 0.03
 """
 
 
-def prepared(tmp_path: Path, stage_name: str = "stage", **settings: Any) -> BenchTruth:
+def prepared(tmp_path: Path, stage_name: str = "stage", size: str = "small", **settings: Any) -> BenchTruth:
     stage = tmp_path / stage_name
     stage.mkdir()
     bench = DRIVER.open(settings, OpenContext(stage=stage), in_seconds(5))
-    bench.prepare(stage, size="small", object_file=None, seed=3)
+    bench.prepare(stage, size=size, object_file=None, seed=3)
     return read_truth(stage)
 
 
@@ -54,6 +54,13 @@ def test_places_that_are_unknown_or_named_twice_are_refused(tmp_path: Path, name
     with pytest.raises(PluginError) as caught:
         prepared(tmp_path, projectors=names)
     assert caught.value.code == "setting-wrong"
+
+
+def test_a_stage_of_modern_size_has_four_projectors_unless_told_otherwise(tmp_path: Path) -> None:
+    four, two = prepared(tmp_path, "four", "uhd"), prepared(tmp_path, "two", "uhd", projectors=2)
+    assert [projector.lens.size_px for projector in four.projectors] == [(3840, 2160)] * 4
+    assert four.camera.lens.size_px == (8192, 5464)
+    assert two.projectors == four.projectors[:2]
 
 
 def test_a_projector_stands_and_shines_as_it_is_told(tmp_path: Path) -> None:

@@ -1,0 +1,97 @@
+"""How much memory a base image takes at its peak, told before it begins (docs/decisions/0055).
+
+Counted are arrays of the process itself. A calibration's own arrays lie in files, and what of them is in memory can be
+had back by the system at any time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from controller.calibrate.values import Calibration
+from controller.core.errors import WorkError
+
+WINDOW: Final = 15
+"""Bytes of one camera sample's share of one projector."""
+LEAST_OBJECT: Final = 0.25
+"""Share of the camera's picture; an object that needs less memory can't be told from one that needs more, before it is
+photographed, and what is refused then must certainly not fit."""
+SPARE: Final = 1.1
+"""Small arrays, stacks and tables of threads."""
+PROGRAM: Final = 300 * 1024 * 1024
+"""Python, its libraries and compiled kernels."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageSize:
+    """What the memory of a solve depends on.
+
+    ``camera``, ``projectors``: pixels of the camera, and of all projectors together; ``count`` of projectors
+    ``windows``: pairs of a camera sample and a projector that lights it; ``samples``: of the camera, one a pixel with
+    a mosaic, else three
+    """
+
+    camera: int
+    projectors: int
+    count: int
+    windows: int
+    samples: int
+
+    @property
+    def transport(self) -> int:
+        """Bytes of the light transport: windows, masks, and four numbers a projector pixel."""
+        return WINDOW * self.windows + self.count * self.camera + 16 * self.projectors
+
+
+def stage_size(calibration: Calibration) -> StageSize:
+    """Of a calibration; as if every projector lit the whole object, so rather too large."""
+    lit = int(calibration.object_mask.sum())
+    channels = 3 if calibration.mosaic is None else 1
+    count = len(calibration.projectors)
+    pixels = sum(part.metapixels.valid.size for part in calibration.projectors)
+    camera = calibration.object_mask.size
+    return StageSize(camera, pixels, count, count * lit * channels, camera * channels)
+
+
+def planned_size(camera_px: tuple[int, int], projectors_px: Sequence[tuple[int, int]]) -> StageSize:
+    """Of a stage that is not calibrated yet, (width, height) each, with an object that is small in the picture."""
+    camera = camera_px[0] * camera_px[1]
+    pixels = sum(width * height for width, height in projectors_px)
+    windows = int(LEAST_OBJECT * len(projectors_px) * camera)
+    return StageSize(camera, pixels, len(projectors_px), windows, camera)
+
+
+def base_peak_bytes(size: StageSize) -> int:
+    """Bytes at the peak of building the transport, solving a base image and preparing to scale it."""
+    C, P, W, S = size.camera, size.projectors, size.windows, size.samples
+    own = 12 * P // max(size.count, 1)
+    # even gains and one picture of samples, wherever means over metapixels are taken
+    means = 4 * W + 4 * S
+    built = size.transport + 3 * size.count * C + 12 * P + max(28 * C, 12 * C + means)
+    # the picture and the weights stay during the solve
+    solving = size.transport + 12 * C + 4 * C
+    ties = solving + 12 * P + 12 * C + 12 * P + 12 * P + own + means
+    begun = solving + 24 * P + 12 * C + 12 * P + 2 * own + means
+    swept = solving + 24 * P + 36 * P + 5 * 4 * S
+    ended = solving + 36 * P + 24 * C
+    prepared = size.transport + 24 * C + 12 * P + 3 * C + max(12 * C + 12 * P + means, 15 * C + 36 * P)
+    return int(SPARE * max(built, ties, begun, swept, ended, prepared)) + PROGRAM
+
+
+def check_memory(need: int, free: int | None) -> str:
+    """One sentence on how much memory is needed and free. Raises WorkError("memory-too-small") where it does not fit.
+
+    ``free``: bytes, or None if not known; then nothing is refused
+    """
+    needed = f"The solve needs about {need / 1e9:.1f} GB of memory"
+    if free is None:
+        return f"{needed}; how much is free is not known."
+    if need > free:
+        raise WorkError(
+            "memory-too-small",
+            what=f"{needed}, and {free / 1e9:.1f} GB are free for this process.",
+            remedy="Close other programs, raise the memory limit of the service, or use a machine with more memory.",
+        )
+    return f"{needed}; {free / 1e9:.1f} GB are free."
