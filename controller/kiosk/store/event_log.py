@@ -49,13 +49,17 @@ class EventLog:
     """Thread-safe. ``problem``: why the log can't be written now, or None.
 
     ``durable``: events survive a power cut, too, not only the end of the process. Events that can't be written are kept
-    in memory until there is space again. A damaged file is renamed and replaced.
+    in memory until there is space again. A damaged file is renamed and replaced. ``connect``: as ``sqlite3.connect``.
     """
 
     FILE: Final = "kiosk/events.sqlite"
 
-    def __init__(self, path: Path, *, wall: Callable[[], float] = time.time, durable: bool = True) -> None:
+    def __init__(
+        self, path: Path, *, wall: Callable[[], float] = time.time, durable: bool = True,
+        monotonic: Callable[[], float] = time.monotonic, connect: Callable[..., sqlite3.Connection] = sqlite3.connect,
+    ) -> None:  # fmt: skip
         self.path, self._wall, self._durable = path, wall, durable
+        self._monotonic, self._connect = monotonic, connect
         self._lock = threading.RLock()
         self.problem: str | None = None
         self._retry_at_s = 0.0
@@ -67,7 +71,7 @@ class EventLog:
         self._done: dict[str, str] = dict(self._query("SELECT key, how FROM done ORDER BY number"))
         self._kept: dict[str, str] = dict(self._query("SELECT name, value FROM kept"))
         self._failures = self._read_failures()
-        self._unwritten: set[tuple[str, str]] = set()
+        self._unwritten: dict[tuple[str, str], None] = {}
 
     # -- events
 
@@ -126,7 +130,7 @@ class EventLog:
         """Record that ``key`` was done or skipped: in memory at once, on disk as soon as possible."""
         with self._lock:
             self._done[key] = how
-            self._unwritten.add(("done", key))
+            self._unwritten[("done", key)] = None
             self._flush(now=True)
 
     def value(self, name: str) -> str | None:
@@ -137,7 +141,7 @@ class EventLog:
         with self._lock:
             if self._kept.get(name) != value:
                 self._kept[name] = value
-                self._unwritten.add(("kept", name))
+                self._unwritten[("kept", name)] = None
                 self._flush()
 
     def close(self) -> None:
@@ -148,7 +152,7 @@ class EventLog:
     # -- the disk
 
     def _flush(self, *, now: bool = False) -> None:
-        if self.problem is not None and not now and time.monotonic() < self._retry_at_s:
+        if self.problem is not None and not now and self._monotonic() < self._retry_at_s:
             return
         try:
             if self._unavailable:
@@ -167,7 +171,7 @@ class EventLog:
                 if self._number % _TRIM_EVERY == 0:
                     self._trim(database)
         except (sqlite3.Error, OSError) as error:
-            self.problem, self._retry_at_s = str(error), time.monotonic() + _RETRY_S
+            self.problem, self._retry_at_s = str(error), self._monotonic() + _RETRY_S
             return
         self._waiting.clear()
         self._unwritten.clear()
@@ -207,7 +211,7 @@ class EventLog:
     def _connected(self, path: Path) -> sqlite3.Connection:
         if str(path) != ":memory:":
             path.parent.mkdir(parents=True, exist_ok=True)
-        database = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
+        database = self._connect(path, check_same_thread=False, timeout=2.0)
         try:
             database.execute("PRAGMA journal_mode=WAL")
             # A finished task must not run again after a power cut.
