@@ -74,6 +74,11 @@ class Line:
         self.turn = Lock(scheduler, again=False)
         self._late: list[tuple[float, bool]] = []
 
+    @property
+    def delayed(self) -> int:
+        """Commands that are still under way."""
+        return len(self._late)
+
     def pass_on(self) -> None:
         """What was delayed reaches the projector now, which refuses a strike while it is hot."""
         now_s = self._scheduler.now_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from controller.kiosk.decide.interfaces import Condition
@@ -30,6 +31,7 @@ PROMISES: Final = {
     "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
     "nothing lost": "Events, settings and counts survive each end of the service.",
     "once a night": "The nightly check is begun at most once a night.",
+    "few words": "What goes wrong again every second does not fill the log.",
     "strikes counted": "A lamp is struck at most as often as it is counted.",
     "few strikes": "A lamp that gives no light is not struck again and again.",
     "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
@@ -46,6 +48,8 @@ BACK_S: Final = 15.0
 OPENED_S: Final = 200.0
 DECIDES_S: Final = 0.3
 MOST_STRIKES: Final = 5
+MOST_WORDS: Final = 500
+WORDS_S: Final = 600.0
 LOOKED_S: Final = 300.0
 _SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
 
@@ -87,6 +91,7 @@ class Witness:
         self._strikes_since: dict[str, int] = {}
         self.begun_checks: dict[str, int] = {}
         self._uncounted: dict[str, int] = {}
+        self._recent: deque[float] = deque(maxlen=MOST_WORDS)
         self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
         self._judged_s = 0.0
 
@@ -149,7 +154,7 @@ class Witness:
 
     def ledger_lost(self) -> None:
         """The counts of strikes begin anew."""
-        self._uncounted = {name: lamp.strikes for name, lamp in self._world.lamps.items()}
+        self._uncounted = {name: line.lamp.strikes + line.delayed for name, line in self._world.lines.items()}
 
     # -- judging
 
@@ -187,7 +192,7 @@ class Witness:
         return news
 
     def _listen(self, service: Service) -> bool:
-        number = service.log.number
+        number, now_s = service.log.number, self._world.scheduler.now_s
         if number == self.read:
             return False
         for row in service.log.after(self.read):
@@ -195,6 +200,7 @@ class Witness:
             self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {row.text}")
             if service.log.problem is None:
                 self.rows[row.number] = row
+            self._recent.append(now_s)
             if row.code == "crash":
                 raise Broken("no crash", row.text)
             if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
@@ -206,6 +212,8 @@ class Witness:
                 self.begun_checks[key] = self.begun_checks.get(key, 0) + 1
                 if self.begun_checks[key] > 1:
                     raise Broken("once a night", row.text)
+        if len(self._recent) == MOST_WORDS and now_s - self._recent[0] < WORDS_S:
+            raise Broken("few words", f"{MOST_WORDS} events in {now_s - self._recent[0]:.0f} s")
         return True
 
     def _strikes(self, service: Service) -> None:

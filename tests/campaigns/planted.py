@@ -3,7 +3,8 @@
     python -m tests.campaigns.planted [SECONDS] [WORD]
 
 Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
-the other are lived, for at most so many seconds of a core. WORD: only the patches that have it in their names.
+the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. WORD: only
+the patches that have it in their names.
 """
 
 from __future__ import annotations
@@ -46,15 +47,16 @@ def patches(word: str = "") -> list[Path]:
     return sorted(path for path in BUGS.glob("*.patch") if word in path.stem)
 
 
-def planted(patch: Path, folder: Path) -> Path:
-    """A copy of the code in ``folder`` with this bug."""
+def planted(patch: Path | None, folder: Path) -> Path:
+    """A copy of the code in ``folder`` with this bug; None: without one."""
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
-    subprocess.run(["patch", "-p1", "--quiet", "-i", str(patch)], cwd=folder, check=True)
+    if patch is not None:
+        subprocess.run(["patch", "-p1", "--quiet", "-i", str(patch)], cwd=folder, check=True)
     return folder
 
 
-def search(patch: Path, seconds: float) -> Found:
+def search(patch: Path | None, seconds: float) -> Found:
     """Live until a promise is broken, or the time is over."""
     with tempfile.TemporaryDirectory() as name:
         copy = planted(patch, Path(name))
@@ -67,12 +69,14 @@ def search(patch: Path, seconds: float) -> Found:
         took_s = os.times().children_user + os.times().children_system - before_s
     if done.returncode not in (0, 9):
         raise RuntimeError(done.stderr[-2000:])
-    return Found(patch.stem, done.stdout.strip(), took_s)
+    return Found("" if patch is None else patch.stem, done.stdout.strip(), took_s)
 
 
 def main() -> int:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 120.0
     began_s, found, all_s = time.monotonic(), 0, 0.0
+    control = search(None, seconds)
+    print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
     bugs = patches(sys.argv[2] if len(sys.argv) > 2 else "")
     for patch in bugs:
         one = search(patch, seconds)

@@ -292,8 +292,10 @@ class ProjectorSupervisor:
             resting = status.power is Power.COOLING or guard.rest_left_s() > 0
             self._see(Condition.COOLING if resting else Condition.DARK, status, problem)
         else:
-            # Until the next status shows it off: the lamp may be lit behind FAULT and UNKNOWN.
-            self._see(Condition.BROKEN if faults else Condition.LIT, status, problem)
+            # Until the next status shows it off: the lamp may be lit behind FAULT and UNKNOWN. What prevented the last
+            # attempt stays a problem so long; otherwise every second would have two events.
+            kept = self._view.problem if self._view.condition is Condition.LIT else None
+            self._see(Condition.BROKEN if faults else Condition.LIT, status, problem or kept)
             if not (faults and status.power is Power.FAULT and not guard.may_be_lit):
                 guard.switch_off(deadline=self._deadline(guard.switch_s))
 
