@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from controller.core.errors import VelaturaError
 from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.decide.interfaces import Condition
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service, serving
@@ -36,7 +37,7 @@ from hal.errors import DeviceError
 
 LIFE_DAYS: Final = 14.0
 AGAIN_S: Final = 5.0
-CALM: Final = (8.0, 80.0, 2400.0)
+CALM: Final = (8.0, 240.0, 2400.0)
 """How far pauses are stretched: while lamps or work are under way, while something is wrong, while all is well."""
 CALMER: Final = 1.6
 END_S: Final = 150.0
@@ -234,13 +235,11 @@ class Life:
             return
         well = not any(view.problem for view in views) and service.player.view.problem is None
         settled = state in (State.PLAYING, State.OFF) and not service.reconciler.working
-        rests = all(
-            view.condition.value in ("lit", "dark") and view.stable_left_s in (0, float("inf")) for view in views
-        )
-        limit = (
-            CALM[2] if settled and well and rests else CALM[1] if state in (State.DEGRADED, State.FAULT) else CALM[0]
-        )
-        scheduler.stretch = min(max(scheduler.stretch, 1.0) * CALMER, max(limit, 1.0))
+        steady = all(view.stable_left_s in (0, float("inf")) for view in views)
+        rests = steady and all(view.condition in (Condition.LIT, Condition.DARK) for view in views)
+        wrong = state in (State.DEGRADED, State.FAULT) or (settled and not well)
+        limit = CALM[2] if settled and well and rests else CALM[1] if wrong else CALM[0]
+        scheduler.stretch = min(scheduler.stretch * CALMER, limit)
 
     # -- people
 

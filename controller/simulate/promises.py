@@ -31,6 +31,7 @@ PROMISES: Final = {
     "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
     "nothing lost": "Events, settings and counts survive each end of the service.",
     "once a night": "The nightly check is begun at most once a night.",
+    "at night": "The nightly check begins only while the stage is closed.",
     "few words": "What goes wrong again every second does not fill the log.",
     "strikes counted": "A lamp is struck at most as often as it is counted.",
     "few strikes": "A lamp that gives no light is not struck again and again.",
@@ -208,6 +209,9 @@ class Witness:
             if row.code == "state":
                 self._told = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
             elif row.code == "task-due":
+                open_s = now_s - self.changed_s
+                if self._wanted and self.wanted_open() and open_s > BLACK_S and now_s > self.clock_wrong_until_s:
+                    raise Broken("at night", row.text)
                 key = row.text.partition("(")[2].partition(")")[0]
                 self.begun_checks[key] = self.begun_checks.get(key, 0) + 1
                 if self.begun_checks[key] > 1:
@@ -244,7 +248,7 @@ class Witness:
             self._missing_since_s = None
         elif self._missing_since_s is None:
             self._missing_since_s = now_s
-        elif now_s - self._missing_since_s > OPENED_S and world.scheduler.stretch == 1:
+        elif now_s - self._missing_since_s > (OPENED_S if world.scheduler.stretch == 1 else REPAIR_S):
             raise Broken("devices back", f"the camera is there for {now_s - self._missing_since_s:.0f} s")
 
     @property
@@ -304,10 +308,8 @@ class Witness:
         if wants is not None and world.screen.process is not None and dark_s == 0:
             names = {name for name, _, _ in wants.in_turn} | {wants.appearance}
             brightness = world.screen.process.brightness
-            if shown not in names or (self._steady and abs(brightness - live.brightness) > 0.01):
+            if shown not in names or abs(brightness - live.brightness) > 0.01:
                 raise Broken("plays while open", f"{shown} at {brightness:g} is shown instead of {wants.appearance}")
-
-    _steady = False
 
     def _back(self, shown: str, asked_black: bool) -> None:
         if self._back_by_s is not None and self._world.scheduler.now_s > self._back_by_s and not asked_black:
