@@ -91,7 +91,9 @@ class Database(sqlite3.Connection):
         try:
             self._disk.changes()
         except OSError as error:
-            raise sqlite3.OperationalError("database or disk is full") from error
+            full = sqlite3.OperationalError("database or disk is full")
+            full.sqlite_errorcode = sqlite3.SQLITE_FULL
+            raise full from error
 
 
 _watched: list[Disk] = []

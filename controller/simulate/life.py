@@ -237,7 +237,7 @@ class Life:
         settled = state in (State.PLAYING, State.OFF) and not service.reconciler.working
         steady = all(view.stable_left_s in (0, float("inf")) for view in views)
         rests = steady and all(view.condition in (Condition.LIT, Condition.DARK) for view in views)
-        wrong = state in (State.DEGRADED, State.FAULT) or (settled and not well)
+        wrong = state in (State.DEGRADED, State.FAULT) or (not well and (settled or state is State.COOLING))
         limit = CALM[2] if settled and well and rests else CALM[1] if wrong else CALM[0]
         scheduler.stretch = min(scheduler.stretch * CALMER, limit)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import sqlite3
+import tempfile
 import threading
 import time
 from collections import deque
@@ -21,6 +23,7 @@ SHOWN: Final = 2_000
 MOST_FAILURES: Final = 20
 _TRIM_EVERY: Final = 200
 _RETRY_S: Final = 30.0
+_MEMORY: Final = Path("/dev/shm")  # noqa: S108 - the folder in it has a name of its own
 _LEVELS: Final[dict[str, EventLevel]] = {"info": "info", "warning": "warning", "error": "error"}
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS events (
@@ -201,11 +204,16 @@ class EventLog:
     def _copied(self) -> sqlite3.Connection:
         """An in-memory copy of a log that can be read but not opened, as on a full disk; see ``_flush``."""
         database = self._connected(Path(":memory:"))
-        with (
-            contextlib.suppress(sqlite3.Error),
-            contextlib.closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?immutable=1", uri=True)) as source,
-        ):
-            source.backup(database)
+        folder = _MEMORY if _MEMORY.is_dir() else None
+        # With its write-ahead log, which a kill leaves behind, and in which the newest events are. Both are read from
+        # a folder in memory, because SQLite has to write beside them.
+        with contextlib.suppress(sqlite3.Error, OSError), tempfile.TemporaryDirectory(dir=folder) as name:
+            copy = Path(name) / self.path.name
+            for end in ("", "-wal"):
+                with contextlib.suppress(FileNotFoundError):
+                    shutil.copyfile(f"{self.path}{end}", f"{copy}{end}")
+            with contextlib.closing(sqlite3.connect(copy)) as source:
+                source.backup(database)
         return database
 
     def _connected(self, path: Path) -> sqlite3.Connection:
