@@ -47,6 +47,10 @@ class Disk:
         finally:
             self._outside -= 1
 
+    def alive(self) -> None:
+        """Raises Killed in a task whose program is."""
+        self._scheduler.check()
+
     def changes(self) -> None:
         """The present task is about to change a file. Raises OSError and Killed."""
         program = self._scheduler.present.program
@@ -86,6 +90,11 @@ class Database(sqlite3.Connection):
     def executescript(self, script: str) -> sqlite3.Cursor:
         self._asked()
         return super().executescript(script)
+
+    def close(self) -> None:
+        # A killed program closes nothing, so what SQLite does then is not done either.
+        self._disk.alive()
+        super().close()
 
     def _asked(self) -> None:
         try:

@@ -88,6 +88,7 @@ class Witness:
         self._black_since_s: float | None = None
         self._back_by_s: float | None = None
         self._missing_since_s: float | None = None
+        self._explained_s = 0.0
         self._alerted, self._alerted_number, self._kills = 0, 0, 0
         self._strikes_since: dict[str, int] = {}
         self.begun_checks: dict[str, int] = {}
@@ -291,7 +292,9 @@ class Witness:
         self._back(shown, asked_black)
         open_s = now_s - max(self.changed_s, self._began_s)
         dark_s = 0.0 if self._black_since_s is None else now_s - self._black_since_s
-        if dark_s > SETTLING_S and open_s > SETTLING_S and not self._explained(kiosk, state):
+        if dark_s <= SETTLING_S or open_s <= SETTLING_S or self._explained(kiosk, state):
+            self._explained_s = now_s
+        elif now_s - self._explained_s > BLACK_S:
             raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
         if not self.calm or open_s < SETTLING_S or asked_black:
             if asked_black:

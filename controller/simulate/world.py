@@ -21,7 +21,7 @@ from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.world import Lock as AnyLock
 from controller.kiosk.world import Thread, World
 from controller.play.control.launch import PlayerSettings
-from controller.simulate.disk import TOTAL_BYTES, Disk
+from controller.simulate.disk import STAGE, TOTAL_BYTES, Disk
 from controller.simulate.lamps import Lamp, Line, SimulatedProjector
 from controller.simulate.player import Screen, SimulatedPlayer
 from controller.simulate.scheduler import Event, Lock, Program, Scheduler
@@ -148,8 +148,13 @@ class SimulatedWorld(World):
     def release(self) -> None:
         """The system closes what a killed program had open."""
         self.camera.owner = None
+        # As a kill leaves them: SQLite would write its write-ahead log into the file when it is closed.
+        log = STAGE / "kiosk" / "events.sqlite"
+        left = {path: path.read_bytes() for path in (log, log.with_name(f"{log.name}-wal")) if path.is_file()}
         for connection in self._connections:
             connection.close()
+        for path, content in left.items() if self._connections else ():
+            path.write_bytes(content)
         self._connections.clear()
         for line in self.lines.values():
             line.owner = None

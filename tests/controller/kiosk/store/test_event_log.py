@@ -90,7 +90,8 @@ def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_pat
 
     def full(database: Any, **options: Any) -> sqlite3.Connection:
         if str(database) == ":memory:":
-            return sqlite3.connect(database, **options)
+            memory: sqlite3.Connection = sqlite3.connect(database, **options)
+            return memory
         error = sqlite3.OperationalError("database or disk is full")
         error.sqlite_errorcode = sqlite3.SQLITE_FULL
         raise error
