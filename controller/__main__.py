@@ -44,6 +44,7 @@ from controller.cli.commands.report import report
 from controller.cli.commands.study import study
 from controller.cli.record_command import record
 from controller.cli.running import Json, StageFolder, group, projector_names, work
+from controller.cli.simulate_command import simulate
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.files import file_error
 from hal.runtime.caches import prepare_libraries, state_folder, temporary_folder
@@ -241,6 +242,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     plan,
     report,
     study,
+    simulate,
     states,
     *serve_commands.COMMANDS,
     *kiosk_commands.COMMANDS,

@@ -7,12 +7,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
 from hal.errors import DeviceError, DeviceTimeout
 
 SLICE_S: Final = 0.05
 """Longest single wait, so that a cancelled call ends soon."""
+
+
+class Time(Protocol):
+    """What deadlines measure time with; the module ``time`` is one."""
+
+    def monotonic(self) -> float: ...
+
+    def sleep(self, seconds: float, /) -> None: ...
 
 
 class Cancelled(DeviceError):
@@ -48,18 +56,19 @@ class Deadline:
 
     at_s: float
     cancel: threading.Event | None = field(default=None, compare=False)
+    time: Time = field(default=time, compare=False, repr=False)
 
     def left_s(self) -> float:
         """Seconds left, never negative."""
-        return max(0.0, self.at_s - time.monotonic())
+        return max(0.0, self.at_s - self.time.monotonic())
 
     @property
     def passed(self) -> bool:
-        return time.monotonic() >= self.at_s
+        return self.time.monotonic() >= self.at_s
 
     def within(self, seconds: float) -> Deadline:
         """The earlier of this deadline and ``seconds`` from now, with the same cancellation."""
-        return Deadline(min(self.at_s, time.monotonic() + seconds), self.cancel)
+        return Deadline(min(self.at_s, self.time.monotonic() + seconds), self.cancel, self.time)
 
     def check(self, code: str, *, what: str, remedy: str) -> None:
         """Raise ``Cancelled`` if cancelled and ``DeviceTimeout`` with these sentences if passed."""
@@ -72,7 +81,7 @@ class Deadline:
         """Sleep at most ``seconds``, at most until the deadline; raise ``Cancelled`` as soon as cancelled."""
         wait_s = min(seconds, self.left_s())
         if self.cancel is None:
-            time.sleep(wait_s)
+            self.time.sleep(wait_s)
         elif self.cancel.wait(wait_s):
             raise Cancelled
 

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from controller.bundle.install import CURRENT, STARTS, current, previous, switch_back
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import ANY_SIGNER
 from controller.core.errors import VelaturaError
 from controller.core.storage import write_atomically
 
@@ -55,8 +57,8 @@ class Starts:
 class CountedStart:
     """One start of the player with the installed bundle; ``file`` is the bundle that it is to play.
 
-    Making it counts the start, and goes back to the previous bundle if three starts before it failed. ``tell`` gets
-    a sentence for the log when that happens, and when the count can not be kept.
+    Making it counts the start, and goes back to the previous bundle, if that can be read, after three failed starts.
+    ``tell`` gets a sentence for the log when that happens, and when the count can not be kept.
     """
 
     def __init__(self, folder: Path, tell: Callable[[str], None]) -> None:
@@ -67,7 +69,7 @@ class CountedStart:
         starts = before if before.bundle == name else Starts(name, 0, before.given_up)
         earlier = previous(folder)
         failing = now is None or starts.failed >= MOST_FAILED_STARTS
-        if failing and earlier is not None and earlier.name not in (name, starts.given_up):
+        if failing and earlier is not None and earlier.name not in (name, starts.given_up) and _readable(earlier):
             why = f"The bundle {name} showed no picture in {starts.failed} starts" if name else "The bundle is missing"
             tell(f"{why}; {earlier.name} plays again.")
             now, starts = earlier, Starts(earlier.name, 0, name or MISSING)
@@ -105,3 +107,12 @@ class CountedStart:
             write()
         except (VelaturaError, OSError) as error:
             self._tell(f"The count of starts could not be saved: {error}")
+
+
+def _readable(file: Path) -> bool:
+    """Whether it is worth going back to: three failed starts tell nothing certain, a damaged file does."""
+    try:
+        Bundle.open_trusted(file, ANY_SIGNER).close()
+    except (VelaturaError, OSError):
+        return False
+    return True

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from datetime import date
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -17,14 +15,13 @@ from controller.core.storage import runtime_folder
 from controller.kiosk.alerts.alerts import Alerts
 from controller.kiosk.backup.nightly import NightlyBackup
 from controller.kiosk.changes.inventory import Inventory
-from controller.kiosk.changes.machine import Machine
-from controller.kiosk.changes.watch import InventoryWatch, take
+from controller.kiosk.changes.watch import InventoryWatch
 from controller.kiosk.decide.clock import TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Request
 from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
-from controller.kiosk.jobs.job_runner import JobRunner
+from controller.kiosk.jobs.job_runner import JobHandler, JobRunner
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -37,6 +34,7 @@ from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.kiosk.supervisors.lamp_history import LampHistory
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
+from controller.kiosk.world import Thread, World
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
 from controller.run.state_machine import State
@@ -55,17 +53,24 @@ INVENTORY_S: Final = 30.0
 END_WORK_S: Final = 30.0
 AFTER_CRASH_S: Final = 5.0
 
+MakeJobs = Callable[[JobHandlers], Mapping[str, JobHandler]]
+
 
 class Service:
     """One stage that runs by itself. ``changed`` is called after every step that may have changed something, ``alive``
     by the loop as long as it turns.
 
     ``problem``: why it runs with older settings than those of stage.toml, or None. ``cools``: the projectors whose
-    lamps are switched off at its end; None: all.
+    lamps are switched off at its end; None: all. ``world``: clock, threads and all else outside; ``jobs``
+    makes the handlers of all kinds of jobs.
     """
 
-    def __init__(self, checked: Checked, log: EventLog, problem: Decision | None = None) -> None:
+    def __init__(
+        self, checked: Checked, log: EventLog, problem: Decision | None = None, world: World | None = None,
+        jobs: MakeJobs = JobHandlers.table,
+    ) -> None:  # fmt: skip
         stage = checked.stage
+        self._world = world = world or World()
         self.problem = problem
         self.cools: tuple[str, ...] | None = None
         self.checked, self.log, self.stage = checked, log, stage.folder
@@ -74,44 +79,48 @@ class Service:
         self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
         attach = partial(AttachedPlayer, kiosk_places.PLAYER_SOCKET, kiosk_places.PLAYER_OPTIONS)
         installed = kiosk_places.is_installed(stage.folder)
-        self.player = PlayerSupervisor(self.runtime, self._settings, log.tell, attach=attach if installed else None)
+        self.player = PlayerSupervisor(
+            self.runtime, self._settings, log.tell, monotonic=world.monotonic, attach=attach if installed else None,
+            launch=world.launch, channel=world.channel(),
+        )  # fmt: skip
         self.alive: Callable[[], None] = lambda: None
         self.bundle_watch = BundleWatch(self.bundles, log.tell)
-        self.devices = Devices(checked, self.runtime, self._tell)
+        self.devices = Devices(checked, self.runtime, self._tell, world)
         self.devices.scene = self._scene
-        self.lamp_history = LampHistory(stage.folder)
+        self.lamp_history = LampHistory(stage.folder, monotonic=world.monotonic)
         handlers = JobHandlers(
             stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated,
             open_now=lambda: bool(self.schedule.now.rows) and self.reconciler.plan.open is True,
         )  # fmt: skip
-        self.jobs = JobRunner(handlers.table(), log, number=int(log.value("job") or 0))
+        self.jobs = JobRunner(jobs(handlers), log, number=int(log.value("job") or 0), world=world)
         safety = stage.tables.safety
         self.reconciler = Reconciler(
             self.devices.projectors, self.player, self.jobs, self.bundles, log,
             schedule=lambda: self.schedule.now,
-            clock=TrustedClock(log, time.time, time.monotonic),
-            monotonic=time.monotonic,
+            clock=TrustedClock(log, world.wall, world.monotonic, world.synchronised),
+            monotonic=world.monotonic,
             without_time=self.schedule.open_without_time,
             limits=Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
         )  # fmt: skip
         self.disk = DiskSupervisor(
             stage.folder, lambda: self.checked.stage.tables.disk, self.bundles, log,
-            busy=lambda: self.jobs.running is not None,
+            busy=lambda: self.jobs.running is not None, world=world,
         )  # fmt: skip
         self.backups = NightlyBackup(
             stage.folder, lambda: self.checked.stage.tables.backup, lambda: self.schedule.now.time_zone, log,
-            busy=lambda: self.jobs.running is not None,
+            busy=lambda: self.jobs.running is not None, wall=world.wall,
         )  # fmt: skip
         self.inventories = InventoryWatch(
             stage.folder, self.inventory, lambda: self.checked.stage.tables.calibration.worst_grade, log,
-            busy=lambda: self.jobs.running is not None,
+            busy=lambda: self.jobs.running is not None, wall=world.wall,
         )  # fmt: skip
         self.alerts = Alerts(
-            stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log
-        )
+            stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log,
+            monotonic=world.monotonic, ways=world.ways_out,
+        )  # fmt: skip
         self.changed: Callable[[], None] = lambda: None
-        self._stop = threading.Event()
-        self._threads: list[threading.Thread] = []
+        self._stop = world.event()
+        self._threads: list[Thread] = []
         self.keys = self._keys_supervisor()
         self._known_runs: tuple[float, bool] = (0.0, False)
 
@@ -136,7 +145,7 @@ class Service:
             self._thread(supervisor.name, supervisor.step, STEP_S)
         if self.keys is not None:
             self._thread("keys", self.keys.step, 2.0)
-        purge_old = partial(purge_old_photographs, self.stage, self.log, time.time)
+        purge_old = partial(purge_old_photographs, self.stage, self.log, self._world.wall)
         self._thread("old photographs", purge_old, TIDY_S, first_s=TIDY_S)
 
     def run(self, cancel: threading.Event) -> None:
@@ -159,7 +168,7 @@ class Service:
             self.devices.mains.want_on = self._light_wanted()
         if self.jobs.number:
             self.log.keep("job", str(self.jobs.number))
-        self.lamp_history.note(self.lamps, date.today())
+        self.lamp_history.note(self.lamps, self._world.today())
         self.changed()
 
     def end(self, *, leave_lit: bool) -> None:
@@ -177,7 +186,7 @@ class Service:
             thread.join(5.0)
         if self.keys is not None:
             self.keys.close()
-        self.lamp_history.note(self.lamps, date.today(), now=True)
+        self.lamp_history.note(self.lamps, self._world.today(), now=True)
         self.player.close()
         self.devices.close()
         self.log.tell(Decision("service-ended", "The kiosk has stopped."))
@@ -194,7 +203,7 @@ class Service:
 
     def inventory(self, run: str = "") -> Inventory:
         """What the kiosk consists of now; ``run``: what graded well before. Seconds."""
-        return take(self.stage, self.checked.stage.tables, self.devices.facts(), Machine(), run)
+        return self._world.inventory(self.stage, self.checked.stage.tables, self.devices.facts(), run)
 
     def ask(self, *requests: Request) -> None:
         self.reconciler.ask(*requests)
@@ -233,9 +242,9 @@ class Service:
     def _calibrated(self) -> bool:
         # Called four times a second while a task is due, so the journals are not opened each time.
         at_s, calibrated = self._known_runs
-        if time.monotonic() - at_s > 5.0 or not at_s:
+        if self._world.monotonic() - at_s > 5.0 or not at_s:
             calibrated = bool(finished_calibrations(self.stage))
-            self._known_runs = time.monotonic(), calibrated
+            self._known_runs = self._world.monotonic(), calibrated
         return calibrated
 
     def _light_wanted(self) -> bool:
@@ -245,10 +254,10 @@ class Service:
         )
 
     def _wait_until_dark(self, projectors: Sequence[ProjectorSupervisor]) -> None:
-        until_s = time.monotonic() + self.checked.stage.tables.safety.power_down_s
-        while any(one.may_light for one in projectors) and time.monotonic() < until_s:
+        until_s = self._world.monotonic() + self.checked.stage.tables.safety.power_down_s
+        while any(one.may_light for one in projectors) and self._world.monotonic() < until_s:
             self.alive()
-            time.sleep(0.1)
+            self._world.sleep(0.1)
         names = [projector.name for projector in projectors if projector.view.maybe_lit]
         if names:
             self.log.tell(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
@@ -266,7 +275,7 @@ class Service:
                     self._stop.wait(AFTER_CRASH_S)
                 self._stop.wait(every_s)
 
-        thread = threading.Thread(target=loop, name=name, daemon=True)
+        thread = self._world.thread(loop, name)
         self._threads.append(thread)
         thread.start()
 
@@ -290,26 +299,33 @@ class Service:
             self.reconciler.ask(Request("quick", light=True))
 
 
-def _usable(stage: Path) -> tuple[Checked, Decision | None]:
+def _usable(stage: Path, world: World) -> tuple[Checked, Decision | None]:
     """The stage's settings, or the last good ones and why. Raises what ``check_stage`` raises."""
     try:
-        return check_stage(stage), None
+        return check_stage(stage, drivers=world.drivers), None
     except UsageError as error:
-        return settings_change.last_good(stage, error)
+        return settings_change.last_good(stage, error, world.drivers)
 
 
 @contextlib.contextmanager
 def serving(
-    stage: Path, cancel: threading.Event, *, leave_lit: bool = False, alive: Callable[[], None] = lambda: None
+    stage: Path,
+    cancel: threading.Event,
+    *,
+    leave_lit: bool = False,
+    alive: Callable[[], None] = lambda: None,
+    world: World | None = None,
+    jobs: MakeJobs = JobHandlers.table,
 ) -> Iterator[Service]:
     """A started service, its loop in a thread; ended, with the lamps cooled, on leaving. ``alive``: as ``Service``'s.
 
     Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
     """
+    world = world or World()
     if (stage / archive.RESTORING).exists():
         with stage_lock(stage):
             archive.finish_restore(stage)
-    checked, problem = _usable(stage)
+    checked, problem = _usable(stage, world)
     if checked.stage.tables.display.driver != "player":
         raise UsageError(
             "display-plays-no-bundles",
@@ -318,12 +334,13 @@ def serving(
         )
     with stage_lock(checked.stage.folder):
         archive.clear_cut_off(checked.stage.folder)
-        log = EventLog(checked.stage.folder / EventLog.FILE)
+        file = checked.stage.folder / EventLog.FILE
+        log = EventLog(file, wall=world.wall, monotonic=world.monotonic, connect=world.connect)
         with contextlib.closing(log):
-            service = Service(checked, log, problem)
+            service = Service(checked, log, problem, world, jobs)
             service.alive = alive
-            ended = threading.Event()
-            loop = threading.Thread(target=service.run, args=(ended,), name="reconciler", daemon=True)
+            ended = world.event()
+            loop = world.thread(partial(service.run, ended), "reconciler")
             try:
                 service.start()
                 loop.start()

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 from controller.core.errors import VelaturaError
@@ -41,6 +42,7 @@ class LampGuard:
     ----------
     name : the projector's name in stage.toml and in the ledger
     at_least : rules of the stage; each may be stricter than the device's own, never less strict
+    lock : one that may be taken again by the thread that has it; default: a ``threading.RLock``
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class LampGuard:
         *,
         at_least: LampRules | None = None,
         clock: Clock | None = None,
+        lock: AbstractContextManager[object] | None = None,
     ) -> None:
         self.name = name
         self._projector = projector
@@ -58,7 +61,7 @@ class LampGuard:
         self._clock = clock or SystemClock()
         self._known = projector.capabilities
         self._rules = stricter(self._known.lamp_rules, at_least)
-        self._lock = threading.RLock()
+        self._lock: AbstractContextManager[object] = lock or threading.RLock()
         self._record = self._remembered()
         self._born_s = self._counted_s = self._clock.now_s()
         self._unsaved_s = 0.0

@@ -69,14 +69,15 @@ class Alerts:
 
     def __init__(
         self, stage: Path, name: Callable[[], str], table: Callable[[], AlertsTable], log: EventLog, *,
-        monotonic: Callable[[], float] = time.monotonic,
+        monotonic: Callable[[], float] = time.monotonic, ways: Callable[[AlertsTable], dict[str, Send]] | None = None,
     ) -> None:  # fmt: skip
         self._stage, self._name, self._table, self._log, self._monotonic = stage, name, table, log, monotonic
+        self._ways = ways or ways_out
         self._channels: dict[str, Channel] = {}
 
     def step(self) -> None:
         table = self._table()
-        for kind, send in _wanted(table).items():
+        for kind, send in self._ways(table).items():
             if kind not in self._channels:
                 self._channels[kind] = Channel(kind, send, self._log, self._monotonic)
             self._channels[kind].step(self._stage, self._name(), table)
@@ -84,7 +85,7 @@ class Alerts:
     def test(self) -> None:
         """Send a test on every channel. Raises UsageError("alerts-none"), WorkError("alert-not-sent")."""
         table = self._table()
-        if not (wanted := _wanted(table)):
+        if not (wanted := self._ways(table)):
             raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.",
                              remedy="Write mail_to or webhook under [alerts].")  # fmt: skip
         row = EventRow(self._log.number, time.time(), "info", "This is a test: alerts arrive.", "alert-test")
@@ -92,7 +93,8 @@ class Alerts:
             send(self._stage, self._name(), table, (row,))
 
 
-def _wanted(table: AlertsTable) -> dict[str, Send]:
+def ways_out(table: AlertsTable) -> dict[str, Send]:
+    """What sends to each receiver that the settings name."""
     mail = {"mail": channels.mail} if table.mail_to else {}
     return {**mail, **({"webhook": channels.webhook} if table.webhook is not None else {})}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -47,6 +46,7 @@ from controller.kiosk.store import archive, runs, settings, settings_change, tar
 from controller.kiosk.store.accounts import Accounts, stage_accounts
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.store.schedule_file import check
+from controller.kiosk.world import World
 from controller.stage.check import check_stage
 
 NOTICE_S: Final = 900.0
@@ -65,18 +65,21 @@ class StageKiosk(FolderKiosk):
     when the settings have changed: its owner then restarts the service.
     """
 
-    def __init__(self, stage: Path) -> None:
+    def __init__(self, stage: Path, world: World | None = None) -> None:
         super().__init__(stage)
-        self.reload = threading.Event()
+        self._world = world or World()
+        self.reload = self._world.event()
         self.accounts: Accounts | None = None
         self.sessions_ended: Callable[[str], object] = lambda name: None
         self._service: Service | None = None
         self._lock = threading.RLock()
         self._opening_accounts = threading.Lock()
         self._callbacks: list[Callable[[], None]] = []
-        self._last = KioskState(0, stage.name, "off", "The stage is not set up yet.", time.time(), needs_setup=True)
+        self._last = KioskState(
+            0, stage.name, "off", "The stage is not set up yet.", self._world.wall(), needs_setup=True
+        )
         self._events = 0
-        self._snapshots = Snapshots(stage)
+        self._snapshots = Snapshots(stage, self._world)
         self._examinations = finding.Examinations(lambda: finding.findings(stage, self._service))
         self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
         self._notice_ends_s = float("inf")
@@ -89,7 +92,7 @@ class StageKiosk(FolderKiosk):
             if service is None:
                 revision = self._last.revision + 1
                 state, why = ("fault", reason) if reason else ("off", "The stage is not set up yet.")
-                self._last = KioskState(revision, self.stage.name, state, why, time.time(), needs_setup=True)
+                self._last = KioskState(revision, self.stage.name, state, why, self._world.wall(), needs_setup=True)
             else:
                 starts = int(service.log.value("starts") or 0) + 1
                 service.log.keep("starts", str(starts))
@@ -142,10 +145,10 @@ class StageKiosk(FolderKiosk):
         if service is not None and self._notice is not None and service.bundles.bundle() is None:
             service.player.notice = self._notice[0]
             service.reconciler.light_for(NOTICE_S)
-            self._notice_ends_s = time.monotonic() + NOTICE_S
+            self._notice_ends_s = self._world.monotonic() + NOTICE_S
 
     def _end_notice(self, service: Service) -> None:
-        if self._notice is not None and (self._notice[1]() or time.monotonic() > self._notice_ends_s):
+        if self._notice is not None and (self._notice[1]() or self._world.monotonic() > self._notice_ends_s):
             self._notice = None
             service.player.notice = ()
             service.reconciler.light_for(0.0)
@@ -302,7 +305,7 @@ class StageKiosk(FolderKiosk):
     def effect_of_schedule(self, schedule: Schedule) -> str:
         service = self.service
         check(schedule, service.bundles.names())
-        return effect(schedule, service.reconciler.overrides, service.reconciler.plan, time.time())
+        return effect(schedule, service.reconciler.overrides, service.reconciler.plan, self._world.wall())
 
     def identify(self, on: bool) -> None:
         self.service.player.identifying = on
@@ -336,7 +339,7 @@ class StageKiosk(FolderKiosk):
             archive.restore(self.stage, backup)
             service = self._service
             if service is not None:
-                after = check_stage(self.stage).stage.tables
+                after = check_stage(self.stage, drivers=self._world.drivers).stage.tables
                 service.cools = settings_change.change(self._in_use, after).lamps
             self.reload.set()
 
@@ -350,7 +353,9 @@ class StageKiosk(FolderKiosk):
 
     def save_settings(self, text: str) -> None:
         with self._idle():
-            settings.save(self.stage, text if settings.text(self.stage) else settings.with_own_key(self.stage, text))
+            first = not settings.text(self.stage)
+            text = settings.with_own_key(self.stage, text) if first else text
+            settings.save(self.stage, text, self._world.drivers)
             self.take_over()
 
     @property
@@ -363,7 +368,7 @@ class StageKiosk(FolderKiosk):
         if service is None:
             self.reload.set()
             return
-        checked = check_stage(self.stage)
+        checked = check_stage(self.stage, drivers=self._world.drivers)
         found = settings_change.change(self._in_use, checked.stage.tables)
         if not found.restarts:
             service.use(checked)

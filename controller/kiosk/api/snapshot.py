@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -12,6 +11,7 @@ from controller.kiosk.interface import BundleIdentity, DeviceRow, Grade, Job, Ki
 from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
+from controller.kiosk.world import World
 from controller.run.state_machine import State
 
 GRADES_EVERY_S: Final = 10.0
@@ -20,8 +20,8 @@ GRADES_EVERY_S: Final = 10.0
 class Snapshots:
     """Use it only in the reconciler's thread."""
 
-    def __init__(self, stage: Path) -> None:
-        self._stage = stage
+    def __init__(self, stage: Path, world: World) -> None:
+        self._stage, self._world = stage, world
         self._grades: tuple[float, tuple[Grade, ...]] = (0.0, ())
         self._places: tuple[Place, ...] = ()
         self._since = ("", 0.0)
@@ -32,11 +32,11 @@ class Snapshots:
         job = self._job(service)
         state, reason = self._state(service, job)
         if self._since[0] != state:
-            self._since = (state, time.time())
+            self._since = (state, self._world.wall())
         at_s, grades = self._grades
-        if time.monotonic() - at_s > GRADES_EVERY_S or not at_s:
+        if self._world.monotonic() - at_s > GRADES_EVERY_S or not at_s:
             grades = runs.grades(self._stage, service.checked.stage.tables.calibration.worst_grade)
-            self._grades = time.monotonic(), grades
+            self._grades = self._world.monotonic(), grades
             self._places = places(self._stage)
         index = service.bundles.index(bundle := service.bundles.bundle())
         identity = None

@@ -48,18 +48,18 @@ class JobHandlers:
         calibrated: Callable[[], bool],
         open_now: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._stage, self._lend = stage, lend
-        self._missing_device, self._calibrated, self._open_now = missing_device, calibrated, open_now
+        self._stage, self.lend = stage, lend
+        self.missing_device, self.calibrated, self._open_now = missing_device, calibrated, open_now
 
     def table(self) -> dict[str, JobHandler]:
         """Every kind by its name."""
         lit, known = self._needs_camera, self._needs_calibration
         return {
-            "aim": JobHandler(self._aim, lambda request: self._missing_device()),
+            "aim": JobHandler(self._aim, lambda request: self.missing_device()),
             "drift": JobHandler(self._drift, lit),
             "quick": JobHandler(self._quick, lit),
             "projector": JobHandler(self._projector, lit),
-            "full": JobHandler(self._full, lambda request: self._missing_device()),
+            "full": JobHandler(self._full, lambda request: self.missing_device()),
             "compare": JobHandler(self._compare, lit),
             "publish": JobHandler(self._publish, known),
             "compute": JobHandler(self._publish, known),
@@ -69,24 +69,24 @@ class JobHandlers:
         }
 
     def _needs_calibration(self, request: Request) -> Decision | None:
-        if self._calibrated():
+        if self.calibrated():
             return None
         return Decision("not-calibrated", "This stage has no finished calibration.", "Calibrate it first.", "error")
 
     def _needs_camera(self, request: Request) -> Decision | None:
-        return self._missing_device() or self._needs_calibration(request)
+        return self.missing_device() or self._needs_calibration(request)
 
     # -- jobs that need the lamps
 
     @contextlib.contextmanager
     def _borrowed(self) -> Iterator[BorrowedSession]:
-        with self._lend() as rig:
+        with self.lend() as rig:
             yield BorrowedSession(self._stage, rig)
 
     def _drift(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         from controller.services.recalibrate import check_drift
 
-        with self._lend() as rig:
+        with self.lend() as rig:
             result = check_drift(
                 session=BorrowedSession(self._stage, rig), details=True, reporter=reporter, cancel=cancel
             )
@@ -115,7 +115,7 @@ class JobHandlers:
             reporter.progress(running)
 
         capture = check_stage(self._stage).stage.tables.capture
-        with self._lend() as rig:
+        with self.lend() as rig:
             take_test_shots(rig, longest_exposure_s=capture.longest_exposure_s,
                             deadline=in_seconds(AIM_S, cancel), advance=advance)  # fmt: skip
         return Finished(request, Decision("aimed", "The test shots are done. See the aiming page."))
@@ -131,7 +131,7 @@ class JobHandlers:
         from controller.services.recalibrate import recalibrate
 
         (name,) = request.arguments
-        with self._lend() as rig:
+        with self.lend() as rig:
             result = recalibrate(
                 session=BorrowedSession(self._stage, rig), projector=name, reporter=reporter, cancel=cancel
             )
@@ -162,7 +162,7 @@ class JobHandlers:
         if request.key and self._open_now():
             return Finished(request, Decision("photographs-left-out", "The appearances were not photographed, because"
                                               " the stage opened in the meantime.", "", "warning"))  # fmt: skip
-        with self._lend() as rig:
+        with self.lend() as rig:
             result = photograph(
                 session=BorrowedSession(self._stage, rig), names=request.arguments, reporter=reporter, cancel=cancel
             )

@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +14,7 @@ from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job, JobStep
 from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.world import Thread, World
 from controller.run.progress import Level, Phase, Progress
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
@@ -84,16 +86,18 @@ class JobRunner:
         changed: Callable[[], None] = lambda: None,
         *,
         number: int = 0,
+        world: World | None = None,
     ) -> None:
+        self._world = world or World()
         self._handlers, self._log, self._changed = handlers, log, changed
         self._number = number
         self._lock = threading.Lock()
         self._request: Request | None = None
         self._reporter: JobReporter | None = None
         self._ended: OrderedDict[int, Job] = OrderedDict()
-        self._cancel = threading.Event()
+        self._cancel = self._world.event()
         self._finished: Finished | None = None
-        self._thread: threading.Thread | None = None
+        self._thread: Thread | None = None
 
     @property
     def job(self) -> Job | None:
@@ -124,13 +128,12 @@ class JobRunner:
         return self._handlers[request.kind].refusal(request)
 
     def begin(self, request: Request) -> None:
-        self._request, self._cancel = request, threading.Event()
+        self._request, self._cancel = request, self._world.event()
         title = title_of(request)
         self._reporter = JobReporter(Job(request.number or self.reserve(), title), self._log, self._changed)
         self._log.tell(Decision("work-begins", f"Started: {title}."))
-        thread = threading.Thread(
-            target=self._run, args=(request, self._reporter, self._cancel), name=f"work-{request.kind}", daemon=True
-        )
+        run = partial(self._run, request, self._reporter, self._cancel)
+        thread = self._world.thread(run, f"work-{request.kind}")
         try:
             thread.start()
             self._thread = thread

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import sqlite3
+import tempfile
 import threading
 import time
 from collections import deque
@@ -21,6 +23,7 @@ SHOWN: Final = 2_000
 MOST_FAILURES: Final = 20
 _TRIM_EVERY: Final = 200
 _RETRY_S: Final = 30.0
+_MEMORY: Final = Path("/dev/shm")  # noqa: S108 - the folder in it has a name of its own
 _LEVELS: Final[dict[str, EventLevel]] = {"info": "info", "warning": "warning", "error": "error"}
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS events (
@@ -49,13 +52,17 @@ class EventLog:
     """Thread-safe. ``problem``: why the log can't be written now, or None.
 
     ``durable``: events survive a power cut, too, not only the end of the process. Events that can't be written are kept
-    in memory until there is space again. A damaged file is renamed and replaced.
+    in memory until there is space again. A damaged file is renamed and replaced. ``connect``: as ``sqlite3.connect``.
     """
 
     FILE: Final = "kiosk/events.sqlite"
 
-    def __init__(self, path: Path, *, wall: Callable[[], float] = time.time, durable: bool = True) -> None:
+    def __init__(
+        self, path: Path, *, wall: Callable[[], float] = time.time, durable: bool = True,
+        monotonic: Callable[[], float] = time.monotonic, connect: Callable[..., sqlite3.Connection] = sqlite3.connect,
+    ) -> None:  # fmt: skip
         self.path, self._wall, self._durable = path, wall, durable
+        self._monotonic, self._connect = monotonic, connect
         self._lock = threading.RLock()
         self.problem: str | None = None
         self._retry_at_s = 0.0
@@ -67,7 +74,7 @@ class EventLog:
         self._done: dict[str, str] = dict(self._query("SELECT key, how FROM done ORDER BY number"))
         self._kept: dict[str, str] = dict(self._query("SELECT name, value FROM kept"))
         self._failures = self._read_failures()
-        self._unwritten: set[tuple[str, str]] = set()
+        self._unwritten: dict[tuple[str, str], None] = {}
 
     # -- events
 
@@ -126,7 +133,7 @@ class EventLog:
         """Record that ``key`` was done or skipped: in memory at once, on disk as soon as possible."""
         with self._lock:
             self._done[key] = how
-            self._unwritten.add(("done", key))
+            self._unwritten[("done", key)] = None
             self._flush(now=True)
 
     def value(self, name: str) -> str | None:
@@ -137,7 +144,7 @@ class EventLog:
         with self._lock:
             if self._kept.get(name) != value:
                 self._kept[name] = value
-                self._unwritten.add(("kept", name))
+                self._unwritten[("kept", name)] = None
                 self._flush()
 
     def close(self) -> None:
@@ -148,7 +155,7 @@ class EventLog:
     # -- the disk
 
     def _flush(self, *, now: bool = False) -> None:
-        if self.problem is not None and not now and time.monotonic() < self._retry_at_s:
+        if self.problem is not None and not now and self._monotonic() < self._retry_at_s:
             return
         try:
             if self._unavailable:
@@ -167,7 +174,7 @@ class EventLog:
                 if self._number % _TRIM_EVERY == 0:
                     self._trim(database)
         except (sqlite3.Error, OSError) as error:
-            self.problem, self._retry_at_s = str(error), time.monotonic() + _RETRY_S
+            self.problem, self._retry_at_s = str(error), self._monotonic() + _RETRY_S
             return
         self._waiting.clear()
         self._unwritten.clear()
@@ -197,17 +204,22 @@ class EventLog:
     def _copied(self) -> sqlite3.Connection:
         """An in-memory copy of a log that can be read but not opened, as on a full disk; see ``_flush``."""
         database = self._connected(Path(":memory:"))
-        with (
-            contextlib.suppress(sqlite3.Error),
-            contextlib.closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?immutable=1", uri=True)) as source,
-        ):
-            source.backup(database)
+        folder = _MEMORY if _MEMORY.is_dir() else None
+        # With its write-ahead log, which a kill leaves behind, and in which the newest events are. Both are read from
+        # a folder in memory, because SQLite has to write beside them.
+        with contextlib.suppress(sqlite3.Error, OSError), tempfile.TemporaryDirectory(dir=folder) as name:
+            copy = Path(name) / self.path.name
+            for end in ("", "-wal"):
+                with contextlib.suppress(FileNotFoundError):
+                    shutil.copyfile(f"{self.path}{end}", f"{copy}{end}")
+            with contextlib.closing(sqlite3.connect(copy)) as source:
+                source.backup(database)
         return database
 
     def _connected(self, path: Path) -> sqlite3.Connection:
         if str(path) != ":memory:":
             path.parent.mkdir(parents=True, exist_ok=True)
-        database = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
+        database = self._connect(path, check_same_thread=False, timeout=2.0)
         try:
             database.execute("PRAGMA journal_mode=WAL")
             # A finished task must not run again after a power cut.

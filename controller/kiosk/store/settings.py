@@ -18,6 +18,7 @@ from controller.core.files import LARGEST_TEXT, read_bytes
 from controller.core.storage import write_atomically
 from controller.stage.calibrations import finished_calibrations
 from controller.stage.check import check_stage
+from hal.registry import Drivers
 
 BEFORE: Final = "stage.toml.before"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
@@ -47,7 +48,7 @@ def tables_of(content: str) -> StageTables:
     return parse_stage(tomllib.loads(content), Place(FILE, KeyLines(content)))
 
 
-def save(stage: Path, content: str) -> None:
+def save(stage: Path, content: str, drivers: Drivers | None = None) -> None:
     """Validate, also the keys of drivers, keep the old text as ``BEFORE``, and write.
 
     Raises UsageError as above; stage.toml is then unchanged.
@@ -56,7 +57,7 @@ def save(stage: Path, content: str) -> None:
     before = text(stage)
     write_atomically(stage / FILE, content.encode())
     try:
-        check_stage(stage)
+        check_stage(stage, drivers=drivers)
     except BaseException:
         if before:
             write_atomically(stage / FILE, before.encode())

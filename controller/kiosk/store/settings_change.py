@@ -14,6 +14,7 @@ from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.store.event_log import Decision
 from controller.stage.check import Checked, check_stage
+from hal.registry import Drivers
 
 GOOD: Final = "kiosk/stage.toml.good"
 """A copy of the stage.toml that the kiosk last ran with."""
@@ -74,12 +75,12 @@ def keep_good(checked: Checked, source: Path | None = None) -> None:
         return
 
 
-def last_good(stage: Path, error: UsageError) -> tuple[Checked, Decision]:
+def last_good(stage: Path, error: UsageError, drivers: Drivers | None = None) -> tuple[Checked, Decision]:
     """The settings that the kiosk last ran with, and what people must know. Raises ``error`` if there are none."""
     if error.code == "stage-missing" or not (stage / GOOD).is_file():
         raise error
     try:
-        checked = check_stage(stage, instead=stage / GOOD)
+        checked = check_stage(stage, drivers=drivers, instead=stage / GOOD)
     except VelaturaError:
         raise error from None
     why = f"{error.what} The kiosk runs with the last good settings, and starts no job."

@@ -1,4 +1,4 @@
-"""Says as long as it is so that an older bundle plays, because the newest one showed no picture."""
+"""Says as long as it is so that the newest bundle does not play, because it showed no picture."""
 
 from __future__ import annotations
 
@@ -24,9 +24,13 @@ class BundleWatch:
             self._tell(Decision("bundle-newest", "The newest bundle plays again."))
 
     def _look(self) -> Decision | None:
+        bundle = self._bundles.bundle()
+        if bundle is not None and self._bundles.index(bundle) is None:
+            return Decision("bundle-bad", "The installed bundle can't be read, so nothing of it is shown.",
+                            "Compute and publish the appearances again.", "error")  # fmt: skip
         if not self._bundles.given_up():
             return None
-        index = self._bundles.index(self._bundles.bundle())
+        index = self._bundles.index(bundle)
         made = "" if index is None else time.strftime(" of %Y-%m-%d %H:%M UTC", time.gmtime(index.created_unix_s))
         return Decision(
             "bundle-older-plays",

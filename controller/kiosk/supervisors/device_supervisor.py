@@ -10,6 +10,7 @@ from typing import Final
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
+from controller.kiosk.world import Lock
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device
@@ -31,6 +32,7 @@ class DeviceSupervisor:
     def __init__(
         self, name: str, kind: str, driver: str, open_it: Callable[[Deadline], Device], look: Look,
         tell: Callable[[Decision], object], *, every_s: float = 30.0, monotonic: Callable[[], float] = time.monotonic,
+        deadline: Callable[[float], Deadline] = in_seconds, lock: Lock | None = None,
     ) -> None:  # fmt: skip
         self.name, self.kind, self.driver = name, kind, driver
         self._open, self._look, self._tell = open_it, look, tell
@@ -40,7 +42,8 @@ class DeviceSupervisor:
         self._problem: Decision | None = None
         self._next_s, self._failures = 0.0, 0
         self._closed = False
-        self.lent = threading.Lock()
+        self._deadline = deadline
+        self.lent: Lock = lock or threading.Lock()
 
     @property
     def device(self) -> Device | None:
@@ -62,8 +65,8 @@ class DeviceSupervisor:
             return
         try:
             if self._device is None:
-                self._device = self._open(in_seconds(OPEN_S))
-            self._values = self._look(self._device, in_seconds(LOOK_S))
+                self._device = self._open(self._deadline(OPEN_S))
+            self._values = self._look(self._device, self._deadline(LOOK_S))
             self._recovered()
         except (DeviceError, VelaturaError) as error:
             self._lost(Decision(error.code, error.what, error.remedy, "error"))

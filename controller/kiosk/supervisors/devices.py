@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, cast
+from typing import Any, Final, cast
 
 from controller.core.text import printable
 from controller.kiosk.changes.devices import camera_facts, projector_facts
@@ -18,14 +18,14 @@ from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
+from controller.kiosk.world import World
 from controller.rig.ambient_light import Darkness, LightWatch
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile
 from controller.rig.rig import Rig
 from controller.stage.check import Checked
 from controller.stage.open import light_sensor, mains_circuits, open_device, rig_of
-from controller.stage.recording import open_context
-from hal.deadline import Deadline, in_seconds
+from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Camera, Device, Display, LightSensor, Projector, WatchedCamera
 
@@ -38,9 +38,10 @@ class Devices:
     ``scene`` names the steady picture on the object, for the light sensor; None while nothing is steady.
     """
 
-    def __init__(self, checked: Checked, runtime: Path, tell: Tell) -> None:
+    def __init__(self, checked: Checked, runtime: Path, tell: Tell, world: World | None = None) -> None:
         self._checked, self._tell = checked, tell
-        self._context = open_context(checked.stage.folder, runtime=runtime)
+        self._world = world or World()
+        self._context = self._world.open_context(checked.stage.folder, runtime)
         self._ledger = LampFile(checked.stage.folder / LampFile.NAME)
         self.mains = self._mains_supervisor()
         self.projectors = tuple(self._projector(number) for number in range(len(checked.projectors)))
@@ -50,7 +51,14 @@ class Devices:
         self.scene: Callable[[], str | None] = lambda: None
         self._room: str | None = None
         self.camera = DeviceSupervisor(
-            "camera", "camera", tables.camera.driver, self._open_camera, _look_at_camera, tell, every_s=60.0
+            "camera",
+            "camera",
+            tables.camera.driver,
+            self._open_camera,
+            _look_at_camera,
+            tell,
+            every_s=60.0,
+            **self._of_the_world(),
         )
         self.sensor = self._sensor()
 
@@ -120,7 +128,7 @@ class Devices:
                                  remedy="See the list of devices.")  # fmt: skip
             driver, settings = self._checked.display
             table = self._checked.stage.tables.display
-            display = cast("Display", open_device(table, driver, settings, self._context, in_seconds(20)))
+            display = cast("Display", open_device(table, driver, settings, self._context, self._world.deadline(20)))
             stack.callback(display.close)
             held = [guard for guard in guards if guard is not None]
             rig = rig_of(self._checked.stage, held, cast("Camera", camera), display)
@@ -143,6 +151,9 @@ class Devices:
 
     # -- opening
 
+    def _of_the_world(self) -> dict[str, Any]:
+        return {"monotonic": self._world.monotonic, "deadline": self._world.deadline, "lock": self._world.lock()}
+
     def _projector(self, number: int) -> ProjectorSupervisor:
         tables = self._checked.stage.tables
         table, (driver, settings) = tables.projectors[number], self._checked.projectors[number]
@@ -150,11 +161,13 @@ class Devices:
 
         def open_guard(deadline: Deadline) -> LampGuard:
             projector = cast("Projector", open_device(table, driver, settings, self._context, deadline))
-            return LampGuard(table.name, projector, self._ledger, at_least=at_least)
+            return LampGuard(table.name, projector, self._ledger, at_least=at_least, clock=self._world,
+                             lock=self._world.rlock())  # fmt: skip
 
         silenced = None if self.mains is None else partial(self.mains.silences, table.name)
         unfed = partial(self._unfed, table.name)
-        return ProjectorSupervisor(table.name, open_guard, self._tell, asleep=silenced, unfed=unfed)
+        return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, asleep=silenced, unfed=unfed,
+                                   deadline=self._world.deadline)  # fmt: skip
 
     def _unfed(self, projector: str) -> Decision | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]
@@ -182,7 +195,8 @@ class Devices:
             dark = "dark enough to calibrate" if lux <= table.most_lux else "too bright to calibrate"
             return (LiveValue("Light", f"{lux:.2f} lux ({dark})"),)
 
-        return DeviceSupervisor("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0)
+        return DeviceSupervisor("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0,
+                                **self._of_the_world())  # fmt: skip
 
     def _report_light(self, room: str | None) -> None:
         before, self._room = self._room, room

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -17,6 +15,7 @@ from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.disk_space import make_room, runs_of
 from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.world import World
 
 GB: Final = 1e9
 STEP_BYTES: Final = 10_000_000
@@ -33,8 +32,10 @@ class DiskSupervisor:
     """
 
     def __init__(
-        self, stage: Path, table: Callable[[], DiskTable], bundles: BundleStore, log: EventLog, busy: Callable[[], bool]
-    ) -> None:
+        self, stage: Path, table: Callable[[], DiskTable], bundles: BundleStore, log: EventLog,
+        busy: Callable[[], bool], world: World | None = None,
+    ) -> None:  # fmt: skip
+        self._world = world or World()
         self._stage, self._table, self._bundles, self._log, self._busy = stage, table, bundles, log, busy
         self.free_bytes = self.total_bytes = 0
         self.problem: Decision | None = None
@@ -48,7 +49,7 @@ class DiskSupervisor:
     def step(self) -> None:
         """Look once."""
         self._look()
-        if self.free_bytes < self._level and not self._busy() and time.monotonic() >= self._again_at_s:
+        if self.free_bytes < self._level and not self._busy() and self._world.monotonic() >= self._again_at_s:
             self._make_room()
         self._judge()
 
@@ -65,12 +66,12 @@ class DiskSupervisor:
         return self._table().warn_free_gb * GB
 
     def _look(self) -> None:
-        usage = shutil.disk_usage(self._stage)
+        total, free = self._world.disk_usage(self._stage)
         # In steps: each change of the state is sent to every open panel.
-        self.free_bytes, self.total_bytes = usage.free // STEP_BYTES * STEP_BYTES, usage.total
+        self.free_bytes, self.total_bytes = free // STEP_BYTES * STEP_BYTES, total
 
     def _make_room(self) -> None:
-        self._again_at_s = time.monotonic() + AGAIN_S
+        self._again_at_s = self._world.monotonic() + AGAIN_S
         before = self.free_bytes
 
         def enough() -> bool:

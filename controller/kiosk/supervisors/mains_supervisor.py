@@ -12,6 +12,7 @@ from controller.kiosk.interface import LiveValue
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
+from controller.kiosk.world import Lock
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.mains_relays import Circuit
 from hal.deadline import Deadline, in_seconds
@@ -43,9 +44,11 @@ class MainsSupervisor(DeviceSupervisor):
 
     def __init__(
         self, driver: str, open_it: Callable[[Deadline], Device], tell: Tell,
-        *, monotonic: Callable[[], float] = time.monotonic,
+        *, monotonic: Callable[[], float] = time.monotonic, deadline: Callable[[float], Deadline] = in_seconds,
+        lock: Lock | None = None,
     ) -> None:  # fmt: skip
-        super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0, monotonic=monotonic)
+        super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0, monotonic=monotonic,
+                         deadline=deadline, lock=lock)  # fmt: skip
         self.want_on = True
         self.supervisors: tuple[ProjectorSupervisor, ...] = ()
         self._off: frozenset[str] = frozenset()
@@ -76,7 +79,7 @@ class MainsSupervisor(DeviceSupervisor):
         return tuple(values)
 
     def _switch_on(self, circuit: Circuit) -> str:
-        if circuit.close(deadline=in_seconds(LOOK_S)):
+        if circuit.close(deadline=self._deadline(LOOK_S)):
             self._tell(Decision("mains-on", f"Mains on: {circuit.name}."))
             self._booted_at_s |= dict.fromkeys(circuit.feeds, self._monotonic() + circuit.boot_s)
         return "on"
@@ -84,18 +87,18 @@ class MainsSupervisor(DeviceSupervisor):
     def _switch_off(self, circuit: Circuit, guards: dict[str, LampGuard | None]) -> str:
         # The board is asked first, even if its state is known: a missing board must be reported as such, not as the
         # silence of the projectors that lost their mains with it.
-        if not circuit.on(deadline=in_seconds(LOOK_S)):
+        if not circuit.on(deadline=self._deadline(LOOK_S)):
             return self._is_off(circuit)
         self._off -= frozenset(circuit.feeds)  # closed by hand, or by another program
         known = {name: guard for name, guard in guards.items() if guard is not None}
         if any(name not in known for name in circuit.feeds):
             return "unchanged"
         try:
-            circuit.open(known, deadline=in_seconds(LOOK_S))
+            circuit.open(known, deadline=self._deadline(LOOK_S))
         except DeviceError as error:
             if error.code == "mains-lamp-hot":
                 return "on until the lamps have cooled"
-            if not _all_answer([known[name] for name in circuit.feeds]):
+            if not self._all_answer([known[name] for name in circuit.feeds]):
                 return "on, because it is unknown whether the lamps have cooled"
             raise
         return self._is_off(circuit)
@@ -106,12 +109,11 @@ class MainsSupervisor(DeviceSupervisor):
             self._tell(Decision("mains-off", f"Mains off: {circuit.name}."))
         return "off"
 
-
-def _all_answer(guards: Sequence[LampGuard]) -> bool:
-    """Whether all these projectors answer; the supervisor of each reports its problems."""
-    try:
-        for guard in guards:
-            guard.status(deadline=in_seconds(guard.answer_s))
-    except DeviceError:
-        return False
-    return True
+    def _all_answer(self, guards: Sequence[LampGuard]) -> bool:
+        """Whether all these projectors answer; the supervisor of each reports its problems."""
+        try:
+            for guard in guards:
+                guard.status(deadline=self._deadline(guard.answer_s))
+        except DeviceError:
+            return False
+        return True

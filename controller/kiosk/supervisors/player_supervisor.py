@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from controller.core.errors import VelaturaError, WorkError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
@@ -40,12 +38,37 @@ on the outputs that was not seen here.
 """
 
 
+class Process(Protocol):
+    """A running player, as ``play.control.launch.PlayerProcess``."""
+
+    @property
+    def socket(self) -> Path: ...
+
+    @property
+    def pid(self) -> int: ...
+
+    @property
+    def alive(self) -> bool: ...
+
+    def wait_until_ready(self, timeout_s: float = READY_S) -> dict[str, Any]: ...
+
+    def kill(self) -> None: ...
+
+    def terminate(self) -> int: ...
+
+
+def launched(runtime: Path, settings: PlayerSettings) -> Process:
+    """A player that is being started, in the place of one that a killed starter left behind."""
+    end_leftover(runtime)
+    return PlayerProcess(runtime, settings)
+
+
 class PlayerSupervisor:
     """The player of a stage; see ``decide.interfaces.PlayerPort``.
 
     ``settings`` is asked at each start (the flag: with the installed bundle); ``tell`` hears what happens. ``notice``:
     lines of text that one projector after the other shows as long as nothing else is wanted than black. ``attach``:
-    gets hold of a player that somebody else starts, instead of starting one.
+    gets hold of a player that somebody else starts, instead of starting one with ``launch``.
     """
 
     def __init__(
@@ -56,14 +79,17 @@ class PlayerSupervisor:
         *,
         monotonic: Callable[[], float] = time.monotonic,
         attach: Callable[[PlayerSettings], AttachedPlayer] | None = None,
+        launch: Callable[[Path, PlayerSettings], Process] = launched,
+        channel: PlayerChannel | None = None,
     ) -> None:
         self._runtime, self._settings, self._tell, self._monotonic = runtime, settings, tell, monotonic
         self.want: Showing | None = BLACK
         self.identifying = False
         self.notice: tuple[str, ...] = ()
         self._attach = attach
-        self._process: PlayerProcess | AttachedPlayer | None = None
-        self._channel = PlayerChannel()
+        self._launch = launch
+        self._process: Process | None = None
+        self._channel = channel or PlayerChannel()
         self._view = PlayerView()
         self._identities: dict[str, Path] = {}
         self._misses, self._failed = 0, 0
@@ -156,11 +182,8 @@ class PlayerSupervisor:
             self._identities[str(hello["bundle"])] = installed.resolve()
         self._tell(Decision("player-started", "The player is running."))
 
-    def _player(self, settings: PlayerSettings) -> PlayerProcess | AttachedPlayer:
-        if self._attach is not None:
-            return self._attach(settings)
-        end_leftover(self._runtime)
-        return PlayerProcess(self._runtime, settings)
+    def _player(self, settings: PlayerSettings) -> Process:
+        return self._launch(self._runtime, settings) if self._attach is None else self._attach(settings)
 
     def _restart(self, why: Decision) -> None:
         assert self._process is not None
@@ -168,7 +191,7 @@ class PlayerSupervisor:
         self._channel.close()
         if self._process.alive:
             # It had its time to answer; SIGTERM would be one more thing that it does not hear.
-            os.kill(self._process.pid, signal.SIGKILL)
+            self._process.kill()
         self._process.terminate()
         self._process = None
         healthy = self._monotonic() - self._started_at_s >= HEALTHY_S

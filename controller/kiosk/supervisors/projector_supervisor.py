@@ -43,6 +43,7 @@ class ProjectorSupervisor:
     tell : receives observations and decisions
     asleep : whether it has no mains now, or is booting, so that its silence means nothing
     unfed : the problem of the relays that supply it, which may be the reason for its silence
+    deadline : one that ends in so many seconds
     """
 
     def __init__(
@@ -54,11 +55,13 @@ class ProjectorSupervisor:
         clock: Clock | None = None,
         asleep: Callable[[], bool] | None = None,
         unfed: Callable[[], Decision | None] | None = None,
+        deadline: Callable[[float], Deadline] = in_seconds,
     ) -> None:
         self.name = name
         self._open_guard, self._tell = open_guard, tell
         self._clock = clock or SystemClock()
         self._asleep, self._unfed = asleep or (lambda: False), unfed or (lambda: None)
+        self._deadline = deadline
         self._guard: LampGuard | None = None
         self._want_lit: bool | None = None
         self._view = ProjectorView(name)
@@ -120,7 +123,7 @@ class ProjectorSupervisor:
             guard = self._opened()
             if guard is None:
                 return
-            status = guard.status(deadline=in_seconds(ANSWER_S))
+            status = guard.status(deadline=self._deadline(ANSWER_S))
             for code, sentence in guard.troubles():
                 self._tell(Decision(code, sentence, "", "warning"))
         except (DeviceError, VelaturaError) as error:
@@ -151,7 +154,7 @@ class ProjectorSupervisor:
         if self._guard is None:
             if self._clock.now_s() < self._reopen_at_s:
                 return None
-            self._guard = self._open_guard(in_seconds(ANSWER_S))
+            self._guard = self._open_guard(self._deadline(ANSWER_S))
             if self._closed:
                 # Closed while it was being opened: release the line, because the next service needs it.
                 self._release(self._guard)
@@ -172,7 +175,7 @@ class ProjectorSupervisor:
         if guard is not None and self._want_lit is False and guard.may_be_lit:
             # It may receive the command, even if it does not answer.
             with contextlib.suppress(DeviceError, VelaturaError):
-                guard.switch_off(deadline=in_seconds(guard.switch_s))
+                guard.switch_off(deadline=self._deadline(guard.switch_s))
         limit_s = PATIENCE_S
         if guard is not None and self._struck_at_s is not None:
             # Many do not answer while they boot.
@@ -199,7 +202,7 @@ class ProjectorSupervisor:
     def _light(self, guard: LampGuard, status: ProjectorStatus) -> None:
         if status.power is Power.FAULT or fatal_faults(status):
             if status.power in (Power.ON, Power.WARMING):
-                guard.switch_off(deadline=in_seconds(guard.switch_s))
+                guard.switch_off(deadline=self._deadline(guard.switch_s))
             self._struck_at_s = None
             self._see(Condition.BROKEN, status, _decision(faulty(self.name, status)))
             self._reopen_after_fault(guard)
@@ -231,7 +234,7 @@ class ProjectorSupervisor:
             self._struck_at_s = self._clock.now_s()
         if self._clock.now_s() - self._struck_at_s > self._light_limit_s(guard):
             self._strike_failed()
-            guard.switch_off(deadline=in_seconds(guard.switch_s))
+            guard.switch_off(deadline=self._deadline(guard.switch_s))
         self._see(Condition.LIGHTING, status, self._view.problem)
 
     def _strike(self, guard: LampGuard, status: ProjectorStatus) -> None:
@@ -244,7 +247,7 @@ class ProjectorSupervisor:
         if self._failed_strikes >= MOST_STRIKES:
             return self._see(Condition.BROKEN, status, _unlit(self.name))
         try:
-            guard.switch_on(deadline=in_seconds(guard.switch_s))
+            guard.switch_on(deadline=self._deadline(guard.switch_s))
         except DeviceRefused as error:
             if error.code in ("lamp-cooling", "lamp-resting"):
                 return self._see(Condition.COOLING, status, self._view.problem)
@@ -289,10 +292,12 @@ class ProjectorSupervisor:
             resting = status.power is Power.COOLING or guard.rest_left_s() > 0
             self._see(Condition.COOLING if resting else Condition.DARK, status, problem)
         else:
-            # Until the next status shows it off: the lamp may be lit behind FAULT and UNKNOWN.
-            self._see(Condition.BROKEN if faults else Condition.LIT, status, problem)
+            # Until the next status shows it off: the lamp may be lit behind FAULT and UNKNOWN. What prevented the last
+            # attempt stays a problem so long; otherwise every second would have two events.
+            kept = self._view.problem if self._view.condition is Condition.LIT else None
+            self._see(Condition.BROKEN if faults else Condition.LIT, status, problem or kept)
             if not (faults and status.power is Power.FAULT and not guard.may_be_lit):
-                guard.switch_off(deadline=in_seconds(guard.switch_s))
+                guard.switch_off(deadline=self._deadline(guard.switch_s))
 
     # -- the view
 

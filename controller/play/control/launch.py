@@ -121,6 +121,10 @@ class PlayerProcess:
             raise ConnectionError
         return answer
 
+    def kill(self) -> None:
+        """End it at once, without asking."""
+        os.kill(self.pid, signal.SIGKILL)
+
     def terminate(self, timeout_s: float = _END_S) -> int:
         """Ask the player to leave black and end; kill it if it does not in time. Returns its exit code."""
         if self.alive:
@@ -128,7 +132,7 @@ class PlayerProcess:
             try:
                 self._process.wait(timeout_s)
             except subprocess.TimeoutExpired:
-                os.kill(self.pid, signal.SIGKILL)
+                self.kill()
         return self._process.wait()
 
     def restart(self, timeout_s: float = _READY_S) -> dict[str, Any]:

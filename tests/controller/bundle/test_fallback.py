@@ -59,6 +59,14 @@ def test_two_bad_bundles_do_not_take_turns(folder: Path) -> None:
     assert plays(folder) == 1
 
 
+def test_a_damaged_bundle_is_not_gone_back_to(folder: Path) -> None:
+    before = folder / (folder / "previous").readlink()
+    before.write_bytes(before.read_bytes()[:-40])
+    for _ in range(8):
+        start(folder)
+    assert plays(folder) == 2
+
+
 def test_without_another_bundle_the_current_one_is_tried_for_ever(tmp_path: Path) -> None:
     install(made(tmp_path / "b.vel", 5), tmp_path / "bundles", allow_unsigned=True)
     for _ in range(8):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -28,29 +29,28 @@ def test_what_failed_is_kept_until_it_was_seen_over_starts_and_nonsense(tmp_path
 
 
 def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_when_there_is_space(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    path, connect = tmp_path / EventLog.FILE, sqlite3.connect
+    path, is_full = tmp_path / EventLog.FILE, [True]
     log = EventLog(path, durable=False)
     log.tell(Decision("first", "One."))
     log.keep("chosen", "glass")
     log.close()
 
     def full(database: Any, **options: Any) -> sqlite3.Connection:
-        if database == path:
+        if is_full and database == path:
             error = sqlite3.OperationalError("disk I/O error")
             error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE  # what SQLite says on a file system without space
             raise error
-        found: sqlite3.Connection = connect(database, **options)
+        found: sqlite3.Connection = sqlite3.connect(database, **options)
         return found
 
-    monkeypatch.setattr(sqlite3, "connect", full)
-    log = EventLog(path, durable=False)
+    log = EventLog(path, durable=False, connect=full)
     log.tell(Decision("second", "Two."))
     log.mark_done("drift-check 2026-01-01", "drift-none")
     assert log.problem == "disk I/O error"
     assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
-    monkeypatch.setattr(sqlite3, "connect", connect)
+    is_full.clear()
     log.mark_done("drift-check 2026-01-02", "drift-none")
     assert log.problem is None
     log.close()
@@ -77,3 +77,26 @@ def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length:
     assert [row.code for row in log.after(0)] == ["after"]
     log.close()
     assert len(list(path.parent.glob("*.damaged-*"))) == 1
+
+
+def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_path: Path) -> None:
+    killed, left = EventLog(tmp_path / "before" / "events.sqlite"), tmp_path / "left" / "events.sqlite"
+    killed.tell(Decision("last", "It was the last."))
+    killed.keep("override", "[true, false]")
+    left.parent.mkdir()
+    for end in ("", "-wal"):
+        shutil.copyfile(f"{killed.path}{end}", f"{left}{end}")
+    killed.close()
+
+    def full(database: Any, **options: Any) -> sqlite3.Connection:
+        if str(database) == ":memory:":
+            memory: sqlite3.Connection = sqlite3.connect(database, **options)
+            return memory
+        error = sqlite3.OperationalError("database or disk is full")
+        error.sqlite_errorcode = sqlite3.SQLITE_FULL
+        raise error
+
+    log = EventLog(left, connect=full)
+    assert [row.code for row in log.after(0)] == ["last"]
+    assert (log.value("override"), log.number) == ("[true, false]", 1)
+    log.close()

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from controller.kiosk import service
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.supervisors import projector_supervisor
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
+from controller.kiosk.world import World
 from controller.stage.check import check_stage
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
@@ -144,15 +142,19 @@ class SlowLamp(QuickLamp):
         super().switch_off(deadline=deadline)
 
 
-def test_a_service_that_ends_in_the_middle_of_a_strike_waits_for_the_lamp_to_go_off(
-    models: Models, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_service_that_ends_in_the_middle_of_a_strike_waits_for_the_lamp_to_go_off(models: Models) -> None:
     text = (models.folder / "stage.toml").read_text()
     (models.folder / "stage.toml").write_text(text.replace("power_down_s = 0.3", "power_down_s = 60"))
     lamp, log = SlowLamp(), EventLog(models.folder / EventLog.FILE, durable=False)
     projectors = Driver("projector", "model", "A lamp.", lambda *_: lamp, {"port": "the port"}, ("port",))
     drivers = Drivers((projectors, models.drivers.get("camera", "model"), models.drivers.get("display", "model")))
-    found = Service(check_stage(models.folder, drivers=drivers), log)
+
+    class Answering(World):
+        def sleep(self, seconds: float, deadline: Deadline | None = None) -> None:
+            lamp.answered.set()
+            super().sleep(seconds, deadline)
+
+    found = Service(check_stage(models.folder, drivers=drivers), log, world=Answering())
     supervisor, over = found.devices.projectors[0], threading.Event()
     supervisor.want_lit = True
 
@@ -160,11 +162,6 @@ def test_a_service_that_ends_in_the_middle_of_a_strike_waits_for_the_lamp_to_go_
         while not over.wait(0.1):
             supervisor.step()
 
-    def answered(seconds: float) -> None:
-        lamp.answered.set()
-        time.sleep(seconds)
-
-    monkeypatch.setattr(service, "time", SimpleNamespace(monotonic=time.monotonic, time=time.time, sleep=answered))
     thread = threading.Thread(target=looking)
     thread.start()
     assert lamp.asked.wait(20)

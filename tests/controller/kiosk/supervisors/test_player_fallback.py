@@ -81,3 +81,20 @@ def test_a_player_that_dies_soon_after_its_start_on_a_damaged_bundle_comes_back_
         assert watch.warning is None
     finally:
         supervisor.close()
+
+
+def test_an_only_bundle_that_can_not_be_read_is_a_problem_as_long_as_it_is_so(tmp_path: Path) -> None:
+    key = SigningKey(bytes(range(32)))
+    public, slots, told = bytes(key.verify_key), tmp_path / "bundles", list[Decision]()
+    install(write_noise(tmp_path / "b.vel", key=key, revision=1), slots, trusted=[public])
+    only = current(slots)
+    assert only is not None
+    only.write_bytes(b"no bundle")
+    watch = BundleWatch(BundleStore(tmp_path, Trust((public,))), told.append)
+    watch.step()
+    watch.step()
+    assert watch.warning is not None
+    install(write_noise(tmp_path / "b.vel", key=key, revision=2), slots, trusted=[public])
+    watch.step()
+    assert watch.warning is None
+    assert [(one.code, one.level) for one in told] == [("bundle-bad", "error"), ("bundle-newest", "info")]

@@ -230,3 +230,17 @@ def test_a_line_that_opens_after_its_keeper_was_closed_is_let_go_of_and_no_lamp_
     assert closed == ["left"]
     assert kept.lamp.strikes == 0
     assert supervisor.guard is None
+
+
+def test_a_lamp_that_can_not_be_switched_off_is_one_problem_and_not_one_each_second() -> None:
+    kept = Kept()
+    kept.supervisor.want_lit = True
+    kept.run(20.0)
+    kept.lamp.trouble = "lost"
+    kept.supervisor.want_lit = False
+    assert kept.run(60.0) is Condition.LIT
+    assert [one.code for one in kept.told if one.code != "lamp-struck"] == ["model-trouble"]
+    kept.lamp.trouble = ""
+    kept.run(30.0)
+    assert [one.code for one in kept.told if one.code != "lamp-struck"] == ["model-trouble", "projector-back"]
+    assert kept.supervisor.view.problem is None

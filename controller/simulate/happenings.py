@@ -1,0 +1,343 @@
+"""What the items of a script do to a life, and how the witness has to take them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from controller.bundle.install import current
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.service import Service
+from controller.simulate.calendar import Calendar
+from controller.simulate.disk import STAGE, TOTAL_BYTES
+from controller.simulate.lamps import RULES, Lamp
+from controller.simulate.promises import REPAIR_S, SETTLING_S, Witness
+from controller.simulate.scheduler import Event
+from controller.simulate.script import Item
+from controller.simulate.stage import publish
+from controller.simulate.world import SimulatedWorld
+
+
+class Living(Protocol):
+    """A life, as far as it is needed here; see ``life.Life``."""
+
+    world: SimulatedWorld
+    witness: Witness
+    service: Service | None
+    damaged: set[str]
+    news: Event
+
+    def later(self, seconds: float, mend: Callable[[], None]) -> None: ...
+
+    def boot(self) -> None: ...
+
+    def end_of_program(self) -> None: ...
+
+    def restart(self, *, lit: bool) -> None: ...
+
+    def ask(self, item: Item) -> None: ...
+
+
+PLAYER_S: Final = 120.0
+"""After trouble with the player: its longest pause before a start, and a start that fails."""
+MEND_FILE_S: Final = 600.0
+HOLD_S: Final = 7200.0
+"""For so long a kiosk's time may stand still after its clock was set back."""
+
+
+def happen(life: Living, item: Item) -> None:
+    """Let it happen. Raises Broken."""
+    _DEEDS[item.what](life, item)
+
+
+def _line(life: Living, item: Item) -> None:
+    line = life.world.lines[item.who]
+    line.trouble = item.how
+    life.witness.disturb(item.for_s + 120.0)
+
+    def mend() -> None:
+        line.trouble = ""
+
+    life.later(item.for_s, mend)
+
+
+def _lamp_fails(life: Living, item: Item) -> None:
+    lamp = life.world.lamps[item.who]
+    lamp.dud = True
+    lamp.go_dark()
+    life.witness.disturb(item.for_s)
+    life.later(item.for_s, partial(_new_lamp, life, lamp))
+
+
+def _new_lamp(life: Living, lamp: Lamp) -> None:
+    """A technician puts in a new one, and opens the stage if it is to be open."""
+    lamp.dud, lamp.fault = False, ""
+    life.witness.disturb(0.0)
+    if life.service is not None:
+        for supervisor in life.service.devices.projectors:
+            supervisor.forgive()
+    life.witness.forgive()
+
+
+def _lamp_reports(life: Living, item: Item) -> None:
+    lamp = life.world.lamps[item.who]
+    lamp.fault = item.how
+    if item.how in ("temperature", "cover"):
+        lamp.go_dark()
+    life.witness.disturb(item.for_s)
+    life.later(item.for_s, partial(_new_lamp, life, lamp))
+
+
+def _by_hand(life: Living, item: Item) -> None:
+    lamp = life.world.lamps[item.who]
+    now_s = life.world.scheduler.now_s
+    if item.how == "off":
+        lamp.go_dark()
+    elif not lamp.lit and not lamp.dud and now_s - lamp.off_at_s >= RULES.minimum_off_s:
+        lamp.lit_at_s = now_s
+    life.witness.disturb(0.0)
+
+
+def _player(life: Living, item: Item) -> None:
+    screen, now_s = life.world.screen, life.world.scheduler.now_s
+    witness = life.witness
+    fell = item.how in ("killed", "hung") and witness.calm and bool(screen.appearance)
+    if item.how in ("killed", "crashes"):
+        screen.dies_at_start += int(item.number)
+        if screen.process is not None:
+            screen.process.kill()
+    elif item.how == "hung":
+        screen.hung = True
+    else:
+        screen.trouble = item.how
+
+        def mend() -> None:
+            screen.trouble = ""
+
+        life.later(item.for_s, mend)
+    witness.player_disturbed_until_s = max(witness.player_disturbed_until_s, now_s + item.for_s + PLAYER_S)
+    witness.disturb(item.for_s, PLAYER_S)
+    if fell:
+        witness.player_fell()
+
+
+def _camera(life: Living, item: Item) -> None:
+    camera = life.world.camera
+    camera.gone = True
+
+    def mend() -> None:
+        camera.gone = False
+
+    life.later(item.for_s, mend)
+
+
+def _disk_full(life: Living, item: Item) -> None:
+    disk = life.world.disk
+    disk.full = True
+    life.witness.disturb(item.for_s)
+
+    def mend() -> None:
+        disk.full = False
+
+    life.later(item.for_s, mend)
+
+
+def _disk_low(life: Living, item: Item) -> None:
+    disk = life.world.disk
+    disk.free_bytes = 1_000_000_000
+
+    def mend() -> None:
+        disk.free_bytes = TOTAL_BYTES // 2
+
+    life.later(item.for_s, mend)
+
+
+def _killed(life: Living, item: Item) -> None:
+    life.end_of_program()
+    life.world.scheduler.sleep(2.0)
+    life.boot()
+
+
+def _killed_writing(life: Living, item: Item) -> None:
+    life.world.disk.kill_after = int(item.number)
+    life.witness.disturb(600.0)
+
+
+def _power_cut(life: Living, item: Item) -> None:
+    world = life.world
+    life.end_of_program()
+    if world.screen.process is not None:
+        world.screen.process.kill()
+    for lamp in world.lamps.values():
+        lamp.go_dark()
+    world.scheduler.sleep(item.for_s + 1.0)
+    world.reboot()
+    life.witness.disturb(0.0)
+    life.boot()
+
+
+def _restarted(life: Living, item: Item) -> None:
+    life.restart(lit=item.how == "lamps stay lit")
+
+
+def _clock(life: Living, item: Item) -> None:
+    world, witness = life.world, life.witness
+    world.clock_off_s, world.is_synchronised = item.number, False
+    _unsure(life, item.for_s + HOLD_S + REPAIR_S)
+
+    def mend() -> None:
+        world.clock_off_s, world.is_synchronised = 0.0, True
+        _unsure(life, HOLD_S + REPAIR_S)
+        if witness.override is not None:
+            _unsure_until_hours(life)
+
+    life.later(item.for_s, mend)
+
+
+def _unsure(life: Living, for_s: float) -> None:
+    """For so long nobody knows from outside whether the kiosk takes itself for open."""
+    witness = life.witness
+    witness.clock_wrong_until_s = max(witness.clock_wrong_until_s, life.world.scheduler.now_s + for_s)
+
+
+def _unsure_until_hours(life: Living) -> None:
+    witness = life.witness
+    witness.override = None
+    edge_s = witness.next_edge_s()
+    _unsure(life, min(edge_s - life.world.scheduler.now_s, 9 * 86_400.0) + SETTLING_S)
+
+
+def _no_network(life: Living, item: Item) -> None:
+    world = life.world
+    world.no_network = True
+
+    def mend() -> None:
+        world.no_network = False
+
+    life.later(item.for_s, mend)
+
+
+def _drift(life: Living, item: Item) -> None:
+    life.world.drifted = True
+
+
+def _file_damaged(life: Living, item: Item) -> None:
+    """While the service is away, a file becomes another one. Somebody puts the settings right after a while."""
+    life.end_of_program()
+    path = STAGE / item.who
+    before = path.read_bytes() if path.is_file() else None
+    if before is not None:
+        life.damaged.add(item.who)
+        if item.how == "removed":
+            path.unlink()
+        else:
+            path.write_bytes(_damaged(before, item))
+        if item.who.startswith("kiosk/events"):
+            life.witness.begun_checks.clear()
+            _unsure_until_hours(life)
+        if item.who.endswith("lamps.json"):
+            life.witness.ledger_lost()
+        if item.who in ("stage.toml", "schedule.toml"):
+            _unsure(life, MEND_FILE_S + REPAIR_S)
+            life.later(MEND_FILE_S, partial(_put_right, life, path, before))
+    life.world.scheduler.sleep(2.0)
+    life.boot()
+
+
+def _damaged(content: bytes, item: Item) -> bytes:
+    at = int(item.number * len(content))
+    if item.how == "empty":
+        return b""
+    if item.how == "cut":
+        return content[:at]
+    return content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + 64]) + content[at + 64 :]
+
+
+def _put_right(life: Living, path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    if life.service is not None:
+        life.restart(lit=True)
+    life.witness.disturb(0.0)
+
+
+def _bundle_damaged(life: Living, item: Item) -> None:
+    """The installed bundle's file goes bad, and the player dies. After a while the appearances are published again."""
+    file = current(STAGE / "bundles")
+    if file is None:
+        return
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2] + bytes(byte ^ 0xA5 for byte in content[len(content) // 2 :]))
+    _player(life, Item(item.at_s, "player", "", "killed"))
+    life.witness.disturb(MEND_FILE_S)
+    world, witness = life.world, life.witness
+    witness.player_disturbed_until_s = max(
+        witness.player_disturbed_until_s, world.scheduler.now_s + MEND_FILE_S + PLAYER_S
+    )
+
+    def mend() -> None:
+        publish(STAGE, int(world.truth_s))
+        witness.disturb(0.0)
+
+    life.later(MEND_FILE_S, mend)
+
+
+def _command(life: Living, item: Item) -> None:
+    life.ask(item)
+
+
+_DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
+    "line": _line, "lamp fails": _lamp_fails, "lamp reports": _lamp_reports, "lamp switched by hand": _by_hand,
+    "player": _player, "camera gone": _camera, "disk full": _disk_full, "disk low": _disk_low,
+    "file damaged": _file_damaged, "bundle damaged": _bundle_damaged, "killed": _killed,
+    "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted, "clock set": _clock,
+    "network gone": _no_network, "drift": _drift, "command": _command,
+}  # fmt: skip
+
+
+def arguments_of(life: Living, item: Item, kiosk: StageKiosk) -> dict[str, Any]:
+    """The values of a command. Raises VelaturaError."""
+    values: dict[str, Any] = json.loads(item.arguments or "{}")
+    if item.who == "save-settings":
+        values["text"] = _changed(kiosk.settings(), values["text"])
+    return values
+
+
+def _changed(text: str, what: str) -> str:
+    if what == "comment":
+        return f"{text.rstrip()}\n# A comment.\n"
+    if what == "projector":
+        plain, other = 'address = "192.0.2.1"', 'address = "192.0.2.1"\nprofile = "pjlink"'
+        return text.replace(other, plain) if other in text else text.replace(plain, other)
+    return (
+        text.replace("power_down_s = 20.0", "power_down_s = 21.0")
+        if "power_down_s = 20.0" in text
+        else text.replace("power_down_s = 21.0", "power_down_s = 20.0")
+    )
+
+
+def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
+    """A command was accepted: what it asks for is wanted from now on."""
+    witness, now_s = life.witness, life.world.scheduler.now_s
+    if item.who in ("start", "play", "rotate"):
+        witness.say(True)
+        witness.disturb(0.0, SETTLING_S)
+        if item.who == "start":
+            witness.forgive()
+    elif item.who == "stop":
+        witness.say(False)
+        witness.disturb(0.0, SETTLING_S)
+    elif item.who == "set-schedule":
+        witness.use(Calendar(values["time_zone"], values["rows"]))
+        life.news.set()
+        witness.disturb(0.0)
+    elif item.who == "test-shots":
+        witness.light_until_s = now_s + 900.0 + SETTLING_S
+    elif item.who in ("save-settings", "recalibrate", "compare", "cancel"):
+        witness.disturb(0.0)
+    else:
+        witness.disturb(0.0, 60.0)
+    if life.world.disk.full:
+        _unsure_until_hours(life)

@@ -1,0 +1,279 @@
+"""One life of a simulated kiosk: its service is started, things happen to it from outside, and a witness judges."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import heapq
+import os
+import random
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import VelaturaError
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.decide.interfaces import Condition
+from controller.kiosk.interface import Schedule, ScheduleRow
+from controller.kiosk.operations.dispatch import socket_table
+from controller.kiosk.service import Service, serving
+from controller.run.state_machine import State
+from controller.simulate import happenings
+from controller.simulate.calendar import Calendar
+from controller.simulate.disk import STAGE, watched
+from controller.simulate.jobs import SimulatedJobs
+from controller.simulate.promises import Broken, Witness, after_the_end
+from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
+from controller.simulate.script import ZONES, Item, draw, hours
+from controller.simulate.stage import make_stage
+from controller.simulate.world import SimulatedWorld
+from hal.deadline import Stop
+from hal.errors import DeviceError
+
+LIFE_DAYS: Final = 14.0
+AGAIN_S: Final = 5.0
+CALM: Final = (8.0, 240.0, 2400.0)
+"""How far pauses are stretched: while lamps or work are under way, while something is wrong, while all is well."""
+CALMER: Final = 1.6
+END_S: Final = 150.0
+
+
+class Halt(Event, Stop):
+    """A request to the service to end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a life. ``broken``: the promise's name, and how; ``digest``: of every line of its event log."""
+
+    seed: str
+    days: float
+    items: tuple[Item, ...]
+    digest: str
+    broken: str = ""
+    how: str = ""
+    at_s: float = 0.0
+    events: int = 0
+    took_s: float = 0.0
+    minutes: dict[str, float] = field(default_factory=dict)
+    last: tuple[str, ...] = ()
+
+
+class Life:
+    """``items``: the script; None: drawn. ``days``: for so long, less if a promise is broken."""
+
+    def __init__(self, seed: str, days: float = LIFE_DAYS, items: Sequence[Item] | None = None) -> None:
+        self.seed, self.days = seed, days
+        self.items = tuple(draw(seed, days) if items is None else items)
+        chance = random.Random(f"{seed} life")
+        begins = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(
+            days=chance.randrange(0, 1000), minutes=chance.randrange(1440)
+        )
+        self.zone, self.rows = chance.choice(ZONES), hours(chance)
+        self.drift_check = chance.choice(["03:30", "02:30", "23:00"])
+        self.world = SimulatedWorld(seed, begins.timestamp())
+        self.witness = Witness(self.world, Calendar(self.zone, self.rows))
+        self.program: Program | None = None
+        self.kiosk: StageKiosk | None = None
+        self.service: Service | None = None
+        self.stop = Halt(self.world.scheduler)
+        self.news = Event(self.world.scheduler)
+        self.broken: Exception | None = None
+        self.restart_in_s: float | None = None
+        self.damaged: set[str] = set()
+        self._mends: list[tuple[float, int, Callable[[], None]]] = []
+        self._last: tuple[Any, ...] = ()
+
+    # -- living
+
+    def live(self) -> Outcome:
+        began_s = time.process_time()
+        with _folder(), watched(self.world.disk):
+            rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.rows)
+            make_stage(STAGE, Schedule(self.zone, rows, self.drift_check))
+            self.world.scheduler.on_kill = self.news.set
+            self.boot()
+            try:
+                self._pass()
+            except Broken as error:
+                self.broken = self.broken or error
+            finally:
+                self.end_of_program()
+        if self.broken is not None and not isinstance(self.broken, Broken):
+            raise self.broken
+        witness = self.witness
+        text = "\n".join(witness.digested)
+        lamps = " ".join(f"{name} {lamp.strikes} {lamp.off_at_s!r}" for name, lamp in self.world.lamps.items())
+        broken = self.broken
+        return Outcome(
+            self.seed, self.days, self.items, hashlib.sha256(f"{text}\n{lamps}".encode()).hexdigest(),
+            "" if broken is None else broken.promise, "" if broken is None else str(broken),
+            self.world.scheduler.now_s, len(witness.digested), time.process_time() - began_s, witness.minutes,
+            tuple(witness.digested[-30:]),
+        )  # fmt: skip
+
+    def _pass(self) -> None:
+        scheduler, left = self.world.scheduler, list(self.items)
+        while scheduler.now_s < self.days * DAY_S and self.broken is None:
+            soon = [self.days * DAY_S, self.witness.next_edge_s()]
+            soon += [left[0].at_s] if left else []
+            soon += [self._mends[0][0]] if self._mends else []
+            self.news.wait(max(0.0, min(soon) - scheduler.now_s))
+            self.news.clear()
+            if scheduler.crashes and self.broken is None:
+                name, error = scheduler.crashes[0]
+                self.broken = Broken("no crash", f"{name}: {type(error).__name__}: {error}")
+            if self.broken is not None:
+                return
+            scheduler.rush()
+            if self.program is not None and self.program.dead:
+                # Killed while it wrote; systemd starts it again.
+                self.end_of_program()
+                scheduler.sleep(3.0)
+                self.boot()
+            while self._mends and self._mends[0][0] <= scheduler.now_s:
+                heapq.heappop(self._mends)[2]()
+            while left and left[0].at_s <= scheduler.now_s and self.broken is None:
+                happenings.happen(self, left.pop(0))
+                scheduler.rush()
+
+    def later(self, seconds: float, mend: Callable[[], None]) -> None:
+        """Do this after so many seconds."""
+        heapq.heappush(self._mends, (self.world.scheduler.now_s + seconds, len(self._mends), mend))
+
+    # -- the service
+
+    def boot(self) -> None:
+        """Start the service's program."""
+        self.program, self.stop = self.world.scheduler.program(), Halt(self.world.scheduler)
+        self.world.program = self.program
+        self.world.scheduler.task(self._serve, "service", self.program).start()
+
+    def end_of_program(self) -> None:
+        """Kill it, and let go of all that it had."""
+        if self.program is not None:
+            self.world.scheduler.kill(self.program)
+            self.world.scheduler.bury(self.program)
+        self.world.disk.kill_after = None
+        self.world.release()
+        self.program = self.kiosk = self.service = None
+        self.witness.killed()
+        self.witness.disturb(0.0)
+
+    def restart(self, *, lit: bool) -> None:
+        """As systemd does: asked to end, then started anew. Raises Broken."""
+        program, scheduler = self.program, self.world.scheduler
+        assert program is not None
+        self.stop.restarting = lit
+        self.stop.set()
+        ends_s = scheduler.now_s + END_S
+        while any(task.is_alive() for task in program.tasks) and scheduler.now_s < ends_s and not program.dead:
+            scheduler.sleep(0.5)
+        self.end_of_program()
+        scheduler.sleep(1.0)
+        self.boot()
+
+    def _serve(self) -> None:
+        """As ``controller.cli.serve_command.serve``, without panel and socket."""
+        world, stop = self.world, self.stop
+        kiosk = self.kiosk = StageKiosk(STAGE, world)
+        while not stop.is_set():
+            kiosk.reload.clear()
+            try:
+                with serving(STAGE, stop, world=world, jobs=SimulatedJobs(world)) as service:
+                    kiosk.attach(service)
+                    self._follow(kiosk, service)
+                    while not (stop.is_set() or kiosk.reload.is_set()):
+                        stop.wait(0.2)
+                    self.service = None
+                kiosk.detach()
+                self.witness.disturb(0.0)
+            except (VelaturaError, DeviceError) as error:
+                kiosk.attach(None, f"{error.what} {error.remedy}")
+                stop.wait(AGAIN_S)
+
+    def _follow(self, kiosk: StageKiosk, service: Service) -> None:
+        self.service = service
+        self.witness.begins()
+        refresh = service.changed
+
+        def stepped() -> None:
+            refresh()
+            if self.broken is None and self.service is service:
+                try:
+                    self._calm(service, news=self.witness.judge(kiosk, service))
+                    self.witness.paused_long = self.world.scheduler.stretch > 1
+                except Exception as error:  # noqa: BLE001 - a mistake of the witness must not be taken for one of the kiosk
+                    self.broken = error
+                    self.news.set()
+
+        try:
+            after_the_end(self.witness, service, damaged=frozenset(self.damaged))
+        except Broken as error:
+            self.broken = error
+            self.news.set()
+        self.damaged.clear()
+        service.changed = stepped
+
+    def _calm(self, service: Service, *, news: bool) -> None:
+        """Stretch pauses while nothing happens."""
+        scheduler, state, job = self.world.scheduler, service.reconciler.machine.state, service.jobs.job
+        views = [supervisor.view for supervisor in service.devices.projectors]
+        seen = (
+            state, service.player.want, service.player.view.shown, service.player.view.restarts,
+            [(view.condition, view.power, view.stable_left_s > 0, view.problem) for view in views],
+            service.jobs.running, job and job.ended, service.disk.problem, service.devices.camera.problem,
+        )  # fmt: skip
+        if news or seen != self._last:
+            self._last = seen
+            scheduler.rush()
+            return
+        well = not any(view.problem for view in views) and service.player.view.problem is None
+        settled = state in (State.PLAYING, State.OFF) and not service.reconciler.working
+        steady = all(view.stable_left_s in (0, float("inf")) for view in views)
+        rests = steady and all(view.condition in (Condition.LIT, Condition.DARK) for view in views)
+        wrong = state in (State.DEGRADED, State.FAULT) or (not well and (settled or state is State.COOLING))
+        limit = CALM[2] if settled and well and rests else CALM[1] if wrong else CALM[0]
+        scheduler.stretch = min(scheduler.stretch * CALMER, limit)
+
+    # -- people
+
+    def ask(self, item: Item) -> None:
+        """A person's command, in a thread of the service, as the panel's."""
+        kiosk, program = self.kiosk, self.program
+        if kiosk is None or program is None:
+            return
+
+        def asked() -> None:
+            with contextlib.suppress(VelaturaError, DeviceError):
+                values = happenings.arguments_of(self, item, kiosk)
+                socket_table({"kiosk": kiosk})[item.who](**values)
+                happenings.believe(self, item, values)
+
+        self.world.scheduler.task(asked, "command", program).start()
+
+
+@contextlib.contextmanager
+def _folder() -> Iterator[None]:
+    """A folder in memory as the present one, and UTC as this computer's time zone."""
+    before, memory = Path.cwd(), Path("/dev/shm")  # noqa: S108 - the folder in it has a name of its own
+    kept = {name: os.environ.get(name) for name in ("TZ", "XDG_RUNTIME_DIR")}
+    stack = threading.stack_size(STACK_BYTES)
+    with tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None) as name:
+        os.environ |= {"TZ": "UTC", "XDG_RUNTIME_DIR": name}
+        time.tzset()
+        os.chdir(name)
+        try:
+            yield
+        finally:
+            os.chdir(before)
+            threading.stack_size(stack)
+            for variable, value in kept.items():
+                os.environ.pop(variable, None)
+                os.environ |= {} if value is None else {variable: value}
+            time.tzset()

@@ -1,0 +1,240 @@
+"""A simulated player: a process that starts, hangs and dies, and answers the requests of the player's protocol."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from controller.bundle.fallback import CountedStart
+from controller.bundle.format import Index
+from controller.bundle.install import CURRENT
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import Trust, load_public_key
+from controller.core.errors import VelaturaError, WorkError
+from controller.play.control import protocol
+from controller.play.control.launch import PlayerSettings
+from controller.simulate.disk import Disk
+from controller.simulate.scheduler import Scheduler
+
+TROUBLES: Final = ("slow", "doubles", "torn", "garbles", "loses", "reorders")
+END_S: Final = 5.0
+
+
+class Screen:
+    """What the projectors show, and the process that makes it. ``trouble``: of its answers, or empty."""
+
+    def __init__(self, scheduler: Scheduler, disk: Disk, chance: random.Random) -> None:
+        self.scheduler, self.disk, self.chance = scheduler, disk, chance
+        self.process: SimulatedPlayer | None = None
+        self.trouble, self.hung = "", False
+        self.dies_at_start = 0
+        self.number = 0
+
+    @property
+    def appearance(self) -> str:
+        """What is to be seen; empty: black."""
+        process = self.process
+        return "" if process is None or not process.alive or process.showing != "appearance" else process.appearance
+
+    def launch(self, runtime: Path, settings: PlayerSettings) -> SimulatedPlayer:
+        """Start one in the place of the one that runs."""
+        before = self.process
+        if before is not None and before.alive:
+            self.scheduler.sleep(END_S if self.hung else 0.2)
+            before.terminate()
+        self.hung = False
+        self.number += 1
+        self.process = SimulatedPlayer(self, settings)
+        return self.process
+
+    def connect(self, path: Path, timeout_s: float) -> Any:
+        """As ``player_channel.connected``."""
+        process = self.process
+        if process is None or not process.alive or self.scheduler.now_s < process.ready_at_s:
+            raise ConnectionRefusedError
+        return Connection(self, process)
+
+
+class SimulatedPlayer:
+    """See ``kiosk.supervisors.player_supervisor.Process``."""
+
+    def __init__(self, screen: Screen, settings: PlayerSettings) -> None:
+        self._screen, self._settings = screen, settings
+        self.alive = True
+        self.showing, self.appearance, self.brightness = "black", "", 1.0
+        self.running = False
+        self.loaded: Index | None = None
+        self.identity = ""
+        self.ready_at_s = screen.scheduler.now_s + screen.chance.uniform(0.3, 1.5)
+        self.pid = screen.number
+        self._start: CountedStart | None = None
+        self._counted = False
+        self._failed = self._load_first()
+
+    @property
+    def socket(self) -> Path:
+        return Path("player.sock")
+
+    def wait_until_ready(self, timeout_s: float = 8.0) -> dict[str, Any]:
+        screen = self._screen
+        screen.scheduler.sleep(min(timeout_s, self.ready_at_s - screen.scheduler.now_s))
+        if screen.dies_at_start > 0:
+            screen.dies_at_start -= 1
+            self._failed = self._failed or "it crashed."
+        if self._failed or not self.alive or screen.hung:
+            self.kill()
+            raise WorkError("player-not-started", what=f"The player did not start: {self._failed or 'it is silent.'}",
+                            remedy="Correct the cause.")  # fmt: skip
+        outputs = [{"name": name, "width_px": w, "height_px": h} for name, w, h in self._settings.outputs]
+        return {"bundle": self.identity or None, "inbox": "player.inbox", "outputs": outputs}
+
+    def kill(self) -> None:
+        self.alive = False
+
+    def terminate(self) -> int:
+        if self.alive and self._start is not None and not self._screen.hung:
+            with self._screen.disk.untouched():
+                self._start.ended()
+        self.alive = False
+        return 0
+
+    # -- bundles
+
+    @property
+    def _trust(self) -> Trust:
+        return Trust(tuple(load_public_key(path) for path in self._settings.trusted), False, ())
+
+    def _load_first(self) -> str:
+        link = self._settings.bundle
+        if link is None:
+            return ""
+        try:
+            with self._screen.disk.untouched():
+                if link.name == CURRENT and link.is_symlink():
+                    self._start = CountedStart(link.parent, lambda _: None)
+                    self.load(self._start.file)
+                elif link.exists():
+                    self.load(link)
+        except VelaturaError as error:
+            return error.what
+        return ""
+
+    def load(self, path: Path) -> None:
+        """Use this bundle from now on. Raises VelaturaError."""
+        with self._screen.disk.untouched(), Bundle.open_trusted(path, self._trust) as bundle:
+            bundle.verify()
+            self.loaded, self.identity = bundle.index, path.resolve().name
+        self.running = False
+
+    # -- requests
+
+    def pattern(self) -> None:
+        """Show the frames of a job."""
+        self.showing, self.appearance, self.running = "pattern", "", False
+
+    def do(self, request: protocol.Request) -> tuple[dict[str, Any], float]:  # noqa: PLR0911 - one for each request
+        """Its answer, and the seconds until it comes. Raises VelaturaError."""
+        match request:
+            case protocol.Status():
+                return self._status(), 0.0
+            case protocol.Play(appearance, fade_s, brightness):
+                self._show(appearance, brightness, running=False)
+                return {}, fade_s
+            case protocol.Sequence(items, _, _, brightness, first_fade_s):
+                for item in items:
+                    self._known(item[0])
+                self._show(items[0][0], brightness, running=True)
+                return {}, items[0][2] if first_fade_s is None else first_fade_s
+            case protocol.Stop(fade_s):
+                self.showing, self.appearance, self.running = "black", "", False
+                return {}, fade_s
+            case protocol.Identify():
+                self.showing, self.appearance, self.running = "identification", "", False
+                return {}, 0.0
+            case protocol.LoadBundle(path):
+                self.load(Path(path))
+                return {"bundle": self.identity}, 0.0
+            case _:
+                return {}, 0.0
+
+    def _known(self, name: str) -> None:
+        if self.loaded is None or name not in [entry.name for entry in self.loaded.appearances]:
+            raise WorkError("bundle-no-appearance", what=f"There is no appearance {name}.", remedy="Choose another.")
+
+    def _show(self, name: str, brightness: float, *, running: bool) -> None:
+        self._known(name)
+        self.showing, self.appearance, self.brightness, self.running = "appearance", name, brightness, running
+        if self._start is not None and not self._counted:
+            self._counted = True
+            with self._screen.disk.untouched():
+                # It writes in a thread of its own, for which this waits.
+                self._start.shown()
+                self._start.ended()
+
+    def _status(self) -> dict[str, Any]:
+        return {
+            "bundle": self.identity or None, "showing": self.showing, "appearance": self.appearance or None,
+            "brightness": self.brightness, "sequence_running": self.running, "skipped": 0, "warning": None,
+        }  # fmt: skip
+
+
+class Connection:
+    """As far as ``PlayerChannel`` uses a socket: lines of JSON, on which things go wrong."""
+
+    def __init__(self, screen: Screen, process: SimulatedPlayer) -> None:
+        self._screen, self._process = screen, process
+        self._coming: list[tuple[float, bytes]] = []
+        self._timeout_s = 1.0
+
+    def settimeout(self, seconds: float) -> None:
+        self._timeout_s = seconds
+
+    def close(self) -> None:
+        self._coming.clear()
+
+    def sendall(self, data: bytes) -> None:
+        screen, process = self._screen, self._process
+        screen.scheduler.check()
+        if not process.alive or process is not screen.process:
+            raise BrokenPipeError
+        if screen.hung:
+            return
+        ticket, request = protocol.parse_request(data.rstrip(b"\n"))
+        after_s = 0.0
+        try:
+            answer, after_s = process.do(request)
+            line = protocol.answer_line(ticket, answer)
+        except VelaturaError as error:
+            line = protocol.error_line(ticket, error)
+        self._send(line, screen.scheduler.now_s + after_s + screen.chance.uniform(0.001, 0.02))
+
+    def _send(self, line: bytes, at_s: float) -> None:
+        chance, trouble = self._screen.chance, self._screen.trouble
+        troubled = trouble and chance.random() < 0.4
+        pieces: list[tuple[float, bytes]] = [(at_s, line)]
+        if troubled:
+            half = len(line) // 2
+            made: dict[str, Callable[[], list[tuple[float, bytes]]]] = {
+                "slow": lambda: [(at_s + chance.uniform(0.3, 3.0), line)],
+                "doubles": lambda: [(at_s, line), (at_s + chance.uniform(0.0, 1.0), line)],
+                "torn": lambda: [(at_s, line[:half]), (at_s + chance.uniform(0.0, 1.0), line[half:])],
+                "garbles": lambda: [(at_s, b"{" + line)],
+                "loses": list,
+                "reorders": lambda: [(at_s + 0.05, line), (at_s, json.dumps({"id": 0, "ok": True}).encode() + b"\n")],
+            }
+            pieces = made[trouble]()
+        self._coming = sorted([*self._coming, *pieces], key=lambda piece: piece[0])
+
+    def recv(self, _: int) -> bytes:
+        scheduler, ends_s = self._screen.scheduler, self._screen.scheduler.now_s + self._timeout_s
+        if self._coming and self._coming[0][0] <= ends_s:
+            scheduler.sleep(self._coming[0][0] - scheduler.now_s)
+        else:
+            scheduler.sleep(ends_s - scheduler.now_s)
+            raise TimeoutError
+        if not self._process.alive:
+            return b""
+        return self._coming.pop(0)[1]

@@ -1,0 +1,349 @@
+"""What a kiosk promises, checked after each of its steps against what really is."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from controller.kiosk.decide.interfaces import Condition
+from controller.kiosk.decide.live_changes import LiveChanges
+from controller.kiosk.interface import EventRow
+from controller.run.state_machine import State
+from controller.simulate.calendar import Calendar
+from controller.simulate.disk import STAGE
+from controller.simulate.world import SimulatedWorld
+
+if TYPE_CHECKING:
+    from controller.kiosk.api.kiosk import StageKiosk
+    from controller.kiosk.service import Service
+
+PROMISES: Final = {
+    "lamp rules": "No lamp is switched on while it is hot, or before its minimum off time.",
+    "one owner": "A device is used by one program, and by one of its threads, at a time.",
+    "no crash": "Nothing ends with an unexpected error.",
+    "decides always": "The decider waits for nothing.",
+    "remedy": "An error says what happened and what to do.",
+    "state": "The log's last word on the state is the state.",
+    "black while closed": "No picture is shown while the stage is closed.",
+    "dark while closed": "No lamp burns while the stage is closed and no work needs it.",
+    "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
+    "says why it is dark": "While an open stage shows nothing, it says why.",
+    "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
+    "nothing lost": "Events, settings and counts survive each end of the service.",
+    "once a night": "The nightly check is begun at most once a night.",
+    "at night": "The nightly check begins only while the stage is closed.",
+    "few words": "What goes wrong again every second does not fill the log.",
+    "strikes counted": "A lamp is struck at most as often as it is counted.",
+    "few strikes": "A lamp that gives no light is not struck again and again.",
+    "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
+    "as usual again": "What people changed of the picture ends when the stage closes.",
+    "devices back": "A camera that is there again is opened again.",
+}
+SETTLING_S: Final = 200.0
+"""After a change of any kind, the stage may be between what it did and what it is to do: warm-up, rests, cooling."""
+REPAIR_S: Final = 2000.0
+"""After a fault: the longest retry out of the state fault, and the lamps' times."""
+BLACK_S: Final = 30.0
+DARK_S: Final = 240.0
+BACK_S: Final = 15.0
+OPENED_S: Final = 200.0
+DECIDES_S: Final = 0.3
+MOST_STRIKES: Final = 5
+MOST_WORDS: Final = 500
+WORDS_S: Final = 600.0
+LOOKED_S: Final = 300.0
+_SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
+
+
+class Broken(Exception):
+    """``promise``: its name in ``PROMISES``."""
+
+    def __init__(self, promise: str, how: str) -> None:
+        super().__init__(f"{promise}: {how}")
+        assert promise in PROMISES
+        self.promise = promise
+
+
+class Witness:
+    """Sees what really is, and judges.
+
+    ``disturbed_until_s``: until when a fault, or what follows of it, excuses; ``paused_long``: whether the decider's
+    pause that begins now is stretched.
+    """
+
+    def __init__(self, world: SimulatedWorld, calendar: Calendar) -> None:
+        self._world, self.calendar = world, calendar
+        self.paused_long = False
+        self._edge_s, self._open = -1.0, False
+        self.override: tuple[bool, float] | None = None
+        self.disturbed_until_s, self.clock_wrong_until_s = SETTLING_S, 0.0
+        self.player_disturbed_until_s = 0.0
+        self.changed_s = 0.0
+        self._wanted: bool | None = None
+        self._began_s, self._stepped_s = 0.0, 0.0
+        self.read = 0
+        self.rows: dict[int, EventRow] = {}
+        self.digested: list[str] = []
+        self._told = ""
+        self._black_since_s: float | None = None
+        self._back_by_s: float | None = None
+        self._missing_since_s: float | None = None
+        self._explained_s = 0.0
+        self._alerted, self._alerted_number, self._kills = 0, 0, 0
+        self._strikes_since: dict[str, int] = {}
+        self.begun_checks: dict[str, int] = {}
+        self._uncounted: dict[str, int] = {}
+        self._recent: deque[float] = deque(maxlen=MOST_WORDS)
+        self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
+        self._judged_s = 0.0
+
+    # -- what is wanted
+
+    def wanted_open(self) -> bool:
+        """Whether the stage is to be open now, by its hours and what people said."""
+        truth_s = self._world.truth_s
+        if truth_s >= self._edge_s:
+            self._open, self._edge_s = self.calendar.open(truth_s), self.calendar.changes_s(truth_s)
+        if self.override is not None and truth_s >= self.override[1]:
+            self.override = None
+        return self._open if self.override is None else self.override[0]
+
+    def next_edge_s(self) -> float:
+        """When hours change next, in the world's time."""
+        self.wanted_open()
+        return self._edge_s - self._world.begins_unix_s
+
+    def use(self, calendar: Calendar) -> None:
+        """New hours: what a person said stays, until they change next, if they say the same as the old ones."""
+        said = self.calendar.open(self._world.truth_s)
+        self.calendar, self._edge_s = calendar, -1.0
+        if self.override is not None:
+            now_says = calendar.open(self._world.truth_s)
+            self.override = (self.override[0], calendar.changes_s(self._world.truth_s)) if now_says is said else None
+        self.wanted_open()
+
+    def say(self, wanted: bool) -> None:
+        """A person opened or closed the stage, until its hours change next."""
+        self.override = None
+        if self.wanted_open() is not wanted:
+            self.override = (wanted, self._edge_s)
+
+    # -- the service
+
+    def begins(self) -> None:
+        self._began_s = self._stepped_s = self._world.scheduler.now_s
+        self.paused_long = True
+        self._told = State.OFF.value
+
+    def player_fell(self) -> None:
+        """The player died or hangs, and nothing else is wrong."""
+        self._back_by_s = self._world.scheduler.now_s + BACK_S
+
+    def killed(self) -> None:
+        """The service was, perhaps between an alert and the note that it was sent."""
+        self._kills += 1
+        self._missing_since_s = None
+
+    def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
+        """A fault, so long, and what it takes to get over it."""
+        now_s = self._world.scheduler.now_s
+        self._back_by_s = None
+        self.disturbed_until_s = max(self.disturbed_until_s, now_s + for_s + after_s)
+
+    def forgive(self) -> None:
+        """Lamps may be tried anew."""
+        self._strikes_since = {name: lamp.strikes for name, lamp in self._world.lamps.items()}
+
+    def ledger_lost(self) -> None:
+        """The counts of strikes begin anew."""
+        self._uncounted = {name: line.lamp.strikes + line.delayed for name, line in self._world.lines.items()}
+
+    # -- judging
+
+    def judge(self, kiosk: StageKiosk, service: Service) -> bool:
+        """After a step of the decider. Whether something changed in it. Raises Broken."""
+        world, now_s = self._world, self._world.scheduler.now_s
+        scheduler = world.scheduler
+        if world.camera.sins:
+            raise Broken("one owner", world.camera.sins[0])
+        if scheduler.crashes:
+            name, error = scheduler.crashes[0]
+            raise Broken("no crash", f"{name}: {type(error).__name__}: {error}")
+        for lamp in world.lamps.values():
+            if lamp.sins:
+                raise Broken("lamp rules", lamp.sins[0])
+        if now_s - self._stepped_s > DECIDES_S and not self.paused_long:
+            raise Broken("decides always", f"it did not for {now_s - self._stepped_s:.1f} s")
+        self._stepped_s = now_s
+        news = self._listen(service)
+        wanted = self.wanted_open()
+        if wanted is not self._wanted:
+            self._wanted, self.changed_s = wanted, now_s
+            if wanted:
+                self.forgive()
+        state = service.reconciler.machine.state
+        if self._told != state.value:
+            raise Broken("state", f"it says {self._told}, but it is {state.value}")
+        self._strikes(service)
+        self._alerts()
+        self._devices(service)
+        self._closed(service, state, wanted)
+        self._opened(kiosk, service, state, wanted)
+        elapsed_s, self._judged_s = now_s - self._judged_s, now_s
+        self.minutes["open" if wanted else "closed"] += elapsed_s / 60
+        return news
+
+    def _listen(self, service: Service) -> bool:
+        number, now_s = service.log.number, self._world.scheduler.now_s
+        if number == self.read:
+            return False
+        for row in service.log.after(self.read):
+            self.read = row.number
+            self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {row.text}")
+            if service.log.problem is None:
+                self.rows[row.number] = row
+            self._recent.append(now_s)
+            if row.code == "crash":
+                raise Broken("no crash", row.text)
+            if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
+                raise Broken("remedy", f"{row.code}: {row.text}")
+            if row.code == "state":
+                self._told = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
+            elif row.code == "task-due":
+                open_s = now_s - self.changed_s
+                if self._wanted and self.wanted_open() and open_s > BLACK_S and now_s > self.clock_wrong_until_s:
+                    raise Broken("at night", row.text)
+                key = row.text.partition("(")[2].partition(")")[0]
+                self.begun_checks[key] = self.begun_checks.get(key, 0) + 1
+                if self.begun_checks[key] > 1:
+                    raise Broken("once a night", row.text)
+        if len(self._recent) == MOST_WORDS and now_s - self._recent[0] < WORDS_S:
+            raise Broken("few words", f"{MOST_WORDS} events in {now_s - self._recent[0]:.0f} s")
+        return True
+
+    def _strikes(self, service: Service) -> None:
+        for supervisor in service.devices.projectors:
+            lamp, view = self._world.lamps[supervisor.name], supervisor.view
+            # A look at it after the strike has ended.
+            seen = view.condition in _SEEN and self._world.scheduler.now_s - lamp.struck_at_s > LOOKED_S
+            if seen and view.strikes < lamp.strikes - self._uncounted.get(lamp.name, 0):
+                raise Broken("strikes counted", f"{view.strikes} instead of {lamp.strikes} for {lamp.name}")
+        for name, lamp in self._world.lamps.items():
+            if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.dud:
+                raise Broken("few strikes", f"the lamp of {name} was struck {MOST_STRIKES + 1} times without light")
+            if not lamp.dud:
+                self._strikes_since[name] = lamp.strikes
+
+    def _alerts(self) -> None:
+        world = self._world
+        for row in world.alerted[self._alerted :]:
+            if row.number <= self._alerted_number and not self._kills:
+                raise Broken("alerts", f"event {row.number} was sent after {self._alerted_number}")
+            if row.number > self._alerted_number:
+                self._alerted_number, self._kills = row.number, 0
+        self._alerted = len(world.alerted)
+
+    def _devices(self, service: Service) -> None:
+        world, now_s = self._world, self._world.scheduler.now_s
+        if world.camera.gone or service.devices.camera.device is not None:
+            self._missing_since_s = None
+        elif self._missing_since_s is None:
+            self._missing_since_s = now_s
+        elif now_s - self._missing_since_s > (OPENED_S if world.scheduler.stretch == 1 else REPAIR_S):
+            raise Broken("devices back", f"the camera is there for {now_s - self._missing_since_s:.0f} s")
+
+    @property
+    def calm(self) -> bool:
+        """Whether no fault, and nothing that follows of one, excuses anything now."""
+        now_s = self._world.scheduler.now_s
+        return now_s > self.disturbed_until_s and now_s > self.clock_wrong_until_s
+
+    def _closed(self, service: Service, state: State, wanted: bool) -> None:
+        world, now_s = self._world, self._world.scheduler.now_s
+        if wanted or now_s <= self.clock_wrong_until_s:
+            return
+        shut_s = now_s - max(self.changed_s, self._began_s)
+        if shut_s > BLACK_S and service.reconciler.live != LiveChanges():
+            raise Broken("as usual again", f"{service.reconciler.live}, {shut_s:.0f} s after it closed")
+        reached = now_s > self.player_disturbed_until_s
+        if shut_s > BLACK_S and reached and world.screen.appearance and not world.screen.hung:
+            raise Broken("black while closed", f"{world.screen.appearance} is shown, {shut_s:.0f} s after it closed")
+        works = service.reconciler.working or now_s < self.light_until_s
+        if works:
+            self.changed_s = max(self.changed_s, now_s - BLACK_S - 1)
+        burning = [name for name, lamp in world.lamps.items() if lamp.lit]
+        if shut_s > DARK_S and burning and not works and self.calm:
+            raise Broken("dark while closed", f"the lamp of {burning[0]} burns, {shut_s:.0f} s after it closed")
+
+    light_until_s = 0.0
+
+    def _opened(self, kiosk: StageKiosk, service: Service, state: State, wanted: bool) -> None:
+        world, now_s = self._world, self._world.scheduler.now_s
+        live, shown = service.reconciler.live, world.screen.appearance
+        asked_black = live.black or service.player.identifying or service.reconciler.working
+        bright = any(lamp.shines for lamp in world.lamps.values()) and bool(shown)
+        if not wanted or bright or asked_black:
+            self._black_since_s = None
+        elif self._black_since_s is None:
+            self._black_since_s = now_s
+        if not wanted or now_s <= self.clock_wrong_until_s:
+            self._back_by_s = None
+            return
+        self._back(shown, asked_black)
+        open_s = now_s - max(self.changed_s, self._began_s)
+        dark_s = 0.0 if self._black_since_s is None else now_s - self._black_since_s
+        if dark_s <= SETTLING_S or open_s <= SETTLING_S or self._explained(kiosk, state):
+            self._explained_s = now_s
+        elif now_s - self._explained_s > BLACK_S:
+            raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
+        if not self.calm or open_s < SETTLING_S or asked_black:
+            if asked_black:
+                self.disturb(0.0, SETTLING_S)
+            return
+        if state is not State.PLAYING:
+            raise Broken("plays while open", f"it is {state.value}: {service.reconciler.machine.reason}")
+        unlit = [name for name, lamp in world.lamps.items() if not lamp.shines]
+        if unlit:
+            raise Broken("plays while open", f"the lamp of {unlit[0]} gives no light")
+        if dark_s > BACK_S:
+            raise Broken("plays while open", f"black for {dark_s:.0f} s")
+        wants = service.player.want
+        if wants is not None and world.screen.process is not None and dark_s == 0:
+            names = {name for name, _, _ in wants.in_turn} | {wants.appearance}
+            brightness = world.screen.process.brightness
+            if shown not in names or abs(brightness - live.brightness) > 0.01:
+                raise Broken("plays while open", f"{shown} at {brightness:g} is shown instead of {wants.appearance}")
+
+    def _back(self, shown: str, asked_black: bool) -> None:
+        if self._back_by_s is not None and self._world.scheduler.now_s > self._back_by_s and not asked_black:
+            if not shown:
+                raise Broken("picture back", f"it is still black {BACK_S:.0f} s after the player fell")
+            self._back_by_s = None
+
+    def _explained(self, kiosk: StageKiosk, state: State) -> bool:
+        told = kiosk.snapshot()
+        if state in (State.FAULT, State.DEGRADED) and told.reason:
+            return True
+        return (
+            bool(told.warnings)
+            or any(row.problem for row in told.devices)
+            or any(row.code == "nothing-installed" for row in self.rows.values())
+        )
+
+
+def after_the_end(witness: Witness, service: Service, *, damaged: frozenset[str]) -> None:
+    """A service has begun anew: what the one before told is there. ``damaged``: files that were. Raises Broken."""
+    rows = list(service.log.after(0))
+    # What could not be written before the end is gone, and its numbers are given again.
+    witness.read = next((row.number - 1 for row in reversed(rows) if row.code == "service-started"), witness.read)
+    there = {row.number: row for row in rows}
+    if damaged & {"kiosk/events.sqlite", "kiosk/events.sqlite-wal"}:
+        witness.rows.clear()
+    least = min(there, default=0)
+    for number, row in list(witness.rows.items()):
+        if number < least:
+            del witness.rows[number]
+        elif there.get(number) != row:
+            raise Broken("nothing lost", f"event {number} is gone from the log: {row.text}")
+    if not (STAGE / "stage.toml").exists() and "stage.toml" not in damaged:
+        raise Broken("nothing lost", "stage.toml is gone")

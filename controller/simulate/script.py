@@ -1,0 +1,161 @@
+"""What happens to a kiosk from outside in one life: drawn from the seed before it begins, so it can be shortened."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from controller.simulate.lamps import LINE_TROUBLES
+from controller.simulate.player import TROUBLES
+from controller.simulate.scheduler import DAY_S
+from controller.simulate.stage import APPEARANCES, NAMES
+
+HOUR_S: Final = 3600.0
+RESTLESS: Final = ("garbled", "flaky")
+RESTLESS_S: Final = 900.0
+"""Trouble that comes and goes every second is not drawn for longer: it would take most of the time of a life."""
+ZONES: Final = ("Europe/Vienna", "America/New_York", "Australia/Lord_Howe", "Asia/Kolkata", "UTC")
+FILES: Final = (
+    "kiosk/events.sqlite", "kiosk/events.sqlite-wal", "kiosk/lamps.json", "schedule.toml", "stage.toml",
+    "bundles/starts.json", "lamps.json", "kiosk/stage.toml.good",
+)  # fmt: skip
+DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One thing that happens ``at_s``; ``for_s``: how long it lasts, 0: it has no end of its own.
+
+    ``who``: a projector, a file, an operation; ``how``: which trouble; ``number``: its size; ``arguments``: of an
+    operation.
+    """
+
+    at_s: float
+    what: str
+    who: str = ""
+    how: str = ""
+    for_s: float = 0.0
+    number: float = 0.0
+    arguments: str = ""
+
+    @property
+    def line(self) -> str:
+        """It in words."""
+        said = " ".join(word for word in (self.what, self.who, self.how, self.arguments) if word)
+        lasts = f" for {self.for_s:.0f} s" if self.for_s else ""
+        size = f" ({self.number:g})" if self.number else ""
+        return f"{self.at_s / DAY_S:7.3f} d  {said}{size}{lasts}"
+
+
+def to_json(items: Sequence[Item]) -> str:
+    """Items as text, one a line."""
+    return "[\n" + ",\n".join(json.dumps(asdict(item)) for item in items) + "\n]\n"
+
+
+def from_json(text: str) -> list[Item]:
+    """As ``to_json``. Raises ValueError and TypeError."""
+    return [Item(**values) for values in json.loads(text)]
+
+
+def hours(chance: random.Random) -> list[dict[str, str]]:
+    """Rows of opening hours, some over midnight, never two at a time."""
+    rows = []
+    for day in DAYS:
+        if chance.random() < 0.15:
+            continue
+        opens = chance.randrange(8 * 60, 18 * 60)
+        # Not in the hour that summer time leaves out: what its times mean is not worked out a second time here.
+        closes = min(opens + chance.randrange(60, 10 * 60), 25 * 60 + 55)
+        rows.append({"day": day, "opens": _clock(opens), "closes": _clock(closes)})
+    return rows or [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
+
+
+def _clock(minutes: int) -> str:
+    return f"{minutes // 60 % 24:02}:{minutes % 60:02}"
+
+
+def draw(seed: str, days: float) -> list[Item]:
+    """The script of a life. Many things happen alone, some several at once."""
+    chance = random.Random(f"{seed} script")
+    items: list[Item] = []
+    at_s = chance.expovariate(1 / (5 * HOUR_S)) + 600.0
+    while at_s < days * DAY_S:
+        count = 1 if chance.random() < 0.75 else chance.randint(2, 5)
+        items += [_one(chance, at_s + chance.expovariate(1 / 60.0) * (number > 0)) for number in range(count)]
+        at_s += chance.expovariate(1 / (6 * HOUR_S)) + 30.0
+    return sorted(items, key=lambda item: item.at_s)
+
+
+def _one(chance: random.Random, at_s: float) -> Item:  # noqa: PLR0911 - one for each kind
+    at_s = round(at_s, 3)
+    lasts_s = round(
+        chance.choice([chance.uniform(0.5, 30.0), chance.uniform(30.0, 900.0), chance.uniform(900, 30_000)]), 1
+    )
+    name = chance.choice(NAMES)
+    what = chance.choices([kind for kind, _ in _KINDS], [weight for _, weight in _KINDS])[0]
+    match what:
+        case "line":
+            how = chance.choice(LINE_TROUBLES)
+            return Item(at_s, what, name, how, min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s)
+        case "lamp fails":
+            return Item(at_s, what, name, "", lasts_s)
+        case "lamp reports":
+            return Item(at_s, what, name, chance.choice(["temperature", "cover", "lamp-failed", "fan"]), lasts_s)
+        case "lamp switched by hand":
+            return Item(at_s, what, name, chance.choice(["off", "on"]))
+        case "player":
+            how = chance.choice(["killed", "hung", "crashes", *TROUBLES])
+            count = chance.randint(1, 4) * (how == "crashes")
+            return Item(at_s, what, "", how, min(lasts_s, RESTLESS_S) if how in TROUBLES else 0.0, count)
+        case "file damaged":
+            return Item(at_s, what, chance.choice(FILES), chance.choice(["cut", "flipped", "empty", "removed"]),
+                        number=round(chance.random(), 3))  # fmt: skip
+        case "killed while writing":
+            return Item(at_s, what, number=chance.randint(1, 12))
+        case "power cut":
+            return Item(at_s, what, for_s=lasts_s)
+        case "clock set":
+            number = chance.choice([chance.uniform(-7000, 7000), chance.uniform(-200_000, 200_000), -1.5e9])
+            return Item(at_s, what, "", "", lasts_s, round(number, 1))
+        case "restarted":
+            return Item(at_s, what, "", chance.choice(["lamps stay lit", "lamps off"]))
+        case "command":
+            return _command(chance, at_s)
+        case _:
+            return Item(at_s, what, for_s=0.0 if what in ("killed", "drift", "bundle damaged") else lasts_s)
+
+
+def _command(chance: random.Random, at_s: float) -> Item:
+    who = chance.choices([kind for kind, _ in _COMMANDS], [weight for _, weight in _COMMANDS])[0]
+    values: dict[str, Any] = {}
+    match who:
+        case "play":
+            values = {"name": chance.choice(APPEARANCES), **({"fade_s": 2.0} if chance.random() < 0.5 else {})}
+        case "black" | "pause" | "identify":
+            values = {"on": chance.random() < 0.5}
+        case "brightness":
+            values = {"percent": chance.choice([0, 10, 50, 100])}
+        case "recalibrate":
+            values = {"kind": chance.choice(["quick", "full"])}
+        case "set-schedule":
+            values = {"time_zone": chance.choice(ZONES), "drift_check": chance.choice(["03:30", "02:30", ""]),
+                      "rows": hours(chance)}  # fmt: skip
+        case "save-settings":
+            values = {"text": chance.choice(["comment", "projector", "display"])}
+    return Item(at_s, "command", who, arguments=json.dumps(values, sort_keys=True) if values else "")
+
+
+_KINDS: Final = (
+    ("line", 14), ("lamp fails", 4), ("lamp reports", 3), ("lamp switched by hand", 3), ("player", 8),
+    ("camera gone", 3), ("disk full", 4), ("disk low", 1), ("file damaged", 4), ("bundle damaged", 2), ("killed", 5),
+    ("killed while writing", 6), ("power cut", 5), ("restarted", 4), ("clock set", 3), ("network gone", 3),
+    ("drift", 4), ("command", 28),
+)  # fmt: skip
+_COMMANDS: Final = (
+    ("start", 6), ("stop", 6), ("play", 4), ("rotate", 2), ("next", 3), ("black", 3), ("pause", 3), ("brightness", 3),
+    ("identify", 2), ("recalibrate", 4), ("cancel", 3), ("compare", 2), ("set-schedule", 3), ("seen", 1),
+    ("save-settings", 3), ("test-shots", 1),
+)  # fmt: skip

@@ -1,0 +1,78 @@
+"""The stage of a simulated kiosk on disk, with three tiny appearances in a signed bundle."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from nacl.signing import SigningKey
+
+from controller.bundle.format import PlaylistEntry
+from controller.bundle.install import install, revision_floor
+from controller.bundle.signing import Trust
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.config.writer import toml_text
+from controller.kiosk.interface import Schedule
+from controller.kiosk.store.bundle_store import slots_without
+
+NAMES: Final = ("left", "right", "above")
+APPEARANCES: Final = ("glass", "marble", "shine")
+RUN: Final = "20260101-030000-calibrate"
+_KEY: Final = SigningKey(bytes(range(32)))
+TRUST: Final = Trust((bytes(_KEY.verify_key),))
+_SIDE_PX: Final = 8
+
+
+def make_stage(folder: Path, schedule: Schedule) -> None:
+    """Write all that a kiosk needs to play."""
+    folder.mkdir()
+    (folder / "stage.toml").write_text(_text(schedule), "utf-8")
+    publish(folder, 1_767_225_600)
+
+
+def publish(folder: Path, created_unix_s: int, missing: Collection[str] = ()) -> Path:
+    """Install a new bundle, or the frames without some projectors. Raises as ``bundle.install.install``."""
+    slots = slots_without(folder, missing) if missing else folder / "bundles"
+    built = folder / "runs" / "built.vel"
+    revision = revision_floor(slots, TRUST) + 1
+    names = [name for name in NAMES if name not in missing]
+    write_bundle(
+        built, stage="Simulated", calibration=RUN, created_unix_s=created_unix_s, revision=revision, key=_KEY,
+        outputs=[(f"P{number}", _SIDE_PX, _SIDE_PX) for number in range(1, len(NAMES) + 1)],
+        appearances=[
+            NewAppearance(name, {
+                f"P{number}": np.full((_SIDE_PX, _SIDE_PX, 3), shade * 40 if lit in names else 0, np.uint8)
+                for number, lit in enumerate(NAMES, 1)
+            })
+            for shade, name in enumerate(APPEARANCES, 1)
+        ],
+        schedule=[PlaylistEntry(name, 30_000, 1_000) for name in APPEARANCES],
+    )  # fmt: skip
+    try:
+        return install(built, slots, trusted=TRUST.keys)
+    finally:
+        with contextlib.suppress(OSError):
+            built.unlink()
+
+
+def _text(schedule: Schedule) -> str:
+    rows = [{"day": row.day, "opens": row.opens, "closes": row.closes} for row in schedule.rows]
+    return toml_text({
+        "stage": {"name": "Simulated"},
+        "projectors": [
+            {"name": name, "output": f"P{number}", "driver": "pjlink", "address": f"192.0.2.{number}"}
+            for number, name in enumerate(NAMES, 1)
+        ],
+        "camera": {"driver": "ptp", "iso": 100, "address": "ptpip:192.0.2.9", "focal_length_px": 4100.0},
+        "display": {"driver": "player", "outputs": [
+            {"name": f"P{number}", "width_px": _SIDE_PX, "height_px": _SIDE_PX} for number in range(1, len(NAMES) + 1)
+        ]},
+        "bundle": {"trusted_keys": [TRUST.keys[0].hex()]},
+        "schedule": {"time_zone": schedule.time_zone, "drift_check": schedule.drift_check, "hours": rows},
+        "safety": {"power_up_s": 300.0, "power_down_s": 20.0},
+        "alerts": {"webhook": "https://example.org/velatura", "least": "warning"},
+        "appearances": [{"name": name, "kind": "pattern"} for name in APPEARANCES],
+    })  # fmt: skip

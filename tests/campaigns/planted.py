@@ -1,0 +1,92 @@
+"""How good the simulation is: bugs planted in a copy of the kiosk's code, and how many of them it finds.
+
+    python -m tests.campaigns.planted [SECONDS] [WORD]
+
+Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
+the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. WORD: only
+the patches that have it in their names.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+BUGS = Path(__file__).parent / "planted_bugs"
+PARTS = ("controller", "hal", "plugins", "firmware_configs")
+LIVES = """
+import sys, time
+from controller.simulate.life import Life
+number = 0
+while time.process_time() < float(sys.argv[1]):
+    outcome = Life(f"planted-{number}", 7.0).live()
+    number += 1
+    if outcome.broken:
+        print(f"{outcome.how} (seed {outcome.seed}, day {outcome.at_s / 86400:.2f})")
+        sys.exit(9)
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """``how``: the broken promise, empty if none was; ``took_s``: seconds of a core."""
+
+    bug: str
+    how: str
+    took_s: float
+
+
+def patches(word: str = "") -> list[Path]:
+    return sorted(path for path in BUGS.glob("*.patch") if word in path.stem)
+
+
+def planted(patch: Path | None, folder: Path) -> Path:
+    """A copy of the code in ``folder`` with this bug; None: without one."""
+    for part in PARTS:
+        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+    if patch is not None:
+        subprocess.run(["patch", "-p1", "--quiet", "-i", str(patch)], cwd=folder, check=True)
+    return folder
+
+
+def search(patch: Path | None, seconds: float) -> Found:
+    """Live until a promise is broken, or the time is over."""
+    with tempfile.TemporaryDirectory() as name:
+        copy = planted(patch, Path(name))
+        before_s = os.times().children_user + os.times().children_system
+        environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run(
+            [sys.executable, "-c", LIVES, str(seconds)], cwd=copy, env=environment, capture_output=True, text=True,
+            check=False,
+        )  # fmt: skip
+        took_s = os.times().children_user + os.times().children_system - before_s
+    if done.returncode not in (0, 9):
+        raise RuntimeError(done.stderr[-2000:])
+    return Found("" if patch is None else patch.stem, done.stdout.strip(), took_s)
+
+
+def main() -> int:
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 120.0
+    began_s, found, all_s = time.monotonic(), 0, 0.0
+    control = search(None, seconds)
+    print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
+    bugs = patches(sys.argv[2] if len(sys.argv) > 2 else "")
+    for patch in bugs:
+        one = search(patch, seconds)
+        found += bool(one.how)
+        all_s += one.took_s
+        print(f"{one.took_s:6.0f} s  {one.bug:42} {one.how or 'NOT FOUND'}", flush=True)
+    took_s = time.monotonic() - began_s
+    print(f"{found} of {len(bugs)} found in {all_s:.0f} s of a core, {took_s:.0f} s here")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,31 @@
+"""Years of simulated kiosks, each life of another seed: ``python -m tests.campaigns.simulate [YEARS] [SEED]``."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from controller.simulate.run import YEAR_DAYS, lives
+from controller.simulate.scheduler import DAY_S
+from controller.simulate.shrink import shortened
+
+
+def main() -> int:
+    years = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
+    seed = int(sys.argv[2]) if len(sys.argv) > 2 else int(time.time())
+    began_s, days, failed = time.process_time(), 0.0, 0
+    print(f"seed {seed}")
+    for outcome in lives(seed, years):
+        days += outcome.at_s / DAY_S
+        if outcome.broken:
+            failed += 1
+            print(f"{outcome.how} (seed {outcome.seed}, day {outcome.at_s / DAY_S:.3f})", flush=True)
+            short = shortened(outcome)
+            print("\n".join([*(item.line for item in short.items), *short.last]), flush=True)
+    hours = (time.process_time() - began_s) / 3600
+    print(f"{days / YEAR_DAYS:.2f} years, {failed} broken promises, {days / YEAR_DAYS / hours:.1f} years a core-hour")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
