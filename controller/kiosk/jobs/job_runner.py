@@ -126,7 +126,10 @@ class JobRunner:
     def begin(self, request: Request) -> None:
         self._request, self._cancel = request, threading.Event()
         title = title_of(request)
-        self._reporter = JobReporter(Job(request.number or self.reserve(), title), self._log, self._changed)
+        # Only a job that is named after an appearance makes one.
+        made = request.arguments[0] if request.kind == "compute" and request.arguments else ""
+        job = Job(request.number or self.reserve(), title, appearance=made)
+        self._reporter = JobReporter(job, self._log, self._changed)
         self._log.tell(Decision("work-begins", f"Started: {title}."))
         thread = threading.Thread(
             target=self._run, args=(request, self._reporter, self._cancel), name=f"work-{request.kind}", daemon=True
