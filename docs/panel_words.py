@@ -28,7 +28,7 @@ OPTIONS: Final = {"templates/**.html": {"trimmed": "true", "silent": "false", "e
 def words() -> Catalog:
     """All that the panel says: in its templates and code, and the sentences of the operations that have a form."""
     found = Catalog(project="Velatura", charset="utf-8", fuzzy=False)
-    for file, _, message, _, context in extract_from_dir(PANEL, METHODS, OPTIONS, KEYWORDS):  # type: ignore[arg-type]
+    for file, _, message, _, context in extract_from_dir(PANEL, METHODS, OPTIONS, KEYWORDS):
         found.add(message, None, [(file, 0)], context=context)
     for operation in OPERATIONS:
         if operation.name in LEADS_TO:

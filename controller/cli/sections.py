@@ -14,7 +14,7 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Calibrate": ("calibrate", "recalibrate", "drift", "results", "report", "export"),
     "Make appearances": (
         "appearance", "compute", "reach", "reach-picture", "feasibility", "photograph", "compare", "appearances",
-        "remove", "bundle",
+        "remove", "view", "bundle",
     ),
     "Show them": (
         "play", "live", "show", "rotate", "next", "black", "pause", "brightness", "start", "stop", "schedule",

@@ -11,7 +11,7 @@ import threading
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -126,7 +126,7 @@ def _in_white(calibrated: Calibrated) -> bytes:
 
 
 def _bytes(light: PreviewLight) -> bytes:
-    parts = {f"transport_{name}": part for name, part in light.transport.arrays().items()}
+    parts: dict[str, Any] = {f"transport_{name}": part for name, part in light.transport.arrays().items()}
     if light.indirect is not None:
         parts |= {f"indirect_{name}": part for name, part in light.indirect.arrays().items()}
     out = io.BytesIO()
