@@ -6,6 +6,7 @@ It keeps the contract of tests/controller/kiosk/contract.py, as the real one doe
 from __future__ import annotations
 
 import io
+import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -82,6 +83,8 @@ class MemoryKiosk:
     ) -> None:  # fmt: skip
         self._folder, self._step_s = pictures, step_s
         pictures.mkdir(parents=True, exist_ok=True)
+        # Requests draw side by side, each into a file of its own.
+        self._drawings = itertools.count()
         self._lock = threading.RLock()
         self._callbacks: list[Callable[[], None]] = []
         self._cancel = threading.Event()
@@ -137,7 +140,7 @@ class MemoryKiosk:
             callback()
 
     def _drawn(self, name: str, shade: int = 120) -> Path:
-        file = self._folder / f"{len(list(self._folder.iterdir()))}.png"
+        file = self._folder / f"{next(self._drawings)}.png"
         # A ball in soft light, of another colour for each name.
         light = ImageOps.invert(Image.radial_gradient("L")).resize((300, 300)).crop((70, 30, 310, 190))
         ball = Image.new("L", (240, 160))

@@ -33,7 +33,8 @@ def test_every_word_has_its_translation_and_no_other_is_kept(language: str) -> N
     for one in kept.values():
         assert not one.fuzzy, one.id
         originals = (one.id,) if isinstance(one.id, str) else one.id
-        translations = (one.string,) if isinstance(one.string, str) else one.string
+        translations = (one.string,) if isinstance(one.string, str) else tuple(one.string or ())
+        assert translations, one.id
         for text in translations:
             assert text.strip(), one.id
             assert sorted(PLACEHOLDER.findall(text)) == sorted(PLACEHOLDER.findall(originals[-1])), text
@@ -113,8 +114,10 @@ def test_numbers_are_as_the_worlds_locales_write_them(language: str, value: floa
 def test_shares_and_names_of_days_are_as_the_worlds_locales_write_them(language: str) -> None:
     with speaking(language):
         assert figures.percent(0.45) == format_percent(0.45, locale=language)
-        context = "stand-alone" if language == "de" else "format"
-        days = get_day_names("abbreviated", context, locale=language)
+        if language == "de":
+            days = get_day_names("abbreviated", "stand-alone", locale=language)
+        else:
+            days = get_day_names("abbreviated", "format", locale=language)
         months = get_month_names("abbreviated", "format", locale=language)
         assert figures.FIGURES[language].weekdays == tuple(days[n] for n in range(7))
         assert figures.FIGURES[language].months == tuple(months[n] for n in range(1, 13))
