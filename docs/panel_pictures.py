@@ -51,9 +51,9 @@ def photograph(browser: Browser, folder: Path) -> None:
             page.goto("/results")
             save(page, "panel-results.png")
             page.goto("/schedule")
-            page.locator("#language").select_option("ja")
+            page.locator("#language").select_option("de")
             page.locator("footer button").click()
-            save(page, "panel-japanese.png")
+            save(page, "panel-german.png")
 
 
 if __name__ == "__main__":

@@ -121,7 +121,7 @@ def test_what_is_no_outline_is_refused(text: str) -> None:
 def test_only_what_is_inside_an_outline_stays_in_the_target() -> None:
     picture = cv2.imencode(".png", np.full((40, 80, 3), 200, np.uint8))[1].tobytes()
     left, lower = ((0, 0), (0.4, 0), (0.4, 1), (0, 1)), ((0, 0.5), (1, 0.5), (1, 1), (0, 1))
-    kept = cv2.imdecode(np.frombuffer(restricted(picture, [left, lower]), np.uint8), cv2.IMREAD_UNCHANGED)
+    kept = seen(restricted(picture, [left, lower]))
     assert [int(kept[place][3]) for place in ((5, 5), (35, 5), (35, 75), (5, 75))] == [255, 255, 255, 0]
     assert (kept[..., :3] == 200).all()
     assert restricted(picture, []) == picture
