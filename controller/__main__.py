@@ -261,7 +261,7 @@ GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
 
 def application() -> typer.Typer:
     """The command line with all commands and groups."""
-    app = group("velatura", SUMMARY, COMMANDS, completion=True)
+    app = group("velatura", SUMMARY, COMMANDS, whole=True)
     for name, (summary, commands) in GROUPS.items():
         app.add_typer(group(name, summary, commands), name=name)
     return app

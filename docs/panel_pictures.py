@@ -36,6 +36,24 @@ def photograph(browser: Browser, folder: Path) -> None:
             expect(page.locator(".steps li").nth(1)).to_have_class("done")
             expect(page.get_by_alt_text("What the camera sees now")).to_be_visible()
             save(page, "panel-recalibrating.png")
+            expect(page.get_by_text("It ended well.")).to_be_visible()
+            page.get_by_role("link", name="Appearances").click()
+            page.get_by_role("button", name="Photograph and compare all").click()
+            expect(page.get_by_text("It ended well.")).to_be_visible()
+        with tab(browser, running.address) as page:
+            enter(page, "tina")
+            page.emulate_media(color_scheme="dark")
+            save(page, "panel-now.png")
+            page.goto("/aiming")
+            expect(page.locator("#live-view")).to_be_visible()
+            save(page, "panel-aiming.png")
+            page.emulate_media(color_scheme="light")
+            page.goto("/results")
+            save(page, "panel-results.png")
+            page.goto("/schedule")
+            page.locator("#language").select_option("de")
+            page.locator("footer button").click()
+            save(page, "panel-german.png")
 
 
 if __name__ == "__main__":

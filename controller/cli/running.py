@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from controller.cli import console
+from controller.cli.sections import Sections, show_version
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -60,20 +61,29 @@ def work(do: Work, *, as_json: bool) -> None:
     console.show_result(result, as_json=as_json)
 
 
-def group(name: str, summary: str, commands: Iterable[Callable[..., Any]], *, completion: bool = False) -> typer.Typer:
+def group(name: str, summary: str, commands: Iterable[Callable[..., Any]], *, whole: bool = False) -> typer.Typer:
     """A command line with these commands: a function's name is the command's, its docstring the help.
 
-    ``completion``: with the options that install it in the user's shell.
+    ``whole``: of the whole program, with its commands in sections, its version, and the options that install its
+    completion in the user's shell.
     """
     app = typer.Typer(
-        name=name, help=summary, add_completion=completion, pretty_exceptions_enable=False, rich_markup_mode=None
-    )
+        name=name, cls=Sections if whole else None, help=summary, add_completion=whole,
+        pretty_exceptions_enable=False, rich_markup_mode=None,
+    )  # fmt: skip
 
     def nothing_before_a_command() -> None:
         pass
 
+    def of_the_program(
+        version: Annotated[
+            bool, typer.Option("--version", callback=show_version, is_eager=True, help="Show the version and exit.")
+        ] = False,
+    ) -> None:
+        pass
+
     # With a callback a single command stays a command, instead of becoming the whole program.
-    app.callback(help=summary)(nothing_before_a_command)
+    app.callback(help=summary)(of_the_program if whole else nothing_before_a_command)
     for command in commands:
         app.command(command.__name__.replace("_", "-"))(command)
     return app

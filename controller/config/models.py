@@ -187,7 +187,9 @@ class KeyPanelTable(OpenConfigTable):
 class HoursTable(ConfigTable):
     """Opening hours of a weekday or a date; see ``controller.kiosk.decide.hours`` for what they mean together."""
 
-    day: str = Field(description='"mon" to "sun", or a date such as "2026-12-24", which takes precedence')
+    day: str = Field(
+        description='weekdays such as "mon", "mon-fri" or "daily", or a date such as "2026-12-24", which comes first'
+    )
     opens: str = Field(
         default="", description='the local time "HH:MM"; if omitted together with closes: closed all day'
     )

@@ -15,9 +15,13 @@ from controller.core.arrays import ByteImage
 def figure_of(size_in: tuple[float, float], *, dpi: int, constrained: bool = False) -> Any:
     """An empty figure (width, height) in inches; ``constrained``: its parts do not overlap."""
     # Agg directly: pyplot would look for a window system, and keeps every figure in memory.
+    import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from controller.core.lettering import register_for_plots
+
+    mpl.rcParams["font.family"] = [register_for_plots(), "DejaVu Sans"]
     figure = Figure(figsize=size_in, dpi=dpi, layout="constrained" if constrained else None)
     FigureCanvasAgg(figure)
     return figure

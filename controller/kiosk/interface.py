@@ -22,6 +22,7 @@ from controller.kiosk.values import (
     BundleIdentity,
     Comparison,
     DeviceRow,
+    DriftCheck,
     EventLevel,
     EventRow,
     Finding,
@@ -42,6 +43,7 @@ from controller.kiosk.values import (
     Results,
     Schedule,
     ScheduleRow,
+    Sharpness,
     TriedDevice,
     Unsubscribe,
 )
@@ -114,6 +116,21 @@ class Kiosk(Protocol):
         """
 
     def appearances(self) -> Sequence[Appearance]: ...
+
+    def projector_picture(self, name: str, projector: str) -> Path | None:
+        """A small JPEG of what this projector shows of an appearance; None if it has none. Seconds at the first time.
+
+        Raises UsageError("appearance-unknown").
+        """
+
+    def view(self) -> Path:
+        """The object in white light as the camera sees it (PNG), to paint a target on. Seconds at the first time.
+
+        Raises UsageError("not-calibrated").
+        """
+
+    def photograph(self) -> bytes | None:
+        """The newest photograph of the job that runs, small, as JPEG; None without one."""
 
     def compare(self, name: str | None = None) -> Job:
         """Start to photograph the installed appearances, or only ``name``, and compare them with their targets.
@@ -216,6 +233,7 @@ __all__ = [
     "Changes",
     "Comparison",
     "DeviceRow",
+    "DriftCheck",
     "EventLevel",
     "EventRow",
     "Finding",
@@ -237,6 +255,7 @@ __all__ = [
     "Results",
     "Schedule",
     "ScheduleRow",
+    "Sharpness",
     "TriedDevice",
     "Unsubscribe",
 ]

@@ -55,7 +55,7 @@ class Job:
     ``number`` grows with every job; ``left_s`` None until it is known; ``run`` the run's folder name if the job
     makes one; ``outcome`` a sentence when it ended, with ``failed`` if it failed; ``count`` the number of steps it will
     have, 0 until that is known; ``waits`` a sentence on what a job waits for that did not start yet;
-    ``why``: why ``left_s`` rose; ``steps`` those up to the current one
+    ``why``: why ``left_s`` rose; ``steps`` those up to the current one; ``appearance``: the one that it makes, or empty
     """
 
     number: int
@@ -70,6 +70,7 @@ class Job:
     count: int = 0
     waits: str = ""
     why: str = ""
+    appearance: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,8 @@ class Grade:
     """The grade of one calibration: ``grade`` as shown ("A", "B", ...), ``kept`` False if the older one stays in use.
 
     ``delta_e`` is the largest of the newest median colour differences (CIEDE2000) of the appearances that were solved
-    on this calibration, None if none was photographed.
+    on this calibration, None if none was photographed. ``worst_percent``: the largest predicted error, per cent of
+    white.
     """
 
     run: str
@@ -125,6 +127,19 @@ class Grade:
     kept: bool
     delta_e: float | None = None
     note: str = ""
+    worst_percent: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DriftCheck:
+    """One drift check: ``advice`` "nothing", "quick", "full" or "look"; ``moved_px`` the rms motion of the camera's or
+    the object's picture, camera pixels, None if it was not recognised.
+    """
+
+    run: str
+    unix_s: float
+    advice: str
+    moved_px: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +162,7 @@ class KioskState:
     it began. ``warnings``: sentences on problems that belong to no device (light in the room); ``failures``: failed
     jobs, as in the event log, until an operator confirms them. ``in_turn``: ``playing`` is one of those that are
     shown in turn. ``disk_free_bytes``: free space on the stage's disk, in steps of 10 MB, 0 until it is known.
-    ``places`` of the projectors, empty until they are calibrated.
+    ``places`` of the projectors, empty until they are calibrated. ``drifts``: the drift checks, newest first.
     ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
     has no valid stage.toml. ``black``, ``paused``, ``brightness`` (percent): what people changed of the picture until
     the stage closes.
@@ -175,6 +190,7 @@ class KioskState:
     black: bool = False
     paused: bool = False
     brightness: float = 100.0
+    drifts: tuple[DriftCheck, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +207,8 @@ class EventRow:
 @dataclass(frozen=True, slots=True)
 class Appearance:
     """A solved appearance; ``preview`` is a PNG of how the object will look, or None. ``delta_e``: the newest of its
-    ``Comparison``, None if it was never photographed.
+    ``Comparison``, None if it was never photographed. ``outputs``: the projectors whose light can be shown;
+    ``source``: the kind of its target in stage.toml, empty if it is not there.
     """
 
     name: str
@@ -199,6 +216,8 @@ class Appearance:
     delta_e: float | None = None
     playing: bool = False
     preview: Path | None = None
+    outputs: tuple[str, ...] = ()
+    source: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +225,7 @@ class Reach:
     """How much of a target the projectors can make. Shares of the visible object, 0..1: ``share`` in reach;
     ``too_bright`` for their light; ``too_dark`` for the room and the other projectors; ``too_colourful``. The rest is
     not lit, or not in the picture. ``pictures`` of the object: "target", "result" (what it will look like), "map".
+    ``coarse``: it was calculated on every so-many-th pixel of the camera, 1: on all.
     """
 
     share: float
@@ -213,6 +233,7 @@ class Reach:
     too_dark: float
     too_colourful: float
     pictures: dict[str, Path] = field(default_factory=dict)
+    coarse: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,13 +309,24 @@ class ProjectorAim:
 
 
 @dataclass(frozen=True, slots=True)
+class Sharpness:
+    """How sharp earlier test shots were: the sharpest pattern, and the focus of each projector by name, all 0..1."""
+
+    unix_s: float
+    camera_focus: float
+    projectors: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Aiming:
     """What the aiming page shows. Shares are of the object's area in the camera's picture, 0..1.
 
     ``overlap`` lit by two projectors or more; ``too_dark`` and ``too_grazing``: shares that can't be used;
     ``camera_focus`` 0..1, and ``exposure`` the level of the brightest 1 %, 0..1 of full scale: None without test shots;
     ``hints`` sentences on what to change; ``source`` "test shots", "calibration", or empty if nothing was measured yet
-    (``projectors`` is empty then); ``picture`` an overview that the kiosk drew (PNG), or None
+    (``projectors`` is empty then); ``picture`` an overview that the kiosk drew (PNG), or None; ``outlined``: it shows
+    where each projector's light ends; ``clipped``: the share of the object at the camera's limit; ``histogram``: shares
+    of the object's pixels by level, dark first; ``history``: earlier test shots, oldest first
     """
 
     projectors: tuple[ProjectorAim, ...] = ()
@@ -307,6 +339,10 @@ class Aiming:
     source: str = ""
     measured_unix_s: float = 0.0
     picture: Path | None = None
+    outlined: bool = False
+    clipped: float | None = None
+    histogram: tuple[float, ...] = ()
+    history: tuple[Sharpness, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.operation import Operation
@@ -36,9 +37,10 @@ from controller.panel.pages.forms import Forms
 from controller.panel.pages.routes import Pages
 from controller.panel.pages.setup import Setup
 from controller.panel.uploads import Targets
+from controller.panel.words.language import COOKIE, chosen, gettext, speaking
 
 FONTS: Final = ("velatura-sans-400.woff", "velatura-sans-700.woff")
-STATIC: Final = ("style.css", "panel.js", "icon.svg", *FONTS)
+STATIC: Final = ("style.css", "panel.js", "looks.js", "icon.svg", *FONTS)
 
 
 def make_panel(
@@ -54,11 +56,12 @@ def make_panel(
     shutil.rmtree(options.folder / answers.INCOMING, ignore_errors=True)
     drawing = Drawing()
 
-    def draw() -> dict[str, str]:
+    def draw(name: str) -> dict[str, str]:
         # A stage that is not set up may have no schedule.
         with contextlib.suppress(*FAILURES):
             drawing.use_zone(kiosk.schedule().time_zone)
-        return drawing.parts(kiosk.snapshot(), list(kiosk.events()))
+        with speaking(name):
+            return drawing.parts(kiosk.snapshot(), list(kiosk.events()))
 
     panel = Panel(
         kiosk=kiosk,
@@ -87,7 +90,7 @@ def make_panel(
     )  # fmt: skip
     app = Starlette(
         routes=_routes(panel, table),
-        middleware=[guard],
+        middleware=[guard, Middleware(Speaking)],
         exception_handlers={BodyTooLarge: wrong.too_large, HTTPException: wrong.http, Exception: wrong.unforeseen},
         lifespan=_lifespan(panel),
     )
@@ -143,6 +146,30 @@ def _static(name: str) -> Endpoint:
     return answer
 
 
+class Speaking:
+    """Every request in the language that its visitor has chosen, or that the browser asks for."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        with speaking(chosen(request.cookies.get(COOKIE, ""), request.headers.get("accept-language", ""))):
+            await self._app(scope, receive, send)
+
+
+def _first_sentence(text: str) -> tuple[str, str, str]:
+    """The first sentence, its end, and the others."""
+    ends = [(text.find(end), end) for end in (". ", "。") if end in text[:-1]]
+    if not ends:
+        return text, "", ""
+    at, end = min(ends)
+    return text[:at], end, text[at + len(end) :]
+
+
 class Wrong:
     """Answers for what no route answers: a page for browsers, one line for other clients."""
 
@@ -150,25 +177,28 @@ class Wrong:
         self._drawing = drawing
 
     async def too_large(self, request: Request, _: Exception) -> Response:
-        what, remedy = "This is too large.", "Send a smaller file: a picture of at most 64 MB."
+        what, remedy = gettext("This is too large."), gettext("Send a smaller file: a picture of at most 64 MB.")
         return self._answer(request, 413, "Too large.", what, remedy, {"connection": "close"})
 
     async def http(self, request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         what, remedy = {
-            404: ("This page does not exist.", "Check the address, or begin at the first page."),
-            405: ("This page can't be opened like that.", "Begin at the first page."),
-        }.get(error.status_code, ("This is not possible.", "Go back, load the page again, and repeat it."))
-        if error.detail.endswith("."):
+            404: (gettext("This page does not exist."), gettext("Check the address, or begin at the first page.")),
+            405: (gettext("This page can't be opened like that."), gettext("Begin at the first page.")),
+        }.get(
+            error.status_code,
+            (gettext("This is not possible."), gettext("Go back, load the page again, and repeat it.")),
+        )
+        if error.detail.endswith((".", "。")):
             # Words of ours: what happened, and what to do.
-            what, _, remedy = error.detail.partition(". ")
-            what += "." if remedy else ""
+            what, end, remedy = _first_sentence(gettext(error.detail))
+            what += end.strip()
         return self._answer(request, error.status_code, error.detail, what, remedy, dict(error.headers or {}))
 
     async def unforeseen(self, request: Request, _: Exception) -> Response:
         """An error of ours. It is logged by the server, too."""
-        what = "Something went wrong in the panel."
-        remedy = "The stage plays on. Repeat it; if it happens again, send the diagnostics file (page Backup)."
+        what = gettext("Something went wrong in the panel.")
+        remedy = gettext("The stage plays on. Repeat it; if it happens again, send the diagnostics file (page Backup).")
         return self._answer(request, 500, "Internal error.", what, remedy, {})
 
     def _answer(

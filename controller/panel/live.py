@@ -1,4 +1,4 @@
-"""Server-sent events: each change is rendered once, however many panels are open."""
+"""Server-sent events: each change is rendered once for each language that is read, however many panels are open."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ AGAIN_S: Final = 1.0
 """Pause after a failed rendering."""
 _LOG: Final = logging.getLogger("velatura.panel")
 
-Draw = Callable[[], dict[str, str]]
+Draw = Callable[[str], dict[str, str]]
+"""The live parts in a language, by name."""
 
 
 class Hub:
     """Renders the live parts after a change, at most ``frames_per_s`` times a second, for all open panels.
 
-    ``draw`` returns the HTML of each part by name; it runs in a thread. Use it on the event loop of ``run``; only
-    ``changed`` and ``end`` may be called from any thread.
+    ``draw`` returns the HTML of each part in a language, by name; it runs in a thread. Use it on the event loop of
+    ``run``; only ``changed`` and ``end`` may be called from any thread.
     """
 
     def __init__(self, draw: Draw, *, frames_per_s: float, most: int) -> None:
         self._draw, self._pause_s, self._most = draw, 1.0 / frames_per_s, most
-        self._parts: dict[str, str] = {}
-        self._listeners: set[asyncio.Queue[str]] = set()
+        self._parts: dict[str, dict[str, str]] = {}
+        self._listeners: dict[asyncio.Queue[str], str] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
         self._dirty = asyncio.Event()
         self._drawing = asyncio.Lock()
@@ -76,41 +77,46 @@ class Hub:
 
     async def _redraw(self) -> None:
         async with self._drawing:
-            await self._draw_and_send()
+            for language in dict.fromkeys(self._listeners.values()):
+                await self._draw_and_send(language)
 
-    async def _draw_and_send(self) -> None:
-        parts = await anyio.to_thread.run_sync(self._draw)
-        changed = {name: html for name, html in parts.items() if self._parts.get(name) != html}
-        self._parts = parts
+    async def _draw_and_send(self, language: str) -> None:
+        parts = await anyio.to_thread.run_sync(self._draw, language)
+        before = self._parts.get(language, {})
+        changed = {name: html for name, html in parts.items() if before.get(name) != html}
+        self._parts[language] = parts
         if changed:
             self._number += 1
             message = self._message(changed)
-            for queue in tuple(self._listeners):
-                _put(queue, message)
+            for queue, read in tuple(self._listeners.items()):
+                if read == language:
+                    _put(queue, message)
 
     def _message(self, parts: dict[str, str]) -> str:
         return f"id: {self._number}\nevent: parts\ndata: {json.dumps(parts)}\n\n"
 
-    async def stream(self, alive: Callable[[], bool]) -> AsyncIterator[str]:
-        """The events of one panel: first all parts, then the changed ones, until ``alive`` is false (logged out)."""
+    async def stream(self, alive: Callable[[], bool], language: str = "en") -> AsyncIterator[str]:
+        """The events of one panel in its language: first all parts, then the changed ones, until ``alive`` is false
+        (logged out).
+        """
         if len(self._listeners) >= self._most:
             yield "retry: 10000\nevent: full\ndata: {}\n\n"
             return
         queue: asyncio.Queue[str] = asyncio.Queue(QUEUED)
         # Before rendering, so that a change in the meantime is sent, too.
-        self._listeners.add(queue)
+        self._listeners[queue] = language
         try:
             # All open panels get it, because later changes are computed against the last rendering.
             await self._redraw()
             _empty(queue)
-            yield "retry: 1000\n" + self._message(self._parts)
+            yield "retry: 1000\n" + self._message(self._parts[language])
             while alive() and not self._ended:
                 try:
                     yield await asyncio.wait_for(queue.get(), KEEP_ALIVE_S)
                 except TimeoutError:
                     yield ": still here\n\n"
         finally:
-            self._listeners.discard(queue)
+            self._listeners.pop(queue, None)
 
 
 def _put(queue: asyncio.Queue[str], message: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import secrets
 import subprocess
@@ -14,8 +15,12 @@ from pathlib import Path
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.kiosk.operations.table import TARGET_KEY
+from controller.kiosk.store import targets
 from controller.kiosk.values import Fit
 from controller.panel import decoder
+
+WHOLE, OUTLINE = ".whole", ".json"
+"""Beside a target: what was uploaded, and the regions of it that are used."""
 
 Fitted = Callable[[Path, Fit], bytes]
 """Fits a PNG file to the camera's view."""
@@ -104,8 +109,30 @@ class Targets:
             write_atomically(file, self._fitted(file, fit), mode=0o600)
             kept = sorted(self._folder.glob("*.png"), key=lambda file: file.stat().st_mtime, reverse=True)
             for old in kept[self._most :]:
-                old.unlink(missing_ok=True)
+                for part in (old, old.with_suffix(WHOLE), old.with_suffix(OUTLINE)):
+                    part.unlink(missing_ok=True)
         return key
+
+    def restrict(self, key: str, text: str) -> None:
+        """Use only the regions of an outline (JSON) of this target; with none, all of it again.
+
+        Raises UsageError("target-unknown", "outline-wrong").
+        """
+        file = self.path(key)
+        regions = targets.regions_of(text)
+        whole = file.with_suffix(WHOLE)
+        with self._decoding:
+            if not whole.exists():
+                write_atomically(whole, file.read_bytes(), mode=0o600)
+            write_atomically(file, targets.restricted(whole.read_bytes(), regions), mode=0o600)
+            write_atomically(file.with_suffix(OUTLINE), json.dumps(regions).encode(), mode=0o600)
+
+    def outline(self, key: str) -> str:
+        """The regions in use as JSON. Raises UsageError("target-unknown")."""
+        try:
+            return json.dumps(targets.regions_of(self.path(key).with_suffix(OUTLINE).read_text()))
+        except OSError:
+            return "[]"
 
     def path(self, key: str) -> Path:
         """Raises UsageError("target-unknown")."""

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 
 from controller.core.arrays import ByteImage
+from controller.core.lettering import text_size, write
 from controller.run.state_machine import Event, State, allowed_events
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
@@ -147,9 +147,7 @@ def key_picture(command: KeyCommand, state: State, size_px: tuple[int, int]) -> 
 
 def _write(picture: ByteImage, text: str, colour: tuple[int, int, int]) -> None:
     """Write ``text`` in the centre, as large as fits."""
-    font = cv2.FONT_HERSHEY_SIMPLEX
     height, width = picture.shape[:2]
-    (wide, tall), _ = cv2.getTextSize(text, font, 1.0, 2)
-    scale = min(0.9 * width / max(wide, 1), 0.4 * height / max(tall, 1))
-    at = (round((width - wide * scale) / 2), round((height + tall * scale) / 2))
-    cv2.putText(picture, text, at, font, scale, colour, max(1, round(2 * scale)), cv2.LINE_AA)
+    wide, tall = text_size(text, 100)
+    size_px = int(min(90 * width / max(wide, 1), 60 * height / max(tall, 1)))
+    write(picture, text, ((width - text_size(text, size_px)[0]) // 2, height // 2), size_px, colour)

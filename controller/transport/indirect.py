@@ -95,8 +95,9 @@ def down_adjoint(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tu
 def up(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> FloatImage:
     """(rows, columns, 3): values of blocks, interpolated between their middles."""
     down_, across = _between(shape[0], grid[0], side), _between(shape[1], grid[1], side)
-    values = blocks.reshape(*grid, -1)
-    return np.stack([down_ @ values[..., c] @ across.T for c in range(values.shape[2])], axis=2).astype(np.float32)
+    # One channel after the other: the products of every third number are several times slower.
+    planes = np.ascontiguousarray(np.moveaxis(blocks.reshape(*grid, -1), 2, 0))
+    return np.ascontiguousarray(np.moveaxis((down_ @ planes) @ across.T, 0, 2), np.float32)
 
 
 def up_adjoint(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:

@@ -27,6 +27,11 @@ SOFT: Final = 0.2
 """Sharpness below which neither patterns nor appearances have detail: out of focus, or grazing light."""
 
 
+LEVELS: Final = 32
+EDGES: Final = ((255, 255, 255), (109, 179, 242), (127, 201, 139), (229, 143, 208))
+"""Colours of the projectors' outlines, in turn, as in the page's legend."""
+
+
 @dataclass(frozen=True, slots=True)
 class AimedProjector:
     """``coverage`` the share of the object that it lights; ``focus`` its usual sharpness there, both 0..1."""
@@ -41,7 +46,8 @@ class Aim:
 
     ``overlap`` lit by two or more; ``too_dark`` below a tenth of the usual light; ``too_soft`` lit, and sharp from no
     projector; ``camera_focus`` the sharpest that the camera sees anywhere, 0..1; ``seen`` how many projectors light
-    each camera pixel, (rows, columns) uint8; ``dark`` and ``soft`` the places of the shares
+    each camera pixel, (rows, columns) uint8; ``lit`` (projectors, rows, columns) where each does; ``dark`` and ``soft``
+    the places of the shares
     """
 
     projectors: tuple[AimedProjector, ...]
@@ -52,6 +58,7 @@ class Aim:
     seen: ByteImage
     dark: Mask
     soft: Mask
+    lit: Mask
 
 
 def checkerboard(size_px: tuple[int, int], *, inverse: bool) -> ByteImage:
@@ -89,18 +96,38 @@ def assess_aim(black: FloatImage, boards: Sequence[tuple[FloatImage, FloatImage]
     best = float(np.percentile(sharp[lit], 99)) if lit.any() else 0.0
     return Aim(
         projectors, float(np.count_nonzero(seen >= 2) / area), float(np.count_nonzero(too_dark) / area),
-        float(np.count_nonzero(soft) / area), best, seen, too_dark, soft,
+        float(np.count_nonzero(soft) / area), best, seen, too_dark, soft, lit,
     )  # fmt: skip
 
 
 def aim_overview(picture: FloatImage, aim: Aim) -> ByteImage:
-    """What the camera saw in white, with its faults in colour: red too dark, blue too soft, amber lit by one alone."""
+    """What the camera saw in white, with its faults in colour: red too dark, blue too soft, amber lit by one alone.
+
+    A line in a colour of its own goes around what each projector lights (``EDGES``).
+    """
     level = np.nan_to_num(_grey(picture), nan=1.0)
     grey = np.clip(level / max(float(np.percentile(level, 99.5)), 1e-9), 0, 1) ** (1 / 2.2)
     image = np.repeat((215 * grey).astype(np.uint8)[..., None], 3, axis=2)
     for where, colour in ((aim.seen == 1, (240, 179, 90)), (aim.soft, (90, 140, 255)), (aim.dark, (255, 80, 70))):
         image[where] = (0.55 * image[where] + 0.45 * np.array(colour)).astype(np.uint8)
+    wide = max(1, round(max(image.shape) / 400))
+    for number, part in enumerate(aim.lit):
+        square = np.ones((4 * wide + 1, 4 * wide + 1), np.uint8)
+        whole = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_CLOSE, square)
+        lines, _ = cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(image, lines, -1, EDGES[number % len(EDGES)], wide)
     return image
+
+
+def levels(picture: FloatImage, aim: Aim) -> tuple[tuple[float, ...], float]:
+    """Of the object in a photograph (rows, columns, 3): shares of its pixels by their brightest channel, dark first and
+    evenly spaced to the eye, and the share at the camera's limit (NaN in the photograph).
+    """
+    top = picture[aim.lit.any(axis=0)].max(axis=1, initial=0) if aim.lit.any() else np.zeros(0, np.float32)
+    known = np.nan_to_num(top, nan=1.0)
+    counts, _ = np.histogram(np.clip(known, 0, 1) ** (1 / 2.2), bins=LEVELS, range=(0, 1))
+    size = max(1, known.size)
+    return tuple(float(count / size) for count in counts), float(np.count_nonzero(np.isnan(top)) / size)
 
 
 def _grey(image: FloatImage) -> FloatImage:

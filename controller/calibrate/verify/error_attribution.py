@@ -14,6 +14,7 @@ import numpy.typing as npt
 from controller.calibrate.values import Calibration
 from controller.calibrate.verify.drift import TransportModel
 from controller.core.arrays import ByteImage, FloatImage, Mask
+from controller.core.lettering import write
 
 NEAR_PX = 15
 BAD = 0.05
@@ -290,14 +291,10 @@ def _legend(why: ErrorAttribution, name: str, width: int) -> ByteImage:
     reasons = [reason for reason in COLOURS if np.any(why.labels == reason)]
     # As high for every projector, so that panels of one run can be distinguished by their height.
     band = np.full((line * (1 + math.ceil(len(COLOURS) / per_line)) + int(16 * size), width, 3), 24, np.uint8)
-    thick = max(1, round(2 * size))
-    ascii_name = name.encode("ascii", "replace").decode()
-    cv2.putText(band, f"projector {ascii_name}", (int(20 * size), int(34 * size)), cv2.FONT_HERSHEY_SIMPLEX,
-                size, (235, 235, 235), thick, cv2.LINE_AA)  # fmt: skip
+    write(band, f"projector {name}", (int(20 * size), int(22 * size)), round(30 * size), (235, 235, 235))
     for number, reason in enumerate(reasons):
         x, y = int((20 + 370 * (number % per_line)) * size), line * (1 + number // per_line)
         cv2.rectangle(band, (x, y + int(8 * size)), (x + int(28 * size), y + int(36 * size)), COLOURS[reason], -1)
         cv2.rectangle(band, (x, y + int(8 * size)), (x + int(28 * size), y + int(36 * size)), (160, 160, 160), 1)
-        cv2.putText(band, WORDS[reason][0], (x + int(40 * size), y + int(32 * size)), cv2.FONT_HERSHEY_SIMPLEX,
-                    0.85 * size, (235, 235, 235), thick, cv2.LINE_AA)  # fmt: skip
+        write(band, WORDS[reason][0], (x + int(40 * size), y + int(22 * size)), round(26 * size), (235, 235, 235))
     return band

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from controller.core.arrays import Mask
 from controller.core.errors import VelaturaError
-from controller.kiosk.interface import Aiming, ProjectorAim
+from controller.kiosk.interface import Aiming, ProjectorAim, Sharpness
 from controller.kiosk.store.runs import began_s
 from controller.kiosk.supervisors.devices import Devices
 from controller.stage.calibrations import finished_calibrations
@@ -30,7 +30,7 @@ GRAZING: Final = 0.25
 """Below this cosine of the angle to the surface normal, light is grazing."""
 LEAST_COVERAGE, SOFT_FOCUS, MUCH = 0.5, 0.4, 0.1
 DIM, BURNT = 0.25, 0.98
-DARK = 0.1
+DARK, CLIPPED = 0.1, 0.02
 """Below this share of the object's median light, a place is too dark."""
 FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
 """Names as in ``controller.steps.capture.aiming``, which is loaded only to photograph."""
@@ -108,8 +108,15 @@ def _judged(folder: Path, figures: dict[str, Any]) -> Aiming:
         hints.append(f"The camera's picture is too {word}: change the aperture, or the ISO in stage.toml.")
     if camera < SOFT_FOCUS:
         hints.append("No pattern is sharp anywhere: focus the camera first.")
-    return Aiming(aims, figures["overlap"], figures["too_dark"], figures["too_soft"], camera, exposure, tuple(hints),
-                  "test shots", figures["measured_unix_s"], folder / PICTURE)  # fmt: skip
+    clipped = figures.get("clipped")
+    if clipped is not None and clipped > CLIPPED:
+        hints.append(f"{clipped:.0%} of the object is too bright for the camera: a shorter exposure is needed.")
+    # Test shots of an older version have none of the last four.
+    return Aiming(
+        aims, figures["overlap"], figures["too_dark"], figures["too_soft"], camera, exposure, tuple(hints),
+        "test shots", figures["measured_unix_s"], folder / PICTURE, clipped is not None, clipped,
+        tuple(map(float, figures.get("histogram", ()))), tuple(Sharpness(**row) for row in figures.get("history", ())),
+    )  # fmt: skip
 
 
 def _hints(aims: Sequence[ProjectorAim]) -> list[str]:

@@ -16,8 +16,8 @@ from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.schedule_file import ScheduleFile, check
 from controller.kiosk.supervisors.lamp_history import LampHistory
-from controller.stage.calibrations import stage_trust, worst_grade
-from controller.stage.check import check_stage
+from controller.stage.calibrations import finished_calibration, stage_trust, worst_grade
+from controller.stage.check import Checked, check_stage
 
 
 class FolderKiosk:
@@ -34,7 +34,15 @@ class FolderKiosk:
             return log.after(after)
 
     def appearances(self) -> Sequence[Appearance]:
-        return appearances_of(self._bundles(), self.comparisons(), playing="")
+        return appearances_of(self._bundles(), self.comparisons(), check_stage(self.stage), playing="")
+
+    def projector_picture(self, name: str, projector: str) -> Path | None:
+        return projector_picture(self._bundles(), check_stage(self.stage), name, projector)
+
+    def view(self) -> Path:
+        from controller.kiosk.api.preview_light import view_picture
+
+        return view_picture(self.stage, finished_calibration(self.stage), check_stage(self.stage).names)
 
     def comparisons(self) -> Sequence[Comparison]:
         return runs.comparisons(self.stage, self._bundles().names())
@@ -99,14 +107,29 @@ class FolderKiosk:
         return ScheduleFile(self.stage, load_stage(self.stage).tables.schedule)
 
 
-def appearances_of(bundles: BundleStore, compared: Sequence[Comparison], *, playing: str) -> tuple[Appearance, ...]:
+def projector_picture(bundles: BundleStore, checked: Checked, name: str, projector: str) -> Path | None:
+    """What this projector shows of an appearance. Raises UsageError("appearance-unknown")."""
+    bundles.check_name(name)
+    fed = {table.name: table.output for table in checked.stage.tables.projectors}
+    return bundles.output_picture(name, fed[projector]) if projector in fed else None
+
+
+def appearances_of(
+    bundles: BundleStore, compared: Sequence[Comparison], checked: Checked, *, playing: str
+) -> tuple[Appearance, ...]:
     """The appearances of the installed bundle, in its order. ``playing``: the name of the one that plays, or empty."""
     index = bundles.index(bundles.bundle())
     if index is None:
         return ()
+    shown = {one.name for one in index.outputs}
+    outputs = tuple(table.name for table in checked.stage.tables.projectors if table.output in shown)
+    sources = {table.name: table.kind for table in checked.stage.tables.appearances}
     made, previews = float(index.created_unix_s), bundles.previews()
     errors = {comparison.name: comparison.history[0].delta_e for comparison in compared}
     return tuple(
-        Appearance(entry.name, made, errors.get(entry.name), entry.name == playing, previews.get(entry.name))
+        Appearance(
+            entry.name, made, errors.get(entry.name), entry.name == playing, previews.get(entry.name), outputs,
+            sources.get(entry.name, ""),
+        )
         for entry in index.appearances
-    )
+    )  # fmt: skip

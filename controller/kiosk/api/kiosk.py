@@ -15,7 +15,8 @@ from controller.core.errors import UsageError, WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.api import aim, finding
 from controller.kiosk.api.control import plain
-from controller.kiosk.api.folder import FolderKiosk, appearances_of
+from controller.kiosk.api.folder import FolderKiosk, appearances_of, projector_picture
+from controller.kiosk.api.photograph import newest_photograph
 from controller.kiosk.api.snapshot import Snapshots
 from controller.kiosk.changes.watch import since_good
 from controller.kiosk.decide.changed_hours import effect
@@ -270,7 +271,16 @@ class StageKiosk(FolderKiosk):
             return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def appearances(self) -> Sequence[Appearance]:
-        return appearances_of(self.service.bundles, self.comparisons(), playing=self._last.playing)
+        service = self.service
+        return appearances_of(service.bundles, self.comparisons(), service.checked, playing=self._last.playing)
+
+    def projector_picture(self, name: str, projector: str) -> Path | None:
+        service = self.service
+        return projector_picture(service.bundles, service.checked, name, projector)
+
+    def photograph(self) -> bytes | None:
+        service = self.service
+        return None if service.jobs.running is None else newest_photograph(self.stage, time.time())
 
     def compare(self, name: str | None = None) -> Job:
         service = self.service

@@ -21,7 +21,7 @@ from controller.stage.calibrations import finished_calibration
 from controller.stage.check import Checked, check_stage
 
 if TYPE_CHECKING:
-    from controller.artefacts.calibrated import Calibrated
+    from controller.kiosk.api.preview_light import PreviewLight
     from controller.solve.feasibility import Feasibility
     from controller.solve.request import Aim
     from controller.solve.targets.values import Target
@@ -70,39 +70,59 @@ def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
 
 
 def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
-    from controller.artefacts.calibrated import Calibrated
+    from controller.kiosk.api.preview_light import preview_light
     from controller.solve.judged import visible_object
     from controller.solve.request import aim_at
     from controller.steps.appearance.solving import options_of
 
-    calibrated = Calibrated(run, checked.names)
-    wanted = _wanted(calibrated, target)
+    light = preview_light(checked.stage.folder, run, checked.names)
+    wanted = _wanted(light, target)
     aim = aim_at(
-        calibrated.transport, calibrated.calibration.black, wanted.image, options_of(checked.stage.tables.solve),
-        drive=calibrated.drive, indirect=calibrated.indirect,
+        light.transport, light.black, wanted.image, options_of(checked.stage.tables.solve),
+        drive=light.drive, indirect=light.indirect,
     )  # fmt: skip
-    lit = calibrated.calibration.object_mask
+    lit = light.transport.object_mask
     seen = visible_object(lit)
     kinds = kinds_of(aim.asked_possible, lit & wanted.mask)
     folder.mkdir(parents=True, exist_ok=True)
-    grey = _drawn(folder, calibrated, aim, seen)
+    grey = _drawn(folder, light, aim, seen)
     _write(folder / FILES["map"], map_of(kinds, grey), seen)
     area = max(1, int(seen.sum()))
     share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
-    return Reach(**share, pictures={name: folder / file for name, file in FILES.items()})
+    pictures = {name: folder / file for name, file in FILES.items()}
+    return Reach(**share, pictures=pictures, coarse=round(light.step))
 
 
-def _wanted(calibrated: Calibrated, target: Path) -> Target:
+def _wanted(light: PreviewLight, target: Path) -> Target:
     from controller.solve.targets.files import load_target
+    from controller.solve.targets.values import Target
 
-    black = calibrated.calibration.black
-    size_px = (black.shape[1], black.shape[0])
+    rows, columns = light.transport.camera_shape
+    if target.suffix.lower() == ".exr":
+        # Rendered for this view already.
+        whole = load_target(target, light.camera_px)
+        return Target(
+            _shrunk(whole.image, (columns, rows)), _shrunk(whole.mask.astype(np.float32), (columns, rows)) > 0.5
+        )
     with tempfile.TemporaryDirectory() as scratch:
-        # An EXR is rendered for this view already.
-        whole = target if target.suffix.lower() == ".exr" else Path(scratch) / "target.png"
-        if whole != target:
-            whole.write_bytes(fitted(target.read_bytes(), size_px))
-        return load_target(whole, size_px)
+        small = Path(scratch) / "target.png"
+        # Made small before its colours become light: on a whole picture that alone takes a second.
+        picture = target.read_bytes()
+        if _size_px(picture) != light.camera_px:
+            picture = fitted(picture, light.camera_px)
+        small.write_bytes(fitted(picture, (columns, rows), "stretch"))
+        return load_target(small, (columns, rows))
+
+
+def _size_px(png: bytes) -> tuple[int, int]:
+    """(width, height) from a PNG's head."""
+    return int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
+
+
+def _shrunk(image: FloatImage, size_px: tuple[int, int]) -> FloatImage:
+    import cv2
+
+    return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
@@ -119,14 +139,13 @@ def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
     }
 
 
-def _drawn(folder: Path, calibrated: Calibrated, aim: Aim, seen: Mask) -> ByteImage:
+def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> ByteImage:
     """Write what was asked for and what will come of it; returns the first one in grey, (rows, columns) uint8."""
     from controller.report.pictures import to_screen
 
-    black, matrix = calibrated.calibration.black, calibrated.calibration.camera_to_xyz
-    light: FloatImage = np.clip(aim.direct - black, 0, calibrated.transport.reach())
-    made = light if calibrated.indirect is None else light + calibrated.indirect.forward(light)
-    asked, result = (to_screen(image, matrix, white=aim.exposure) for image in (aim.asked, black + made))
+    light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())
+    made = light if of.indirect is None else light + of.indirect.forward(light)
+    asked, result = (to_screen(image, of.camera_to_xyz, white=aim.exposure) for image in (aim.asked, of.black + made))
     _write(folder / FILES["target"], asked, seen)
     _write(folder / FILES["result"], result, seen)
     return np.asarray(asked.mean(axis=2), np.uint8)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.kiosk.api.places import places
-from controller.kiosk.interface import BundleIdentity, DeviceRow, Grade, Job, KioskState, LiveValue, Place
+from controller.kiosk.interface import BundleIdentity, DeviceRow, DriftCheck, Grade, Job, KioskState, LiveValue, Place
 from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
@@ -24,6 +24,7 @@ class Snapshots:
         self._stage, self._world = stage, world
         self._grades: tuple[float, tuple[Grade, ...]] = (0.0, ())
         self._places: tuple[Place, ...] = ()
+        self._drifts: tuple[DriftCheck, ...] = ()
         self._since = ("", 0.0)
 
     def of(self, service: Service, revision: int) -> KioskState:
@@ -37,7 +38,7 @@ class Snapshots:
         if self._world.monotonic() - at_s > GRADES_EVERY_S or not at_s:
             grades = runs.grades(self._stage, service.checked.stage.tables.calibration.worst_grade)
             self._grades = self._world.monotonic(), grades
-            self._places = places(self._stage)
+            self._places, self._drifts = places(self._stage), runs.drifts(self._stage)
         index = service.bundles.index(bundle := service.bundles.bundle())
         identity = None
         if index is not None and bundle is not None:
@@ -62,6 +63,7 @@ class Snapshots:
             warnings=self._warnings(service),
             failures=service.log.failures,
             places=self._places,
+            drifts=self._drifts,
             black=live.black,
             paused=bool(live.held),
             brightness=round(100 * live.brightness, 1),

@@ -130,7 +130,10 @@ class JobRunner:
     def begin(self, request: Request) -> None:
         self._request, self._cancel = request, self._world.event()
         title = title_of(request)
-        self._reporter = JobReporter(Job(request.number or self.reserve(), title), self._log, self._changed)
+        # Only a job that is named after an appearance makes one.
+        made = request.arguments[0] if request.kind == "compute" and request.arguments else ""
+        job = Job(request.number or self.reserve(), title, appearance=made)
+        self._reporter = JobReporter(job, self._log, self._changed)
         self._log.tell(Decision("work-begins", f"Started: {title}."))
         run = partial(self._run, request, self._reporter, self._cancel)
         thread = self._world.thread(run, f"work-{request.kind}")

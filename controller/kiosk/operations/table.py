@@ -59,10 +59,15 @@ EVENTS: Final = (
     Field("level", "only this level", required=False, choices=("info", "warning", "error")),
     Field("most", "only this many of the newest events", "integer", False, least=1, most=MOST_EVENTS),
 )
+OUTLINE: Final = Field(
+    "outline", "regions as lists of corners [x, y], each from 0 to 1 of the picture, such as [[[0,0],[1,0],[1,1]]]",
+    longest=1 << 16,
+)  # fmt: skip
 _FULL_OR_QUICK: Final = Field(
     "kind", "full or quick", choices=("full", "quick"),
     flag=Flag("--quick", "Redo only what changed since the last calibration.", "quick", "full"),
 )  # fmt: skip
+PROJECTOR: Final = Field("projector", "a projector's name", pattern=r"^[^\u0000-\u001f\u007f/\\]+$", names="projector")
 _ONE_PROJECTOR: Final = Field("projector", "only this projector", required=False,
                               pattern=r"^[^\u0000-\u001f\u007f/\\]+$", names="projector")  # fmt: skip
 _IDENTIFYING: Final = Field(
@@ -149,6 +154,8 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
               Answer.NOTHING, said="Look at the projectors."),
     Operation("camera", "What the camera sees", VIEWER, LOOKS, answer=Answer.JPEG, call="camera_picture",
               at_socket="camera-picture", within="aim"),
+    Operation("photograph", "The newest photograph of the job that runs", VIEWER, LOOKS, answer=Answer.JPEG,
+              within="status"),
     Operation("lamp-history", "Hours and strikes of each lamp, day by day", VIEWER, LOOKS, offline=True,
               http=("GET", "/lamps"), command="lamps"),
     # -- jobs
@@ -169,6 +176,11 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
     Operation("preview", "A picture of how an appearance will look", VIEWER, LOOKS, (APPEARANCE,), Answer.PICTURE,
               call="appearances", take=_nothing, part=_preview, offline=True,
               http=("GET", "/appearances/{name}/preview"), within="bundle inspect"),
+    Operation("projector-picture", "A small picture of what a projector shows of an appearance", VIEWER, LOOKS,
+              (APPEARANCE, PROJECTOR), Answer.PICTURE, offline=True,
+              http=("GET", "/appearances/{name}/projectors/{projector}"), within="bundle inspect"),
+    Operation("view", "The object in white light as the camera sees it, to paint a target on", OPERATOR, LOOKS,
+              answer=Answer.PICTURE, offline=True),
     Operation("remove-appearance", "Remove an appearance", TECHNICIAN, CHANGES, (APPEARANCE,), Answer.NOTHING,
               http=("DELETE", "/appearances/{name}"), command="remove", asks="Remove the appearance {name}?",
               said="A new bundle without {name} is being made.",
@@ -181,6 +193,11 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
               (Field("target", TARGET.about, pattern=TARGET_KEY, longest=24),), Answer.PICTURE, holder="targets",
               call="path", take=lambda values: {"key": values["target"]}, http=("GET", "/targets/{target}"),
               within="compute"),
+    Operation("outline-target", "Use only these parts of an uploaded target; everything else stays dark", OPERATOR,
+              CHANGES, (Field("target", TARGET.about, pattern=TARGET_KEY, longest=24), OUTLINE), Answer.NOTHING,
+              holder="targets", call="restrict",
+              take=lambda values: {"key": values["target"], "text": values["outline"]},
+              http=("PUT", "/targets/{target}/outline"), within="compute", said="The outline is used."),
     Operation("reach", "How much of a target the projectors can make", OPERATOR, LOOKS, (TARGET,), offline=True,
               http=("GET", "/targets/{target}/reach")),
     Operation("reach-picture", "The target, what it will look like, or a map of what is out of reach", OPERATOR, LOOKS,

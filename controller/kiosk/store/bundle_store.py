@@ -21,6 +21,9 @@ from controller.kiosk.decide.interfaces import Turn
 from controller.play.control.protocol import MAX_FADE_S, MAX_SECONDS
 
 PREVIEWS: Final = "kiosk/previews"
+OUTPUTS: Final = "kiosk/outputs"
+OUTPUT_PX: Final = 320
+"""The longer side of a small picture of what an output shows."""
 WITHOUT: Final = "bundles-without"
 """Folder of the stage with a subfolder like ``bundles`` for each set of missing projectors."""
 
@@ -111,6 +114,39 @@ class BundleStore:
                 if (data := bundle.thumbnail(entry.name)) is not None:
                     write_atomically(fresh / f"{number}.png", data)
             fresh.rename(folder)
+
+    def output_picture(self, appearance: str, output: str) -> Path | None:
+        """A small JPEG of what an output shows of an installed appearance, made once; None if it has none."""
+        path = self.bundle()
+        index = self.index(path)
+        if path is None or index is None:
+            return None
+        outputs, names = [one.name for one in index.outputs], [one.name for one in index.appearances]
+        if output not in outputs or appearance not in names:
+            return None
+        file = self._stage / OUTPUTS / path.stem / f"{names.index(appearance)}-{outputs.index(output)}.jpg"
+        with self._previewing:
+            if not file.exists() and not self._draw_output(path, appearance, output, file):
+                return None
+        return file
+
+    def _draw_output(self, path: Path, appearance: str, output: str, file: Path) -> bool:
+        import cv2
+
+        try:
+            with Bundle.open_trusted(path, self._trust) as bundle:
+                image = bundle.decode(appearance, output)
+            scale = OUTPUT_PX / max(image.shape[:2])
+            size_px = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+            small = cv2.resize(image[..., ::-1], size_px, interpolation=cv2.INTER_AREA)
+            if not file.parent.is_dir():
+                # Those of older bundles.
+                shutil.rmtree(file.parent.parent, ignore_errors=True)
+                file.parent.mkdir(parents=True)
+            write_atomically(file, cv2.imencode(".jpg", small)[1].tobytes())
+        except (BundleError, VelaturaError, OSError):
+            return False
+        return True
 
     def index(self, path: Path | None) -> Index | None:
         """The index of an installed bundle; None without one, and for one that this stage would not play."""

@@ -10,9 +10,10 @@ from typing import Final
 
 from controller.artefacts.comparison import Compared, all_compared, history_of, pictures_of
 from controller.artefacts.grade import BEFORE, PICTURE, RESOLUTION, graded, passes, worst_letter, worst_of
-from controller.artefacts.names import REPORT_PAGE, run_kind
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.names import REPORT_PAGE, json_path, read_json, run_kind
 from controller.core.errors import UsageError, VelaturaError
-from controller.kiosk.interface import Achieved, Comparison, Grade, Results
+from controller.kiosk.interface import Achieved, Comparison, DriftCheck, Grade, Results
 from controller.stage.calibrations import finished_calibrations
 from controller.stage.check import Checked
 
@@ -46,7 +47,21 @@ def _grade(run: Path, finished: bool, worst_grade: float, delta_e: float | None)
         return None
     note = f"Largest predicted error: {worst[1]:.1f} % in {worst[0]}"
     kept = finished and passes(run, worst_grade)
-    return Grade(run.name, began_s(run.name), run_kind(run), worst_letter(run), kept, delta_e, note)
+    return Grade(run.name, began_s(run.name), run_kind(run), worst_letter(run), kept, delta_e, note, worst[1])
+
+
+def drifts(stage: Path) -> tuple[DriftCheck, ...]:
+    """The drift checks that can be read, newest first."""
+    result = []
+    for run in sorted((stage / "runs").glob("*-drift"), reverse=True)[:MOST]:
+        try:
+            found = read_json(json_path(run, StepKind.DRIFT))
+            camera = found["camera"]
+            moved = float(camera["rms_px"]) if camera["found"] else None
+            result.append(DriftCheck(run.name, began_s(run.name), str(found["advice"]), moved))
+        except _UNREADABLE:
+            continue
+    return tuple(result)
 
 
 def began_s(run: str) -> float:

@@ -15,6 +15,7 @@ from controller.config.writer import toml_text
 from controller.core.errors import UsageError
 from controller.core.files import read_text
 from controller.core.storage import write_atomically
+from controller.kiosk.decide.days import expanded
 from controller.kiosk.decide.hours import check_overlaps, check_schedule
 from controller.kiosk.interface import Schedule, ScheduleRow
 
@@ -23,8 +24,8 @@ _HEADING: Final = "# Opening hours, written by the panel. This file replaces [sc
 
 
 def of_table(table: ScheduleTable) -> Schedule:
-    """Raises UsageError as ``check_schedule``."""
-    rows = tuple(ScheduleRow(row.day, row.opens, row.closes, row.appearance) for row in table.hours)
+    """The days may be written as on the panel's page. Raises UsageError as ``expanded`` and ``check_schedule``."""
+    rows = expanded([ScheduleRow(row.day, row.opens, row.closes, row.appearance) for row in table.hours])
     schedule = Schedule(table.time_zone, rows, table.drift_check)
     check_schedule(schedule)
     return schedule

@@ -1,9 +1,11 @@
-"""Fits pictures to the camera's view, because a target must have exactly its size."""
+"""Fits pictures to the camera's view, because a target must have exactly its size, and cuts them to outlines."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,10 @@ from controller.core.errors import UsageError, VelaturaError
 from controller.kiosk.values import Fit
 from controller.stage.calibrations import finished_calibrations
 from controller.stage.check import check_stage
+
+Region = tuple[tuple[float, float], ...]
+"""Corners of one part of a target, as shares of its width and height."""
+MOST_REGIONS, MOST_CORNERS = 32, 400
 
 
 def camera_view_px(stage: Path) -> tuple[int, int] | None:
@@ -26,11 +32,11 @@ def camera_view_px(stage: Path) -> tuple[int, int] | None:
         return None
 
 
-def fitted(picture: bytes, size_px: tuple[int, int], how: Fit = "fit") -> bytes:
+def fitted(picture: bytes, size_px: tuple[int, int], how: Fit | Literal["stretch"] = "fit") -> bytes:
     """``picture`` (PNG) as a PNG of the size of the camera's view; unchanged if it has that size already.
 
     "fit" shows the whole picture; "fill" fills the view and cuts the edges; "crop" keeps the original pixels in the
-    middle of the view. Uncovered parts are transparent: they stay dark.
+    middle of the view. Uncovered parts are transparent: they stay dark. "stretch" covers the view with all of it.
     Raises UsageError("target-unreadable").
     """
     import cv2
@@ -45,8 +51,8 @@ def fitted(picture: bytes, size_px: tuple[int, int], how: Fit = "fit") -> bytes:
         return picture
     across, down = size_px[0] / width, size_px[1] / height
     scale = 1.0 if how == "crop" else min(across, down) if how == "fit" else max(across, down)
-    if scale != 1.0:
-        wanted = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if scale != 1.0 or how == "stretch":
+        wanted = size_px if how == "stretch" else (max(1, round(width * scale)), max(1, round(height * scale)))
         decoded = cv2.resize(decoded, wanted, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     try:
         profile = embedded_profile(picture)
@@ -56,6 +62,53 @@ def fitted(picture: bytes, size_px: tuple[int, int], how: Fit = "fit") -> bytes:
         ) from error
     png = cv2.imencode(".png", _in_the_middle(_with_alpha(decoded), size_px))[1].tobytes()
     return png if profile is None else with_profile(png, profile)
+
+
+def regions_of(text: str) -> tuple[Region, ...]:
+    """The regions of an outline as JSON: lists of corners (x, y), each from 0 to 1 of the picture.
+
+    Raises UsageError("outline-wrong").
+    """
+    try:
+        regions = tuple(tuple((float(x), float(y)) for x, y in region) for region in json.loads(text or "[]"))
+    except (ValueError, TypeError, RecursionError):
+        raise _wrong_outline() from None
+    if len(regions) > MOST_REGIONS or any(not _is_region(region) for region in regions):
+        raise _wrong_outline()
+    return regions
+
+
+def _is_region(region: Region) -> bool:
+    return 3 <= len(region) <= MOST_CORNERS and all(0 <= x <= 1 and 0 <= y <= 1 for x, y in region)
+
+
+def _wrong_outline() -> UsageError:
+    return UsageError(
+        "outline-wrong", what="The outline is not a list of regions with at least three corners each.",
+        remedy=f"Draw it again: at most {MOST_REGIONS} regions of {MOST_CORNERS} corners, all inside the picture.",
+    )  # fmt: skip
+
+
+def restricted(picture: bytes, regions: Sequence[Region]) -> bytes:
+    """``picture`` (PNG), transparent outside all ``regions``; without any it stays as it is.
+
+    A transparent part of a target is no part of it: it stays dark. Raises UsageError("target-unreadable").
+    """
+    import cv2
+
+    if not regions:
+        return picture
+    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED)
+    if decoded is None:
+        raise UsageError("target-unreadable", what="The target can't be read as a picture.", remedy="Save it as PNG.")
+    whole = _with_alpha(decoded)
+    rows, columns = whole.shape[:2]
+    inside = np.zeros((rows, columns), np.uint8)
+    for region in regions:
+        # Each on its own, because together their overlaps would count as outside.
+        cv2.fillPoly(inside, [np.rint(np.array(region) * (columns - 1, rows - 1)).astype(np.int32)], 255)
+    whole[..., 3] = np.minimum(whole[..., 3], inside.astype(whole.dtype) * (np.iinfo(whole.dtype).max // 255))
+    return cv2.imencode(".png", whole, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
 def _with_alpha(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -19,6 +19,7 @@ from starlette.responses import JSONResponse, RedirectResponse, Response
 from controller.kiosk.store.accounts import Role
 from controller.panel.auth.sessions import Session
 from controller.panel.context import Panel
+from controller.panel.words.language import mark
 
 Way = Literal["public", "session", "token"]
 
@@ -107,7 +108,8 @@ def _navigates(request: Request) -> bool:
 
 
 def _denied(status: int) -> HTTPException:
-    text = "Log in first." if status == 401 else "Your role does not allow this. A technician can change your role."
+    not_allowed = mark("Your role does not allow this. A technician can change your role.")
+    text = mark("Log in first.") if status == 401 else not_allowed
     return HTTPException(status, text)
 
 

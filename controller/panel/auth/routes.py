@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+import re
 from functools import partial
 from typing import Any
 
@@ -17,10 +18,11 @@ from controller.panel.auth.identity import Entry, Visitor, cookie_name, form_pai
 from controller.panel.auth.sessions import LONGEST_S
 from controller.panel.context import Panel
 from controller.panel.pages.drawing import Drawing
-from controller.panel.pages.forms import Sent, checked
+from controller.panel.pages.forms import Sent, checked, refused
 from controller.panel.pages.routes import Pages
+from controller.panel.words.language import COOKIE, LANGUAGES, gettext, mark, ngettext
 
-_WRONG = "Name or password is wrong."
+_WRONG = mark("Name or password is wrong.")
 
 
 class Entrance:
@@ -40,15 +42,28 @@ class Entrance:
         return [
             Entry("GET", "/login", "public", None, self._login_page),
             Entry("POST", "/login", "public", None, self._login),
+            Entry("POST", "/language", "public", None, self._language),
             *(Entry("POST", path, "session", role, checked(self._panel, handler)) for path, role, handler in forms),
         ]
 
     async def _login_page(self, _: Request, __: Visitor) -> Response:
         return self._form("", 200)
 
+    async def _language(self, request: Request, _: Visitor) -> Response:
+        """Keep the visitor's language in a cookie, and go back to the page."""
+        form = await request.form(max_files=0, max_fields=4, max_part_size=4096)
+        name, back = str(form.get("language", "")), str(form.get("back", "/"))
+        if name not in LANGUAGES or not same_origin(request.headers):
+            raise refused()
+        # Only a path of ours: it must not lead elsewhere.
+        page = RedirectResponse(back if re.fullmatch(r"/[A-Za-z0-9._/-]*", back) and "//" not in back else "/", 303)
+        self._set_cookie(page, COOKIE, name, 400 * 86400)
+        return page
+
     def _form(self, problem: str, status: int) -> Response:
         cookie, token = form_pair(self._panel)
-        page = HTMLResponse(self._drawing.page("login.html", {"csrf": token, "problem": problem}), status)
+        facts = {"csrf": token, "problem": gettext(problem), "here": "/login"}
+        page = HTMLResponse(self._drawing.page("login.html", facts), status)
         self._set_cookie(page, cookie_name(self._panel) + "-form", cookie, 3600)
         return page
 
@@ -68,11 +83,14 @@ class Entrance:
             or not same_origin(request.headers)
             or not hmac.compare_digest(expected, token.encode().decode("ascii", "replace"))
         ):
-            return self._form("This page was out of date. Try again.", 403)
+            return self._form(mark("This page was out of date. Try again."), 403)
         address = request.client.host if request.client else ""
         wait_s = max(panel.by_address.wait_s(address), panel.by_account.wait_s(name))
         if wait_s > 0:
-            page = self._form(f"Too many wrong passwords. Wait {int(wait_s) + 1} seconds.", 429)
+            whole_s = int(wait_s) + 1
+            said = ngettext("Too many wrong passwords. Wait %(num)d second.",
+                            "Too many wrong passwords. Wait %(num)d seconds.", whole_s)  # fmt: skip
+            page = self._form(said % {"num": whole_s}, 429)
             page.headers["retry-after"] = str(int(wait_s) + 1)
             return page
         # Counted before the check, so that many simultaneous tries are all counted.
@@ -131,7 +149,7 @@ class Entrance:
         panel.kiosk.record("done-by", f"{visitor.name}: Change the own password.")
         panel.sessions.end_all(visitor.name, but=visitor.session)
         page = "/setup" if panel.kiosk.snapshot().needs_setup and visitor.role is Role.TECHNICIAN else "/"
-        return await self._redirect(visitor, page, "good", "Your new password is in use.")
+        return await self._redirect(visitor, page, "good", gettext("Your new password is in use."))
 
     async def _redirect(self, visitor: Visitor, page: str, level: str, text: str) -> Response:
         assert visitor.session is not None
@@ -160,7 +178,8 @@ class Entrance:
     async def _add(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name, password, role = (sent.texts.get(key, "") for key in ("name", "password", "role"))
         return await self._apply(
-            visitor, lambda: self._panel.accounts.add(name, Role.named(role), password), "The account is added.",
+            visitor, lambda: self._panel.accounts.add(name, Role.named(role), password),
+            gettext("The account is added."),
             f"Add the account {name} ({role})", {"name": name, "role": role},
         )  # fmt: skip
 
@@ -172,18 +191,20 @@ class Entrance:
             if name != visitor.name:
                 self._panel.sessions.end_all(name)
 
-        return await self._apply(visitor, change, "The role is changed.", f"Make {name} a {role}")
+        return await self._apply(visitor, change, gettext("The role is changed."), f"Make {name} a {role}")
 
     async def _remove(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name = sent.texts.get("name", "")
         if sent.texts.get("sure") != "yes":
-            return await self._ask(visitor, "/accounts/remove", f"Remove the account {name}?", name)
+            question = gettext("Remove the account {name}?").format(name=name)
+            return await self._ask(visitor, "/accounts/remove", question, name)
 
         def change() -> None:
             self._panel.accounts.remove(name)
             self._panel.sessions.end_all(name)
 
-        return await self._apply(visitor, change, "The account is removed.", f"Remove the account {name}")
+        said = gettext("The account is removed.")
+        return await self._apply(visitor, change, said, f"Remove the account {name}")
 
     async def _add_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         accounts = self._panel.accounts
@@ -201,11 +222,11 @@ class Entrance:
     async def _remove_token(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         name = sent.texts.get("name", "")
         if sent.texts.get("sure") != "yes":
-            return await self._ask(
-                visitor, "/tokens/remove", f"Remove the token {name}? Its programs are refused.", name
-            )
+            question = gettext("Remove the token {name}? Its programs are refused.").format(name=name)
+            return await self._ask(visitor, "/tokens/remove", question, name)
         change = partial(self._panel.accounts.remove_token, name)
-        return await self._apply(visitor, change, "The token is removed.", f"Remove the token {name}")
+        said = gettext("The token is removed.")
+        return await self._apply(visitor, change, said, f"Remove the token {name}")
 
     async def _ask(self, visitor: Visitor, action: str, question: str, name: str) -> Response:
         facts = {"question": question, "action": action, "back": "/accounts", "kept": [("name", name)]}

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
 from typing import Final
 
-from controller.kiosk.decide.interfaces import IN_TURN
 from controller.kiosk.interface import Schedule, ScheduleRow
 
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
@@ -17,12 +16,13 @@ SHOWN: Final = 14
 
 @dataclass(frozen=True, slots=True)
 class CalendarDay:
-    """One day: ``bars`` are (first minute, minutes, appearance) within it; ``special``: whether a row for
-    this date applies; ``check_minute`` of the nightly check, None without one.
+    """One day: ``hours`` are (opens, closes, appearance) as they are saved; ``bars`` are (first minute, minutes,
+    appearance) within it; ``special``: whether a row for this date applies; ``check_minute`` of the nightly check, None
+    without one.
     """
 
     day: date
-    text: str
+    hours: tuple[tuple[str, str, str], ...]
     bars: tuple[tuple[int, int, str], ...]
     special: bool
     check_minute: int | None = None
@@ -47,11 +47,11 @@ def _day(schedule: Schedule, day: date) -> CalendarDay:
     before, _ = _rows(schedule, day - timedelta(1))
     bars = [(0, end - 1440, row.appearance) for row in before for _, end in [_minutes(row)] if end > 1440]
     bars += [(start, min(end, 1440) - start, row.appearance) for row in rows for start, end in [_minutes(row)]]
-    text = "; ".join(f"{row.opens} to {row.closes}{_shown(row.appearance)}" for row in rows)
+    hours = tuple((row.opens, row.closes, row.appearance) for row in rows)
     check_minute = _minute(schedule.drift_check)
     if not schedule.rows:
-        return CalendarDay(day, "open all day", ((0, 1440, ""),), False, check_minute)
-    return CalendarDay(day, text or "closed", tuple(bars), special, check_minute)
+        return CalendarDay(day, (), ((0, 1440, ""),), False, check_minute)
+    return CalendarDay(day, hours, tuple(bars), special, check_minute)
 
 
 def _minute(clock: str) -> int | None:
@@ -60,10 +60,6 @@ def _minute(clock: str) -> int | None:
     except ValueError:
         return None
     return at.hour * 60 + at.minute
-
-
-def _shown(appearance: str) -> str:
-    return ", all in turn" if appearance == IN_TURN else f", {appearance}" if appearance else ""
 
 
 def _rows(schedule: Schedule, day: date) -> tuple[list[ScheduleRow], bool]:

@@ -1,11 +1,12 @@
-"""Renders HTML templates. All values are escaped, because text of devices, files and users is untrusted."""
+"""Renders HTML templates in the visitor's language. All values are escaped, because text of devices, files and users
+is untrusted."""
 
 from __future__ import annotations
 
 import math
 import time
 import zoneinfo
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, tzinfo
 from importlib import resources
 from typing import Any, Final
@@ -14,24 +15,30 @@ import jinja2
 
 from controller.core.text import duration
 from controller.kiosk.interface import EventRow, KioskState
+from controller.panel.pages import curves
+from controller.panel.words import figures, spoken
+from controller.panel.words.language import LANGUAGES, gettext, language, mark, ngettext
 
 STATES: Final = {
-    "off": ("Closed", "quiet"),
-    "powering": ("Switching on", "busy"),
-    "warming": ("Warming up", "busy"),
-    "ready": ("Ready", "good"),
-    "calibrating": ("Calibrating", "busy"),
-    "solving": ("Computing", "busy"),
-    "publishing": ("Publishing", "busy"),
-    "playing": ("Playing", "good"),
-    "cooling": ("Cooling down", "busy"),
-    "degraded": ("Playing with problems", "warn"),
-    "fault": ("Fault", "bad"),
+    "off": (mark("Closed"), "quiet"),
+    "powering": (mark("Switching on"), "busy"),
+    "warming": (mark("Warming up"), "busy"),
+    "ready": (mark("Ready"), "good"),
+    "calibrating": (mark("Calibrating"), "busy"),
+    "solving": (mark("Computing"), "busy"),
+    "publishing": (mark("Publishing"), "busy"),
+    "playing": (mark("Playing"), "good"),
+    "cooling": (mark("Cooling down"), "busy"),
+    "degraded": (mark("Playing with problems"), "warn"),
+    "fault": (mark("Fault"), "bad"),
 }
+NOTHING_YET: Final = mark("Nothing to show yet")
+UNKNOWN_TIME: Final = mark("at an unknown time")
 """Label and style of each state."""
 
 EVENTS_SHOWN: Final = 200
 OPEN: Final = ("powering", "warming", "ready", "calibrating", "playing", "degraded")
+PLAYS: Final = ("playing", "degraded")
 CLOSED: Final = ("off", "cooling", "fault", "solving", "publishing")
 
 
@@ -39,11 +46,14 @@ def flags(state: KioskState) -> frozenset[str]:
     """What is true now; ``data-if`` of a control names those that it needs, with "!" those that it must not have."""
     busy = state.job is not None and not state.job.ended
     stops = busy and state.job is not None and state.job.cancellable
+    made = state.job is not None and state.job.ended and not state.job.failed and bool(state.job.appearance)
     found = {
         "open": state.state in OPEN, "closed": state.state in CLOSED, "busy": busy, "stops": stops,
         "set-up": not state.needs_setup, "calibrated": any(grade.kept for grade in state.grades),
         "playable": state.bundle is not None, "identifying": state.identifying, "in-turn": state.in_turn,
-        "failed": bool(state.failures),
+        "failed": bool(state.failures), "plays": state.state in PLAYS and bool(state.playing),
+        "black": state.black, "paused": state.paused,
+        "made": made and state.job is not None and state.job.appearance != state.playing,
     }  # fmt: skip
     return frozenset(name for name, true in found.items() if true)
 
@@ -60,6 +70,7 @@ def around(state: KioskState) -> list[dict[str, Any]]:
     """
     problems = {row.name for row in state.devices if row.problem is not None}
     lit = {lamp.projector for lamp in state.lamps if lamp.lit}
+    lives = {lamp.projector: lamp.hours / lamp.life_hours for lamp in state.lamps if lamp.life_hours}
     drawn: list[dict[str, Any]] = []
     for place in state.places:
         angle = math.radians(place.aside_deg)
@@ -67,11 +78,24 @@ def around(state: KioskState) -> list[dict[str, Any]]:
         x, y = 160 + 125 * math.sin(angle), 84 + 66 * math.cos(angle)
         health = "bad" if place.projector in problems else "lit" if place.projector in lit else "dark"
         drawn.append(
-            {"name": place.projector, "word": place.word, "x": round(x, 1), "y": round(y, 1), "health": health}
-        )
+            {
+                "name": place.projector, "word": place.word, "x": round(x, 1), "y": round(y, 1), "health": health,
+                "life": lives.get(place.projector, 0.0), "arc": _arc(x, y, lives.get(place.projector, 0.0)),
+            }
+        )  # fmt: skip
     # Without the empty half where nobody stands behind the object.
-    top = min([44.0, *(one["y"] - 30 for one in drawn)])
+    top = min([44.0, *(one["y"] - 34 for one in drawn)])
     return [one | {"top": round(top)} for one in drawn]
+
+
+def _arc(x: float, y: float, share: float, radius: float = 14.5) -> str:
+    """An SVG path around a place, clockwise from above: the whole circle at 1."""
+    if share <= 0:
+        return ""
+    angle = 2 * math.pi * min(share, 0.9999)
+    end_x, end_y = x + radius * math.sin(angle), y - radius * math.cos(angle)
+    large = int(share > 0.5)
+    return f"M{x:.1f} {y - radius:.1f}A{radius} {radius} 0 {large} 1 {end_x:.1f} {end_y:.1f}"
 
 
 class Drawing:
@@ -85,17 +109,29 @@ class Drawing:
             undefined=jinja2.StrictUndefined,
             trim_blocks=True,
             lstrip_blocks=True,
+            extensions=["jinja2.ext.i18n"],
         )
+        # The language is that of the present request, so one set of templates serves all.
+        environment.install_gettext_callables(gettext, ngettext, newstyle=True)  # type: ignore[attr-defined]
         environment.filters |= {
             "duration": duration,
             "moment": self._moment,
             "clock": self._clock,
             "exact": self._exact,
-            "percent": lambda share: f"{100 * share:.0f} %",
-            "thousands": lambda number: f"{number:,.0f}",
-            "ago": lambda unix_s: duration(time.time() - unix_s),
+            "percent": figures.percent,
+            "number": figures.number,
+            "date": self._date,
+            "day": figures.day,
+            "said": gettext,
+            "job_title": spoken.job_title,
         }
-        environment.globals |= {"states": STATES, "flags": flags, "holds": holds, "around": around}
+        environment.globals |= {
+            "states": STATES, "flags": flags, "holds": holds, "around": around, "language": language,
+            "languages": LANGUAGES, "curve": curves.curve, "bars": curves.bars, "grade_errors": curves.grade_errors,
+            "drift_moves": curves.drift_moves, "colour_differences": curves.colour_differences,
+            "sharpness_of": curves.sharpness_of, "source_word": lambda kind: spoken.SOURCES.get(kind, ""),
+            "drift_word": lambda advice: spoken.DRIFTS.get(advice, advice), "nothing_yet": NOTHING_YET,
+        }  # fmt: skip
         self._environment = environment
 
     def use_zone(self, name: str) -> None:
@@ -123,22 +159,29 @@ class Drawing:
         }
 
     def _moment(self, unix_s: float) -> str:
-        return self._local(unix_s, "%a %d %b %Y, %H:%M")
+        return self._local(unix_s, figures.moment)
 
     def _exact(self, unix_s: float) -> str:
-        return self._local(unix_s, "%a %d %b %Y, %H:%M:%S")
+        return self._local(unix_s, lambda at: figures.moment(at, seconds=True))
+
+    def _date(self, unix_s: float) -> str:
+        return self._local(unix_s, figures.day)
 
     def _clock(self, unix_s: float) -> str:
         """With the weekday, unless it is today."""
-        today = self._local(unix_s, "%x") == self._local(time.time(), "%x")
-        return self._local(unix_s, "%H:%M" if today else "%a %H:%M")
+        today = self._local(unix_s, str_of_date) == self._local(time.time(), str_of_date)
+        return self._local(unix_s, (lambda at: f"{at:%H:%M}") if today else figures.short)
 
-    def _local(self, unix_s: float, form: str) -> str:
+    def _local(self, unix_s: float, form: Callable[[datetime], str]) -> str:
         try:
-            return datetime.fromtimestamp(unix_s, self._zone).strftime(form)
+            return form(datetime.fromtimestamp(unix_s, self._zone))
         except (ValueError, OverflowError, OSError):
             # A wrong time in a file must not break a page.
-            return "at an unknown time"
+            return gettext(UNKNOWN_TIME)
+
+
+def str_of_date(at: datetime) -> str:
+    return at.date().isoformat()
 
 
 def _source(name: str) -> str:

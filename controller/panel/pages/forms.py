@@ -22,13 +22,16 @@ from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor, same_origin
 from controller.panel.context import Panel
 from controller.panel.pages.routes import Pages
+from controller.panel.words.language import gettext
 
 MOST_FIELDS = 2000
 LEADS_TO: Final = {
     **dict.fromkeys(("recalibrate", "cancel", "start", "stop", "identify", "compute", "compare", "seen"), "/"),
+    **dict.fromkeys(("next", "black", "pause", "brightness"), "/"),
     **dict.fromkeys(("play", "rotate", "remove-appearance"), "/appearances"),
     **dict.fromkeys(("backup", "restore", "diagnostics", "test-alerts", "test-backup"), "/care"),
     "upload-target": "/appearances/new/{target}",
+    "outline-target": "/appearances/new/{target}",
     "set-schedule": "/schedule",
     "test-shots": "/aiming",
     "save-settings": "/settings",
@@ -80,8 +83,8 @@ class Forms:
                 return await self._again(operation, visitor, sent, error)
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
-            visitor.session.notes.append(("good", operation.sentence(values)))
-            return RedirectResponse("/" if back == "/" else _then(operation, result), 303)
+            visitor.session.notes.append(("good", gettext(operation.said).format_map(values)))
+            return RedirectResponse("/" if back == "/" else _then(operation, result, values), 303)
 
         return answer
 
@@ -89,12 +92,12 @@ class Forms:
         """What a person has to agree to first, or nothing."""
         if operation.name == "save-settings":
             effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_settings(values["text"]))
-            return f"Save these settings now? {effect}" if effect else ""
+            return " ".join((gettext("Save these settings now?"), effect)) if effect else ""
         if operation.name == "set-schedule":
             schedule = operation.take(values)["schedule"]
             effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_schedule(schedule))
-            return f"Save these hours now? {effect}" if effect else ""
-        return operation.question(values)
+            return " ".join((gettext("Save these hours now?"), effect)) if effect else ""
+        return gettext(operation.asks).format_map(values)
 
     async def _again(
         self, operation: Operation, visitor: Visitor, sent: Sent, error: answers.Failure | None
@@ -125,7 +128,7 @@ class Forms:
             # A file can't be sent on; its own page has the question beside it.
             assert visitor.session is not None
             visitor.session.notes.append(
-                ("error", "Nothing was done. Tick the box to confirm, and choose the file again.")
+                ("error", gettext("Nothing was done. Tick the box to confirm, and choose the file again."))
             )
             return RedirectResponse(LEADS_TO[operation.name], 303)
         kept = [(name, value) for name, values in sent.many.items() if name != "sure" for value in values]
@@ -142,7 +145,7 @@ class Forms:
         assert visitor.session is not None
         effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_settings(text))
         if effect:
-            visitor.session.notes.append(("warn", f"When you save them: {effect}"))
+            visitor.session.notes.append(("warn", " ".join((gettext("When you save them:"), effect))))
         return await self._settings(visitor, sent, None)
 
     async def _settings(self, visitor: Visitor, sent: Sent, error: answers.Failure | None) -> Response:
@@ -179,7 +182,7 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
 
 
 def refused() -> HTTPException:
-    return HTTPException(403, "This form is out of date or comes from another site. Load the page again.")
+    return HTTPException(403, gettext("This form is out of date or comes from another site. Load the page again."))
 
 
 async def _read(form: FormData, sent: Sent, folder: Path) -> None:
@@ -227,9 +230,9 @@ def _typed_rows(sent: Sent) -> list[dict[str, str]]:
     return [typed for row in rows if any((typed := {f.name: text for f, text in zip(ROW, row, strict=True)}).values())]
 
 
-def _then(operation: Operation, result: Any) -> str:
-    page = LEADS_TO[operation.name]
-    return page.replace("{target}", str(result.get("target", ""))) if isinstance(result, dict) else page
+def _then(operation: Operation, result: Any, values: Values) -> str:
+    known = result if isinstance(result, dict) else values
+    return LEADS_TO[operation.name].replace("{target}", str(known.get("target", "")))
 
 
 def _back(operation: Operation, sent: Sent) -> str:
@@ -237,6 +240,6 @@ def _back(operation: Operation, sent: Sent) -> str:
     if operation.name == "upload-target":
         return "/appearances/new"
     target = sent.texts.get("target", "")
-    if operation.name == "compute" and target.isascii() and target.isalnum():
+    if operation.name in ("compute", "outline-target") and target.isascii() and target.isalnum():
         return f"/appearances/new/{target}"
-    return LEADS_TO[operation.name]
+    return "/appearances/new" if operation.name == "outline-target" else LEADS_TO[operation.name]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 
 from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
 from controller.kiosk.decide.days import grouped
@@ -20,23 +22,31 @@ from controller.panel.context import Panel
 from controller.panel.pages import calendar
 from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
 from controller.panel.pages.lamp_days import lamp_reports
+from controller.panel.words.language import language, mark
 
-GROUPS: Final = ("Show", "Calibration", "System")
+GROUPS: Final = (mark("Show"), mark("Calibration"), mark("System"))
 NAVIGATION: Final = (
-    ("/", "Now", Role.VIEWER, "Show"),
-    ("/appearances", "Appearances", Role.VIEWER, "Show"),
-    ("/schedule", "Schedule", Role.VIEWER, "Show"),
-    ("/results", "Results", Role.VIEWER, "Calibration"),
-    ("/aiming", "Aiming", Role.TECHNICIAN, "Calibration"),
-    ("/lamps", "Lamps", Role.VIEWER, "System"),
-    ("/events", "Events", Role.VIEWER, "System"),
-    ("/doctor", "Doctor", Role.OPERATOR, "System"),
-    ("/settings", "Settings", Role.TECHNICIAN, "System"),
-    ("/care", "Backup", Role.TECHNICIAN, "System"),
-    ("/accounts", "Accounts", Role.TECHNICIAN, "System"),
+    ("/", mark("Now"), Role.VIEWER, "Show"),
+    ("/appearances", mark("Appearances"), Role.VIEWER, "Show"),
+    ("/schedule", mark("Schedule"), Role.VIEWER, "Show"),
+    ("/results", mark("Results"), Role.VIEWER, "Calibration"),
+    ("/aiming", mark("Aiming"), Role.TECHNICIAN, "Calibration"),
+    ("/lamps", mark("Lamps"), Role.VIEWER, "System"),
+    ("/events", mark("Events"), Role.VIEWER, "System"),
+    ("/doctor", mark("Doctor"), Role.OPERATOR, "System"),
+    ("/settings", mark("Settings"), Role.TECHNICIAN, "System"),
+    ("/care", mark("Backup"), Role.TECHNICIAN, "System"),
+    ("/accounts", mark("Accounts"), Role.TECHNICIAN, "System"),
 )
-BELOW: Final = {"/setup": "/settings", "/password": "/accounts"}
+BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/results"}
 """Pages that are not in the navigation, and those that they belong to."""
+NO_TARGET: Final[dict[str, Any]] = {"target": None, "reach": None, "outline": "[]", "stamp": 0}
+FRAMED: Final = {
+    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
+    "frame-ancestors 'self'",
+    "x-frame-options": "SAMEORIGIN",
+}
+"""Of a report that a page shows in a frame."""
 _SEEN: Final = (Answer.PICTURE, Answer.JPEG, Answer.PAGE)
 
 Facts = Callable[[Request], dict[str, Any]]
@@ -54,7 +64,7 @@ class Group:
 
 def _navigation(role: Role, here: str) -> list[Group]:
     allowed = [entry for entry in NAVIGATION if role >= entry[2]]
-    at = here if here in BELOW else "/" + here.split("/")[1]
+    at = "/" + here.split("/")[1]
     at = BELOW.get(at, at)
     groups = []
     for label in GROUPS:
@@ -85,10 +95,11 @@ class Pages:
             ("/schedule", Role.VIEWER, "schedule.html", self._schedule),
             ("/results", Role.VIEWER, "results.html", self._results),
             ("/results/{run}", Role.VIEWER, "results.html", self._results),
+            ("/reports/{run}", Role.VIEWER, "shown_report.html", lambda request: {"run": request.path_params["run"]}),
             ("/events", Role.VIEWER, "events.html", self._events),
             ("/lamps", Role.VIEWER, "lamps.html", self._lamps),
             ("/password", Role.VIEWER, "password.html", lambda _: {}),
-            ("/appearances/new", Role.OPERATOR, "target.html", lambda _: {"target": None, "reach": None}),
+            ("/appearances/new", Role.OPERATOR, "target.html", self._new),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
             ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
             ("/changes", Role.OPERATOR, "changes.html", lambda _: {"found": self._panel.kiosk.changes()}),
@@ -115,6 +126,7 @@ class Pages:
                 "GET", "/late/reach/{target}", "session", Role.OPERATOR, self._late("late_reach.html", self._reached)
             ),
         ]
+        entries.append(Entry("GET", "/shown/{run}", "session", Role.VIEWER, self._report))
         return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]
 
     async def show(self, template: str, visitor: Visitor, facts: dict[str, Any], status: int = 200) -> Response:
@@ -174,12 +186,22 @@ class Pages:
 
         return answer
 
+    async def _report(self, request: Request, _: Visitor) -> Response:
+        """A report inside its page. It is one file with its own styles and pictures, and must not run anything."""
+        try:
+            path = await self._panel.ask(lambda: self._panel.kiosk.report(request.path_params["run"]))
+        except answers.FAILURES as error:
+            return answers.failure(error)
+        return FileResponse(path, media_type="text/html", headers=FRAMED)
+
     async def _live(self, _: Request, visitor: Visitor) -> Response:
         def alive() -> bool:
             return self._panel.sessions.get(visitor.secret, touch=False) is not None
 
         return StreamingResponse(
-            self._panel.hub.stream(alive), media_type="text/event-stream", headers={"x-accel-buffering": "no"}
+            self._panel.hub.stream(alive, language()),
+            media_type="text/event-stream",
+            headers={"x-accel-buffering": "no"},
         )
 
     def _settings(self, _: Request) -> dict[str, Any]:
@@ -215,7 +237,7 @@ class Pages:
         """The page whose form sends this operation, if something is typed into it."""
         return {
             "set-schedule": FormPage("schedule.html", lambda typed: self._hours(typed["rows"])),
-            "upload-target": FormPage("target.html", lambda typed: {"target": None, "reach": None}),
+            "upload-target": FormPage("target.html", lambda typed: NO_TARGET),
             "compute": FormPage("target.html", lambda typed: self._reach(typed["target"])),
         }.get(operation)
 
@@ -251,18 +273,31 @@ class Pages:
     def _found(self, _: Request) -> dict[str, Any]:
         return {"findings": list(self._panel.kiosk.doctor())}
 
+    def _new(self, _: Request) -> dict[str, Any]:
+        """The first preview of a calibration takes seconds to prepare, and a person needs longer to choose a file."""
+
+        def prepare() -> None:
+            with contextlib.suppress(*answers.FAILURES):
+                self._panel.kiosk.view()
+
+        threading.Thread(target=prepare, name="prepare-preview", daemon=True).start()
+        return NO_TARGET
+
     def _target(self, request: Request) -> dict[str, Any]:
         target = request.path_params["target"]
         return self._reached(request) if "wait" in request.query_params else self._reach(target)
 
     def _reach(self, target: str) -> dict[str, Any]:
-        self._panel.targets.path(target)
-        return {"target": target, "reach": None}
+        return {"target": target, "reach": None, **self._drawn_on(target)}
+
+    def _drawn_on(self, target: str) -> dict[str, Any]:
+        file = self._panel.targets.path(target)
+        return {"outline": self._panel.targets.outline(target), "stamp": file.stat().st_mtime_ns}
 
     def _reached(self, request: Request) -> dict[str, Any]:
         target = request.path_params["target"]
         file = self._panel.targets.path(target)
-        return {"target": target, "reach": self._panel.kiosk.reach(file)}
+        return {"target": target, "reach": self._panel.kiosk.reach(file), **self._drawn_on(target)}
 
     def _accounts(self, _: Request) -> dict[str, Any]:
         return self.accounts()

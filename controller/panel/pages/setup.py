@@ -15,6 +15,7 @@ from controller.panel.auth.identity import Entry, Visitor
 from controller.panel.context import Panel
 from controller.panel.pages.forms import Sent, checked
 from controller.panel.pages.routes import Pages
+from controller.panel.words.language import gettext
 
 
 class Setup:
@@ -71,7 +72,7 @@ class Setup:
             return await self._pages.show(
                 "settings.html", visitor, {"text": text, "problem": error, "here": "/settings"}, 422
             )
-        visitor.session.notes.append(("good", "The stage is set up. Aim the projectors next."))
+        visitor.session.notes.append(("good", gettext("The stage is set up. Aim the projectors next.")))
         return RedirectResponse("/aiming", 303)
 
 

@@ -5,6 +5,7 @@
   const link = document.getElementById("link");
   const camera = document.getElementById("camera");
   const sees = document.getElementById("sees");
+  const photograph = document.getElementById("photograph");
   let running = false;
   const measured = document.querySelector('form[action="/do/test-shots"]');
 
@@ -25,6 +26,9 @@
       form.querySelector("button").setAttribute("aria-pressed", String(Boolean(told) && told.dataset.playing === form.dataset.plays));
     }
     if (sees && !running && !(camera && camera.dataset.always)) sees.hidden = true;
+    if (photograph && !running) photograph.hidden = true;
+    const made = document.querySelector("#made [name=name]");
+    if (made && told && told.dataset.made) made.value = told.dataset.made;
   }
 
   function draw(parts) {
@@ -49,9 +53,9 @@
     source.addEventListener("open", () => say(""));
     source.addEventListener("parts", (event) => draw(JSON.parse(event.data)));
     source.addEventListener("reload", () => { source.close(); listen(); });
-    source.addEventListener("full", () => say("Too many panels are open"));
+    source.addEventListener("full", () => say(body.dataset.full));
     source.addEventListener("error", () => {
-      say("No connection, trying again");
+      say(body.dataset.lost);
       if (source.readyState === EventSource.CLOSED) {
         // Refused: the session has ended, or the service is starting.
         setTimeout(async () => {
@@ -67,10 +71,19 @@
   }
 
   function look() {
-    if (!camera || document.hidden || !(running || camera.dataset.always)) return;
+    if (document.hidden) return;
+    if (camera && (running || camera.dataset.always)) show(camera, sees);
+    if (photograph && running) show(document.getElementById("taken"), photograph);
+  }
+
+  function show(picture, place) {
     const next = new Image();
-    next.onload = () => { camera.src = next.src; if (sees) sees.hidden = false; };
-    next.src = camera.dataset.src + "?t=" + Date.now();
+    next.onload = () => {
+      picture.src = next.src;
+      if (place) place.hidden = false;
+      picture.dispatchEvent(new CustomEvent("seen", { detail: next }));
+    };
+    next.src = picture.dataset.src + "?t=" + Date.now();
   }
 
   // What takes seconds comes after the page.
@@ -82,9 +95,14 @@
       html = await answer.text();
     } catch { /* not reachable */ }
     if (html) place.innerHTML = html;
-    else place.querySelector(".waiting").textContent = "No answer. Load the page again.";
+    else place.querySelector(".waiting").textContent = body.dataset.lateLost;
   }
   for (const place of document.querySelectorAll("[data-late]")) late(place);
+
+  for (const range of document.querySelectorAll("input[type=range]")) {
+    const told = document.querySelector(`output[for=${range.id}]`);
+    if (told) range.addEventListener("input", () => { told.textContent = told.textContent.replace(/[0-9]+/, range.value); });
+  }
 
   // A second press before the first one is answered would start the job twice.
   document.addEventListener("submit", (event) => {

@@ -16,6 +16,7 @@ from controller.artefacts.grade import (
     graded,
     passes,
     read_grade_figures,
+    worst_letter,
     worst_of,
     write_accepted,
     write_grade,
@@ -136,10 +137,10 @@ def _figures(found: Verification, why: ErrorAttribution) -> dict[str, object]:
 
 
 def grade_figures(folder: Path) -> dict[str, str]:
-    """For a command's result: each projector's error, and the error map."""
+    """For a command's result: the grade, each projector's error, and the error map."""
     figures = graded(folder) or {}
     text = ", ".join(f"{name} {percent:.2f} %" for name, percent in figures.items())
-    return {"error": text, "map": str(folder / PICTURE)} if figures else {}
+    return {"grade": worst_letter(folder), "error": text, "map": str(folder / PICTURE)} if figures else {}
 
 
 def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:

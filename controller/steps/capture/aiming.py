@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from controller.bundle.export import png
-from controller.calibrate.verify.aim import aim_overview, assess_aim, checkerboard
+from controller.calibrate.verify.aim import aim_overview, assess_aim, checkerboard, levels
 from controller.capture.acquire import Shot
 from controller.capture.brackets import choose_exposure
 from controller.capture.jpeg_response import nominal_response
@@ -30,6 +30,8 @@ FIGURES: Final = "aiming.json"
 PICTURE: Final = "overview.png"
 TRIES: Final = 5
 LONGEST_PX: Final = 960
+KEPT: Final = 40
+"""Test shots whose sharpness is remembered."""
 
 
 def take_test_shots(
@@ -70,13 +72,29 @@ def take_test_shots(
     _keep_picture(folder, aim_overview(picture, aim))
     projectors = [{"projector": one.name, **asdict(found)}
                   for one, found in zip(rig.projectors, aim.projectors, strict=True)]  # fmt: skip
+    shares, clipped = levels(picture, aim)
     level = float(np.nanquantile(np.nan_to_num(picture.max(axis=2), nan=1.0), 0.99))
     figures: dict[str, Any] = {
         "projectors": projectors, "overlap": aim.overlap, "too_dark": aim.too_dark, "too_soft": aim.too_soft,
         "camera_focus": aim.camera_focus, "exposure": level, "exposure_s": exposure_s, "measured_unix_s": time.time(),
+        "histogram": shares, "clipped": clipped,
     }  # fmt: skip
+    figures["history"] = [*_earlier(folder), _sharpness(figures)][-KEPT:]
     write_atomically(folder / FIGURES, json.dumps(figures, indent=1).encode())
     return folder
+
+
+def _sharpness(figures: dict[str, Any]) -> dict[str, Any]:
+    focus = {row["projector"]: row["focus"] for row in figures["projectors"]}
+    return {"unix_s": figures["measured_unix_s"], "camera_focus": figures["camera_focus"], "projectors": focus}
+
+
+def _earlier(folder: Path) -> list[dict[str, Any]]:
+    """How sharp the test shots before these were; none if their file is damaged."""
+    try:
+        return list(json.loads((folder / FIGURES).read_text())["history"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def _take(rig: Rig, folder: Path, deadline: Deadline, name: str, frames: dict[str, ByteImage],

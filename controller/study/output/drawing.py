@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.core.lettering import write
 from controller.core.plotting import figure_of, picture_of
 from controller.report.pictures import Crop, crop_around, fitted, to_screen
 
@@ -65,7 +66,7 @@ def _labelled(panel: LabelledPicture, width: int) -> ByteImage:
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
     picture = cv2.resize(panel.picture, (width, max(1, round(rows * factor))), interpolation=how)
     head = np.full((LABEL_PX, width, 3), _BACKGROUND, np.uint8)
-    cv2.putText(head, panel.label, (2, LABEL_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20, 20, 20), 1, cv2.LINE_AA)
+    write(head, panel.label, (2, LABEL_PX // 2), 15, (20, 20, 20))
     return np.concatenate([head, np.asarray(picture, np.uint8)], axis=0)
 
 

@@ -6,6 +6,7 @@ It keeps the contract of tests/controller/kiosk/contract.py, as the real one doe
 from __future__ import annotations
 
 import io
+import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ from controller.kiosk.interface import (
     Changes,
     Comparison,
     DeviceRow,
+    DriftCheck,
     EventLevel,
     EventRow,
     Finding,
@@ -44,6 +46,7 @@ from controller.kiosk.interface import (
     Results,
     Schedule,
     ScheduleRow,
+    Sharpness,
     TriedDevice,
     Unsubscribe,
 )
@@ -52,6 +55,7 @@ from controller.kiosk.store.schedule_file import check
 from tests.controller.kiosk.vase import TEXT
 
 STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")
+OUTPUTS = ("left", "middle", "right")
 BORN = 1_767_600_000.0
 TOML = TEXT.replace("The vase", "Head of a boy")
 
@@ -79,6 +83,8 @@ class MemoryKiosk:
     ) -> None:  # fmt: skip
         self._folder, self._step_s = pictures, step_s
         pictures.mkdir(parents=True, exist_ok=True)
+        # Requests draw side by side, each into a file of its own.
+        self._drawings = itertools.count()
         self._lock = threading.RLock()
         self._callbacks: list[Callable[[], None]] = []
         self._cancel = threading.Event()
@@ -89,7 +95,9 @@ class MemoryKiosk:
         self.asked: list[tuple[str, object]] = []
         self.recorded: list[tuple[str, str]] = []
         self.effect = ""
-        self._appearances = {name: Appearance(name, BORN, 1.2, name == names[0], self._drawn(name)) for name in names}
+        self._appearances = {
+            name: Appearance(name, BORN, 1.2, name == names[0], self._drawn(name), OUTPUTS, "picture") for name in names
+        }
         self._results: dict[str, Results] = {}
         self._comparisons: dict[str, Comparison] = {}
         self._state = KioskState(
@@ -108,6 +116,9 @@ class MemoryKiosk:
                 Place("middle", "above", 3.0, 25.0),
                 Place("right", "right", 35.0, 0.0),
             ),
+        )
+        self.change(
+            drifts=tuple(DriftCheck(f"night-{n}", BORN - n * 86400, "nothing", 0.04 + 0.01 * n) for n in range(5))
         )
         self._finish(run, "full")
         for number in range(12):
@@ -129,7 +140,7 @@ class MemoryKiosk:
             callback()
 
     def _drawn(self, name: str, shade: int = 120) -> Path:
-        file = self._folder / f"{len(list(self._folder.iterdir()))}.png"
+        file = self._folder / f"{next(self._drawings)}.png"
         # A ball in soft light, of another colour for each name.
         light = ImageOps.invert(Image.radial_gradient("L")).resize((300, 300)).crop((70, 30, 310, 190))
         ball = Image.new("L", (240, 160))
@@ -156,12 +167,13 @@ class MemoryKiosk:
             raise UsageError("projector-unknown", what=f"There is no projector {projector}.", remedy="Choose another.")
         return self._begin(f"Recalibration ({kind})", "calibrating", lambda run: self._finish(run, kind))
 
-    def _begin(self, name: str, state: str, finish: Callable[[str], None]) -> Job:
+    def _begin(self, name: str, state: str, finish: Callable[[str], None], appearance: str = "") -> Job:
         with self._lock:
             self._check_idle()
             old = self._state.job
             number = 1 if old is None else old.number + 1
-            job = Job(number, name, tuple(JobStep(title, 0.0) for title in STEPS), 60.0, run=f"run-{number}")
+            job = Job(number, name, tuple(JobStep(title, 0.0) for title in STEPS), 60.0, run=f"run-{number}",
+                      appearance=appearance)  # fmt: skip
             self._cancel.clear()
             self.change(job=job, state=state, reason=f"{name} is running.")
             self._worker = threading.Thread(target=self._work, args=(job, finish), daemon=True)
@@ -201,7 +213,7 @@ class MemoryKiosk:
         self.change(job=done_job, state="playing", reason="All is well.")
 
     def _finish(self, run: str, kind: str) -> None:
-        grade = Grade(run, BORN + len(self._results) * 86400, kind, "A", True, 1.23)
+        grade = Grade(run, BORN + len(self._results) * 86400, kind, "A", True, 1.23, "", 0.9 + 0.1 * len(self._results))
         names = ("before", "target", "achieved", "error", "resolution")
         pictures = {name: self._drawn(name, 60 + 30 * at) for at, name in enumerate(names)}
         self._results[run] = Results(run, grade, pictures, (("Reprojection", "0.08 px"), ("Photographs", "35")))
@@ -281,9 +293,9 @@ class MemoryKiosk:
         preview = self._drawn(name)
 
         def finish(_: str) -> None:
-            self._appearances[name] = Appearance(name, time.time(), 1.0, preview=preview)
+            self._appearances[name] = Appearance(name, time.time(), 1.0, preview=preview, outputs=OUTPUTS)
 
-        return self._begin(f"Computing {name}", "solving", finish)
+        return self._begin(f"New appearance {name}", "solving", finish, appearance=name)
 
     def reach(self, target: Path) -> Reach:
         pictures = {name: self._drawn(name, 200 - 60 * at) for at, name in enumerate(("target", "result", "map"))}
@@ -291,6 +303,17 @@ class MemoryKiosk:
 
     def appearances(self) -> Sequence[Appearance]:
         return list(self._appearances.values())
+
+    def projector_picture(self, name: str, projector: str) -> Path | None:
+        self._known(name)
+        return self._drawn(projector, 90) if projector in OUTPUTS else None
+
+    def view(self) -> Path:
+        return self._drawn("view", 255)
+
+    def photograph(self) -> bytes | None:
+        job = self._state.job
+        return None if job is None or job.ended else self.camera_picture()
 
     def compare(self, name: str | None = None) -> Job:
         names = [self._known(name).name] if name is not None else list(self._appearances)
@@ -407,7 +430,11 @@ class MemoryKiosk:
     def aiming(self) -> Aiming:
         aims = (ProjectorAim("left", 0.82, 0.9), ProjectorAim("middle", 0.9, 0.7), ProjectorAim("right", 0.4, 0.2))
         hints = ("Turn right's focus ring; its pixels are soft.",)
-        return Aiming(aims, 0.77, 0.04, 0.06, 0.8, 0.93, hints, "test shots", BORN, self._drawn("aiming"))
+        focus = ({"left": 0.5, "right": 0.1}, {"left": 0.8, "right": 0.2}, {"left": 0.9, "middle": 0.7, "right": 0.2})
+        history = tuple(Sharpness(BORN - 60 * (2 - n), 0.6 + 0.1 * n, one) for n, one in enumerate(focus))
+        levels = tuple(abs(15 - n) / 240 for n in range(32))
+        return Aiming(aims, 0.77, 0.04, 0.06, 0.8, 0.93, hints, "test shots", BORN, self._drawn("aiming"), True, 0.002,
+                      levels, history)  # fmt: skip
 
     def test_shots(self) -> Job:
         return self._begin("Test shots", "calibrating", lambda run: None)

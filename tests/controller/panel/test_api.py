@@ -132,7 +132,7 @@ def test_a_machine_can_do_the_whole_job(fresh: Served) -> None:
         target = client.post(f"{PREFIX}/targets", content=jpeg()).json()["target"]
         assert client.get(f"{PREFIX}/targets/{target}/feasibility").content.startswith(b"\x89PNG")
         job = client.post(f"{PREFIX}/appearances", json={"name": "bronze", "target": target}).json()
-        assert job["name"] == "Computing bronze"
+        assert job["name"] == "New appearance bronze"
         assert client.post(f"{PREFIX}/recalibrations", json={"kind": "full"}).status_code == 409
         for _ in range(200):
             if client.get(f"{PREFIX}/state").json()["job"]["ended"]:

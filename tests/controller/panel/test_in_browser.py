@@ -190,7 +190,7 @@ def test_the_doctors_page_is_there_before_its_findings(tmp_path: Path, browser: 
 def test_each_role_sees_only_what_it_may_do(panel: Served, browser: Browser) -> None:
     with tab(browser, panel.address) as page:
         enter(page, "vera")
-        assert page.get_by_role("button").all_inner_texts() == ["Log out"]
+        assert page.get_by_role("button").all_inner_texts() == ["Log out", "Use"]
         assert page.get_by_role("link", name="Settings").count() == 0
     with tab(browser, panel.address) as page:
         enter(page, "otto")

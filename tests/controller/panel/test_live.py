@@ -54,7 +54,7 @@ def test_a_change_while_the_first_picture_is_drawn_is_not_lost() -> None:
     texts = ["old"]
 
     async def story() -> list[str]:
-        def draw() -> dict[str, str]:
+        def draw(_: str) -> dict[str, str]:
             text = texts[-1]
             if text == "old":
                 texts.append("new")
@@ -81,7 +81,7 @@ def test_a_change_whose_drawing_fails_is_drawn_when_it_can_be(monkeypatch: pytes
     monkeypatch.setattr(live, "AGAIN_S", 0.01)
     texts, failures = ["old"], list[Exception]()
 
-    def draw() -> dict[str, str]:
+    def draw(_: str) -> dict[str, str]:
         if failures:
             raise failures.pop()
         return {"top": texts[-1]}
@@ -108,7 +108,7 @@ def test_what_was_drawn_before_the_first_picture_does_not_come_after_it() -> Non
     drawn = itertools.count()
 
     async def story() -> str:
-        hub = Hub(lambda: {"top": str(next(drawn))}, frames_per_s=100, most=2)
+        hub = Hub(lambda _: {"top": str(next(drawn))}, frames_per_s=100, most=2)
         running = asyncio.create_task(hub.run())
         first = hub.stream(lambda: True)
         await anext(first)

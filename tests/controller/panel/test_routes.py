@@ -13,7 +13,7 @@ from controller.panel.context import PanelOptions
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf, served
 
-PUBLIC = {"/login", "/static/style.css", "/static/panel.js", "/static/icon.svg",
+PUBLIC = {"/login", "/language", "/static/looks.js", "/static/style.css", "/static/panel.js", "/static/icon.svg",
           "/static/velatura-sans-400.woff", "/static/velatura-sans-700.woff"}  # fmt: skip
 NAMES = {Role.VIEWER: "vera", Role.OPERATOR: "otto", Role.TECHNICIAN: "tina"}
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from controller.solve.smooth_limits import Sheet, lowest_above
+from controller.solve.smooth_limits import Sheet, _quantile, lowest_above
 
 
 def test_a_sheet_lies_on_wide_obstacles_falls_off_beside_them_and_leaves_out_narrow_ones() -> None:
@@ -54,3 +54,14 @@ def test_the_sheet_is_the_one_of_least_energy(seed: int, length: float, share: f
     expected = lsq_linear(root, np.zeros(size), bounds=(obstacle, np.inf), tol=1e-12).x
     np.testing.assert_allclose(found, expected, atol=1e-4)
     assert (found >= obstacle - 1e-9).all()
+
+
+@given(st.integers(0, 10_000), st.sampled_from((0.0, 0.5, 0.95, 1.0)))
+@settings(max_examples=40, deadline=None)
+def test_the_quantile_of_each_cell_is_numpys(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(7, 12)).astype(np.float32)
+    counted = rng.random((7, 12)) > 0.4
+    counted[:, 0] = True
+    expected = np.nanquantile(np.where(counted, values, np.nan).astype(np.float64), share, axis=1)
+    np.testing.assert_allclose(_quantile(values, counted, share), expected, rtol=1e-6, atol=1e-6)

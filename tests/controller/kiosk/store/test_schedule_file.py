@@ -7,7 +7,7 @@ import pytest
 from controller.config.models import ScheduleTable
 from controller.core.errors import UsageError
 from controller.kiosk.interface import Schedule, ScheduleRow
-from controller.kiosk.store.schedule_file import FILE, ScheduleFile
+from controller.kiosk.store.schedule_file import FILE, ScheduleFile, of_table
 
 TABLE = ScheduleTable.model_validate(
     {"time_zone": "Europe/Vienna", "hours": [{"day": "fri", "opens": "18:00", "closes": "01:30"}]}
@@ -58,3 +58,12 @@ def test_what_holds_without_time_is_kept_by_the_panels_schedule(tmp_path: Path) 
     file = ScheduleFile(tmp_path, table)
     file.replace(MORE, ["marble"])
     assert ScheduleFile(tmp_path, ScheduleTable.model_validate({})).open_without_time
+
+
+def test_stage_toml_takes_the_same_words_for_days_as_the_panel() -> None:
+    table = ScheduleTable.model_validate(
+        {"hours": [{"day": "mon-wed", "opens": "10:00", "closes": "18:00"}, {"day": "2026-12-24 to 2026-12-25"}]}
+    )
+    assert [row.day for row in of_table(table).rows] == ["mon", "tue", "wed", "2026-12-24", "2026-12-25"]
+    with pytest.raises(UsageError, match="someday"):
+        of_table(ScheduleTable.model_validate({"hours": [{"day": "someday"}]}))

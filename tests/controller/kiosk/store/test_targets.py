@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import io
+import json
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
 from controller.core.errors import UsageError
-from controller.kiosk.store.targets import fitted
+from controller.kiosk.store.targets import fitted, regions_of, restricted
 from controller.kiosk.values import Fit
 from controller.solve.targets.profiles import with_profile
 
@@ -95,3 +98,30 @@ def test_a_picture_that_moves_is_refused() -> None:
     with pytest.raises(UsageError, match="animation") as refused:
         fitted(file.getvalue(), VIEW)
     assert refused.value.code == "target-unreadable"
+
+
+CORNER = st.tuples(st.floats(0, 1), st.floats(0, 1))
+
+
+@given(st.lists(st.lists(CORNER, min_size=3, max_size=6), max_size=4))
+def test_an_outline_is_read_as_it_was_written(regions: list[list[tuple[float, float]]]) -> None:
+    assert regions_of(json.dumps(regions)) == tuple(tuple(map(tuple, one)) for one in regions)
+
+
+@pytest.mark.parametrize(
+    "text", ["[[[0,0],[1,1]]]", "[[[0,0],[1,1],[2,0]]]", "{}x", "[1]", "[[[0,0],[1],[1,1]]]", "[[[NaN,0],[1,1],[0,1]]]",
+             json.dumps([[[0, 0], [1, 0], [1, 1]]] * 33)],
+)  # fmt: skip
+def test_what_is_no_outline_is_refused(text: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        regions_of(text)
+    assert caught.value.code == "outline-wrong"
+
+
+def test_only_what_is_inside_an_outline_stays_in_the_target() -> None:
+    picture = cv2.imencode(".png", np.full((40, 80, 3), 200, np.uint8))[1].tobytes()
+    left, lower = ((0, 0), (0.4, 0), (0.4, 1), (0, 1)), ((0, 0.5), (1, 0.5), (1, 1), (0, 1))
+    kept = seen(restricted(picture, [left, lower]))
+    assert [int(kept[place][3]) for place in ((5, 5), (35, 5), (35, 75), (5, 75))] == [255, 255, 255, 0]
+    assert (kept[..., :3] == 200).all()
+    assert restricted(picture, []) == picture

@@ -48,9 +48,9 @@ def test_hours_past_midnight_are_seen_on_the_next_day_and_told_on_their_own() ->
     schedule = Schedule("UTC", (ScheduleRow("mon", "22:00", "02:30", "marble"), ScheduleRow("tue", "10:00", "00:00")))
     monday, tuesday, wednesday = days(schedule, MONDAY)[:3]
     assert monday.bars == ((1320, 120, "marble"),)
-    assert monday.text == "22:00 to 02:30, marble"
+    assert monday.hours == (("22:00", "02:30", "marble"),)
     assert tuesday.bars == ((0, 150, "marble"), (600, 840, ""))
-    assert (wednesday.bars, wednesday.text, wednesday.special) == ((), "closed", False)
+    assert (wednesday.bars, wednesday.hours, wednesday.special) == ((), (), False)
 
 
 @pytest.mark.parametrize("zone", ["Europe/Vienna", "Pacific/Kiritimati", "Nowhere/At_All", "", "../etc", "\ud800"])

@@ -126,7 +126,7 @@ def compared(running: Served, **fields: str) -> str:
 def test_appearances_are_photographed_and_the_results_show_the_newest_and_the_history(fresh: Served) -> None:
     assert "No appearance has been photographed yet." in text_of(fresh, "/results", "otto")
     page = compared(fresh)
-    assert page.count("CIEDE2000") == 2
+    assert page.count("(CIEDE2000) on the whole object") == 2
     again = compared(fresh, name="warm wood")
     wood = again[again.index("<h3>warm wood") :]
     assert "colour difference 2.25" in wood

@@ -1,0 +1,53 @@
+"""The commands of `velatura --help` in groups, and `velatura --version`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Any, Final
+
+import typer
+from typer.core import TyperGroup
+
+SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "Set up a stage": ("demo", "plan", "init", "doctor", "aim", "identify", "camera", "keys", "settings", "account"),
+    "Calibrate": ("calibrate", "recalibrate", "drift", "results", "report", "export"),
+    "Make appearances": (
+        "appearance", "compute", "reach", "reach-picture", "feasibility", "photograph", "compare", "appearances",
+        "remove", "view", "bundle",
+    ),
+    "Show them": (
+        "play", "live", "show", "rotate", "next", "black", "pause", "brightness", "start", "stop", "schedule",
+    ),
+    "Run and keep a kiosk": (
+        "kiosk", "serve", "status", "events", "cancel", "seen", "lamps", "changes", "backup", "restore", "test-backup",
+        "test-alerts", "diagnostics",
+    ),
+    "Develop and study": ("emulate", "record", "study", "states"),
+}  # fmt: skip
+OTHERS: Final = "More"
+
+
+class Sections(TyperGroup):
+    """Lists its commands by ``SECTIONS``; what is in none of them comes last."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        names = self.list_commands(ctx)
+        listed = {name for section in SECTIONS.values() for name in section}
+        for title, section in {**SECTIONS, OTHERS: tuple(name for name in names if name not in listed)}.items():
+            rows = [(name, self._about(ctx, name, formatter)) for name in section if name in names]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+    def _about(self, ctx: Any, name: str, formatter: Any) -> str:
+        command = self.get_command(ctx, name)
+        return "" if command is None else command.get_short_help_str(max(45, formatter.width - 20))
+
+
+def show_version(asked: bool) -> None:
+    """Print the version and end, if it was asked for."""
+    if asked:
+        # As the package says: the command line shows nothing else that is not a result.
+        print(f"velatura {metadata.version('velatura')}")  # noqa: T201
+        raise typer.Exit

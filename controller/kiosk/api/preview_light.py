@@ -1,0 +1,162 @@
+"""A calibration's light at some of the camera's pixels, kept in memory: what a preview needs to come within a second.
+
+All light of a preview but the indirect is a matter of each pixel alone, and the indirect is one of blocks of pixels. So
+a preview calculates the same as a computation, at fewer places.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import Float64, FloatImage
+from controller.core.storage import write_atomically
+
+if TYPE_CHECKING:
+    from controller.artefacts.calibrated import Calibrated
+    from controller.solve.drive_levels import DriveLevels
+    from controller.transport.indirect import IndirectLight
+    from controller.transport.sampled import SampledLight
+
+FOLDER: Final = "kiosk/preview"
+LONGEST_PX: Final = 480
+"""About the longer side of what is calculated; the pictures are for a screen."""
+_UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+_known: dict[Path, PreviewLight] = {}
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreviewLight:
+    """``black`` (rows, columns, 3) and all else at the sampled pixels; ``camera_px`` (width, height) of the whole
+    picture, of which every ``step``-th pixel is here.
+    """
+
+    transport: SampledLight
+    drive: DriveLevels
+    indirect: IndirectLight | None
+    black: FloatImage
+    camera_to_xyz: Float64
+    camera_px: tuple[int, int]
+    step: float
+
+
+def preview_light(stage: Path, run: Path, names: tuple[str, ...]) -> PreviewLight:
+    """Of a finished calibration: from memory, else from the stage's folder, else made of the run, which takes seconds.
+
+    Raises what reading a calibration raises.
+    """
+    with _lock:
+        if run not in _known:
+            file = stage / FOLDER / f"{run.name}.npz"
+            found = _read(file)
+            if found is None:
+                from controller.artefacts.calibrated import Calibrated
+
+                calibrated = Calibrated(run, names)
+                found = sampled(calibrated)
+                file.parent.mkdir(parents=True, exist_ok=True)
+                for old in file.parent.glob("*"):
+                    old.unlink(missing_ok=True)
+                write_atomically(file, _bytes(found))
+                write_atomically(file.with_suffix(".png"), _in_white(calibrated))
+            _known.clear()
+            _known[run] = found
+        return _known[run]
+
+
+def view_picture(stage: Path, run: Path, names: tuple[str, ...]) -> Path:
+    """A PNG of the object in white light, as large as the camera's picture. Seconds at the first time."""
+    file = stage / FOLDER / f"{run.name}.png"
+    if not file.exists():
+        with _lock:
+            _known.pop(run, None)
+            file.with_suffix(".npz").unlink(missing_ok=True)
+    # Whoever paints on it wants a preview next.
+    preview_light(stage, run, names)
+    return file
+
+
+def sampled(calibrated: Calibrated) -> PreviewLight:
+    """The light of a whole calibration at about ``LONGEST_PX`` pixels along its longer side."""
+    from controller.solve.drive_levels import DriveLevels
+    from controller.transport.indirect import IndirectLight
+    from controller.transport.sampled import SampledLight
+
+    whole, indirect = calibrated.transport, calibrated.indirect
+    rows, columns = whole.camera_shape
+    # Blocks of indirect light must have a whole number of samples along their side.
+    side = 1 if indirect is None else indirect.side
+    inside = max(1, round(side * min(1.0, LONGEST_PX / max(rows, columns))))
+    step = side / inside if indirect is not None else max(1.0, max(rows, columns) / LONGEST_PX)
+    at = _samples(rows, step), _samples(columns, step)
+    kept = np.ix_(*at)
+    transport = SampledLight.of(whole, at)
+    coarse = None if indirect is None else IndirectLight(
+        indirect.factors, indirect.scale[kept], indirect.lit[kept], indirect.grid, inside
+    )  # fmt: skip
+    calibration = calibrated.calibration
+    black = np.ascontiguousarray(calibration.black[kept])
+    return PreviewLight(
+        transport, DriveLevels(transport), coarse, black, calibration.camera_to_xyz, (columns, rows), step
+    )
+
+
+def _samples(pixels: int, step: float) -> npt.NDArray[np.int64]:
+    """The pixels in the middle of each step."""
+    count = int(np.ceil(pixels / step))
+    return np.minimum(((np.arange(count) + 0.5) * step).astype(np.int64), pixels - 1)
+
+
+def _in_white(calibrated: Calibrated) -> bytes:
+    from controller.bundle.export import png
+    from controller.report.pictures import to_screen
+
+    calibration = calibrated.calibration
+    lit = np.asarray(sum((part.white for part in calibration.projectors), start=calibration.black), np.float32)
+    level = float(np.nanpercentile(lit[calibration.object_mask], 99))
+    return png(to_screen(lit, calibration.camera_to_xyz, white=level))
+
+
+def _bytes(light: PreviewLight) -> bytes:
+    parts: dict[str, Any] = {f"transport_{name}": part for name, part in light.transport.arrays().items()}
+    if light.indirect is not None:
+        parts |= {f"indirect_{name}": part for name, part in light.indirect.arrays().items()}
+    out = io.BytesIO()
+    np.savez(out, black=light.black, camera_to_xyz=light.camera_to_xyz, camera_px=np.array(light.camera_px),
+             step=np.array(light.step), **parts)  # fmt: skip
+    return out.getvalue()
+
+
+def _read(file: Path) -> PreviewLight | None:
+    """What an earlier service has kept; None if it is not there or damaged."""
+    from controller.solve.drive_levels import DriveLevels
+    from controller.transport.indirect import IndirectLight
+    from controller.transport.sampled import SampledLight
+
+    try:
+        with np.load(file) as parts:
+            transport = SampledLight.made(
+                parts["transport_mixing"], parts["transport_lit"], parts["transport_white"],
+                tuple(map(float, parts["transport_segments"])),
+            )  # fmt: skip
+            indirect = None
+            if "indirect_grid" in parts:
+                rows, columns, side = map(int, parts["indirect_grid"])
+                indirect = IndirectLight(
+                    parts["indirect_factors"], parts["indirect_scale"], parts["indirect_lit"], (rows, columns), side
+                )
+            width, height = map(int, parts["camera_px"])
+            return PreviewLight(
+                transport, DriveLevels(transport), indirect, parts["black"], parts["camera_to_xyz"], (width, height),
+                float(parts["step"]),
+            )  # fmt: skip
+    except _UNREADABLE:
+        return None

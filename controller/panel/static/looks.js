@@ -1,0 +1,106 @@
+"use strict";
+// What is looked at: two pictures with a line between them, an outline on the object, and the live view's sharpness.
+(() => {
+  for (const wipe of document.querySelectorAll("[data-wipe]")) {
+    const over = wipe.querySelector(".over"), under = wipe.querySelector(".under"), range = wipe.querySelector("input");
+    const cut = () => over.style.setProperty("clip-path", `inset(0 0 0 ${range.value}%)`);
+    range.addEventListener("input", cut);
+    const buttons = [...wipe.querySelectorAll("[data-under]")];
+    for (const button of buttons) {
+      button.addEventListener("click", () => {
+        under.src = button.dataset.under;
+        under.alt = button.dataset.alt;
+        for (const one of buttons) one.setAttribute("aria-pressed", String(one === button));
+      });
+    }
+    cut();
+    wipe.hidden = false;
+  }
+
+  function outline(place) {
+    const form = place.querySelector("form"), field = form.elements.outline, svg = place.querySelector("#draw");
+    const over = place.querySelector(".over"), through = place.querySelector("#through");
+    let regions = [];
+    const draw = () => {
+      field.value = JSON.stringify(regions.filter((one) => one.length > 2));
+      svg.replaceChildren(...regions.flatMap((region) => {
+        const shape = document.createElementNS(svg.namespaceURI, "polygon");
+        shape.setAttribute("points", region.map(([x, y]) => `${1000 * x},${1000 * y}`).join(" "));
+        return [shape, ...region.map(([x, y]) => {
+          const corner = document.createElementNS(svg.namespaceURI, "ellipse");
+          const box = svg.getBoundingClientRect();
+          for (const [name, value] of [["cx", 1000 * x], ["cy", 1000 * y], ["rx", 5000 / box.width], ["ry", 5000 / box.height]]) corner.setAttribute(name, value);
+          return corner;
+        })];
+      }));
+    };
+    const typed = () => {
+      try { regions = JSON.parse(field.value || "[]"); } catch { return; }
+      if (Array.isArray(regions)) draw();
+    };
+    svg.addEventListener("click", (event) => {
+      const box = svg.getBoundingClientRect();
+      const inside = (value) => Math.round(1e4 * Math.min(1, Math.max(0, value))) / 1e4;
+      if (!regions.length) regions.push([]);
+      regions[regions.length - 1].push([inside((event.clientX - box.left) / box.width), inside((event.clientY - box.top) / box.height)]);
+      draw();
+    });
+    place.querySelector("#region").addEventListener("click", () => { if (!regions.length || regions[regions.length - 1].length > 2) regions.push([]); });
+    place.querySelector("#undo").addEventListener("click", () => {
+      while (regions.length && !regions[regions.length - 1].length) regions.pop();
+      if (regions.length) regions[regions.length - 1].pop();
+      draw();
+    });
+    place.querySelector("#clear").addEventListener("click", () => { regions = []; draw(); });
+    field.addEventListener("change", typed);
+    const fade = () => over.style.setProperty("opacity", String(through.value / 100));
+    through.addEventListener("input", fade);
+    place.hidden = false;
+    fade();
+    typed();
+  }
+  const place = document.getElementById("on-object");
+  if (place) outline(place);
+
+  // Of the live picture, as small as the eye needs: the energy of its edges, and how many pixels have which level.
+  const live = document.getElementById("live-view"), camera = document.getElementById("camera");
+  if (!live || !camera) return;
+  const history = [], WIDE = 320, KEPT = 60;
+  const canvas = document.createElement("canvas");
+  function measure(picture) {
+    canvas.width = WIDE;
+    canvas.height = Math.max(3, Math.round(WIDE * picture.naturalHeight / picture.naturalWidth));
+    const paper = canvas.getContext("2d", { willReadFrequently: true });
+    paper.drawImage(picture, 0, 0, canvas.width, canvas.height);
+    const { data, width, height } = paper.getImageData(0, 0, canvas.width, canvas.height);
+    const grey = new Float32Array(width * height), levels = new Float32Array(32);
+    let clipped = 0;
+    for (let n = 0; n < grey.length; n += 1) {
+      const top = Math.max(data[4 * n], data[4 * n + 1], data[4 * n + 2]);
+      grey[n] = (data[4 * n] + data[4 * n + 1] + data[4 * n + 2]) / 3;
+      levels[top >> 3] += 1;
+      if (top >= 250) clipped += 1;
+    }
+    let edges = 0, light = 0;
+    for (let y = 1; y < height - 1; y += 1) {
+      for (let x = 1; x < width - 1; x += 1) {
+        const n = y * width + x;
+        edges += (4 * grey[n] - grey[n - 1] - grey[n + 1] - grey[n - width] - grey[n + width]) ** 2;
+        light += grey[n] ** 2;
+      }
+    }
+    return { sharp: light > 0 ? edges / light : 0, levels, clipped: clipped / grey.length };
+  }
+  camera.addEventListener("seen", (event) => {
+    const found = measure(event.detail);
+    history.push(found.sharp);
+    if (history.length > KEPT) history.shift();
+    const best = Math.max(...history) || 1, most = Math.max(...found.levels) || 1;
+    live.querySelector("polyline").setAttribute("points", history.map((value, n) => `${(300 * n / (KEPT - 1)).toFixed(1)},${(86 - 80 * value / best).toFixed(1)}`).join(" "));
+    live.querySelector("#levels path").setAttribute("d", [...found.levels].map((count, n) => `${n ? "" : "M0 90"}V${(90 - 84 * Math.sqrt(count / most)).toFixed(1)}H${(300 * (n + 1) / 32).toFixed(1)}`).join("") + "V90Z");
+    const percent = new Intl.NumberFormat(document.documentElement.lang, { style: "percent", maximumFractionDigits: 1 });
+    live.querySelector("#sharp-now").textContent = percent.format(found.sharp / best);
+    live.querySelector("#clipped").textContent = percent.format(found.clipped);
+    live.hidden = false;
+  });
+})();

@@ -1,0 +1,55 @@
+"""Short words of the kiosk's own that pages show in the visitor's language. Names and sentences with names stay as they
+are."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from controller.panel.words.language import gettext
+from controller.panel.words.language import mark as _
+
+PLACES: Final = (
+    _("in front"), _("left"), _("right"), _("above"), _("below"), _("behind"),
+    _("left above"), _("left below"), _("right above"), _("right below"), _("behind left"), _("behind right"),
+    _("behind above"), _("behind below"), _("behind left above"), _("behind left below"), _("behind right above"),
+    _("behind right below"),
+)  # fmt: skip
+JOBS: Final = (
+    _("Test shots"), _("Drift check"), _("Quick recalibration"), _("Recalibration of projector"),
+    _("Full recalibration"), _("Photographing"), _("Publishing appearances"), _("New appearance"), _("Report of"),
+    _("Frames without projector"), _("Frames for the loss of a projector"),
+)  # fmt: skip
+EVENTS: Final = (_("opens"), _("closes"), _("drift check"))
+KINDS: Final = (_("projector"), _("camera"), _("display"), _("relay"), _("sensor"), _("buttons"))
+LEVELS: Final = (_("info"), _("warning"), _("error"))
+ROLES: Final = (_("viewer"), _("operator"), _("technician"))
+RUNS: Final = (_("full"), _("quick"), _("projector"), _("calibrate"), _("demo"))
+MEASURED: Final = (_("test shots"), _("calibration"))
+LABELS: Final = (
+    _("Battery"), _("Free"), _("Hours"), _("Lamp"), _("Light"), _("Model"), _("Output"), _("Projector's counter"),
+    _("Space for"), _("Stable in"), _("Warnings"),
+)  # fmt: skip
+REASONS: Final = (
+    _("The stage is not set up yet."), _("No lamp gives light."), _("No lamp gave light in time."),
+    _("It starts when the lamps are lit and steady."), _("The stage is recalibrated."),
+    _("Nothing has moved or dimmed since the calibration."),
+)  # fmt: skip
+SOURCES: Final = {
+    "photograph": _("a photograph wrapped around the object"), "pattern": _("another pattern"),
+    "checkerboard": _("a checkerboard"), "gloss": _("a gloss"), "recolour": _("recoloured"),
+    "picture": _("a picture as seen from the camera"), "blender": _("rendered by Blender"),
+}  # fmt: skip
+"""By the kind in stage.toml."""
+DRIFTS: Final = {
+    "nothing": _("nothing has moved or dimmed"), "quick": _("a quick recalibration is needed"),
+    "full": _("a full recalibration is needed"), "look": _("a person has to look at the stage"),
+}  # fmt: skip
+"""By the advice of a drift check."""
+
+
+def job_title(name: str) -> str:
+    """A job's name, whose first words say what it does and whose others are names."""
+    for title in sorted(JOBS, key=len, reverse=True):
+        if name == title or name.startswith(f"{title} "):
+            return gettext(title) + name[len(title) :]
+    return name

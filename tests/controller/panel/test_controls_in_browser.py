@@ -1,0 +1,150 @@
+"""What the pages' controls do, in a real Chromium: the picture's verbs, an outline, a wipe, a report, two languages."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Iterator
+
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, expect
+
+from controller.panel.app import STATIC
+from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.controller.panel.served import Served, csrf
+from tests.controller.panel.test_in_browser import violations
+
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
+FIRST_PAGE_BYTES = 250_000
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as started:
+        yield started
+
+
+def kiosk_of(served: Served) -> MemoryKiosk:
+    assert isinstance(served.kiosk, MemoryKiosk)
+    return served.kiosk
+
+
+def test_the_picture_is_made_darker_black_and_followed_by_the_next(fresh: Served, browser: Browser) -> None:
+    kiosk = kiosk_of(fresh)
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.get_by_label("Brightness", exact=True).fill("40")
+        page.get_by_role("button", name="Set", exact=True).click()
+        expect(page.locator("p.state em")).to_have_text("Brightness 40 %")
+        page.get_by_role("button", name="Black", exact=True).click()
+        expect(page.locator("p.state em")).to_have_text("Black")
+        assert (kiosk.snapshot().brightness, kiosk.snapshot().black) == (40, True)
+        for name in ("Next appearance", "Black", "Set"):
+            expect(page.get_by_role("button", name=name, exact=True)).to_be_hidden()
+        page.get_by_role("button", name="Show the picture again").click()
+        page.get_by_role("button", name="Next appearance").click()
+        expect(page.locator("p.state b")).to_have_text("warm wood")
+        page.get_by_role("button", name="Show all in turn").click()
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="Continue").click()
+        kiosk.stop()
+        for name in ("Next appearance", "Black", "Pause", "Set"):
+            expect(page.get_by_role("button", name=name, exact=True)).to_be_hidden()
+
+
+def test_an_outline_restricts_the_target_and_the_result_is_played(fresh: Served, browser: Browser) -> None:
+    out = io.BytesIO()
+    Image.new("RGB", (240, 160), "white").save(out, "PNG")
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.goto("/appearances/new")
+        page.set_input_files("#file", {"name": "t.png", "mimeType": "image/png", "buffer": out.getvalue()})
+        page.get_by_role("button", name="Upload").click()
+        expect(page.get_by_text("45 %").first).to_be_visible()
+        page.get_by_label("Target over the object").fill("20")
+        assert page.locator("#on-object .over").evaluate("one => getComputedStyle(one).opacity") == "0.2"
+        place = page.locator("#draw")
+        place.scroll_into_view_if_needed()
+        box = place.bounding_box()
+        assert box is not None
+        for x, y in ((0.01, 0.02), (0.5, 0.02), (0.5, 0.98), (0.01, 0.98)):
+            place.click(position={"x": x * box["width"], "y": y * box["height"]})
+        assert not violations(page)
+        page.get_by_role("button", name="Use this outline").click()
+        expect(page.get_by_text("The outline is used.")).to_be_visible()
+        key = page.url.rpartition("/")[2]
+        with Image.open(fresh.app.state.panel.targets.path(key)) as kept:
+            assert kept.mode == "RGBA"
+            alpha = kept.getchannel("A")
+            assert (alpha.getpixel((20, 80)), alpha.getpixel((220, 80))) == (255, 0)
+        assert len(json.loads(page.locator("#outline").input_value())[0]) == 4, "it can be drawn on"
+        page.get_by_label("Name", exact=True).fill("bronze")
+        page.get_by_role("button", name="Compute").click()
+        expect(page.get_by_text("It ended well.")).to_be_visible()
+        page.get_by_role("button", name="Play now").click()
+        expect(page.locator("p.state b")).to_have_text("bronze")
+        expect(page.get_by_role("button", name="Play now")).to_be_hidden()
+
+
+def test_pictures_are_compared_by_a_line_and_a_report_opens_in_its_page(fresh: Served, browser: Browser) -> None:
+    kiosk = kiosk_of(fresh)
+    kiosk.compare()
+    while not kiosk.comparisons():
+        time.sleep(0.02)
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.goto("/results")
+        wipe = page.locator("[data-wipe]").first
+        wipe.get_by_role("slider").fill("30")
+        assert wipe.locator(".over").evaluate("one => getComputedStyle(one).clipPath") == "inset(0px 0px 0px 30%)"
+        wipe.get_by_role("button", name="Before").click()
+        expect(wipe.locator(".under")).to_have_attribute("alt", "Before, marble")
+        assert page.locator("svg.curve").count() >= 3, "trends"
+        page.get_by_role("link", name="Report with plots and maps").click()
+        expect(page.frame_locator("iframe").locator("body")).to_contain_text("")
+        assert page.frames[1].title() == "A report"
+
+
+def test_the_live_picture_says_how_sharp_and_how_bright_it_is(panel: Served, browser: Browser) -> None:
+    with tab(browser, panel.address) as page:
+        enter(page, "tina")
+        page.goto("/aiming")
+        expect(page.locator("#live-view")).to_be_visible()
+        expect(page.locator("#sharp-now")).to_have_text("100%")
+        assert page.locator("#levels path").get_attribute("d").count("H") == 32  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("language", ["de", "ja"])
+def test_a_phone_shows_other_languages_without_scrolling_sideways(
+    panel: Served, browser: Browser, language: str
+) -> None:
+    with tab(browser, panel.address, phone=True) as page:
+        page.set_viewport_size({"width": 360, "height": 740})
+        page.goto("/login")
+        page.locator("#language").select_option(language)
+        page.locator("footer button").click()
+        assert page.locator("html").get_attribute("lang") == language
+        page.locator("#name").fill("tina")
+        page.locator("#password").fill("a long pass phrase")
+        page.locator("button.main").click()
+        page.wait_for_url("**/")
+        for path in ("/", "/schedule", "/results", "/aiming"):
+            page.goto(path)
+            wider = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            assert wider <= 0, f"{path} is wider than the screen by {wider} px"
+        said = {"de": "Es läuft kein Auftrag.", "ja": "実行中の作業はありません。"}[language]
+        page.goto("/aiming")
+        expect(page.locator("#live-job")).to_contain_text(said)
+
+
+def test_the_first_page_with_its_pictures_is_small(panel: Served) -> None:
+    with panel.entered("otto") as client:
+        page = client.get("/")
+        size = len(page.content) + sum(len(client.get(f"/static/{name}").content) for name in STATIC)
+        for address in {one.split('"')[0] for one in page.text.split('src="')[1:] if one.startswith("/see/")}:
+            size += len(client.get(address).content)
+        assert csrf(page.text)
+        assert size <= FIRST_PAGE_BYTES, f"{size:,} bytes"
