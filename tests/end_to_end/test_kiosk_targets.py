@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from controller.kiosk.api.kiosk import StageKiosk
@@ -80,6 +81,25 @@ def test_an_upload_of_another_size_becomes_a_target_and_an_appearance(kiosk: Sta
     assert not job.failed, job.outcome
     assert "phone" in [one.name for one in kiosk.appearances()]
     assert kiosk.snapshot().failures == ()
+
+
+def test_an_outline_keeps_the_light_of_an_appearance_inside_it(kiosk: StageKiosk, tmp_path: Path) -> None:
+    view = cv2.imread(str(kiosk.view()))
+    assert view is not None
+    assert view.shape == (CAMERA_PX[1], CAMERA_PX[0], 3)
+    (tmp_path / "whole.png").write_bytes(grey_png(*CAMERA_PX))
+    targets = Targets(tmp_path / "targets", UploadLimits(), fitted=kiosk.fitted)
+    key = targets.add(tmp_path / "whole.png", "fill")
+    targets.restrict(key, "[[[0, 0], [0.5, 0], [0.5, 1], [0, 1]]]")
+    job = ended(kiosk, kiosk.compute("half", targets.path(key)))
+    assert not job.failed, job.outcome
+    (preview,) = (one.preview for one in kiosk.appearances() if one.name == "half")
+    assert preview is not None
+    picture = cv2.imread(str(preview)).astype(float)
+    middle = picture.shape[1] // 2
+    inside, outside = picture[:, : middle - 8], picture[:, middle + 8 :]
+    assert np.quantile(inside, 0.9) > 40
+    assert np.quantile(outside, 0.9) < 0.3 * np.quantile(inside, 0.9)
 
 
 def test_a_bad_appearance_stops_no_other_and_stays_in_sight_until_it_was_seen(

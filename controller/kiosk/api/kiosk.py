@@ -280,7 +280,7 @@ class StageKiosk(FolderKiosk):
 
     def photograph(self) -> bytes | None:
         service = self.service
-        return None if service.jobs.running is None else newest_photograph(self.stage, time.time())
+        return None if service.jobs.running is None else newest_photograph(self.stage, self._world.wall())
 
     def compare(self, name: str | None = None) -> Job:
         service = self.service

@@ -71,8 +71,10 @@ class Lit:
         """What the camera pixels from ``first`` on see; holds no memory if there are none."""
         n = self.starts[first]
         starts = np.asarray(self.starts[first:] - n, dtype=np.int32)
-        parts = [part[n:] for part in (self.at_px, self.gain, self.blur, self.albedo)]
-        return type(self)(starts, *(part if part.size else part.copy() for part in parts))
+        at_px, gain, blur, albedo = self.at_px[n:], self.gain[n:], self.blur[n:], self.albedo[n:]
+        if not gain.size:
+            at_px, gain, blur, albedo = at_px.copy(), gain.copy(), blur.copy(), albedo.copy()
+        return type(self)(starts, at_px, gain, blur, albedo)
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,7 @@ from tests.controller.kiosk import vase
 PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"
 """Every kiosk of these tests plays PLAYING, has OTHER installed as well, and the finished calibration RUN."""
 TEXT = f"{vase.TEXT}\n[bundle]\nallow_unsigned = true\n"
-NEEDS_A_CALIBRATION = {"feasibility", "reach", "reach-picture"}
+NEEDS_A_CALIBRATION = {"feasibility", "reach", "reach-picture", "view"}
 """What no stage of these tests can do: tests/end_to_end/test_kiosk_targets.py asks it of a calibrated one."""
 
 
@@ -130,6 +130,8 @@ CASES: tuple[Case, ...] = (
     Case("brightness", {"percent": 40}, "nothing-plays", first=(("stop", {}),)),
     Case("identify", {"on": True}, holds=lambda _, stage: shows_names(stage)),
     Case("camera", holds=lambda jpeg, _: jpeg is None or jpeg.startswith(b"\xff\xd8")),
+    Case("photograph", holds=lambda jpeg, _: jpeg is None),
+    Case("photograph", holds=lambda jpeg, _: jpeg is None or jpeg.startswith(b"\xff\xd8"), first=(FULL,)),
     Case("lamp-history", holds=every(LampDay)),
     Case("recalibrate", {"kind": "full"}, holds=a_job),
     Case("recalibrate", {"kind": "quick"}, holds=a_job),
@@ -156,6 +158,9 @@ CASES: tuple[Case, ...] = (
          and [row.playing for row in rows][:2] == [True, False]),
     Case("preview", {"name": PLAYING}, holds=perhaps_a_file),
     Case("preview", {"name": "no such"}),
+    Case("projector-picture", {"name": PLAYING, "projector": "left"}, holds=a_file),
+    Case("projector-picture", {"name": PLAYING, "projector": "camera"}, holds=lambda found, _: found is None),
+    Case("projector-picture", {"name": "no such", "projector": "left"}, "appearance-unknown"),
     Case("remove-appearance", {"name": OTHER}),
     Case("remove-appearance", {"name": PLAYING}, "appearance-in-use"),
     Case("remove-appearance", {"name": OTHER}, "appearance-in-use", first=(("set-schedule", hours()),)),
