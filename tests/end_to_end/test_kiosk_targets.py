@@ -95,7 +95,8 @@ def test_an_outline_keeps_the_light_of_an_appearance_inside_it(kiosk: StageKiosk
     assert not job.failed, job.outcome
     (preview,) = (one.preview for one in kiosk.appearances() if one.name == "half")
     assert preview is not None
-    picture = cv2.imread(str(preview)).astype(float)
+    picture = cv2.imread(str(preview))
+    assert picture is not None
     middle = picture.shape[1] // 2
     inside, outside = picture[:, : middle - 8], picture[:, middle + 8 :]
     assert np.quantile(inside, 0.9) > 40

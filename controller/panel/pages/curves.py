@@ -115,9 +115,11 @@ def colour_differences(compared: Sequence[Comparison]) -> list[tuple[str, list[V
     return [(one.name, [Value(then.unix_s, then.delta_e) for then in one.history]) for one in compared]
 
 
-def sharpness_of(history: Sequence[Sharpness]) -> list[tuple[str, list[Value]]]:
-    """The focus of each projector in each of the test shots, in per cent."""
-    names = dict.fromkeys(name for one in history for name in one.projectors)
+def sharpness_of(history: Sequence[Sharpness], projectors: Sequence[str]) -> list[tuple[str, list[Value]]]:
+    """The focus of each projector in each of the test shots, in per cent; ``projectors`` in the picture's order, so
+    that each has its colour there.
+    """
+    names = dict.fromkeys((*projectors, *(name for one in history for name in one.projectors)))
     return [
         (name, [Value(one.unix_s, 100 * one.projectors[name]) for one in history if name in one.projectors])
         for name in names
