@@ -111,12 +111,12 @@ def _compiler(suite: str, debian: Path | None) -> list[str]:
     """The words that compile a folder's Python files, to be followed by -s, -p and the folder."""
     python = PYTHON[suite]
     # Checked by what a file holds: a package may bring other files of the same date and size.
-    words = ["-m", "compileall", "-q", "--invalidation-mode", "checked-hash", "-j", "0"]
+    words = ["-m", "compileall", "-q", "--invalidation-mode", "checked-hash"]
     if python == f"{sys.version_info.major}.{sys.version_info.minor}":
-        return [sys.executable, *words]
+        return [sys.executable, *words, "-j", "0"]
     if debian is None:
         raise SystemExit(f"Debian's {suite} has Python {python}, this is another. Name a {suite}'s root with --debian.")
-    # Through its own loader, so that it finds its own C library.
+    # Through its own loader, so that it finds its own C library; so it can start no others like it (-j).
     loader = [
         str(debian / "usr/lib64/ld-linux-x86-64.so.2"),
         "--library-path",
@@ -135,9 +135,18 @@ def _pinned(suite: str, compiling: list[str]) -> Path:
         (part / "wheels").mkdir(parents=True)
         (part / "lock").write_text(lock_for(PYTHON[suite]))
         wheels, site = part / "wheels", part / "site"
-        _pip("download", "--require-hashes", *_of(suite), f"--requirement={part / 'lock'}", f"--dest={wheels}")
-        _install(site, ["--no-index", f"--find-links={wheels}", "--require-hashes", f"-r{part / 'lock'}"], suite)
-        subprocess.run([*compiling, "-s", str(site), "-p", _site(suite), str(site)], check=False)
+        _pip(
+            "download",
+            "--require-hashes",
+            "--no-deps",
+            *_of(suite),
+            f"--requirement={part / 'lock'}",
+            f"--dest={wheels}",
+        )
+        # The lock has everything, and the download looked what fits. Pip would ask the Python that it runs on.
+        complete = ["--no-deps", "--ignore-requires-python", "--no-index", f"--find-links={wheels}", "--require-hashes"]
+        _install(site, [*complete, f"--requirement={part / 'lock'}"], suite)
+        subprocess.run([*compiling, "-s", str(site), "-p", _site(suite), str(site)], check=True)
         for old in folder.parent.glob(f"{suite}-*"):
             shutil.rmtree(old)
         site.rename(folder)
