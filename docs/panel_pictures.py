@@ -21,7 +21,9 @@ def save(page: Page, name: str) -> None:
     """Save the whole page with 256 colours: half of the bytes."""
     with Image.open(io.BytesIO(page.screenshot(full_page=True))) as whole:
         # The octree keeps colours of small areas, which the median cut gives up.
-        whole.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(PICTURES / name, optimize=True)
+        whole.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+            PICTURES / name, optimize=True
+        )
 
 
 def photograph(browser: Browser, folder: Path) -> None:
