@@ -8,9 +8,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 from benchmarks._truth import Truth, developed
 from controller.artefacts.calibrated import Calibrated
@@ -25,6 +27,7 @@ from controller.study.lab.measuring import SET_COLUMNS
 from controller.study.lab.subject import Dots, Subject
 from controller.study.lab.trial import trial
 from controller.study.values import Result, column
+from plugins.emulated.optics.sensor import REFERENCE_APERTURE_F
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.program import run_of
 
@@ -37,6 +40,7 @@ class BenchLight:
 
     calibrated: Calibrated
     truth: Truth
+    aperture_f: float
     names: list[str] = field(default_factory=list)
 
     def photograph(self, name: str, frames: Sequence[FloatImage], *, white: float) -> FloatImage:
@@ -45,7 +49,8 @@ class BenchLight:
         shown = device_frames(self.calibrated.calibration, frames)
         sensor = self.truth.bench.camera.sensor
         steps = sensor.white_level - sensor.black_level
-        unit = np.float32(sensor.electrons_per_light_s / (sensor.electrons_per_step * steps))
+        opening = (REFERENCE_APERTURE_F / self.aperture_f) ** 2
+        unit = np.float32(sensor.electrons_per_light_s * opening / (sensor.electrons_per_step * steps))
         light = unit * self.truth.picture([shown[name] for name in self.calibrated.projectors])
         return developed(light, float(light.max()))
 
@@ -53,11 +58,18 @@ class BenchLight:
         raise AssertionError("experiments that need dots are done by `make nightly`")
 
 
+def aperture_of(photograph: Path) -> float:
+    """The f-number in a photograph's EXIF data."""
+    with tifffile.TiffFile(photograph) as file:
+        over, under = file.pages.first.tags["ExifTag"].value["FNumber"]
+    return float(over / under)
+
+
 @pytest.fixture(scope="module")
 def subject(finished_demo: FinishedDemo) -> Subject:
     run, names = run_of(finished_demo.stage), check_stage(finished_demo.stage).names
     calibrated = Calibrated(run, names)
-    light = BenchLight(calibrated, Truth(finished_demo.stage))
+    light = BenchLight(calibrated, Truth(finished_demo.stage), aperture_of(next(run.folder.rglob("*.dng"))))
     return Subject(
         calibration=calibrated.calibration,
         geometry=read_geometry(run, names),
