@@ -14,9 +14,9 @@ class Timing:
 
     ``answer_s``: for an ordinary answer; ``confirm_s``: for the report of a setting; ``busy_s``: with a busy camera;
     ``margin_s``: for a picture, beyond twice its exposure; ``grace_s``: for an event, before its information is
-    requested; ``come_back_s``: for a lost camera to answer again, ``reconnect_s``: the same during a picture;
-    ``keep_alive_s``: between two signs of life while it works, ``idle_s``: without any call; ``slow_s``: an answer that
-    took longer is noted.
+    requested; ``come_back_s``: for a camera to answer when it is opened or was lost, ``reconnect_s``: the same during
+    a picture; ``keep_alive_s``: between two signs of life while it works, ``idle_s``: without any call; ``slow_s``: an
+    answer that took longer is noted.
     """
 
     answer_s: float = 15.0

@@ -74,7 +74,7 @@ class PtpCamera:
         self._diary = Diary(transcript)
         self._lock = threading.RLock()
         self._leaving = threading.Event()
-        self._capabilities = self._reopen(deadline).capabilities
+        self._capabilities = self._ready(deadline, self._timing.come_back_s).capabilities
         threading.Thread(target=self._stay_awake, name="ptp-keep-alive", daemon=True).start()
 
     @property
