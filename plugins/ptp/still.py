@@ -74,7 +74,7 @@ class PtpCamera:
         self._diary = Diary(transcript)
         self._lock = threading.RLock()
         self._leaving = threading.Event()
-        self._capabilities = self._ready(deadline, self._timing.come_back_s).capabilities
+        self._capabilities = self._open(deadline).capabilities
         threading.Thread(target=self._stay_awake, name="ptp-keep-alive", daemon=True).start()
 
     @property
@@ -252,6 +252,17 @@ class PtpCamera:
                     raise gone or error from None
                 give_up.sleep(pause_s)
                 pause_s = min(1.0, 2 * pause_s)
+
+    def _open(self, deadline: Deadline) -> Body:
+        """The first body. Its cable may just be plugged in; but who else uses the camera may do so for hours."""
+        give_up = deadline.within(self._timing.come_back_s)
+        while True:
+            try:
+                return self._reopen(deadline)
+            except DeviceGone:
+                if give_up.passed:
+                    raise
+                give_up.sleep(0.2)
 
     def _check_open(self) -> None:
         if self._closed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from pathlib import Path
@@ -12,8 +13,10 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceGone, DeviceTimeout
 from hal.values import ExposureSettings
 from plugins.emulated.usb.process import UsbBusProcess
+from plugins.ptp.still import PtpCamera
+from plugins.ptp.usb.bus import UsbAddress, UsbFinder
 from tests.plugins.on_usb_bus.camera_rig import Rig, bus, lasting_bus, rig, running
-from tests.plugins.ptp.ptp_rig import FLAVOURS, HASTY, SHORT, when
+from tests.plugins.ptp.ptp_rig import FLAVOURS, HASTY, PATIENT, SHORT, when
 
 __all__ = ["bus", "lasting_bus", "rig"]
 
@@ -53,6 +56,18 @@ def test_after_an_unplug_it_is_found_at_another_address_with_its_settings(rig: R
     assert rig.bus.bus("address_of", "camera") != before
     assert rig.capture(tmp_path) == rig.latest()
     assert rig.bus.call("camera", "last_exposure_s") == pytest.approx(confirmed.exposure_s, rel=0.01)
+
+
+def test_a_cable_that_is_loose_when_the_camera_is_opened_does_not_matter(bus: UsbBusProcess, tmp_path: Path) -> None:
+    with running(bus, "eos-new") as rig:
+        rig.driver.close()
+        bus.unplug("camera")
+        soon = threading.Timer(0.5, bus.plug, ["camera"])
+        soon.start()
+        rig.driver = PtpCamera(UsbFinder(UsbAddress.parse("usb:")).connect, timing=PATIENT, deadline=in_seconds(20))
+        soon.join()
+        with contextlib.closing(rig.driver):
+            assert rig.capture(tmp_path) == rig.latest()
 
 
 def test_another_camera_that_came_meanwhile_is_not_taken_for_it(bus: UsbBusProcess, tmp_path: Path) -> None:
