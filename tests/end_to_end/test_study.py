@@ -69,7 +69,7 @@ def aperture_of(photograph: Path) -> float:
 def subject(finished_demo: FinishedDemo) -> Subject:
     run, names = run_of(finished_demo.stage), check_stage(finished_demo.stage).names
     calibrated = Calibrated(run, names)
-    light = BenchLight(calibrated, Truth(finished_demo.stage), aperture_of(next(run.folder.rglob("*.dng"))))
+    light = BenchLight(calibrated, Truth(finished_demo.stage), aperture_of(next(run.rglob("*.dng"))))
     return Subject(
         calibration=calibrated.calibration,
         geometry=read_geometry(run, names),
