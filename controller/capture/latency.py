@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -36,6 +37,8 @@ WORST_BLOCKS = 3.0
 """Per cent of the blocks that may be below, because something moved or reflects."""
 LEAST_CONTRAST = 0.01
 CONFIRMATIONS = 4
+BEFORE_TIMES = 4.0
+"""While the delay is searched, the picture before is shown for so many times the delay that was enough."""
 SPARSE = 8
 NOTICEABLE = 24
 """Of 255."""
@@ -59,8 +62,13 @@ class Latency:
         return self.delay_s + MARGIN_S
 
 
-CaptureFlat = Callable[[bool, float], FloatImage]
-"""(white or black, delay in seconds): show it after the other one was surely visible, photograph it that much later."""
+class CaptureFlat(Protocol):
+    """Show white or black after the other one was shown for ``before_s``, and photograph it ``delay_s`` later.
+
+    (rows, columns) or (rows, columns, 3) in linear light, NaN where saturated
+    """
+
+    def __call__(self, white: bool, delay_s: float, *, before_s: float) -> FloatImage: ...
 
 
 def measure_latency(look: CaptureFlat) -> Latency:
@@ -68,11 +76,12 @@ def measure_latency(look: CaptureFlat) -> Latency:
 
     Parameters
     ----------
-    look : see ``CaptureFlat``; (rows, columns) or (rows, columns, 3) in linear light, NaN where saturated
+    look : see ``CaptureFlat``
 
     Raises CalibrationError("picture-not-seen") when white and black do not differ even after ``LONGEST_S``.
     """
-    black, white = (_blocks(look(light, LONGEST_S)) for light in (False, True))
+    black = _blocks(look(False, LONGEST_S, before_s=0.0))
+    white = _blocks(look(True, LONGEST_S, before_s=0.0))
     change = white - black
     lit = change > LIT_SHARE * np.nanmax(change, initial=0.0)
     if not np.any(lit) or float(np.nanmax(change)) < LEAST_CONTRAST:
@@ -84,9 +93,10 @@ def measure_latency(look: CaptureFlat) -> Latency:
         )
     tries: list[tuple[float, float]] = []
 
-    def whole(delay_s: float) -> bool:
+    def whole(delay_s: float, before_s: float = LONGEST_S) -> bool:
         to_white = len(tries) % 2 == 1  # the references ended with white
-        share: npt.NDArray[np.float64] = (_blocks(look(to_white, delay_s)) - black)[lit] / change[lit]
+        seen_light = _blocks(look(to_white, delay_s, before_s=before_s))
+        share: npt.NDArray[np.float64] = (seen_light - black)[lit] / change[lit]
         finite = share[np.isfinite(share)]
         seen = finite if to_white else 1 - finite
         share_seen = float(np.percentile(seen, WORST_BLOCKS)) if seen.size else 0.0
@@ -99,9 +109,12 @@ def measure_latency(look: CaptureFlat) -> Latency:
     late_s, delay_s = 0.0, 0.0
     while not whole(delay_s) and delay_s < LONGEST_S:
         late_s, delay_s = delay_s, min(max(FIRST_DELAY_S, 2 * delay_s), LONGEST_S)
+    # Here several times the delay that was enough is enough for the picture before, too. What is found is confirmed
+    # after the longest wait.
+    before_s = min(LONGEST_S, BEFORE_TIMES * delay_s)
     while delay_s - late_s > RESOLUTION_S:
         middle_s = 0.5 * (late_s + delay_s)
-        late_s, delay_s = (late_s, middle_s) if whole(middle_s) else (middle_s, delay_s)
+        late_s, delay_s = (late_s, middle_s) if whole(middle_s, before_s) else (middle_s, delay_s)
     return Latency(_confirmed(whole, delay_s), tuple(tries))
 
 

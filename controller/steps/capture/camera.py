@@ -52,7 +52,7 @@ def delay_step(rig: Rig) -> Step:
         partial(_measure_delay, rig),
         after=(StepId(StepKind.EXPOSURE),),
         title="Measuring the display's delay",
-        weight=6 * LONGEST_S,
+        weight=5 * LONGEST_S,
     )
 
 
@@ -100,13 +100,14 @@ def _measure_delay(rig: Rig, context: Context) -> Sequence[Path]:
     shown: list[tuple[bool, float]] = []
     count = 0
 
-    def look(white: bool, delay_s: float) -> FloatImage:
+    def look(white: bool, delay_s: float, *, before_s: float) -> FloatImage:
         """Each picture follows the other one, which has been shown long enough to be visible."""
         nonlocal count
         context.advance(min(count / 10, 0.9), "display and camera")
-        if not shown or shown[-1][0] == white:
+        if before_s and (not shown or shown[-1][0] == white):
             shown.append((not white, rig.acquirer.show(flats[not white], deadline=context.deadline)))
-        context.deadline.sleep(max(0.0, shown[-1][1] + LONGEST_S - time.monotonic()))
+        if before_s:
+            context.deadline.sleep(max(0.0, shown[-1][1] + before_s - time.monotonic()))
         shot = Shot(f"delay-{count}", flats[white], exposure_s)
         file, _ = rig.acquirer.take(shot, context.folder / CAPTURES, deadline=context.deadline, wait_s=delay_s)
         shown.append((white, time.monotonic()))

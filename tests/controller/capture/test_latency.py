@@ -34,12 +34,15 @@ class Stage:
     looks: list[tuple[bool, float]] = field(default_factory=list)
     seed: int = 0
 
-    def look(self, white: bool, delay_s: float) -> FloatImage:
+    def look(self, white: bool, delay_s: float, *, before_s: float) -> FloatImage:
         self.looks.append((white, delay_s))
         image = np.full((128, 192, 3), 0.004, np.float32)
         for half, lag_s in zip((slice(0, 96), slice(96, 192)), self.lags_s, strict=True):
-            late_s = lag_s + (0.0 if white else self.falls_later_s)
-            new = float(np.clip((delay_s + self.shutter_s + EXPOSURE_S - late_s) / EXPOSURE_S, 0, 1))
+            rises_s, falls_s = lag_s, lag_s + self.falls_later_s
+            came_s, late_s = (falls_s, rises_s) if white else (rises_s, falls_s)
+            # What is not shown for long enough before leaves some of the picture before it, which is the new one.
+            old = 1.0 if len(self.looks) <= 2 else float(np.clip((before_s - came_s) / EXPOSURE_S, 0, 1))
+            new = 1 - old * (1 - float(np.clip((delay_s + self.shutter_s + EXPOSURE_S - late_s) / EXPOSURE_S, 0, 1)))
             light = new if white else 1 - new
             image[:, half] += 0.0 if self.dark else 0.6 * light
         random = np.random.default_rng(len(self.looks) + self.seed)
