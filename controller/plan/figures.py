@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import Float64, Mask
+from controller.plan.resolution import FAINT, MEAN, LineProjector, finest_wave
 from controller.plan.search import Chosen
 from controller.plan.values import Illumination, Placement, PlanGoal, Surface
 
@@ -36,6 +37,11 @@ def together(lit: Sequence[Illumination], useful: Mask) -> Together:
     )
 
 
+WAVE_POINTS: Final = 7
+CAMERA_BLUR_PX: Final = 0.25
+"""Of a projector pixel: what a camera adds whose pixels are a third of that, blurred by 0.7 of its own."""
+
+
 def figures_of(best: Chosen, surface: Surface, goal: PlanGoal) -> dict[str, Any]:
     """Placements in words of a stand and a lens, and what the seen surface gets of each and of all."""
     weight = surface.area_m2 / surface.area_m2.sum()
@@ -53,8 +59,36 @@ def figures_of(best: Chosen, surface: Surface, goal: PlanGoal) -> dict[str, Any]
         "lux_p5": _weighted(lux, weight, 0.05),
         "detail_mm_median": _finite(_weighted(detail, weight, 0.5)),
         "detail_mm_p95": _finite(_weighted(detail, weight, 0.95)),
+        **_finest_waves([one.lit for one in best.candidates], [one.useful for one in best.candidates], weight),
         "projectors": [_placed(one.placement) | _alone(one.useful, one.lit, weight) for one in best.candidates],
     }
+
+
+def _finest_waves(lit: Sequence[Illumination], useful: Sequence[Mask], weight: Float64) -> dict[str, float | None]:
+    """Length of the finest wave by the sharpest projector and by all, median over points of the seen surface.
+
+    Along the longer sides of pixels, as bright as the sharpest projector alone can reach in 95 % of its light.
+    """
+    reached = np.where(np.any(useful, axis=0), weight, 0.0)
+    if not reached.any():
+        return {"wave_mm_one": None, "wave_mm_all": None}
+    share = np.cumsum(reached) / reached.sum()
+    one, every = [], []
+    for point in np.searchsorted(share, (np.arange(WAVE_POINTS) + 0.5) / WAVE_POINTS):
+        there = sorted((n for n in range(len(lit)) if useful[n][point]), key=lambda n: lit[n].detail_mm[point])
+        side_mm = lit[there[0]].pixel_mm[point, 0]
+        white = _weighted(lit[there[0]].lux, np.where(useful[there[0]], weight, 0.0), 0.05) / (MEAN + FAINT)
+        line = [
+            LineProjector(
+                lit[n].pixel_mm[point, 0] / side_mm,
+                float(np.hypot(lit[n].blur_px[point], CAMERA_BLUR_PX)),
+                lit[n].lux[point] / white,
+            )
+            for n in there
+        ]
+        one.append(side_mm / finest_wave(line[:1]))
+        every.append(side_mm / finest_wave(line))
+    return {"wave_mm_one": float(np.median(one)), "wave_mm_all": float(np.median(every))}
 
 
 def _placed(placement: Placement) -> dict[str, Any]:

@@ -115,9 +115,16 @@ def _goals(figures: Mapping[str, Any], goal: PlanGoal) -> list[Goal]:
         share("Light", "share_bright_enough", f"{goal.lux:g} lx; the median is {figures['lux_median']:.0f} lx"),
         share("Detail", "share_fine_enough",
               f"{goal.detail_mm:g} mm; the median is {'-' if detail is None else format(detail, '.2f')} mm"),
+        _finest(figures),
         share("Overlap", "share_overlapped", f"{goal.overlap} projectors at each point"),
         share("Covered", "share_reached", "by at least one projector"),
     ]  # fmt: skip
+
+
+def _finest(figures: Mapping[str, Any]) -> Goal:
+    one, every = figures["wave_mm_one"], figures["wave_mm_all"]
+    reached = "-" if one is None else f"{every:.2f} mm by all, {one:.2f} mm by one projector"
+    return Goal("Finest wave", reached, "the length at which half of a faint wave's contrast is left")
 
 
 def _stands(figures: Mapping[str, Any]) -> dict[str, str]:

@@ -20,7 +20,7 @@ from controller.artefacts.geometry import read_geometry
 from controller.core.arrays import FloatImage
 from controller.stage.check import check_stage
 from controller.steps.appearance.solving import device_frames
-from controller.study.experiments.frequency import rising_sinusoid
+from controller.study.experiments.frequency import PLANNED, rising_sinusoid
 from controller.study.experiments.live import live_pictures
 from controller.study.experiments.residual import BRIGHT, residual
 from controller.study.lab.measuring import SET_COLUMNS
@@ -106,6 +106,9 @@ def test_an_experiment_judges_everything_that_it_asks_and_leaves_no_figure_out(
         assert table.rows
         for name in set(table.columns) & set(SET_COLUMNS):
             assert all(column(table, name)), name
+    if run is rising_sinusoid:
+        planned = [one.holds for one in result.criteria if one.asked.endswith(PLANNED)]
+        assert planned == [True, True]
     if run is residual:
         (table,) = result.tables
         mean = dict(zip(zip(column(table, "as bright as"), column(table, "projectors"), strict=True),

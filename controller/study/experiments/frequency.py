@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.plan.resolution import FAINT, KEPT, MEAN, LineProjector, finest_wave, last_kept
 from controller.report.pictures import crop_around
 from controller.solve.appearance import scale_frames, solve_base
 from controller.solve.bounded.solver import solve_bounded
@@ -24,11 +25,10 @@ from controller.transport import build_transport
 BANDS = 18
 LOWEST, HIGHEST = 0.15, 1.25
 """Frequencies, in cycles a pixel of one projector as the camera sees it; one projector's pixels end at 0.5."""
-MEAN, FAINT, BOLD = 0.5, 0.1, 0.25
-"""Grey of the waves, and their amplitudes. For bold waves the bounds cut off the light that sharpening needs; faint
-ones show the resolution alone."""
-KEPT = 0.5
-"""F is the frequency up to which the photograph keeps this part of the target's contrast."""
+BOLD = 0.25
+"""Amplitude of waves whose sharpening needs more light than there is; ``FAINT`` ones show the resolution alone."""
+PREDICTED = 0.1
+PLANNED = "as the plan calculates it, within 10 %"
 ASKED = 1.4
 SHARP_PX = 0.35
 """Blur of the optics, in projector pixels, at which F_3 / F_1 has to be ``ASKED``."""
@@ -81,7 +81,7 @@ def rising_sinusoid(subject: Subject) -> Result:
             contrast[way] = kept_contrast(pictures[way], wanted, waves)
     limit = {name: last_kept(waves.frequency, kept) for name, kept in contrast.items()}
     return Result(
-        _criteria(limit, len(every), blurs(subject)),
+        _criteria(limit, len(every), blurs(subject), predicted(subject, wanted, waves, order)),
         (_table(waves, contrast), _limits(subject, wanted, waves, limit), _blur_table(subject)),
         _figures(subject, wanted, waves, pictures, contrast, limit),
     )  # fmt: skip
@@ -148,20 +148,6 @@ def _amplitude(values: FloatImage, waves: Waves, inside: Mask) -> float:
     return float(np.linalg.lstsq(parts, values.astype(np.float64), rcond=None)[0][0])
 
 
-def last_kept(frequency: Float64, kept: Float64, *, share: float = KEPT) -> float:
-    """The first frequency at which the contrast falls below ``share``, between bands by a straight line."""
-    known = np.isfinite(kept)
-    frequency, kept = frequency[known], kept[known]
-    below = np.flatnonzero(kept < share)
-    if not below.size:
-        return float(frequency[-1])
-    i = int(below[0])
-    if i == 0:
-        return float(frequency[0])
-    part = (kept[i - 1] - share) / (kept[i - 1] - kept[i])
-    return float(frequency[i - 1] + part * (frequency[i] - frequency[i - 1]))
-
-
 def bases(wanted: ReachableTarget, black: FloatImage, mask: Mask, limit: float) -> dict[str, FloatImage]:
     """Base images for the target: even with its detail above a frequency, or only what is below it.
 
@@ -196,6 +182,37 @@ def blurs(subject: Subject) -> dict[str, float]:
     return found
 
 
+def predicted(subject: Subject, wanted: ReachableTarget, waves: Waves, order: Sequence[int]) -> tuple[float, float]:
+    """F_1 and F of all in cycles a camera pixel, as ``velatura plan`` calculates them, from blur, pitch and light."""
+    box = crop_around(subject.mask, margin=0.0)
+    inside = (waves.band >= 0) & wanted.mask
+    line = []
+    for n in order:
+        pitch = _pitch_px(subject, n, box) / waves.pitch_px
+        line.append(LineProjector(pitch, _blur_there(subject, n, inside), _light_there(subject, n, wanted, inside)))
+    first, every = finest_wave(line[:1]) / waves.pitch_px, finest_wave(line) / waves.pitch_px
+    return first, every
+
+
+def _blur_there(subject: Subject, n: int, inside: Mask) -> float:
+    """Median blur of projector ``n`` along rows, in its pixels without their square, where waves are measured."""
+    part = subject.calibration.projectors[n]
+    assert part.phase_map is not None
+    rows, columns = np.nonzero(part.metapixels.valid)
+    at = np.rint(part.metapixels.centre_px[rows, columns]).astype(np.int64)
+    there = inside[np.clip(at[:, 1], 0, inside.shape[0] - 1), np.clip(at[:, 0], 0, inside.shape[1] - 1)]
+    spread = part.phase_map.spread_px2[rows, columns, 0][there]
+    return float(np.sqrt(max(float(np.median(spread)) - 1 / 12, 0.0)))
+
+
+def _light_there(subject: Subject, n: int, wanted: ReachableTarget, inside: Mask) -> float:
+    """Full light of projector ``n`` over the target's white, median where waves are measured."""
+    frames = subject.frames_of(
+        [n], [np.ones((*subject.calibration.projectors[n].metapixels.valid.shape, 3), np.float32)]
+    )
+    return float(np.median(subject.transport.forward(frames)[..., GREEN][inside])) / wanted.white
+
+
 def _blur_table(subject: Subject) -> ResultTable:
     rows = tuple((name, value, value <= SHARP_PX) for name, value in blurs(subject).items())
     return ResultTable("blur", "Blur of the optics, measured by the calibration",
@@ -218,7 +235,9 @@ def _needed(blur: dict[str, float]) -> str:
     return told + (f"At most {SHARP_PX} px would be needed." if widest > SHARP_PX else "That is sharp enough.")
 
 
-def _criteria(limit: dict[str, float], count: int, blur: dict[str, float]) -> tuple[Criterion, ...]:
+def _criteria(
+    limit: dict[str, float], count: int, blur: dict[str, float], planned: tuple[float, float]
+) -> tuple[Criterion, ...]:
     first, every = limit[_by(1, FAINT)], limit[_by(count, FAINT)]
     bold = limit[_by(count, BOLD)] / limit[_by(1, BOLD)]
     high, lower, low = limit[HIGH], limit[LOWER], limit[LOW]
@@ -231,10 +250,14 @@ def _criteria(limit: dict[str, float], count: int, blur: dict[str, float]) -> tu
         (f"a base high-passed at F_1 / 4 {keeps}", lower >= 0.9 * every, f"{lower / every:.2f} of it"),
         ("a base low-passed at F_1 falls to F_1, within 15 %", low <= 1.15 * first, f"{low / first:.2f} of it"),
     )
+    as_planned = tuple(
+        (f"{name} {PLANNED}", abs(told / found - 1) <= PREDICTED, f"{told / found:.2f} of it")
+        for name, told, found in (("F_1", planned[0], first), (f"F_{count}", planned[1], every))
+    )
     why = _needed(blur)
     return tuple(
         Criterion(asked, reached, holds, why if asked.startswith(ratio) and not holds else "")
-        for asked, holds, reached in rows
+        for asked, holds, reached in (*rows, *as_planned)
     )
 
 

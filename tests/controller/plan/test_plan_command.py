@@ -34,7 +34,9 @@ def test_the_example_with_a_mesh_becomes_a_page_and_figures(tmp_path: Path, ball
     assert len(figures["projectors"]) == 3
     assert 0.9 < figures["share_reached"] <= 1
     assert figures["share_overlapped"] <= figures["share_reached"]
+    assert 0 < figures["wave_mm_all"] <= figures["wave_mm_one"]
     page = Path(result["plan"]).read_text()
+    assert "Finest wave" in page
     assert not re.search(r"https?:|<script|<link", page)
     assert page.count("data:image/") == 1 + 5
     assert all(one["place"] in page for one in figures["projectors"])
