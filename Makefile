@@ -46,6 +46,7 @@ test: test-setup
 test-setup:
 	@.ci/setup test
 	@.ci/setup-blender
+	@.ci/setup-homeassistant
 	@.ci/system-packages
 	@.venv/bin/python -m hal.runtime.kernels compile
 	@.venv/bin/python -m tests.booted.trees
@@ -109,4 +110,4 @@ lock:
 clean:
 	@if [ -x .venv/bin/python ]; then python=.venv/bin/python; else python=python3; fi; \
 	  PYTHONDONTWRITEBYTECODE=1 "$$python" -m hal.runtime.caches remove
-	rm -rf .venv .venv-blender build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-blender .venv-homeassistant build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

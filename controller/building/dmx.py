@@ -21,11 +21,13 @@ _OPEN: Final = (State.READY.value, State.PLAYING.value, State.DEGRADED.value)
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One packet: ``source`` its sender's identity, ``sequence`` 0..255, ``levels`` those of the three channels."""
+    """One packet: ``source`` its sender's identity, ``sequence`` 0..255 or None if packets are not counted, ``levels``
+    those of the three channels.
+    """
 
     source: object
     priority: int
-    sequence: int
+    sequence: int | None
     ended: bool
     levels: tuple[int, int, int]
 
@@ -33,14 +35,16 @@ class Frame:
 class Sources:
     """The source with the highest priority counts; of several, the one that came first, until it is lost."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, lost_s: float = LOST_S) -> None:
+        """A source that is silent for more than ``lost_s`` is lost."""
+        self._lost_s = lost_s
         self._seen: dict[object, tuple[float, Frame]] = {}
 
     def take(self, frame: Frame, now_s: float) -> None:
         """``now_s``: monotonic seconds. A packet that comes too late, after a newer one, is ignored."""
         self._forget(now_s)
         before = self._seen.get(frame.source)
-        if before is not None and -20 < _signed(frame.sequence - before[1].sequence) <= 0:
+        if before is not None and _overtaken(frame.sequence, before[1].sequence):
             return
         if frame.ended:
             self._seen.pop(frame.source, None)
@@ -55,11 +59,13 @@ class Sources:
         return max(frames, key=lambda frame: frame.priority).levels if frames else None
 
     def _forget(self, now_s: float) -> None:
-        self._seen = {source: seen for source, seen in self._seen.items() if now_s - seen[0] <= LOST_S}
+        self._seen = {source: seen for source, seen in self._seen.items() if now_s - seen[0] <= self._lost_s}
 
 
-def _signed(difference: int) -> int:
-    return (difference + 128) % 256 - 128
+def _overtaken(sequence: int | None, newest: int | None) -> bool:
+    if sequence is None or newest is None:
+        return False
+    return -20 < (sequence - newest + 128) % 256 - 128 <= 0
 
 
 Verb = tuple[str, dict[str, Any]]

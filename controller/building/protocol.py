@@ -21,7 +21,7 @@ from controller.kiosk.panel_address import is_loopback
 from controller.kiosk.roles import Role
 
 FILE: Final = "building.toml"
-MODULES: Final = {name: f"controller.building.{name}" for name in ("osc", "pjlink", "sacn", "cues")}
+MODULES: Final = {name: f"controller.building.{name}" for name in ("osc", "pjlink", "sacn", "artnet", "cues")}
 """Imported only if building.toml names them: they may need an extra."""
 
 

@@ -4,33 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-import logging
 import socket
 import struct
 import time
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pydantic import Field
 from sacn import DataPacket
 
-from controller.building.dmx import Follower, Frame, Sources
-from controller.building.protocol import NetworkOptions, Protocol
+from controller.building.desk import DeskOptions, follow
+from controller.building.dmx import Frame, Sources
+from controller.building.protocol import Protocol
 from controller.building.verbs import Verbs
-from controller.core.errors import VelaturaError
-
-STEP_S: Final = 0.05
-_LOG: Final = logging.getLogger("velatura.building")
 
 
-class SacnOptions(NetworkOptions):
-    """``channel``: the first of the three, 1 to 510. ``lost``: whether the picture stays without a signal, or is black.
-    ``multicast``: also join the universe's group, on the interface of ``host``.
-    """
+class SacnOptions(DeskOptions):
+    """``multicast``: also join the universe's group, on the interface of ``host``."""
 
     port: int = Field(default=5568, ge=1, le=65535)
     universe: int = Field(default=1, ge=1, le=63999)
-    channel: int = Field(default=1, ge=1, le=510)
-    lost: Literal["stay", "black"] = "stay"
     multicast: bool = False
 
 
@@ -59,26 +51,14 @@ class _Listener(asyncio.DatagramProtocol):
 
 async def serve(options: SacnOptions, verbs: Verbs) -> None:
     """Serve until cancelled. Raises OSError if it can't listen."""
-    sources, follower = Sources(), Follower(dark_when_lost=options.lost == "black")
+    sources = Sources()
     channel, _ = await asyncio.get_running_loop().create_datagram_endpoint(
         lambda: _Listener(options, sources), sock=_socket(options)
     )
     try:
-        while True:
-            await asyncio.sleep(STEP_S)
-            now_s = time.monotonic()
-            await asyncio.to_thread(_follow, follower, sources.levels(now_s), verbs, now_s)
+        await follow(sources, options, verbs)
     finally:
         channel.close()
-
-
-def _follow(follower: Follower, levels: tuple[int, int, int] | None, verbs: Verbs, now_s: float) -> None:
-    try:
-        for verb, values in follower.verbs(levels, verbs.status(), verbs.appearances(), now_s):
-            verbs.do(verb, values)
-    except VelaturaError:
-        # A stage that is not set up, or that closes at this moment; the desk goes on sending.
-        _LOG.debug("A level could not be followed.", exc_info=True)
 
 
 def _socket(options: SacnOptions) -> socket.socket:

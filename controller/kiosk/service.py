@@ -25,6 +25,7 @@ from controller.kiosk.jobs.job_runner import JobHandler, JobRunner
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.journal import journal_of
 from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.bundle_watch import BundleWatch
@@ -335,7 +336,8 @@ def serving(
     with stage_lock(checked.stage.folder):
         archive.clear_cut_off(checked.stage.folder)
         file = checked.stage.folder / EventLog.FILE
-        log = EventLog(file, wall=world.wall, monotonic=world.monotonic, connect=world.connect)
+        log = EventLog(file, wall=world.wall, monotonic=world.monotonic, connect=world.connect,
+                       also=journal_of(checked.stage.tables.stage.name))  # fmt: skip
         with contextlib.closing(log):
             service = Service(checked, log, problem, world, jobs)
             service.alive = alive

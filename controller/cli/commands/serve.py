@@ -35,6 +35,9 @@ def serve(
     mqtt_certificates: Annotated[
         Path | None, typer.Option(help="CA certificates (PEM) to check the MQTT broker (default: no TLS).")
     ] = None,
+    mqtt_discovery: Annotated[
+        str, typer.Option(help="Let Home Assistant find the stage: its discovery prefix, usually homeassistant.")
+    ] = "",
     leave_lit: Annotated[
         bool, typer.Option("--leave-lit", help="Leave the lamps on at exit, for a service that restarts.")
     ] = False,
@@ -58,7 +61,7 @@ def serve(
             )
         usual = 1883 if mqtt_certificates is None else 8883
         where = parse_address(mqtt if ":" in mqtt else f"{mqtt}:{usual}")
-        broker = BrokerOptions(*where, mqtt_topic, mqtt_user, mqtt_password_file, mqtt_certificates)
+        broker = BrokerOptions(*where, mqtt_topic, mqtt_user, mqtt_password_file, mqtt_certificates, mqtt_discovery)
     address = None if no_panel else PanelAddress(host, port, certificate, key, tuple(name or ()), broker)
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:

@@ -52,7 +52,8 @@ class EventLog:
     """Thread-safe. ``problem``: why the log can't be written now, or None.
 
     ``durable``: events survive a power cut, too, not only the end of the process. Events that can't be written are kept
-    in memory until there is space again. A damaged file is renamed and replaced. ``connect``: as ``sqlite3.connect``.
+    in memory until there is space again. A damaged file is renamed and replaced. ``connect``: as ``sqlite3.connect``;
+    ``also``: is told every new event.
     """
 
     FILE: Final = "kiosk/events.sqlite"
@@ -60,9 +61,10 @@ class EventLog:
     def __init__(
         self, path: Path, *, wall: Callable[[], float] = time.time, durable: bool = True,
         monotonic: Callable[[], float] = time.monotonic, connect: Callable[..., sqlite3.Connection] = sqlite3.connect,
+        also: Callable[[EventRow], None] | None = None,
     ) -> None:  # fmt: skip
         self.path, self._wall, self._durable = path, wall, durable
-        self._monotonic, self._connect = monotonic, connect
+        self._monotonic, self._connect, self._also = monotonic, connect, also
         self._lock = threading.RLock()
         self.problem: str | None = None
         self._retry_at_s = 0.0
@@ -86,7 +88,9 @@ class EventLog:
             self._recent.append(row)
             self._waiting.append(row)
             self._flush()
-            return row
+        if self._also is not None:
+            self._also(row)
+        return row
 
     def tell_failure(self, decision: Decision) -> None:
         """Add one line, which stays in ``failures`` until it is confirmed."""

@@ -1,1 +1,1 @@
-"""MQTT: `bridge` connects a kiosk to a broker, `options` are the broker's settings."""
+"""MQTT: `bridge` connects a kiosk to a broker, `options` are its settings, `home_assistant` describes the entities."""

@@ -8,8 +8,9 @@ import json
 import logging
 import ssl
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import aiomqtt
 import anyio
@@ -20,10 +21,14 @@ from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.panel.answers import FAILURES
+from controller.panel.mqtt import home_assistant
 from controller.panel.mqtt.options import BrokerOptions
+from controller.panel.mqtt.state import told
 
 LONGEST_PAUSE_S: Final = 60.0
 MOST_COMMANDS_WAITING: Final = 20
+MOST_ENTITIES: Final = 200
+"""Discovery messages that the broker has retained and sends at the beginning."""
 LONGEST_PAYLOAD: Final = 256
 AGAIN_S: Final = 1.0
 """Pause after a state that could not be read."""
@@ -37,8 +42,9 @@ class BuildingControl:
 
     Topics: ``T/available`` "online" or "offline" (retained; sent by the broker if the connection is lost); ``T/state``
     JSON (retained); ``T/command/VERB`` for every operation with a ``building_verb`` (open, close, play, next,
-    ...): the payload is its first value as text, or a JSON object; ``T/answer``: the result. The broker decides who
-    may publish to ``T/command``. It reconnects to a broker that confirms nothing for ``patience_s``.
+    ...): the payload is its first value as text, or a JSON object; ``T/command``: the payload is a verb without values;
+    ``T/answer``: the result. The broker decides who may publish to these. With ``options.discovery``, Home Assistant
+    finds the stage. It reconnects to a broker that confirms nothing for ``patience_s``.
     """
 
     def __init__(
@@ -49,6 +55,8 @@ class BuildingControl:
         self._first_pause_s, self._patience_s = first_pause_s, patience_s
         self._verbs = Verbs(kiosk, "Building control", operations=operations)
         self._changed = asyncio.Event()
+        self._found: set[str] = set()
+        """Discovery topics of this stage that the broker retained."""
 
     async def run(self) -> None:
         """Run until cancelled. A missing broker only causes retries."""
@@ -90,9 +98,12 @@ class BuildingControl:
             will=will,
             tls_context=tls,
             timeout=self._patience_s,
-            max_queued_incoming_messages=MOST_COMMANDS_WAITING,
+            max_queued_incoming_messages=MOST_COMMANDS_WAITING + (MOST_ENTITIES if options.discovery else 0),
         ) as client:
-            await client.subscribe(f"{topic}/command/+", qos=1)
+            await client.subscribe([(f"{topic}/command/+", 1), (f"{topic}/command", 1)])
+            if options.discovery:
+                self._found.clear()
+                await client.subscribe(home_assistant.own_topics(options.discovery, topic), qos=1)
             await client.publish(f"{topic}/available", "online", qos=1, retain=True)
             try:
                 await self._both_ways(client)
@@ -108,46 +119,54 @@ class BuildingControl:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._publish, client)
             async for message in client.messages:
-                await self._execute(client, message)
+                if message.topic.matches(f"{self._options.topic}/command/#"):
+                    await self._execute(client, message)
+                elif message.retain and message.payload:
+                    self._found.add(str(message.topic))
+                    self._changed.set()
 
     async def _publish(self, client: aiomqtt.Client) -> None:
-        last = ""
+        last: dict[str, str] = {}
         while True:
             await self._changed.wait()
             self._changed.clear()
             try:
-                now = json.dumps(await anyio.to_thread.run_sync(self._state))
+                now = await anyio.to_thread.run_sync(self._retained)
             except Exception:  # noqa: BLE001 - the next state may succeed
                 # Nothing restarts this task, and without it the broker would keep an old state.
                 _LOG.exception("The state could not be published to MQTT. Trying again.")
                 await asyncio.sleep(AGAIN_S)
                 self._changed.set()
                 continue
-            if now != last:
-                await client.publish(f"{self._options.topic}/state", now, qos=1, retain=True)
-                last = now
+            # An empty message removes what the broker retained: a lamp or a choice that is there no more.
+            gone = dict.fromkeys((self._found | set(last)) - set(now), "")
+            for topic, payload in (gone | now).items():
+                if last.get(topic) != payload:
+                    await client.publish(topic, payload, qos=1, retain=True)
+            last = now
+            self._found.difference_update(gone)  # others may have come meanwhile
             await asyncio.sleep(0.2)
 
-    def _state(self) -> dict[str, Any]:
-        now = self._kiosk.snapshot()
-        return {
-            "state": now.state,
-            "reason": now.reason,
-            "since_unix_s": now.since_unix_s,
-            "playing": now.playing,
-            "in_turn": now.in_turn,
-            "paused": now.paused,
-            "black": now.black,
-            "brightness": now.brightness,
-            "warnings": list(now.warnings),
-            "problems": [{"device": row.name, "problem": row.problem} for row in now.devices if row.problem],
-        }
+    def _retained(self) -> dict[str, str]:
+        """What the broker is to retain, by topic; the state last, because Home Assistant has to know its values."""
+        now, options = self._kiosk.snapshot(), self._options
+        retained: dict[str, str] = {}
+        if options.discovery:
+            try:
+                names = [one.name for one in self._kiosk.appearances()]
+            except FAILURES:
+                names = []  # a stage that is not set up
+            version = metadata.version("velatura")
+            retained |= home_assistant.messages(options.discovery, options.topic, now, names, version)
+        return retained | {f"{options.topic}/state": json.dumps(told(now))}
 
     async def _execute(self, client: aiomqtt.Client, message: aiomqtt.Message) -> None:
         if message.retain:
             return  # an old command: a restart must not open a closed stage
-        word = str(message.topic).rsplit("/", 1)[-1]
         payload = message.payload if isinstance(message.payload, bytes) else b""
+        word = str(message.topic).removeprefix(f"{self._options.topic}/command").removeprefix("/")
+        if not word:
+            word, payload = payload[:LONGEST_PAYLOAD].decode("utf-8", "replace"), b""
         if word not in self._verbs.names:
             answer = {"command": word[:40], "done": False, "code": "command-unknown"}
         else:

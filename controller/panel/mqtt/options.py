@@ -13,7 +13,8 @@ from controller.kiosk.panel_address import is_loopback
 class BrokerOptions:
     """The address of the broker. ``password_file`` contains only the password, so that no settings and no export do.
 
-    ``topic``: the first part of all topics; ``certificates``: the certificate authorities (PEM) for the broker's TLS.
+    ``topic``: the first part of all topics; ``certificates``: the certificate authorities (PEM) for the broker's TLS;
+    ``discovery``: Home Assistant's discovery prefix, empty if it is not to find the stage.
     """
 
     host: str
@@ -22,10 +23,17 @@ class BrokerOptions:
     username: str | None = None
     password_file: Path | None = None
     certificates: Path | None = None
+    discovery: str = ""
 
 
 def check_broker(options: BrokerOptions) -> None:
-    """Raises UsageError("mqtt-password-without-tls"): passwords must not cross a network unencrypted."""
+    """Raises UsageError("mqtt-topic-wrong"), and ("mqtt-password-without-tls"): passwords must not cross a network
+    unencrypted.
+    """
+    if set("+#\0") & set(options.topic + options.discovery):
+        raise UsageError(
+            "mqtt-topic-wrong", what="An MQTT topic must not contain + or #.", remedy="Choose another name for it."
+        )
     if options.password_file is None or options.certificates is not None or is_loopback(options.host):
         return
     raise UsageError(
