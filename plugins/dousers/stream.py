@@ -74,10 +74,15 @@ class Stream:
         self._running.write(line)
 
     def _await_sent(self, deadline: Deadline) -> None:
-        running = self._running
-        assert running is not None
+        running, again = self._process(), True
         patience = deadline.within(_STARTED_S)
         while running.sent < self._number:
+            if running.ended and again:
+                # It was told in the moment in which it ended.
+                again = False
+                self._tell()
+                running = self._process()
+                continue
             if running.ended or patience.passed:
                 self._check(deadline)
                 raise self._gone("the process that sends it does not run")
@@ -86,6 +91,10 @@ class Stream:
             self._check(deadline)
         if running.trouble:
             raise self._gone(running.trouble)
+
+    def _process(self) -> _Running:
+        assert self._running is not None
+        return self._running
 
     def _check(self, deadline: Deadline) -> None:
         deadline.check(
