@@ -23,6 +23,7 @@ from hal.interfaces import (
     ButtonPanel,
     Camera,
     Display,
+    Douser,
     LightSensor,
     LiveViewCamera,
     PowerSwitch,
@@ -43,6 +44,7 @@ INTERFACES: Final[Mapping[str, tuple[type, ...]]] = {
     "camera": (Camera, WatchedCamera, LiveViewCamera),
     "display": (Display, BundleDisplay),
     "power_switch": (PowerSwitch,),
+    "douser": (Douser,),
     "light_sensor": (LightSensor,),
     "button_panel": (ButtonPanel,),
 }

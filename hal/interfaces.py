@@ -193,6 +193,20 @@ class PowerSwitch(Device, Protocol):
 
 
 @runtime_checkable
+class Douser(Device, Protocol):
+    """A mechanical shutter before a projector's lens."""
+
+    def move(self, closed: bool, *, deadline: Deadline) -> None:
+        """Block or pass the light; returns when the blades are there, as far as the driver can know. Repeatable."""
+
+    def closed(self, *, deadline: Deadline) -> bool | None:
+        """Whether it is closed, or was told to be if it can't be read; None: unknown, because it has not been told.
+
+        Raises DeviceGone if it can't be commanded now.
+        """
+
+
+@runtime_checkable
 class LightSensor(Device, Protocol):
     """Ambient light at the object."""
 

@@ -21,7 +21,7 @@ from hal.transcript import Transcript
 GROUP = "velatura.devices"
 BENCH = "-bench"
 """Suffix of the entry points of a bench."""
-KINDS = ("projector", "camera", "display", "power_switch", "light_sensor", "button_panel", "bench")
+KINDS = ("projector", "camera", "display", "power_switch", "douser", "light_sensor", "button_panel", "bench")
 
 
 _KIND_WORDS: Final[Mapping[type, str]] = {

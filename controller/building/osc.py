@@ -124,6 +124,7 @@ async def serve(options: OscOptions, verbs: Verbs) -> None:
     channel, listener = await loop.create_datagram_endpoint(
         lambda: _Listener(options), local_addr=(options.host, options.port)
     )
+    logging.getLogger().addFilter(_not_the_librarys)
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(_tell(channel, options.listeners, verbs))
@@ -132,7 +133,13 @@ async def serve(options: OscOptions, verbs: Verbs) -> None:
                 for verb, arguments in requests(datagram):
                     await _answer(channel, verbs, verb, arguments, source)
     finally:
+        logging.getLogger().removeFilter(_not_the_librarys)
         channel.close()
+
+
+def _not_the_librarys(record: logging.LogRecord) -> bool:
+    """The library logs each argument of a type that it does not know: a broken sender would fill the journal."""
+    return "pythonosc" not in record.pathname
 
 
 async def _answer(

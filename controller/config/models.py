@@ -17,10 +17,17 @@ class StageTable(ConfigTable):
     name: Name = Field(description="the stage's name, 1 to 64 printable characters")
 
 
+class DouserTable(OpenConfigTable):
+    """A mechanical shutter before a projector's lens."""
+
+    driver: Name = Field(description='the name of a douser driver, e.g. "sacn"')
+
+
 class ProjectorTable(OpenConfigTable):
     name: Name = Field(description="a name for people, different for every projector, 1 to 64 printable characters")
     output: Name = Field(description="the name of the display output that feeds this projector")
     driver: Name = Field(description='the name of a projector driver, e.g. "serial"')
+    douser: DouserTable | None = Field(default=None, description="the table [projectors.douser]")
 
 
 class CameraTable(OpenConfigTable):

@@ -15,7 +15,7 @@ EXTRAS: Final = {
     "bench": "emulated devices (velatura demo, emulate) and velatura plan",
     "gphoto2": "cameras through libgphoto2",
     "mains": "mains by network: PDUs by SNMP, relays by Modbus",
-    "building": "show control by OSC and sACN",
+    "building": "show control by OSC and sACN, dousers by sACN",
     "cluster": "solve on many machines (--scheduler)",
     "study": "judge a study by FLIP, and light of Mitsuba on the emulated stage",
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from controller.doctor.values import Finding, Tried
 from controller.rig.lamp_faults import fatal_faults, faulty
@@ -14,11 +14,14 @@ from controller.stage.recording import open_context
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.finding import Problem
-from hal.interfaces import ButtonPanel, Camera, LightSensor, PowerSwitch, Projector, WatchedProjector
+from hal.interfaces import ButtonPanel, Camera, Douser, LightSensor, PowerSwitch, Projector, WatchedProjector
 from hal.registry import Driver, open_device
 from hal.values import Power
 
 OPEN_S = 15.0
+
+
+_DOUSER: Final = {True: "closed", False: "open", None: "not moved yet"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,9 @@ def devices_of(checked: Checked) -> Iterator[Device]:
         yield Device(relays.name, "power_switch", driver, settings)
     for projector, (driver, settings) in zip(tables.projectors, checked.projectors, strict=True):
         yield Device(projector.name, "projector", driver, settings)
+    for projector, douser in zip(tables.projectors, checked.dousers, strict=True):
+        if douser is not None:
+            yield Device(f"{projector.name} (douser)", "douser", *douser)
     yield Device("camera", "camera", *checked.camera)
     if checked.light_sensor is not None:
         yield Device("light sensor", "light_sensor", *checked.light_sensor)
@@ -98,6 +104,8 @@ class Trying:
                 return self._projector(device.name, cast("Projector", opened))
             case "power_switch":
                 return self._relays(device.name, cast("PowerSwitch", opened))
+            case "douser":
+                return _DOUSER[cast("Douser", opened).closed(deadline=until)]
             case "light_sensor":
                 return f"{cast('LightSensor', opened).illuminance_lux(deadline=until):.2f} lux"
             case "button_panel":

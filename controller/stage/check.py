@@ -22,7 +22,8 @@ from hal.registry import Driver, Drivers, OpenContext, check_device, load_driver
 class Checked:
     """A completely checked stage; no device is opened yet.
 
-    ``faults``: drivers that failed to check their settings. Their devices may still open.
+    ``faults``: drivers that failed to check their settings. Their devices may still open. ``dousers``: of each
+    projector.
     """
 
     stage: Stage
@@ -34,6 +35,7 @@ class Checked:
     light_sensor: tuple[Driver, dict[str, Any]] | None = None
     key_panel: tuple[Driver, dict[str, Any]] | None = None
     faults: tuple[DriverFault, ...] = ()
+    dousers: tuple[tuple[Driver, dict[str, Any]] | None, ...] = ()
 
     @property
     def prior(self) -> CameraPrior:
@@ -110,6 +112,10 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None, instead: Path |
         ),
         key_panel=(
             None if tables.key_panel is None else checked("button_panel", tables.key_panel, tables.key_panel.driver)
+        ),
+        dousers=tuple(
+            None if table.douser is None else checked("douser", table.douser, table.douser.driver)
+            for table in tables.projectors
         ),
         faults=tuple(faults),
     )  # fmt: skip

@@ -18,6 +18,7 @@ from controller.core import kiosk_places
 from controller.core.storage import runtime_folder
 from controller.play.control.launch import PlayerProcess, PlayerSettings, replace_player
 from controller.rig.ambient_light import Darkness
+from controller.rig.doused import DousedProjector
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile
 from controller.rig.mains_relays import Circuit, close_circuits
@@ -27,7 +28,7 @@ from controller.stage.recording import open_context
 from hal import registry
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, PluginError
-from hal.interfaces import ButtonPanel, Camera, Device, Display, LightSensor, PowerSwitch, Projector
+from hal.interfaces import ButtonPanel, Camera, Device, Display, Douser, LightSensor, PowerSwitch, Projector
 from hal.registry import Driver, OpenContext
 
 OPEN_S = 20.0
@@ -51,8 +52,8 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
         guards = []
         ledger = LampFile(stage.folder / LampFile.NAME)
         at_least = stage.tables.safety.at_least()
-        for table, (driver, settings) in zip(stage.tables.projectors, checked.projectors, strict=True):
-            projector = cast("Projector", open_device(table, driver, settings, context, deadline))
+        for number, table in enumerate(stage.tables.projectors):
+            projector = open_projector(checked, number, context, deadline)
             guard = LampGuard(table.name, projector, ledger, at_least=at_least)
             _closed_by(stack, guard)
             guards.append(guard)
@@ -79,6 +80,21 @@ def technicians_panel(checked: Checked, *, deadline: Deadline) -> Iterator[Butto
     panel = cast("ButtonPanel", open_device(table, *checked.key_panel, context, deadline))
     with contextlib.closing(panel):
         yield panel
+
+
+def open_projector(checked: Checked, number: int, context: OpenContext, deadline: Deadline) -> Projector:
+    """The projector of this number, with its douser if it has one."""
+    table, (driver, settings) = checked.stage.tables.projectors[number], checked.projectors[number]
+    projector = cast("Projector", open_device(table, driver, settings, context, deadline))
+    douser = checked.dousers[number]
+    if table.douser is None or douser is None:
+        return projector
+    place, (its_driver, its_settings) = table.douser, douser
+
+    def open_douser(until: Deadline) -> Douser:
+        return cast("Douser", open_device(place, its_driver, its_settings, context, until))
+
+    return DousedProjector(table.name, projector, open_douser)
 
 
 def mains_circuits(

@@ -6,15 +6,16 @@
         @pytest.fixture
         def camera(self): return MyCamera.open("emulated")
 
-The fixture (``projector``, ``camera``, ``display``, ``power_switch``, ``light_sensor`` or ``button_panel``) gives an
-opened device and closes it afterwards. The device may be in any healthy state at the start of a test. Class attributes
-are the tests' time limits; increase them for a slow device. Only this part of ``hal`` needs pytest.
+The fixture (``projector``, ``camera``, ``display``, ``power_switch``, ``douser``, ``light_sensor`` or ``button_panel``)
+gives an opened device and closes it afterwards. The device may be in any healthy state at the start of a test. Class
+attributes are the tests' time limits; increase them for a slow device. Only this part of ``hal`` needs pytest.
 """
 
 from hal.conformance.button_panel import ButtonPanelConformance
 from hal.conformance.camera import CameraConformance
 from hal.conformance.device import DeviceConformance
 from hal.conformance.display import BundleDisplayConformance, DisplayConformance
+from hal.conformance.douser import DouserConformance
 from hal.conformance.light_sensor import LightSensorConformance
 from hal.conformance.power_switch import PowerSwitchConformance
 from hal.conformance.projector import ProjectorConformance
@@ -25,6 +26,7 @@ __all__ = [
     "CameraConformance",
     "DeviceConformance",
     "DisplayConformance",
+    "DouserConformance",
     "LightSensorConformance",
     "PowerSwitchConformance",
     "ProjectorConformance",

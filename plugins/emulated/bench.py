@@ -41,6 +41,7 @@ from plugins.emulated.optics.stands import SETTINGS, Stands, read_room, read_sta
 from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World
 from plugins.emulated.projectors.boards import USUAL, board_named
+from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
 from plugins.emulated.projectors.quick_profile import quick_profile
@@ -164,6 +165,10 @@ class _OutputLines:
             f"Projector {projector} {'has' if on else 'has no'} mains.{hurt}",
         )
 
+    def douser(self, projector: str, is_open: bool) -> None:
+        state = "opens" if is_open else "closes"
+        self.say({"douser": projector, "open": is_open}, f"The douser of projector {projector} {state}.")
+
     def ready(self) -> None:
         self.say({"ready": True}, "Ready. Ctrl-C ends.")
 
@@ -210,6 +215,9 @@ def _start(
             wire.scenario = ScenarioPlayer(scenario, device=projector.name, faults=wire.faults, lamp=lamp, plug=wire)
         stack.enter_context(wire)
         out.served(projector.name, "projector", wire.address)
+    covered = {one.name: lamp for one, lamp in zip(truth.projectors, lamps, strict=True)}
+    for node in dmx_nodes(truth.dousers, covered, out.douser):
+        out.served("douser", "dmx", stack.enter_context(node).address)
     if not on_usb:
         camera = stack.enter_context(_network_camera(world, truth.camera))
         out.served("camera", "camera", camera.address)

@@ -13,15 +13,26 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from sacn import DataPacket
+
+from controller.building import osc, pjlink_lines
+from controller.building.sacn import SacnOptions, frame_of
 from controller.bundle import format as bundle_format
 from controller.bundle.index import parse_index
 from controller.config import load_stage
 from controller.core.errors import BundleError, UsageError
 from hal.codecs.hid import light as hid_light
 from hal.codecs.hid import relay as hid_relay
-from hal.codecs.projectors import pjlink, pjlink_udp
+from hal.codecs.projectors import logins, pjlink, pjlink_udp
 from hal.codecs.projectors.profiles import parse_profile
-from hal.codecs.projectors.serial_protocol import parse_hours, parse_line
+from hal.codecs.projectors.serial_protocol import (
+    command_bytes,
+    head_bytes,
+    parse_hours,
+    parse_line,
+    query_bytes,
+    rest_bytes,
+)
 from hal.codecs.ptp import eos as ptp_eos
 from hal.codecs.ptp import ip as ptp_ip
 from hal.codecs.ptp import nikon as ptp_nikon
@@ -29,8 +40,12 @@ from hal.codecs.ptp import sony as ptp_sony
 from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp import values as ptp
 from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
-from hal.errors import ProtocolError
+from hal.errors import DeviceBusy, DeviceRefused, ProtocolError
+from hal.escapes import unescaped
 from hal.tape.reading import parse_tape
+from plugins.emulated.projectors.boards import BOARDS
+from plugins.emulated.projectors.dousers import read_levels
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 
 FOLDER = Path(__file__).parents[2] / "firmware_configs" / "projectors"
@@ -58,6 +73,12 @@ def targets(folder: Path) -> dict[str, Target]:
         "sony": Target(ptp_sony.parse_properties, _SONY),
         "serial-answers": Target(_serial, _answers()),
         "pjlink-answers": Target(_pjlink, tuple(bytes([n]) + answer for n, answer in enumerate(_PJLINK))),
+        "logins": Target(_login, _GREETINGS, (ProtocolError, DeviceRefused, DeviceBusy)),
+        "frames": Target(_frame, tuple(bytes([n]) + bytes.fromhex("fe0106a9020a") for n in range(len(_FRAMES)))),
+        "sacn": Target(_sacn, _levels(), (), 700),
+        "osc": Target(lambda data: list(osc.requests(data)), (osc.message("play", "marble", 2.5),), ()),
+        "pjlink-questions": Target(_pjlink_asked, (b"%1POWR ?\r", b"%2INPT 31\r"), ()),
+        "escapes": Target(lambda data: unescaped(data.decode("latin-1")), (b"on\\r\\x00\\\\",)),
         "pjlink-udp": Target(pjlink_udp.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
         "tape": Target(_tape, _TAPES),
         "hid-reports": Target(_hid, _REPORTS),
@@ -105,16 +126,21 @@ def _eos(data: bytes) -> None:
         ptp_eos.parse_records(data[1:])
 
 
-_TABLES = [table for name in shipped_profiles() if (table := load_profile(name, Path()).serial) is not None]
+_FAMILIES: Final = {
+    name: table for name in shipped_profiles() if (table := load_profile(name, Path()).serial) is not None
+}
+_TABLES: Final = list(_FAMILIES.values())
 
 
 def _serial(data: bytes) -> None:
+    """The first byte is a family, the second a question of it, or a command."""
     if len(data) < 2:
         return
     table = _TABLES[data[0] % len(_TABLES)]
     queries = [None, *table.queries.values()]
     query = queries[data[1] % len(queries)]
-    meaning = parse_line(table, data[2:], query, sent=b"~00124 1\r")
+    sent = command_bytes(table, next(iter(table.commands)), "00") if query is None else query_bytes(table, query, "00")
+    meaning = parse_line(table, data[2:], query, sent=sent)
     value = getattr(meaning, "value", None)
     if query is table.queries.get("lamp_hours") and query is not None and isinstance(value, str):
         parse_hours(value, query.per_hour)
@@ -254,8 +280,61 @@ def _records() -> tuple[bytes, ...]:
 
 
 def _answers() -> tuple[bytes, ...]:
-    lines = (b"OK1", b"INFO2", b"PWR=01\r", b"*POW=ON#", b'(PWR!001 "On")', b"\x02Q$S2\x03", b"00410 00410", b"\x06")
-    return tuple(bytes([n % len(_TABLES), 1 + n % 2]) + line + b"\r" for n in range(8) for line in lines)
+    """What the emulated board of every family answers to every question of its profile."""
+    seeds = []
+    for number, (family, table) in enumerate(_FAMILIES.items()):
+        board = BOARDS[family](EmulatedLamp(LampTiming(0.0, 0.0))) if family in BOARDS else None
+        for at, query in enumerate(table.queries.values(), start=1):
+            said = board.feed(query_bytes(table, query, "00")) if board is not None else []
+            seeds += [bytes([number, at]) + line for line in said or [b"OK1\r"]]
+        seeds.append(bytes([number, 0]) + b"P\r")
+    return tuple(seeds)
+
+
+_FRAMES: Final = [table.frame for table in _TABLES if table.frame is not None]
+
+
+def _frame(data: bytes) -> None:
+    """The first byte is a family whose answers carry their length."""
+    if data and len(data) > (count := head_bytes(frame := _FRAMES[data[0] % len(_FRAMES)])):
+        assert rest_bytes(frame, data[1 : count + 1], longest=512) <= 512
+
+
+_GREETINGS: Final = (
+    b"\0ESC/VP.net\x10\x03\0\0\x20\0", b"\1NTCONTROL 1 09aaaa34\r", b"\1NTCONTROL 2 09aaaa34\r", b"\x0200001\r",
+    b"\x03NOKEY\r\n", b"\x03a1b2c3\r\n", b"\4ok\r\n", b"\4err_auth\r\n", b"\5PJ_OK", b"\6PJACK",
+)  # fmt: skip
+
+
+def _login(data: bytes) -> None:
+    """The first byte is the step of a login."""
+    if not data:
+        return
+    readers: tuple[Callable[[bytes], object], ...] = (
+        lambda said: logins.escvpnet_headers(said, "left"),
+        lambda said: logins.ntcontrol_command(b"QPW", logins.parse_ntcontrol_greeting(said), "admin1", "secret"),
+        lambda said: logins.parse_ntcontrol_answer(said, "left"),
+        lambda said: logins.adcp_proof(said, "secret", "left"),
+        lambda said: logins.check_adcp_accepted(said, "left"), lambda said: logins.check_jvc_greeting(said, "left"),
+        logins.jvc_accepted,
+    )  # fmt: skip
+    readers[data[0] % len(readers)](data[1:])
+
+
+def _sacn(data: bytes) -> None:
+    """Show control's reader, and that of the emulated node."""
+    frame_of(data, SacnOptions())
+    read_levels(data)
+
+
+def _levels() -> tuple[bytes, ...]:
+    packet = DataPacket(tuple(range(16)), "desk", 1, (1, 2, 3))
+    return (bytes(packet.getBytes()),)
+
+
+def _pjlink_asked(data: bytes) -> None:
+    if (command := pjlink_lines.asked(data)) is not None:
+        pjlink_lines.meant(command, ("marble", "warm wood"))
 
 
 STAGE = """\

@@ -174,7 +174,7 @@ def atheris_child(name: str, folder: Path, options: list[str]) -> None:
     # What the fuzzer follows must be told to it before it is imported anew, with its branches counted.
     for module in [m for m in sys.modules if m.startswith(("hal", "controller", "plugins", "tests.campaigns.parser_"))]:
         del sys.modules[module]
-    with atheris.instrument_imports(include=["hal", "controller.bundle", "controller.config"]):
+    with atheris.instrument_imports(include=["hal", "controller.building", "controller.bundle", "controller.config"]):
         again = importlib.import_module("tests.campaigns.parser_targets")
     target: Any = again.targets(folder)[name]
     most_s = MOST_S * 2  # counting branches takes as long as the work itself

@@ -24,10 +24,10 @@ from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile
 from controller.rig.rig import Rig
 from controller.stage.check import Checked
-from controller.stage.open import light_sensor, mains_circuits, open_device, rig_of
+from controller.stage.open import light_sensor, mains_circuits, open_device, open_projector, rig_of
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
-from hal.interfaces import Camera, Device, Display, LightSensor, Projector, WatchedCamera
+from hal.interfaces import Camera, Device, Display, LightSensor, WatchedCamera
 
 Tell = Callable[[Decision], object]
 
@@ -156,11 +156,11 @@ class Devices:
 
     def _projector(self, number: int) -> ProjectorSupervisor:
         tables = self._checked.stage.tables
-        table, (driver, settings) = tables.projectors[number], self._checked.projectors[number]
+        table = tables.projectors[number]
         at_least = tables.safety.at_least()
 
         def open_guard(deadline: Deadline) -> LampGuard:
-            projector = cast("Projector", open_device(table, driver, settings, self._context, deadline))
+            projector = open_projector(self._checked, number, self._context, deadline)
             return LampGuard(table.name, projector, self._ledger, at_least=at_least, clock=self._world,
                              lock=self._world.rlock())  # fmt: skip
 

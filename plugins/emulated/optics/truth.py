@@ -220,6 +220,21 @@ class MainsTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class DouserTruth:
+    """A douser on a DMX node that hears sACN at UDP ``port``. ``covers``: the projector whose lens it stands before.
+
+    ``travel_s``: of its blades, which are open at level 128 and above; ``lost``: what the node does without a signal.
+    """
+
+    port: Annotated[int, Between(1, 65535)]
+    universe: Annotated[int, Between(1, 63999)]
+    channel: Annotated[int, Between(1, 512)]
+    covers: str
+    travel_s: Annotated[float, Between(0.0, 60.0)] = 0.5
+    lost: Annotated[str, OneOf("close", "hold")] = "close"
+
+
+@dataclass(frozen=True, slots=True)
 class BenchTruth:
     """A whole emulated stage. ``subsamples``: S x S rays a camera pixel; ``time_scale``: emulated / real duration;
 
@@ -227,7 +242,7 @@ class BenchTruth:
     default is two).
 
     ``scenario``: faults on the projectors' wires (``plugins.emulated.scenario``), a file relative to the stage folder;
-    ``mains``: which emulated relays feed which projectors, whose mains are on otherwise;
+    ``mains``: which emulated relays feed which projectors, whose mains are on otherwise; ``dousers``: closed at first;
     ``indirect``: the share of all projected light that object and room throw back evenly on the object.
 
     ``surfaces``: of the room round the object; ``engine``: "direct" for light straight from the projectors alone,
@@ -247,6 +262,7 @@ class BenchTruth:
     projectors: tuple[ProjectorTruth, ...]
     scenario: str = ""
     mains: tuple[MainsTruth, ...] = ()
+    dousers: tuple[DouserTruth, ...] = ()
     indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
     surfaces: tuple[SurfaceTruth, ...] = ()
     engine: Annotated[str, OneOf("direct", "radiosity", "mitsuba")] = "direct"

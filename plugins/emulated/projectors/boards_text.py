@@ -84,13 +84,15 @@ class EpsonBoard:
 @dataclass(frozen=True, slots=True)
 class BenqQuirks:
     """By model: the prompt, which answers an empty line; how many times a command comes back, an answer glued to its
-    echo in standby (W700), hours with spaces and without # (W1100), answers that lose their * in standby (W1110)."""
+    echo in standby (W700), hours with spaces and without # (W1100), answers that lose their * in standby (W1110);
+    whether source, lamp mode and keystone can be read and set."""
 
     prompt: bool = True
     echoes: int = 1
     glued_in_standby: bool = False
     bare_hours: bool = False
     starless_in_standby: bool = False
+    menus: bool = True
 
 
 class BenqBoard:
@@ -100,6 +102,7 @@ class BenqBoard:
         self._lamp = lamp
         self._quirks = quirks or BenqQuirks()
         self._lines = Lines(ord("\r"), ord("*"))
+        self._menu = {b"sour": b"HDMI", b"lampm": b"LNOR", b"vkeystone": b"0"} if self._quirks.menus else {}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers, prompt = [], b""
@@ -134,8 +137,15 @@ class BenqBoard:
         if value == b"?" and key in (b"pow", b"ltim"):
             hours = b"*LTIM= %d" if self._quirks.bare_hours else b"*LTIM=%d#"
             return hours % self._lamp.hours if key == b"ltim" else b"*POW=OFF#" if standby else b"*POW=ON#"
-        if key not in (b"blank", b"modelname") or standby:
-            return b"*Block item#" if key in (b"blank", b"modelname") else b"*Unsupported item#"
+        if key not in (known := (b"blank", b"modelname", *self._menu)) or standby:
+            return b"*Block item#" if key in known else b"*Unsupported item#"
+        return self._lit(key, value)
+
+    def _lit(self, key: bytes, value: bytes) -> bytes:
+        """What is answered only while the lamp burns."""
+        if key in self._menu:
+            self._menu[key] = self._menu[key] if value == b"?" else value.upper()
+            return b"*%s=%s#" % (key.upper(), self._menu[key])
         if key == b"modelname":
             return b"*MODELNAME=W1110#"
         self._lamp.shutter_closed = value == b"on"

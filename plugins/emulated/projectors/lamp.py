@@ -63,6 +63,8 @@ class EmulatedLamp:
         self._hot = False
         self._mains = True
         self._damages = 0
+        self.passing: Callable[[], float] = lambda: 1.0
+        """The share of its light that what stands before the lens lets through: a douser's."""
 
     def strike(self) -> bool:
         """Try to light the lamp; False while it cools or is too hot. Harmless when it burns already.
@@ -99,14 +101,15 @@ class EmulatedLamp:
             return LampPhase.STANDBY
 
     def light_level(self) -> float:
-        """Share of the projector's full light: 0 when dark or behind the shutter, rising while it warms; then drifting
-        towards 1.
+        """Share of the projector's full light: 0 when dark or behind shutter or douser, rising while it warms; then
+        drifting towards 1.
         """
         with self._lock:
             if self._lit_since is None or self._shutter_closed:
                 return 0.0
             burning_s = self._clock() - self._lit_since
             drift = 1.0 + self._timing.drift * math.exp(-burning_s / self._timing.drift_s)
+            drift *= self.passing()
             if self._timing.warm_up_s <= 0:
                 return drift
             warmth = min(1.0, burning_s / self._timing.warm_up_s)

@@ -96,6 +96,20 @@ def test_an_asker_hears_the_state_and_refusals(kiosk: MemoryKiosk, tmp_path: Pat
         assert kiosk.snapshot().state == "playing"
 
 
+def test_a_sender_of_unknown_types_does_not_fill_the_journal(
+    kiosk: MemoryKiosk, tmp_path: Path, port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "building.toml").write_text(f"[osc]\nport = {port}\n")
+    with serving(kiosk, read(tmp_path)), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+        asker.connect(("127.0.0.1", port))
+        asker.settimeout(10)
+        wait_for(lambda: _sent(asker, message("status")))
+        asker.send(b"/velatura/brightness\0\0\0\0,pqxyz\0\0")
+        # Answered after the one before, or dropped with it.
+        wait_for(lambda: b"/velatura/error" in asker.recv(4096))
+    assert caplog.records == []
+
+
 def _sent(asker: socket.socket, datagram: bytes) -> bool:
     asker.send(datagram)
     time.sleep(0.05)

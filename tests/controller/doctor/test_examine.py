@@ -21,6 +21,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceBusy
 from hal.finding import Finder, Found, Wanted, load_finders
 from hal.registry import BrokenPlugin, Driver, Drivers, load_drivers
+from plugins.dousers.sacn_douser import DRIVER
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.quick_profile import quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
@@ -155,6 +156,19 @@ def test_a_projector_behind_an_open_relay_is_told_to_have_no_mains(hall: Hall) -
     seen = hall.examine()
     assert "mains-off" in codes(seen)
     assert hall.board.closed == {1: False}
+
+
+def test_a_douser_is_tried_without_a_movement_and_its_table_stays_where_it_is(hall: Hall) -> None:
+    douser = '\n[projectors.douser]\ndriver = "sacn"\naddress = "127.0.0.1:9"\nuniverse = 1\nchannel = 2\n'
+    (hall.folder / "stage.toml").write_text(STAGE.replace("\n[camera]", douser + "[camera]"))
+    hall.drivers = Drivers((*hall.drivers.list, DRIVER))
+    hall.plug("left", baud=19200)
+    seen = hall.examine(write=True)
+    assert ("left (douser)", "douser") in [(one.name, one.kind) for one in seen.tried]
+    assert "universe 1, channel 2: not moved yet" in seen.as_text()
+    (left,) = tomllib.loads((hall.folder / "stage.toml").read_text())["projectors"]
+    assert (left["baud"], left["douser"]["channel"]) == (19200, 2)
+    assert hall.examine().healthy
 
 
 def test_a_wrong_rate_is_written_into_the_file_and_the_comments_stay(hall: Hall) -> None:

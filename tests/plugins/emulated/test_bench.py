@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 import rawpy
 import serial
+from sacn import DataPacket
 
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
@@ -26,7 +28,7 @@ from hal.values import Power
 from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.cameras.shot import ShotSettings
 from plugins.emulated.optics.stands import Stands
-from plugins.emulated.optics.truth import BenchTruth, MainsTruth, ProjectorTruth, read_truth, write_truth
+from plugins.emulated.optics.truth import BenchTruth, DouserTruth, MainsTruth, ProjectorTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World
 from plugins.emulated.projectors.boards import BOARDS, USUAL, login_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
@@ -78,7 +80,10 @@ def power_of(tty: Path, *, patience_s: float = 20.0) -> bytes:
 
 def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(prepared: Path) -> None:
     truth = read_truth(prepared)
-    write_truth(prepared, dataclasses.replace(truth, mains=(MainsTruth("cupboard", 2, ("left", "right"), 0.1),)))
+    (port,) = random.SystemRandom().sample(range(20000, 32768), 1)
+    mains = (MainsTruth("cupboard", 2, ("left", "right"), 0.1),)
+    dousers = (DouserTruth(port, 1, 5, "above"),)
+    write_truth(prepared, dataclasses.replace(truth, mains=mains, dousers=dousers))
     (prepared / "bench" / "usb.toml").write_text('[[device]]\nname = "cupboard"\nkind = "relay"\nserial = "BENCH"\n')
     camera = truth.camera
     ends_s = time.monotonic() + 120
@@ -91,6 +96,13 @@ def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(
             assert all(tty.is_symlink() and tty.resolve().is_char_device() for tty in ttys)
             socket.create_connection(("127.0.0.1", camera.command_port), timeout=60).close()
             assert any("progress" in record for record in records)
+            assert addresses["douser"] == f"127.0.0.1:{port}"
+            packet = DataPacket(tuple(range(16)), "desk", 1, (0, 0, 0, 0, 255))
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as desk:
+                desk.sendto(bytes(packet.getBytes()), ("127.0.0.1", port))
+            told = [json.loads(next(process.stdout)) for _ in range(2)] if process.stdout is not None else []
+            # Nobody goes on sending.
+            assert told == [{"douser": "above", "open": True}, {"douser": "above", "open": False}]
             assert [power_of(tty, patience_s=0.5) for tty in ttys[:2]] == [b"", b""], "these two have no mains"
             assert power_of(ttys[2]) == b"OK0\r"
             variables = next(record["environment"] for record in records if "environment" in record)

@@ -41,3 +41,11 @@ class TestEosNew(EveryFlavour):
 
 class TestEosOld(EveryFlavour):
     flavour = "eos-old"
+
+
+class TestNikon(EveryFlavour):
+    flavour = "nikon"
+
+
+class TestSony(EveryFlavour):
+    flavour = "sony"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import Lines, broken
+from plugins.emulated.projectors.families.collecting import BURNING, Lines, broken
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _UNIT: Final = b"\x89\x01"
@@ -21,6 +21,7 @@ class JvcBoard:
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
         self._lines = Lines(ord("\n"))
+        self._menu = {b"IP": b"6", b"PMLP": b"0"}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers = []
@@ -45,9 +46,12 @@ class JvcBoard:
         if command == b"PW0":
             self._lamp.extinguish()
             return True
+        if command[:-1] in self._menu and self._lamp.phase in BURNING:
+            self._menu[command[:-1]] = command[-1:]
+            return True
         return command == b""  # a check of the connection
 
     def _told(self, command: bytes) -> bytes | None:
         power = b"4" if broken(self._lamp) else _PHASES[self._lamp.phase]
         told = {b"PW": power, b"MD": b"ILAFPJ -- B5B1", b"IFLT": b"%04X" % self._lamp.hours}
-        return told.get(command)
+        return (told | self._menu if self._lamp.phase in BURNING else told).get(command)

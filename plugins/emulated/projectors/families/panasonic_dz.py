@@ -20,6 +20,7 @@ class PanasonicDzBoard:
     def __init__(self, lamp: EmulatedLamp, *, number: bytes = b"01") -> None:
         self._lamp = lamp
         self._number = number
+        self._menu = {b"IIS": b"HD1", b"LPM": b"0"}
         self._lines = Lines(0x03, 0x02)
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
@@ -46,6 +47,12 @@ class PanasonicDzBoard:
             b"QPW": b"001" if lamp.phase in BURNING else b"000",
             b"QSH": b"%d" % lamp.shutter_closed,
         }
+        if lamp.phase in BURNING:
+            told |= {b"QIN": self._menu[b"IIS"], b"QSL": self._menu[b"LPM"]}
+            key, _, value = command.partition(b":")
+            if key in self._menu and value:
+                self._menu[key] = value
+                return command
         if command in told:
             return told[command]
         if command == b"POF":

@@ -27,6 +27,7 @@ class AdcpBoard:
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
         self._lines = Lines(ord("\n"))
+        self._menu = {b"input": b'"hdmi1"', b"light_output_mode": b'"high"'}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         return [
@@ -44,21 +45,33 @@ class AdcpBoard:
             b"power_status ?": b'"%s"' % _ADCP[lamp.phase],
             b"timer ?": b'[{"operation":%d},{"light_src":%d},{"prev_light_src":7}]' % (lamp.hours + 9, lamp.hours),
             b"modelname ?": b'"VPL-FHZ75"',
-            b"blank ?": b'"on"' if lamp.shutter_closed else b'"off"',
         }
         if line in told:
             return told[line]
+        key, _, value = line.partition(b" ")
+        if key == b"blank" or key in self._menu:
+            return self._chosen(key, value)
         if line == b'power "on"':
             return b"ok" if lamp.strike() else b"err_inactive"
         if line == b'power "off"':
             lamp.extinguish()
             return b"ok"
-        if line in (b'blank "on"', b'blank "off"'):
-            if lamp.phase not in BURNING:
-                return b"err_inactive"
-            lamp.shutter_closed = line.endswith(b'"on"')
-            return b"ok"
-        return b"err_val" if line.startswith((b"power ", b"blank ")) else b"err_cmd"
+        return b"err_val" if key == b"power" else b"err_cmd"
+
+    def _chosen(self, key: bytes, value: bytes) -> bytes:
+        """What a menu tells, or how it is set; ``blank`` also tells while it is dark."""
+        lamp, burning = self._lamp, self._lamp.phase in BURNING
+        if value == b"?" and (burning or key == b"blank"):
+            return (self._menu | {b"blank": b'"on"' if lamp.shutter_closed else b'"off"'})[key]
+        if key == b"blank" and value not in (b'"on"', b'"off"'):
+            return b"err_val"
+        if not burning:
+            return b"err_inactive"
+        if key == b"blank":
+            lamp.shutter_closed = value == b'"on"'
+        else:
+            self._menu[key] = value
+        return b"ok"
 
 
 class SdcpBoard:

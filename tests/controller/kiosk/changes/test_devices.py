@@ -24,16 +24,17 @@ from hal.registry import OpenContext
 from hal.values import Power
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
-from plugins.emulated.projectors.boards_text import EpsonBoard
+from plugins.emulated.projectors.boards import BOARDS
+from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink_board import PjLinkOddities
 from plugins.ptp.camera import open_camera
 from tests.controller.kiosk.install.test_outputs import LEFT, OFF, RIGHT
 from tests.controller.kiosk.vase import vase
-from tests.plugins.conftest import hasty, open_pjlink, open_serial, wait_for_power
+from tests.plugins.conftest import hasty, open_network, open_pjlink, open_serial, wait_for_power
 from tests.plugins.ptp.ptp_rig import Studio
 
-__all__ = ["open_pjlink", "open_serial"]
+__all__ = ["open_network", "open_pjlink", "open_serial"]
 SOON = 30.0
 LAMP = LampTiming(warm_up_s=0.2, cool_down_s=0.2)
 
@@ -76,8 +77,39 @@ def test_a_menu_of_a_serial_projector(open_serial: Any, command: bytes, named: s
     assert pair.driver.troubles() == []
 
 
+@pytest.mark.parametrize(
+    ("profile", "commands", "named"),
+    [
+        ("benq", (b"\r*sour=RGB#\r", b"\r*vkeystone=+3#\r", b"\r*lampm=eco#\r"),
+         ("input", "HDMI", "RGB", "keystone", "0", "+3", "lamp mode", "LNOR", "ECO")),
+        ("jvc", (b"!\x89\x01IP7\n", b"!\x89\x01PMLP1\n"), ("input", "6", "7", "lamp mode", "0", "1")),
+        ("panasonic-dz", (b"\x02ADZZ;IIS:SD1\x03", b"\x02ADZZ;LPM:3\x03"),
+         ("input", "HD1", "SD1", "lamp mode", "0", "3")),
+        ("sony-adcp", (b'input "hdmi2"\r\n', b'light_output_mode "low"\r\n'),
+         ("input", "hdmi1", "hdmi2", "lamp mode", "high", "low")),
+    ],
+)  # fmt: skip
+def test_menus_of_other_families(
+    open_serial: Any, open_network: Any, profile: str, commands: tuple[bytes, ...], named: tuple[str, ...]
+) -> None:
+    lamp = EmulatedLamp(LAMP)
+    board = BOARDS[profile](lamp)
+    make = open_network if profile == "sony-adcp" else open_serial
+    pair = make(profile=profile, lamp=lamp, board=lambda _: board, edit=hasty)
+    before = adjusted(lit(pair))
+    for command in commands:
+        assert board.feed(command)
+    told = [f"The {kind} of projector left was {old}, and is now {new}." for kind, old, new in batched(named)]
+    assert sorted(compared(before, adjusted(pair))) == sorted(told)
+    assert pair.driver.troubles() == []
+
+
+def batched(names: tuple[str, ...]) -> list[tuple[str, ...]]:
+    return [names[at : at + 3] for at in range(0, len(names), 3)]
+
+
 def test_a_serial_projector_whose_model_has_no_such_menu_says_nothing(open_serial: Any) -> None:
-    pair = lit(open_serial(profile="benq", edit=hasty))
+    pair = lit(open_serial(profile="benq", board=lambda lamp: BenqBoard(lamp, BenqQuirks(menus=False)), edit=hasty))
     assert pair.driver.adjustments(deadline=in_seconds(SOON)) == {}
     assert pair.driver.troubles() == []
 

@@ -15,7 +15,7 @@ from christie_mseries import ChristieClient, ChristieError, PowerState
 from jvc_projector_remote import JVCProjector
 from jvc_projector_remote.jvcprojector import JVCHandshakeError
 from jvcprojector import JvcProjector, JvcProjectorAuthError
-from jvcprojector.command import LightTime, Power  # type: ignore[attr-defined]
+from jvcprojector.command import Input, LightPower, LightTime, Power  # type: ignore[attr-defined]
 
 from plugins.emulated.projectors.boards import BOARDS, login_of
 from plugins.emulated.projectors.boards_text import ChristieBoard
@@ -75,6 +75,10 @@ def test_pyjvcprojector_logs_in_and_switches_a_jvc(start: Start, password: str, 
             await asyncio.sleep(0.05)
         assert await client.get(Power) == Power.ON
         assert int(await client.get(LightTime)) == 1200
+        assert await client.get(LightPower) == LightPower.LOW
+        await client.set(LightPower, LightPower.HIGH)
+        assert await client.get(LightPower) == LightPower.HIGH
+        assert await client.get(Input) == Input.HDMI1
         await client.set(Power, Power.OFF)
         while await client.get(Power) != Power.STANDBY:
             await asyncio.sleep(0.05)

@@ -43,6 +43,9 @@ def test_benqprojector_finds_the_prompt_and_switches(tmp_path: Path) -> None:
         await until(lamp, LampPhase.LIT)
         assert await client.send_command("pow") == "on"
         assert await client.send_command("ltim") == "1200"
+        assert await client.send_command("lampm") == "lnor"
+        assert await client.send_command("lampm", "eco") == "eco"
+        assert await client.send_command("vkeystone") == "0"
         assert await client.send_command("blank", "on") == "on"
         assert lamp.shutter_closed
         # Its turn_off waits for half a minute after turn_on, so the command alone.
