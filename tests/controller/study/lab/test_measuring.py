@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from controller.plan.resolution import last_kept
 from controller.solve.metrics import sharpness
-from controller.study.experiments.frequency import bases, kept_contrast, last_kept, make_waves
+from controller.study.experiments.frequency import bases, kept_contrast, make_waves
 from controller.study.lab.measuring import normalised_residual, quality, region_means, sharpness_map, unbounded_inverse
 from controller.study.lab.subject import ReachableTarget
 from tests.controller.study.array_stage import CAMERA, array_subject
