@@ -109,6 +109,10 @@ def _player(life: Living, item: Item) -> None:
         screen.dies_at_start += int(item.number)
         if screen.process is not None:
             screen.process.kill()
+    elif item.how == "crashes at a picture":
+        screen.dies_at_play += int(item.number)
+        if screen.process is not None:
+            screen.process.kill()
     elif item.how == "hung":
         screen.hung = True
     else:

@@ -37,6 +37,7 @@ PROMISES: Final = {
     "few strikes": "A lamp that gives no light is not struck again and again.",
     "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
     "as usual again": "What people changed of the picture ends when the stage closes.",
+    "bundle kept": "A bundle that can be read is given up only after three starts that were to show it, and did not.",
     "devices back": "A camera that is there again is opened again.",
 }
 SETTLING_S: Final = 200.0
@@ -166,6 +167,8 @@ class Witness:
         scheduler = world.scheduler
         if world.camera.sins:
             raise Broken("one owner", world.camera.sins[0])
+        if world.screen.sins:
+            raise Broken("bundle kept", world.screen.sins[0])
         if scheduler.crashes:
             name, error = scheduler.crashes[0]
             raise Broken("no crash", f"{name}: {type(error).__name__}: {error}")

@@ -107,8 +107,8 @@ def _one(chance: random.Random, at_s: float) -> Item:  # noqa: PLR0911 - one for
         case "lamp switched by hand":
             return Item(at_s, what, name, chance.choice(["off", "on"]))
         case "player":
-            how = chance.choice(["killed", "hung", "crashes", *TROUBLES])
-            count = chance.randint(1, 4) * (how == "crashes")
+            how = chance.choice(["killed", "hung", "crashes", "crashes at a picture", *TROUBLES])
+            count = chance.randint(1, 4) * how.startswith("crashes")
             return Item(at_s, what, "", how, min(lasts_s, RESTLESS_S) if how in TROUBLES else 0.0, count)
         case "file damaged":
             return Item(at_s, what, chance.choice(FILES), chance.choice(["cut", "flipped", "empty", "removed"]),
