@@ -97,7 +97,7 @@ def _by_hand(life: Living, item: Item) -> None:
     if item.how == "off":
         lamp.go_dark()
     elif not lamp.lit and not lamp.dud and now_s - lamp.off_at_s >= RULES.minimum_off_s:
-        lamp.lit_at_s = now_s
+        lamp.lit_at_s, lamp.by_hand = now_s, True
     life.witness.disturb(0.0)
 
 
@@ -180,6 +180,7 @@ def _power_cut(life: Living, item: Item) -> None:
     world.scheduler.sleep(item.for_s + 1.0)
     world.reboot()
     life.witness.disturb(0.0)
+    life.witness.forgive()
     life.boot()
 
 

@@ -17,7 +17,8 @@ _ROUNDING_S: Final = 1e-6
 
 
 class Lamp:
-    """What the projector really is. ``dud``: it takes strikes and gives no light; ``fault``: a word that it reports.
+    """What the projector really is. ``dud``: it takes strikes and gives no light; ``fault``: a word that it reports;
+    ``by_hand``: it burns because somebody switched it on.
 
     ``sins``: what was done to it against the rules.
     """
@@ -26,7 +27,7 @@ class Lamp:
         self.name, self._scheduler = name, scheduler
         self.lit_at_s: float | None = None
         self.off_at_s = self.struck_at_s = -1e9
-        self.dud, self.fault = False, ""
+        self.dud, self.by_hand, self.fault = False, False, ""
         self.strikes = 0
         self.sins: list[str] = []
 
@@ -53,6 +54,7 @@ class Lamp:
             self.sins.append(f"the lamp of {self.name} was struck {dark_s:.1f} s after it went off")
         self.strikes += 1
         self.lit_at_s = self.struck_at_s = self._scheduler.now_s
+        self.by_hand = False
         if self.dud:
             self.go_dark()
 

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +28,7 @@ from controller.simulate.disk import STAGE, watched
 from controller.simulate.jobs import SimulatedJobs
 from controller.simulate.promises import Broken, Witness, after_the_end
 from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
-from controller.simulate.script import ZONES, Item, draw, hours
+from controller.simulate.script import ZONES, Item, begins, draw, hours
 from controller.simulate.stage import make_stage
 from controller.simulate.world import SimulatedWorld
 from hal.deadline import Stop
@@ -71,12 +70,10 @@ class Life:
         self.seed, self.days = seed, days
         self.items = tuple(draw(seed, days) if items is None else items)
         chance = random.Random(f"{seed} life")
-        begins = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(
-            days=chance.randrange(0, 1000), minutes=chance.randrange(1440)
-        )
         self.zone, self.rows = chance.choice(ZONES), hours(chance)
+        unix_s = begins(chance, self.zone).timestamp()
         self.drift_check = chance.choice(["03:30", "02:30", "23:00"])
-        self.world = SimulatedWorld(seed, begins.timestamp())
+        self.world = SimulatedWorld(seed, unix_s)
         self.witness = Witness(self.world, Calendar(self.zone, self.rows))
         self.program: Program | None = None
         self.kiosk: StageKiosk | None = None

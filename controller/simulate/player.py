@@ -153,7 +153,7 @@ class SimulatedPlayer:
         """Whether that was right, as far as it was."""
         vain = self._screen.vain_starts.pop(before.name, 0) if self._bundle != before.name else MOST_FAILED_STARTS
         if vain < MOST_FAILED_STARTS and before.is_file():
-            self._screen.sins.append(f"the bundle {before.name} was given up after {vain} starts in vain")
+            self._screen.sins.append(f"the bundle {before.name} was given up after {vain} starts without a picture")
 
     def load(self, path: Path) -> None:
         """Use this bundle from now on. Raises VelaturaError."""

@@ -26,6 +26,7 @@ PROMISES: Final = {
     "state": "The log's last word on the state is the state.",
     "black while closed": "No picture is shown while the stage is closed.",
     "dark while closed": "No lamp burns while the stage is closed and no work needs it.",
+    "off is off": "When a stage says that every lamp is off, none burns that it struck.",
     "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
     "says why it is dark": "While an open stage shows nothing, it says why.",
     "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
@@ -49,7 +50,7 @@ DARK_S: Final = 240.0
 BACK_S: Final = 15.0
 OPENED_S: Final = 200.0
 DECIDES_S: Final = 0.3
-MOST_STRIKES: Final = 5
+MOST_STRIKES: Final = 4
 MOST_WORDS: Final = 500
 WORDS_S: Final = 600.0
 LOOKED_S: Final = 300.0
@@ -142,8 +143,15 @@ class Witness:
 
     def killed(self) -> None:
         """The service was, perhaps between an alert and the note that it was sent."""
+        # Sent before it was killed, and not yet looked at.
+        self._alerted_number = max([self._alerted_number, *(row.number for row in self._world.alerted)])
+        self._alerted = len(self._world.alerted)
         self._kills += 1
         self._missing_since_s = None
+
+    def numbers_again(self) -> None:
+        """What was told from ``read`` on has numbers that others had, which were never written."""
+        self._alerted_number = min(self._alerted_number, self.read)
 
     def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
         """A fault, so long, and what it takes to get over it."""
@@ -157,6 +165,7 @@ class Witness:
 
     def ledger_lost(self) -> None:
         """The counts of strikes begin anew."""
+        self.forgive()
         self._uncounted = {name: line.lamp.strikes + line.delayed for name, line in self._world.lines.items()}
 
     # -- judging
@@ -211,6 +220,7 @@ class Witness:
             if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
                 raise Broken("remedy", f"{row.code}: {row.text}")
             if row.code == "state":
+                self._off(row)
                 self._told = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
             elif row.code == "task-due":
                 open_s = now_s - self.changed_s
@@ -223,6 +233,13 @@ class Witness:
         if len(self._recent) == MOST_WORDS and now_s - self._recent[0] < WORDS_S:
             raise Broken("few words", f"{MOST_WORDS} events in {now_s - self._recent[0]:.0f} s")
         return True
+
+    def _off(self, row: EventRow) -> None:
+        for name, line in self._world.lines.items():
+            # A look is some seconds old; a command that was under way may have struck it since.
+            seen = self._world.scheduler.now_s - line.lamp.struck_at_s > BACK_S
+            if line.lamp.lit and seen and not line.lamp.by_hand and row.text.startswith("The stage is off: every lamp"):
+                raise Broken("off is off", f"the lamp of {name} burns")
 
     def _strikes(self, service: Service) -> None:
         for supervisor in service.devices.projectors:
@@ -339,6 +356,7 @@ def after_the_end(witness: Witness, service: Service, *, damaged: frozenset[str]
     rows = list(service.log.after(0))
     # What could not be written before the end is gone, and its numbers are given again.
     witness.read = next((row.number - 1 for row in reversed(rows) if row.code == "service-started"), witness.read)
+    witness.numbers_again()
     there = {row.number: row for row in rows}
     if damaged & {"kiosk/events.sqlite", "kiosk/events.sqlite-wal"}:
         witness.rows.clear()

@@ -6,7 +6,9 @@ import json
 import random
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final
+from zoneinfo import ZoneInfo
 
 from controller.simulate.lamps import LINE_TROUBLES
 from controller.simulate.player import TROUBLES
@@ -22,6 +24,9 @@ FILES: Final = (
     "kiosk/events.sqlite", "kiosk/events.sqlite-wal", "kiosk/lamps.json", "schedule.toml", "stage.toml",
     "bundles/starts.json", "lamps.json", "kiosk/stage.toml.good",
 )  # fmt: skip
+PACES_H: Final = (1.5, 4.0, 8.0)
+LEANINGS: Final = (0.0, 1.0, 1.0, 4.0)
+_Weights = tuple[tuple[str, float], ...]
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 
 
@@ -69,6 +74,8 @@ def hours(chance: random.Random) -> list[dict[str, str]]:
         opens = chance.randrange(8 * 60, 18 * 60)
         # Not in the hour that summer time leaves out: what its times mean is not worked out a second time here.
         closes = min(opens + chance.randrange(60, 10 * 60), 25 * 60 + 55)
+        if chance.random() < 0.2:
+            closes = chance.randrange(27 * 60 + 5, 31 * 60)
         rows.append({"day": day, "opens": _clock(opens), "closes": _clock(closes)})
     return rows or [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
 
@@ -77,25 +84,51 @@ def _clock(minutes: int) -> str:
     return f"{minutes // 60 % 24:02}:{minutes % 60:02}"
 
 
+def begins(chance: random.Random, zone: str) -> datetime:
+    """When a life begins; every third some two days before the clocks of the zone change."""
+    day = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(days=chance.randrange(0, 1000))
+    if chance.random() < 1 / 3:
+        later = [day + timedelta(days=number) for number in range(200)]
+        offsets = [one.astimezone(ZoneInfo(zone)).utcoffset() for one in later]
+        changes = [number for number in range(1, 200) if offsets[number] != offsets[number - 1]]
+        day += timedelta(days=max(0, changes[0] - 3)) if changes else timedelta()
+    return day + timedelta(minutes=chance.randrange(1440))
+
+
 def draw(seed: str, days: float) -> list[Item]:
-    """The script of a life. Many things happen alone, some several at once."""
+    """The script of a life. Many things happen alone, some several at once.
+
+    Each life has a pace and a leaning of its own: some kinds of things never happen in it, others often. What several
+    of one kind do together would hardly ever be seen otherwise.
+    """
     chance = random.Random(f"{seed} script")
+    kinds, commands, pace_s = _leaning(chance, _KINDS), _leaning(chance, _COMMANDS), chance.choice(PACES_H) * HOUR_S
     items: list[Item] = []
     at_s = chance.expovariate(1 / (5 * HOUR_S)) + 600.0
     while at_s < days * DAY_S:
         count = 1 if chance.random() < 0.75 else chance.randint(2, 5)
-        items += [_one(chance, at_s + chance.expovariate(1 / 60.0) * (number > 0)) for number in range(count)]
-        at_s += chance.expovariate(1 / (6 * HOUR_S)) + 30.0
+        for number in range(count):
+            then_s = at_s + chance.expovariate(1 / 60.0) * (number > 0)
+            items.append(_one(chance, then_s, _drawn(chance, kinds), commands))
+        at_s += chance.expovariate(1 / pace_s) + 30.0
     return sorted(items, key=lambda item: item.at_s)
 
 
-def _one(chance: random.Random, at_s: float) -> Item:  # noqa: PLR0911 - one for each kind
+def _leaning(chance: random.Random, usual: _Weights) -> _Weights:
+    return tuple((kind, weight * chance.choice(LEANINGS)) for kind, weight in usual)
+
+
+def _drawn(chance: random.Random, weights: _Weights) -> str:
+    known = any(weight for _, weight in weights)
+    return chance.choices([kind for kind, _ in weights], [weight if known else 1.0 for _, weight in weights])[0]
+
+
+def _one(chance: random.Random, at_s: float, what: str, commands: _Weights) -> Item:  # noqa: PLR0911 - one for each kind
     at_s = round(at_s, 3)
     lasts_s = round(
         chance.choice([chance.uniform(0.5, 30.0), chance.uniform(30.0, 900.0), chance.uniform(900, 30_000)]), 1
     )
     name = chance.choice(NAMES)
-    what = chance.choices([kind for kind, _ in _KINDS], [weight for _, weight in _KINDS])[0]
     match what:
         case "line":
             how = chance.choice(LINE_TROUBLES)
@@ -123,13 +156,12 @@ def _one(chance: random.Random, at_s: float) -> Item:  # noqa: PLR0911 - one for
         case "restarted":
             return Item(at_s, what, "", chance.choice(["lamps stay lit", "lamps off"]))
         case "command":
-            return _command(chance, at_s)
+            return _command(at_s, chance, _drawn(chance, commands))
         case _:
             return Item(at_s, what, for_s=0.0 if what in ("killed", "drift", "bundle damaged") else lasts_s)
 
 
-def _command(chance: random.Random, at_s: float) -> Item:
-    who = chance.choices([kind for kind, _ in _COMMANDS], [weight for _, weight in _COMMANDS])[0]
+def _command(at_s: float, chance: random.Random, who: str) -> Item:
     values: dict[str, Any] = {}
     match who:
         case "play":
