@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from controller.kiosk.decide.interfaces import Condition
+from controller.kiosk.decide.interfaces import Condition, Request
 from controller.kiosk.decide.live_changes import LiveChanges
 from controller.kiosk.interface import EventRow
+from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State
 from controller.simulate.calendar import Calendar
 from controller.simulate.disk import STAGE
@@ -26,6 +27,8 @@ PROMISES: Final = {
     "state": "The log's last word on the state is the state.",
     "black while closed": "No picture is shown while the stage is closed.",
     "dark while closed": "No lamp burns while the stage is closed and no work needs it.",
+    "lit through a restart": "A service that is killed or restarted leaves the lamps of an open stage lit.",
+    "serves": "A service that was started runs, also with a damaged stage.toml, as long as the last good one is there.",
     "off is off": "When a stage says that every lamp is off, none burns that it struck.",
     "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
     "says why it is dark": "While an open stage shows nothing, it says why.",
@@ -39,6 +42,7 @@ PROMISES: Final = {
     "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
     "as usual again": "What people changed of the picture ends when the stage closes.",
     "bundle kept": "A bundle that can be read is given up only after three starts that were to show it, and did not.",
+    "work ends": "Work ends by itself, when it is cancelled and when it fails, and lets go of the stage.",
     "devices back": "A camera that is there again is opened again.",
 }
 SETTLING_S: Final = 200.0
@@ -50,9 +54,11 @@ DARK_S: Final = 240.0
 BACK_S: Final = 15.0
 OPENED_S: Final = 200.0
 DECIDES_S: Final = 0.3
-MOST_STRIKES: Final = 4
-MOST_WORDS: Final = 500
-WORDS_S: Final = 600.0
+MOST_STRIKES: Final = 5
+MOST_WORDS: Final = 240
+WORDS_S: Final = 300.0
+STAYS_S: Final = 120.0
+WORK_S: Final = 3600.0
 LOOKED_S: Final = 300.0
 _SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
 
@@ -85,6 +91,7 @@ class Witness:
         self._began_s, self._stepped_s = 0.0, 0.0
         self.read = 0
         self.rows: dict[int, EventRow] = {}
+        self._held: deque[EventRow] = deque(maxlen=SHOWN)
         self.digested: list[str] = []
         self._told = ""
         self._black_since_s: float | None = None
@@ -98,6 +105,9 @@ class Witness:
         self._recent: deque[float] = deque(maxlen=MOST_WORDS)
         self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
         self._judged_s = 0.0
+        self.stays_lit: dict[str, float | None] = {}
+        self._work: Request | None = None
+        self._work_since_s = 0.0
 
     # -- what is wanted
 
@@ -135,6 +145,7 @@ class Witness:
     def begins(self) -> None:
         self._began_s = self._stepped_s = self._world.scheduler.now_s
         self.paused_long = True
+        self._held.clear()
         self._told = State.OFF.value
 
     def player_fell(self) -> None:
@@ -156,8 +167,14 @@ class Witness:
     def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
         """A fault, so long, and what it takes to get over it."""
         now_s = self._world.scheduler.now_s
-        self._back_by_s = None
+        self._back_by_s, self.stays_lit = None, {}
         self.disturbed_until_s = max(self.disturbed_until_s, now_s + for_s + after_s)
+
+    def lamps_that_stay(self) -> dict[str, float | None]:
+        """Those that a restart now must leave lit, and since when they are."""
+        if not (self.calm and self.wanted_open()):
+            return {}
+        return {name: lamp.lit_at_s for name, lamp in self._world.lamps.items() if lamp.shines}
 
     def forgive(self) -> None:
         """Lamps may be tried anew."""
@@ -197,6 +214,8 @@ class Witness:
         if self._told != state.value:
             raise Broken("state", f"it says {self._told}, but it is {state.value}")
         self._strikes(service)
+        self._stay_lit(wanted)
+        self._works(service)
         self._alerts()
         self._devices(service)
         self._closed(service, state, wanted)
@@ -207,6 +226,10 @@ class Witness:
 
     def _listen(self, service: Service) -> bool:
         number, now_s = service.log.number, self._world.scheduler.now_s
+        if service.log.problem is None:
+            # What was told while nothing could be written has been written now.
+            self.rows.update((row.number, row) for row in self._held)
+            self._held.clear()
         if number == self.read:
             return False
         for row in service.log.after(self.read):
@@ -214,6 +237,8 @@ class Witness:
             self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {row.text}")
             if service.log.problem is None:
                 self.rows[row.number] = row
+            else:
+                self._held.append(row)
             self._recent.append(now_s)
             if row.code == "crash":
                 raise Broken("no crash", row.text)
@@ -249,10 +274,24 @@ class Witness:
             if seen and view.strikes < lamp.strikes - self._uncounted.get(lamp.name, 0):
                 raise Broken("strikes counted", f"{view.strikes} instead of {lamp.strikes} for {lamp.name}")
         for name, lamp in self._world.lamps.items():
-            if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.dud:
+            if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.bad:
                 raise Broken("few strikes", f"the lamp of {name} was struck {MOST_STRIKES + 1} times without light")
-            if not lamp.dud:
+            if not lamp.bad:
                 self._strikes_since[name] = lamp.strikes
+
+    def _stay_lit(self, wanted: bool) -> None:
+        if not wanted or self._world.scheduler.now_s - self._began_s > STAYS_S:
+            self.stays_lit = {}
+        for name, since_s in self.stays_lit.items():
+            if self._world.lamps[name].lit_at_s != since_s:
+                raise Broken("lit through a restart", f"the lamp of {name} went off")
+
+    def _works(self, service: Service) -> None:
+        now_s, running = self._world.scheduler.now_s, service.jobs.running
+        if running is not self._work:
+            self._work, self._work_since_s = running, now_s
+        elif running is not None and now_s - self._work_since_s > WORK_S:
+            raise Broken("work ends", f"{running.kind} runs for {now_s - self._work_since_s:.0f} s")
 
     def _alerts(self) -> None:
         world = self._world

@@ -22,9 +22,10 @@ RESTLESS_S: Final = 900.0
 ZONES: Final = ("Europe/Vienna", "America/New_York", "Australia/Lord_Howe", "Asia/Kolkata", "UTC")
 FILES: Final = (
     "kiosk/events.sqlite", "kiosk/events.sqlite-wal", "kiosk/lamps.json", "schedule.toml", "stage.toml",
-    "bundles/starts.json", "lamps.json", "kiosk/stage.toml.good",
+    "bundles/starts.json", "lamps.json", "kiosk/stage.toml.good", "stage.toml",
 )  # fmt: skip
 PACES_H: Final = (1.5, 4.0, 8.0)
+WORK: Final = ("recalibrate", "compare", "test-shots")
 LEANINGS: Final = (0.0, 1.0, 1.0, 4.0)
 _Weights = tuple[tuple[str, float], ...]
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
@@ -67,14 +68,14 @@ def from_json(text: str) -> list[Item]:
 
 def hours(chance: random.Random) -> list[dict[str, str]]:
     """Rows of opening hours, some over midnight, never two at a time."""
-    rows = []
+    rows, late = [], chance.choice((0.0, 0.1, 0.9))
     for day in DAYS:
         if chance.random() < 0.15:
             continue
         opens = chance.randrange(8 * 60, 18 * 60)
         # Not in the hour that summer time leaves out: what its times mean is not worked out a second time here.
         closes = min(opens + chance.randrange(60, 10 * 60), 25 * 60 + 55)
-        if chance.random() < 0.2:
+        if chance.random() < late:
             closes = chance.randrange(27 * 60 + 5, 31 * 60)
         rows.append({"day": day, "opens": _clock(opens), "closes": _clock(closes)})
     return rows or [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
@@ -85,9 +86,9 @@ def _clock(minutes: int) -> str:
 
 
 def begins(chance: random.Random, zone: str) -> datetime:
-    """When a life begins; every third some two days before the clocks of the zone change."""
+    """When a life begins; every second some two days before the clocks of the zone change."""
     day = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(days=chance.randrange(0, 1000))
-    if chance.random() < 1 / 3:
+    if chance.random() < 0.5:
         later = [day + timedelta(days=number) for number in range(200)]
         offsets = [one.astimezone(ZoneInfo(zone)).utcoffset() for one in later]
         changes = [number for number in range(1, 200) if offsets[number] != offsets[number - 1]]
@@ -110,6 +111,9 @@ def draw(seed: str, days: float) -> list[Item]:
         for number in range(count):
             then_s = at_s + chance.expovariate(1 / 60.0) * (number > 0)
             items.append(_one(chance, then_s, _drawn(chance, kinds), commands))
+            if items[-1].who in WORK and chance.random() < 0.3:
+                # People think better of it.
+                items.append(Item(round(then_s + chance.uniform(1.0, 120.0), 3), "command", "cancel"))
         at_s += chance.expovariate(1 / pace_s) + 30.0
     return sorted(items, key=lambda item: item.at_s)
 
@@ -134,7 +138,7 @@ def _one(chance: random.Random, at_s: float, what: str, commands: _Weights) -> I
             how = chance.choice(LINE_TROUBLES)
             return Item(at_s, what, name, how, min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s)
         case "lamp fails":
-            return Item(at_s, what, name, "", lasts_s)
+            return Item(at_s, what, name, chance.choice(["", "goes out"]), lasts_s)
         case "lamp reports":
             return Item(at_s, what, name, chance.choice(["temperature", "cover", "lamp-failed", "fan"]), lasts_s)
         case "lamp switched by hand":
@@ -158,7 +162,8 @@ def _one(chance: random.Random, at_s: float, what: str, commands: _Weights) -> I
         case "command":
             return _command(at_s, chance, _drawn(chance, commands))
         case _:
-            return Item(at_s, what, for_s=0.0 if what in ("killed", "drift", "bundle damaged") else lasts_s)
+            least_s = 600.0 if what == "bundle damaged" else 0.0
+            return Item(at_s, what, for_s=0.0 if what in ("killed", "drift") else max(least_s, lasts_s))
 
 
 def _command(at_s: float, chance: random.Random, who: str) -> Item:
@@ -182,7 +187,7 @@ def _command(at_s: float, chance: random.Random, who: str) -> Item:
 
 _KINDS: Final = (
     ("line", 14), ("lamp fails", 4), ("lamp reports", 3), ("lamp switched by hand", 3), ("player", 8),
-    ("camera gone", 3), ("disk full", 4), ("disk low", 1), ("file damaged", 4), ("bundle damaged", 2), ("killed", 5),
+    ("camera gone", 3), ("disk full", 6), ("disk low", 1), ("file damaged", 4), ("bundle damaged", 3), ("killed", 5),
     ("killed while writing", 6), ("power cut", 5), ("restarted", 4), ("clock set", 3), ("network gone", 3),
     ("drift", 4), ("command", 28),
 )  # fmt: skip

@@ -42,7 +42,7 @@ class SimulatedCamera:
     """An opened camera; see ``hal.interfaces.Camera``. It takes no pictures: photons are not simulated."""
 
     def __init__(self, body: Body) -> None:
-        self._body, self._closed = body, False
+        self._body, self._closed, self._connection = body, False, body.connection
         if body.owner is not None:
             raise DeviceBusy("camera-taken", what="The camera is in use by another program.", remedy="Stop it.")
         body.answer()
@@ -53,6 +53,8 @@ class SimulatedCamera:
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         if self._closed:
             raise DeviceGone("camera-closed", what="The camera is no longer open.", remedy="Open it again.")
+        if self._connection != self._body.connection:
+            raise DeviceGone("camera-gone", what="The camera was away since it was opened.", remedy="Open it again.")
         self._body.answer()
         return DeviceIdentity("Simulated", "Camera")
 
@@ -72,12 +74,13 @@ class SimulatedCamera:
 
 
 class Body:
-    """The camera itself. ``sins``: that two used it at a time."""
+    """The camera itself. ``sins``: that two used it at a time; ``connection``: another one once it was away."""
 
     def __init__(self, scheduler: Scheduler, chance: random.Random) -> None:
         self._scheduler, self.chance = scheduler, chance
         self.gone, self.owner = False, cast("SimulatedCamera | None", None)
         self.sins: list[str] = []
+        self.connection = 0
         self._asked = False
 
     def answer(self, lasts_s: float = ANSWER_S) -> None:
