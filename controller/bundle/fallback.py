@@ -1,7 +1,9 @@
 """Counts starts of the player that led to no picture; after three with one bundle, the one before plays again.
 
 The count lies in ``bundles/starts.json`` and is written before the bundle is touched, so a start that ends in a crash,
-a hang or a power cut stays counted. A folder that can not be written never keeps the player from playing.
+a hang or a power cut stays counted. A start that is ready, and was not asked for a picture of the bundle, does not
+count: power cuts at night say nothing about a bundle. A folder that can not be written never keeps the player from
+playing.
 """
 
 from __future__ import annotations
@@ -58,12 +60,14 @@ class CountedStart:
     """One start of the player with the installed bundle; ``file`` is the bundle that it is to play.
 
     Making it counts the start, and goes back to the previous bundle, if that can be read, after three failed starts.
+    From ``ready`` to ``asked`` the start is not counted.
     ``tell`` gets a sentence for the log when that happens, and when the count can not be kept.
     """
 
     def __init__(self, folder: Path, tell: Callable[[str], None]) -> None:
         self._folder, self._tell = folder, tell
         self._writing: threading.Thread | None = None
+        self._asked, self._counted = False, True
         before, now = Starts.read(folder), current(folder)
         name = "" if now is None else now.name
         starts = before if before.bundle == name else Starts(name, 0, before.given_up)
@@ -81,6 +85,19 @@ class CountedStart:
         if now is not None and now.name != name:
             self._kept(lambda: switch_back(folder, away_from=folder / name if name else None))
 
+    def ready(self) -> None:
+        """The bundle is loaded, and the player waits: until it is asked for a picture, its end says nothing."""
+        if not self._asked:
+            self._counted = False
+            self._record(self._starts.failed - 1)
+
+    def asked(self) -> None:
+        """A picture of the bundle is to be shown now. The first call after ``ready`` waits for the disk."""
+        self._asked = True
+        if not self._counted:
+            self._counted = True
+            self._record(self._starts.failed)
+
     def shown(self) -> None:
         """The bundle's first picture is on the outputs: the start did not fail. Returns at once."""
         # In a thread: the loop that presents pictures must not wait for a disk.
@@ -89,10 +106,10 @@ class CountedStart:
 
     def ended(self) -> None:
         """The player ends because it was asked to: if no picture came, that was no fault of the bundle."""
-        if self._writing is None:
-            self._record(self._starts.failed - 1)
-        else:
+        if self._writing is not None:
             self._writing.join()
+        elif self._counted:
+            self._record(self._starts.failed - 1)
 
     def _record(self, failed: int) -> None:
         name = self._starts.bundle

@@ -43,7 +43,7 @@ from controller.stage.calibrations import finished_calibrations, stage_trust
 from controller.stage.check import Checked, check_stage
 from controller.stage.open import player_settings, technicians_panel
 from controller.stage.run import stage_lock
-from hal.deadline import Stop, in_seconds
+from hal.deadline import Stop
 from hal.interfaces import ButtonPanel
 
 STEP_S: Final = 0.25
@@ -117,7 +117,7 @@ class Service:
         )  # fmt: skip
         self.alerts = Alerts(
             stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log,
-            monotonic=world.monotonic, ways=world.ways_out,
+            monotonic=world.monotonic, wall=world.wall, ways=world.ways_out,
         )  # fmt: skip
         self.changed: Callable[[], None] = lambda: None
         self._stop = world.event()
@@ -287,7 +287,7 @@ class Service:
 
         @contextlib.contextmanager
         def opened() -> Iterator[ButtonPanel]:
-            with technicians_panel(self.checked, deadline=in_seconds(20.0)) as panel:
+            with technicians_panel(self.checked, deadline=self._world.deadline(20.0)) as panel:
                 assert panel is not None
                 yield panel
 

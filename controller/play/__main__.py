@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from controller.bundle.fallback import CountedStart
 from controller.bundle.install import CURRENT
@@ -86,15 +87,21 @@ def _run(options: argparse.Namespace) -> int:
         if options.bundle is not None and options.bundle.name == CURRENT and not os.path.lexists(options.bundle):
             options.bundle = None  # Nothing is installed yet: a kiosk starts all the same.
         start = _counted_start(options.bundle)
-        shown = None if start is None else start.shown
-        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, on_appearance=shown)
+        count: dict[str, Any] = {} if start is None else {"on_appearance": start.shown, "on_asked": start.asked}
+        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, **count)
         if options.bundle is not None:
             player.load_bundle(options.bundle if start is None else start.file)
         broken = _end_on_signals(player)
         playing = options.socket.with_name(options.socket.name + SUFFIX) if options.resume else None
         first = Suggested(repeat=0) if options.suggested else None
         commands = Commands(player, server, inbox, SavedRequest(playing), first=first)
-        player.run(commands.serve, first=commands.resume)
+
+        def begin() -> None:
+            commands.resume()
+            if start is not None:
+                start.ready()
+
+        player.run(commands.serve, first=begin)
         if start is not None and not broken.is_set() and not player.skipped:
             start.ended()
     return 1 if broken.is_set() else 0

@@ -35,7 +35,8 @@ class Player:
 
     ``serve`` waits at most so many seconds for requests and carries them out by calling the methods below, in the
     loop's own thread; ``wake`` ends its waiting and is called from the decoding thread. ``on_appearance`` is called
-    once, when the first appearance is on the outputs; it must return at once.
+    once, when the first appearance is on the outputs; it must return at once. ``on_asked`` is called whenever
+    appearances are asked for, before the bundle is read for them.
     """
 
     def __init__(
@@ -47,11 +48,12 @@ class Player:
         trust: Trust,
         wake: Callable[[], None],
         on_appearance: Callable[[], None] | None = None,
+        on_asked: Callable[[], None] = lambda: None,
     ) -> None:
         self.sizes = tuple(sizes)
         self.rate_hz = rate_hz
         self._output, self._trust, self._wake = output, trust, wake
-        self._on_appearance = on_appearance
+        self._on_appearance, self._on_asked = on_appearance, on_asked
         self._notifier = Notifier()
         self._presenter = Presenter(output, sizes, rate_hz)
         self._black = self._presenter.shown
@@ -109,6 +111,7 @@ class Player:
 
         Raises BundleError if there is no bundle or it has not all of them; then nothing changes.
         """
+        self._on_asked()
         decoded = self._loaded()
         for name in playlist.names:
             decoded.bundle.index.appearance(name)
@@ -173,6 +176,7 @@ class Player:
 
     def suggested(self, repeat: int) -> Playlist:
         """The playlist of the bundle. Raises BundleError("bundle-none" or "bundle-no-schedule")."""
+        self._on_asked()
         return Playlist.suggested(self._loaded().bundle.index.schedule, repeat)
 
     def _loaded(self) -> DecodedAhead:

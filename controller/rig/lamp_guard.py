@@ -109,8 +109,8 @@ class LampGuard:
         projector = self._projector
         return projector.adjustments(deadline=deadline) if isinstance(projector, AdjustedProjector) else {}
 
-    def switch_on(self, *, deadline: Deadline) -> None:
-        """Strike the lamp if the rules allow; no effect if it is lit.
+    def switch_on(self, *, deadline: Deadline, failed: int | None = None) -> None:
+        """Strike the lamp if the rules allow; no effect if it is lit. ``failed``: as for ``keep_failed``.
 
         Raises DeviceRefused with code "lamp-cooling", "lamp-resting", "lamp-state-unknown" or "projector-fault" before
         anything is sent, and WorkError if the strike can't be recorded (then nothing is sent either).
@@ -121,7 +121,8 @@ class LampGuard:
                 return
             self._refuse_unless_cold(status)
             before = self._record
-            self._write(replace(before, lit=True, since_s=self._now(), boot=self._boot(), strikes=before.strikes + 1))
+            struck = replace(before, lit=True, since_s=self._now(), boot=self._boot(), strikes=before.strikes + 1)
+            self._write(struck if failed is None else replace(struck, failed=failed))
             try:
                 self._projector.switch_on(deadline=deadline)
             except DeviceRefused:
@@ -146,6 +147,17 @@ class LampGuard:
                 raise interrupted
             if self._record.lit or power not in (Power.OFF, Power.COOLING):
                 self._went_off()
+
+    @property
+    def failed_strikes(self) -> int:
+        """What ``keep_failed`` kept last since the computer was started."""
+        return self._record.failed
+
+    def keep_failed(self, count: int) -> None:
+        """Keep how many attempts in a row gave no light, so that a restart does not begin to count anew."""
+        with self._lock:
+            if self._record.failed != count:
+                self._write_quietly(replace(self._record, failed=count))
 
     # -- projectors that only a person can switch
 
@@ -267,7 +279,7 @@ class LampGuard:
         if record.boot == self._boot() and record.since_s is not None:
             return record
         # The clock of another boot can't be compared: the lamp counts as hot from now.
-        return replace(record, since_s=self._now(), boot=self._boot())
+        return replace(record, since_s=self._now(), boot=self._boot(), failed=0)
 
     def _seen(self, power: Power) -> None:
         self._count()

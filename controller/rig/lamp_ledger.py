@@ -47,7 +47,8 @@ class LampRecord:
     """One lamp.
 
     ``lit``: struck and not seen off since; ``since_s``: the clock at the strike (lit) or at the off (not
-    lit), None for "never seen"; ``boot``: the boot of ``since_s``; ``strikes`` and ``lit_s``: totals.
+    lit), None for "never seen"; ``boot``: the boot of ``since_s``; ``strikes`` and ``lit_s``: totals;
+    ``failed``: attempts in a row that gave no light, as the kiosk counts them.
     """
 
     lit: bool = False
@@ -55,6 +56,7 @@ class LampRecord:
     boot: str = ""
     strikes: int = 0
     lit_s: float = 0.0
+    failed: int = 0
 
 
 class LampLedger(Protocol):
@@ -111,15 +113,16 @@ class LampFile:
 
 def _record(fields: Mapping[str, object]) -> LampRecord:
     lit, since_s, boot = fields["lit"], fields["since_s"], fields["boot"]
-    strikes, lit_s = fields["strikes"], fields["lit_s"]
+    strikes, lit_s, failed = fields["strikes"], fields["lit_s"], fields.get("failed", 0)
     if not (
         isinstance(lit, bool)
         and isinstance(since_s, float | int | None)
         and isinstance(boot, str)
         and isinstance(strikes, int)
+        and isinstance(failed, int)
         and isinstance(lit_s, float | int)
         and math.isfinite(lit_s)
         and math.isfinite(since_s or 0.0)
     ):
         raise TypeError("a field of the wrong type")
-    return LampRecord(lit, since_s, boot, strikes, float(lit_s))
+    return LampRecord(lit, since_s, boot, strikes, float(lit_s), failed)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -15,7 +16,7 @@ from controller.simulate.calendar import Calendar
 from controller.simulate.disk import STAGE, TOTAL_BYTES
 from controller.simulate.lamps import RULES, Lamp
 from controller.simulate.promises import REPAIR_S, SETTLING_S, Witness
-from controller.simulate.scheduler import Event
+from controller.simulate.scheduler import Event, Killed
 from controller.simulate.script import Item
 from controller.simulate.stage import publish
 from controller.simulate.world import SimulatedWorld
@@ -28,6 +29,8 @@ class Living(Protocol):
     witness: Witness
     service: Service | None
     damaged: set[str]
+    unreadable: set[str]
+    repaired_s: float
     news: Event
 
     def later(self, seconds: float, mend: Callable[[], None]) -> None: ...
@@ -44,6 +47,8 @@ class Living(Protocol):
 PLAYER_S: Final = 120.0
 """After trouble with the player: its longest pause before a start, and a start that fails."""
 MEND_FILE_S: Final = 600.0
+GOES_OUT_S: Final = 35.0
+"""Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
 HOLD_S: Final = 7200.0
 """For so long a kiosk's time may stand still after its clock was set back."""
 
@@ -56,6 +61,7 @@ def happen(life: Living, item: Item) -> None:
 def _line(life: Living, item: Item) -> None:
     line = life.world.lines[item.who]
     line.trouble = item.how
+    line.connection += item.how == "gone"
     life.witness.disturb(item.for_s + 120.0)
 
     def mend() -> None:
@@ -66,15 +72,18 @@ def _line(life: Living, item: Item) -> None:
 
 def _lamp_fails(life: Living, item: Item) -> None:
     lamp = life.world.lamps[item.who]
-    lamp.dud = True
-    lamp.go_dark()
+    if item.how == "goes out":
+        lamp.lasts_s = GOES_OUT_S
+    else:
+        lamp.dud = True
+        lamp.go_dark()
     life.witness.disturb(item.for_s)
     life.later(item.for_s, partial(_new_lamp, life, lamp))
 
 
 def _new_lamp(life: Living, lamp: Lamp) -> None:
     """A technician puts in a new one, and opens the stage if it is to be open."""
-    lamp.dud, lamp.fault = False, ""
+    lamp.dud, lamp.fault, lamp.lasts_s = False, "", float("inf")
     life.witness.disturb(0.0)
     if life.service is not None:
         for supervisor in life.service.devices.projectors:
@@ -96,8 +105,8 @@ def _by_hand(life: Living, item: Item) -> None:
     now_s = life.world.scheduler.now_s
     if item.how == "off":
         lamp.go_dark()
-    elif not lamp.lit and not lamp.dud and now_s - lamp.off_at_s >= RULES.minimum_off_s:
-        lamp.lit_at_s = now_s
+    elif not lamp.lit and not lamp.bad and now_s - lamp.off_at_s >= RULES.minimum_off_s:
+        lamp.lit_at_s, lamp.by_hand = now_s, True
     life.witness.disturb(0.0)
 
 
@@ -107,6 +116,10 @@ def _player(life: Living, item: Item) -> None:
     fell = item.how in ("killed", "hung") and witness.calm and bool(screen.appearance)
     if item.how in ("killed", "crashes"):
         screen.dies_at_start += int(item.number)
+        if screen.process is not None:
+            screen.process.kill()
+    elif item.how == "crashes at a picture":
+        screen.dies_at_play += int(item.number)
         if screen.process is not None:
             screen.process.kill()
     elif item.how == "hung":
@@ -127,6 +140,7 @@ def _player(life: Living, item: Item) -> None:
 def _camera(life: Living, item: Item) -> None:
     camera = life.world.camera
     camera.gone = True
+    camera.connection += 1
 
     def mend() -> None:
         camera.gone = False
@@ -156,9 +170,11 @@ def _disk_low(life: Living, item: Item) -> None:
 
 
 def _killed(life: Living, item: Item) -> None:
+    lit = life.witness.lamps_that_stay()
     life.end_of_program()
     life.world.scheduler.sleep(2.0)
     life.boot()
+    life.witness.stays_lit = lit
 
 
 def _killed_writing(life: Living, item: Item) -> None:
@@ -176,11 +192,14 @@ def _power_cut(life: Living, item: Item) -> None:
     world.scheduler.sleep(item.for_s + 1.0)
     world.reboot()
     life.witness.disturb(0.0)
+    life.witness.forgive()
     life.boot()
 
 
 def _restarted(life: Living, item: Item) -> None:
+    lit = life.witness.lamps_that_stay() if item.how == "lamps stay lit" else {}
     life.restart(lit=item.how == "lamps stay lit")
+    life.witness.stays_lit = lit
 
 
 def _clock(life: Living, item: Item) -> None:
@@ -231,6 +250,9 @@ def _file_damaged(life: Living, item: Item) -> None:
     before = path.read_bytes() if path.is_file() else None
     if before is not None:
         life.damaged.add(item.who)
+        # A stage.toml that is gone is not replaced: it would most likely be the wrong folder.
+        gone = item.who == "stage.toml" and item.how == "removed"
+        life.unreadable |= {item.who, "kiosk/stage.toml.good"} if gone else {item.who}
         if item.how == "removed":
             path.unlink()
         else:
@@ -258,6 +280,8 @@ def _damaged(content: bytes, item: Item) -> bytes:
 
 def _put_right(life: Living, path: Path, content: bytes) -> None:
     path.write_bytes(content)
+    life.unreadable.discard(path.name)
+    life.repaired_s = life.world.scheduler.now_s
     if life.service is not None:
         life.restart(lit=True)
     life.witness.disturb(0.0)
@@ -271,17 +295,18 @@ def _bundle_damaged(life: Living, item: Item) -> None:
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2] + bytes(byte ^ 0xA5 for byte in content[len(content) // 2 :]))
     _player(life, Item(item.at_s, "player", "", "killed"))
-    life.witness.disturb(MEND_FILE_S)
+    mended_s = item.for_s or MEND_FILE_S
+    life.witness.disturb(mended_s)
     world, witness = life.world, life.witness
     witness.player_disturbed_until_s = max(
-        witness.player_disturbed_until_s, world.scheduler.now_s + MEND_FILE_S + PLAYER_S
+        witness.player_disturbed_until_s, world.scheduler.now_s + mended_s + PLAYER_S
     )
 
     def mend() -> None:
         publish(STAGE, int(world.truth_s))
         witness.disturb(0.0)
 
-    life.later(MEND_FILE_S, mend)
+    life.later(mended_s, mend)
 
 
 def _command(life: Living, item: Item) -> None:
@@ -295,6 +320,16 @@ _DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
     "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted, "clock set": _clock,
     "network gone": _no_network, "drift": _drift, "command": _command,
 }  # fmt: skip
+
+
+@contextlib.contextmanager
+def whole(life: Living) -> Iterator[None]:
+    """Of a command in the middle of which the program is killed, nobody knows whether it was kept."""
+    try:
+        yield
+    except Killed:
+        _unsure_until_hours(life)
+        raise
 
 
 def arguments_of(life: Living, item: Item, kiosk: StageKiosk) -> dict[str, Any]:

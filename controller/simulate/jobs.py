@@ -37,7 +37,7 @@ class SimulatedJobs:
                 with own.lend() as rig:
                     for _ in self._seconds(request, cancel):
                         rig.display.show({}, deadline=self._world.deadline(10.0))
-                        rig.camera.identity(deadline=self._world.deadline(10.0))
+                        rig.camera.capture(STAGE, deadline=self._world.deadline(10.0))
                         for projector in rig.projectors:
                             self._look(
                                 projector.name, projector.guard.status(deadline=self._world.deadline(10.0)).power

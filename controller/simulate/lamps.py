@@ -17,7 +17,9 @@ _ROUNDING_S: Final = 1e-6
 
 
 class Lamp:
-    """What the projector really is. ``dud``: it takes strikes and gives no light; ``fault``: a word that it reports.
+    """What the projector really is. ``dud``: it takes strikes and gives no light; ``fault``: a word that it reports;
+    ``by_hand``: it burns because somebody switched it on;
+    ``lasts_s``: after so long it goes out by itself, infinite for a good one.
 
     ``sins``: what was done to it against the rules.
     """
@@ -26,20 +28,29 @@ class Lamp:
         self.name, self._scheduler = name, scheduler
         self.lit_at_s: float | None = None
         self.off_at_s = self.struck_at_s = -1e9
-        self.dud, self.fault = False, ""
+        self.dud, self.by_hand, self.fault = False, False, ""
+        self.lasts_s = float("inf")
         self.strikes = 0
         self.sins: list[str] = []
 
     @property
+    def bad(self) -> bool:
+        """Whether no strike gives light that stays."""
+        return self.dud or self.lasts_s != float("inf")
+
+    @property
     def lit(self) -> bool:
+        since_s = self.lit_at_s
+        if since_s is not None and self._scheduler.now_s - since_s >= self.lasts_s:
+            self.lit_at_s, self.off_at_s = None, since_s + self.lasts_s
         return self.lit_at_s is not None
 
     @property
     def shines(self) -> bool:
-        return self.lit_at_s is not None and self._scheduler.now_s - self.lit_at_s >= RULES.warm_up_s
+        return self.lit and self._scheduler.now_s - (self.lit_at_s or 0.0) >= RULES.warm_up_s
 
     def power(self) -> Power:
-        if self.lit_at_s is not None:
+        if self.lit:
             return Power.ON if self.shines else Power.WARMING
         if self.fault:
             return Power.FAULT
@@ -53,6 +64,7 @@ class Lamp:
             self.sins.append(f"the lamp of {self.name} was struck {dark_s:.1f} s after it went off")
         self.strikes += 1
         self.lit_at_s = self.struck_at_s = self._scheduler.now_s
+        self.by_hand = False
         if self.dud:
             self.go_dark()
 
@@ -64,13 +76,14 @@ class Lamp:
 class Line:
     """The control line of one projector. ``trouble``: one of ``LINE_TROUBLES``, or empty.
 
-    ``owner``: the opened device that has it.
+    ``owner``: the opened device that has it; ``connection``: its number, another one once it broke.
     """
 
     def __init__(self, lamp: Lamp, scheduler: Scheduler, chance: random.Random) -> None:
         self.lamp, self._scheduler, self._chance = lamp, scheduler, chance
         self.trouble = ""
         self.owner: SimulatedProjector | None = None
+        self.connection = 0
         self.turn = Lock(scheduler, again=False)
         self._late: list[tuple[float, bool]] = []
 
@@ -132,7 +145,7 @@ class SimulatedProjector:
     """An opened projector; see ``hal.interfaces.Projector``."""
 
     def __init__(self, line: Line, deadline: Deadline) -> None:
-        self._line, self._closed = line, False
+        self._line, self._closed, self._connection = line, False, line.connection
         if line.owner is not None:
             raise DeviceBusy("port-taken", what=f"The line of {line.lamp.name} is in use by another program.",
                              remedy="Stop that program.")  # fmt: skip
@@ -174,6 +187,8 @@ class SimulatedProjector:
         if self._closed:
             raise DeviceGone("projector-closed", what="The projector is no longer open.", remedy="Open it again.")
         with self._line.turn:
+            if self._connection != self._line.connection:
+                raise DeviceGone("link-lost", what=f"The connection to {self._line.lamp.name} broke.", remedy="Wait.")
             if on is None:
                 self._line.talk(deadline)
             else:

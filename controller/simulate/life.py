@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +29,7 @@ from controller.simulate.disk import STAGE, watched
 from controller.simulate.jobs import SimulatedJobs
 from controller.simulate.promises import Broken, Witness, after_the_end
 from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
-from controller.simulate.script import ZONES, Item, draw, hours
+from controller.simulate.script import ZONES, Item, begins, draw, hours
 from controller.simulate.stage import make_stage
 from controller.simulate.world import SimulatedWorld
 from hal.deadline import Stop
@@ -41,6 +41,8 @@ CALM: Final = (8.0, 240.0, 2400.0)
 """How far pauses are stretched: while lamps or work are under way, while something is wrong, while all is well."""
 CALMER: Final = 1.6
 END_S: Final = 150.0
+SERVES_S: Final = 60.0
+GOOD: Final = "kiosk/stage.toml.good"
 
 
 class Halt(Event, Stop):
@@ -71,12 +73,10 @@ class Life:
         self.seed, self.days = seed, days
         self.items = tuple(draw(seed, days) if items is None else items)
         chance = random.Random(f"{seed} life")
-        begins = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(
-            days=chance.randrange(0, 1000), minutes=chance.randrange(1440)
-        )
         self.zone, self.rows = chance.choice(ZONES), hours(chance)
+        unix_s = begins(chance, self.zone).timestamp()
         self.drift_check = chance.choice(["03:30", "02:30", "23:00"])
-        self.world = SimulatedWorld(seed, begins.timestamp())
+        self.world = SimulatedWorld(seed, unix_s)
         self.witness = Witness(self.world, Calendar(self.zone, self.rows))
         self.program: Program | None = None
         self.kiosk: StageKiosk | None = None
@@ -86,6 +86,8 @@ class Life:
         self.broken: Exception | None = None
         self.restart_in_s: float | None = None
         self.damaged: set[str] = set()
+        self.unreadable: set[str] = set()
+        self.repaired_s = 0.0
         self._mends: list[tuple[float, int, Callable[[], None]]] = []
         self._last: tuple[Any, ...] = ()
 
@@ -153,6 +155,15 @@ class Life:
         self.program, self.stop = self.world.scheduler.program(), Halt(self.world.scheduler)
         self.world.program = self.program
         self.world.scheduler.task(self._serve, "service", self.program).start()
+        self.later(SERVES_S, partial(self._serves, self.program))
+
+    def _serves(self, program: Program) -> None:
+        """A program that was not ended since has a service. Raises Broken."""
+        spoilt = {"stage.toml", GOOD} <= self.unreadable or self.world.disk.full
+        spoilt = spoilt or self.world.scheduler.now_s - self.repaired_s < SERVES_S
+        if self.program is program and not program.dead and self.service is None and not spoilt:
+            why = None if self.kiosk is None else self.kiosk.snapshot().reason
+            raise Broken("serves", f"{SERVES_S:.0f} s after its start it does not: {why}")
 
     def end_of_program(self) -> None:
         """Kill it, and let go of all that it had."""
@@ -199,6 +210,9 @@ class Life:
 
     def _follow(self, kiosk: StageKiosk, service: Service) -> None:
         self.service = service
+        if "stage.toml" not in self.unreadable:
+            # A good one is kept again.
+            self.unreadable.clear()
         self.witness.begins()
         refresh = service.changed
 
@@ -250,7 +264,7 @@ class Life:
             return
 
         def asked() -> None:
-            with contextlib.suppress(VelaturaError, DeviceError):
+            with contextlib.suppress(VelaturaError, DeviceError), happenings.whole(self):
                 values = happenings.arguments_of(self, item, kiosk)
                 socket_table({"kiosk": kiosk})[item.who](**values)
                 happenings.believe(self, item, values)

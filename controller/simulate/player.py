@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from controller.bundle.fallback import CountedStart
+from controller.bundle.fallback import MOST_FAILED_STARTS, CountedStart
 from controller.bundle.format import Index
 from controller.bundle.install import CURRENT
 from controller.bundle.reader import Bundle
@@ -30,8 +30,11 @@ class Screen:
         self.scheduler, self.disk, self.chance = scheduler, disk, chance
         self.process: SimulatedPlayer | None = None
         self.trouble, self.hung = "", False
-        self.dies_at_start = 0
+        self.dies_at_start = self.dies_at_play = 0
         self.number = 0
+        self.vain_starts: dict[str, int] = {}
+        """Starts in a row with a bundle that were asked for a picture, or never got so far, and showed none."""
+        self.sins: list[str] = []
 
     @property
     def appearance(self) -> str:
@@ -71,8 +74,12 @@ class SimulatedPlayer:
         self.ready_at_s = screen.scheduler.now_s + screen.chance.uniform(0.3, 1.5)
         self.pid = screen.number
         self._start: CountedStart | None = None
-        self._counted = False
+        self._bundle = ""
+        self._is_ready = self._asked = self._counted = False
         self._failed = self._load_first()
+        if screen.dies_at_start > 0:
+            screen.dies_at_start -= 1
+            self._failed = self._failed or "it crashed."
 
     @property
     def socket(self) -> Path:
@@ -81,10 +88,8 @@ class SimulatedPlayer:
     def wait_until_ready(self, timeout_s: float = 8.0) -> dict[str, Any]:
         screen = self._screen
         screen.scheduler.sleep(min(timeout_s, self.ready_at_s - screen.scheduler.now_s))
-        if screen.dies_at_start > 0:
-            screen.dies_at_start -= 1
-            self._failed = self._failed or "it crashed."
-        if self._failed or not self.alive or screen.hung:
+        self._get_ready()
+        if not self._is_ready or not self.alive:
             self.kill()
             raise WorkError("player-not-started", what=f"The player did not start: {self._failed or 'it is silent.'}",
                             remedy="Correct the cause.")  # fmt: skip
@@ -92,14 +97,33 @@ class SimulatedPlayer:
         return {"bundle": self.identity or None, "inbox": "player.inbox", "outputs": outputs}
 
     def kill(self) -> None:
+        if self.alive:
+            self._get_ready()
+            if self._asked or not self._is_ready:
+                self._blame(1)
         self.alive = False
 
     def terminate(self) -> int:
         if self.alive and self._start is not None and not self._screen.hung:
             with self._screen.disk.untouched():
                 self._start.ended()
-        self.alive = False
+            self.alive = False
+        self.kill()
         return 0
+
+    def _get_ready(self) -> None:
+        """It does so by itself, whether the one that started it still runs or not."""
+        screen = self._screen
+        if self._is_ready or self._failed or screen.hung or screen.scheduler.now_s < self.ready_at_s or not self.alive:
+            return
+        self._is_ready = True
+        if self._start is not None:
+            with screen.disk.untouched():
+                self._start.ready()
+
+    def _blame(self, vain: int) -> None:
+        if self._bundle and not self._counted:
+            self._screen.vain_starts[self._bundle] = vain and self._screen.vain_starts.get(self._bundle, 0) + 1
 
     # -- bundles
 
@@ -114,13 +138,22 @@ class SimulatedPlayer:
         try:
             with self._screen.disk.untouched():
                 if link.name == CURRENT and link.is_symlink():
+                    before = link.resolve()
                     self._start = CountedStart(link.parent, lambda _: None)
+                    self._bundle = link.resolve().name
+                    self._given_up(before)
                     self.load(self._start.file)
                 elif link.exists():
                     self.load(link)
         except VelaturaError as error:
             return error.what
         return ""
+
+    def _given_up(self, before: Path) -> None:
+        """Whether that was right, as far as it was."""
+        vain = self._screen.vain_starts.pop(before.name, 0) if self._bundle != before.name else MOST_FAILED_STARTS
+        if vain < MOST_FAILED_STARTS and before.is_file():
+            self._screen.sins.append(f"the bundle {before.name} was given up after {vain} starts without a picture")
 
     def load(self, path: Path) -> None:
         """Use this bundle from now on. Raises VelaturaError."""
@@ -141,9 +174,11 @@ class SimulatedPlayer:
             case protocol.Status():
                 return self._status(), 0.0
             case protocol.Play(appearance, fade_s, brightness):
+                self._begin_to_play()
                 self._show(appearance, brightness, running=False)
                 return {}, fade_s
             case protocol.Sequence(items, _, _, brightness, first_fade_s):
+                self._begin_to_play()
                 for item in items:
                     self._known(item[0])
                 self._show(items[0][0], brightness, running=True)
@@ -160,6 +195,16 @@ class SimulatedPlayer:
             case _:
                 return {}, 0.0
 
+    def _begin_to_play(self) -> None:
+        screen, self._asked = self._screen, True
+        if self._start is not None:
+            with screen.disk.untouched():
+                self._start.asked()
+        if screen.dies_at_play > 0:
+            screen.dies_at_play -= 1
+            self.kill()
+            raise BrokenPipeError
+
     def _known(self, name: str) -> None:
         if self.loaded is None or name not in [entry.name for entry in self.loaded.appearances]:
             raise WorkError("bundle-no-appearance", what=f"There is no appearance {name}.", remedy="Choose another.")
@@ -168,6 +213,7 @@ class SimulatedPlayer:
         self._known(name)
         self.showing, self.appearance, self.brightness, self.running = "appearance", name, brightness, running
         if self._start is not None and not self._counted:
+            self._blame(0)
             self._counted = True
             with self._screen.disk.untouched():
                 # It writes in a thread of its own, for which this waits.

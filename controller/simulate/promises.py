@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from controller.kiosk.decide.interfaces import Condition
+from controller.kiosk.decide.interfaces import Condition, Request
 from controller.kiosk.decide.live_changes import LiveChanges
 from controller.kiosk.interface import EventRow
+from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State
 from controller.simulate.calendar import Calendar
 from controller.simulate.disk import STAGE
@@ -26,6 +27,9 @@ PROMISES: Final = {
     "state": "The log's last word on the state is the state.",
     "black while closed": "No picture is shown while the stage is closed.",
     "dark while closed": "No lamp burns while the stage is closed and no work needs it.",
+    "lit through a restart": "A service that is killed or restarted leaves the lamps of an open stage lit.",
+    "serves": "A service that was started runs, also with a damaged stage.toml, as long as the last good one is there.",
+    "off is off": "When a stage says that every lamp is off, none burns that it struck.",
     "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
     "says why it is dark": "While an open stage shows nothing, it says why.",
     "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
@@ -37,6 +41,8 @@ PROMISES: Final = {
     "few strikes": "A lamp that gives no light is not struck again and again.",
     "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
     "as usual again": "What people changed of the picture ends when the stage closes.",
+    "bundle kept": "A bundle that can be read is given up only after three starts that were to show it, and did not.",
+    "work ends": "Work ends by itself, when it is cancelled and when it fails, and lets go of the stage.",
     "devices back": "A camera that is there again is opened again.",
 }
 SETTLING_S: Final = 200.0
@@ -49,8 +55,10 @@ BACK_S: Final = 15.0
 OPENED_S: Final = 200.0
 DECIDES_S: Final = 0.3
 MOST_STRIKES: Final = 5
-MOST_WORDS: Final = 500
-WORDS_S: Final = 600.0
+MOST_WORDS: Final = 240
+WORDS_S: Final = 300.0
+STAYS_S: Final = 120.0
+WORK_S: Final = 3600.0
 LOOKED_S: Final = 300.0
 _SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
 
@@ -83,6 +91,7 @@ class Witness:
         self._began_s, self._stepped_s = 0.0, 0.0
         self.read = 0
         self.rows: dict[int, EventRow] = {}
+        self._held: deque[EventRow] = deque(maxlen=SHOWN)
         self.digested: list[str] = []
         self._told = ""
         self._black_since_s: float | None = None
@@ -96,6 +105,9 @@ class Witness:
         self._recent: deque[float] = deque(maxlen=MOST_WORDS)
         self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
         self._judged_s = 0.0
+        self.stays_lit: dict[str, float | None] = {}
+        self._work: Request | None = None
+        self._work_since_s = 0.0
 
     # -- what is wanted
 
@@ -133,6 +145,7 @@ class Witness:
     def begins(self) -> None:
         self._began_s = self._stepped_s = self._world.scheduler.now_s
         self.paused_long = True
+        self._held.clear()
         self._told = State.OFF.value
 
     def player_fell(self) -> None:
@@ -141,14 +154,27 @@ class Witness:
 
     def killed(self) -> None:
         """The service was, perhaps between an alert and the note that it was sent."""
+        # Sent before it was killed, and not yet looked at.
+        self._alerted_number = max([self._alerted_number, *(row.number for row in self._world.alerted)])
+        self._alerted = len(self._world.alerted)
         self._kills += 1
         self._missing_since_s = None
+
+    def numbers_again(self) -> None:
+        """What was told from ``read`` on has numbers that others had, which were never written."""
+        self._alerted_number = min(self._alerted_number, self.read)
 
     def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
         """A fault, so long, and what it takes to get over it."""
         now_s = self._world.scheduler.now_s
-        self._back_by_s = None
+        self._back_by_s, self.stays_lit = None, {}
         self.disturbed_until_s = max(self.disturbed_until_s, now_s + for_s + after_s)
+
+    def lamps_that_stay(self) -> dict[str, float | None]:
+        """Those that a restart now must leave lit, and since when they are."""
+        if not (self.calm and self.wanted_open()):
+            return {}
+        return {name: lamp.lit_at_s for name, lamp in self._world.lamps.items() if lamp.shines}
 
     def forgive(self) -> None:
         """Lamps may be tried anew."""
@@ -156,6 +182,7 @@ class Witness:
 
     def ledger_lost(self) -> None:
         """The counts of strikes begin anew."""
+        self.forgive()
         self._uncounted = {name: line.lamp.strikes + line.delayed for name, line in self._world.lines.items()}
 
     # -- judging
@@ -166,6 +193,8 @@ class Witness:
         scheduler = world.scheduler
         if world.camera.sins:
             raise Broken("one owner", world.camera.sins[0])
+        if world.screen.sins:
+            raise Broken("bundle kept", world.screen.sins[0])
         if scheduler.crashes:
             name, error = scheduler.crashes[0]
             raise Broken("no crash", f"{name}: {type(error).__name__}: {error}")
@@ -185,6 +214,8 @@ class Witness:
         if self._told != state.value:
             raise Broken("state", f"it says {self._told}, but it is {state.value}")
         self._strikes(service)
+        self._stay_lit(wanted)
+        self._works(service)
         self._alerts()
         self._devices(service)
         self._closed(service, state, wanted)
@@ -195,6 +226,10 @@ class Witness:
 
     def _listen(self, service: Service) -> bool:
         number, now_s = service.log.number, self._world.scheduler.now_s
+        if service.log.problem is None:
+            # What was told while nothing could be written has been written now.
+            self.rows.update((row.number, row) for row in self._held)
+            self._held.clear()
         if number == self.read:
             return False
         for row in service.log.after(self.read):
@@ -202,12 +237,15 @@ class Witness:
             self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {row.text}")
             if service.log.problem is None:
                 self.rows[row.number] = row
+            else:
+                self._held.append(row)
             self._recent.append(now_s)
             if row.code == "crash":
                 raise Broken("no crash", row.text)
             if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
                 raise Broken("remedy", f"{row.code}: {row.text}")
             if row.code == "state":
+                self._off(row)
                 self._told = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
             elif row.code == "task-due":
                 open_s = now_s - self.changed_s
@@ -221,6 +259,13 @@ class Witness:
             raise Broken("few words", f"{MOST_WORDS} events in {now_s - self._recent[0]:.0f} s")
         return True
 
+    def _off(self, row: EventRow) -> None:
+        for name, line in self._world.lines.items():
+            # A look is some seconds old; a command that was under way may have struck it since.
+            seen = self._world.scheduler.now_s - line.lamp.struck_at_s > BACK_S
+            if line.lamp.lit and seen and not line.lamp.by_hand and row.text.startswith("The stage is off: every lamp"):
+                raise Broken("off is off", f"the lamp of {name} burns")
+
     def _strikes(self, service: Service) -> None:
         for supervisor in service.devices.projectors:
             lamp, view = self._world.lamps[supervisor.name], supervisor.view
@@ -229,10 +274,24 @@ class Witness:
             if seen and view.strikes < lamp.strikes - self._uncounted.get(lamp.name, 0):
                 raise Broken("strikes counted", f"{view.strikes} instead of {lamp.strikes} for {lamp.name}")
         for name, lamp in self._world.lamps.items():
-            if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.dud:
+            if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.bad:
                 raise Broken("few strikes", f"the lamp of {name} was struck {MOST_STRIKES + 1} times without light")
-            if not lamp.dud:
+            if not lamp.bad:
                 self._strikes_since[name] = lamp.strikes
+
+    def _stay_lit(self, wanted: bool) -> None:
+        if not wanted or self._world.scheduler.now_s - self._began_s > STAYS_S:
+            self.stays_lit = {}
+        for name, since_s in self.stays_lit.items():
+            if self._world.lamps[name].lit_at_s != since_s:
+                raise Broken("lit through a restart", f"the lamp of {name} went off")
+
+    def _works(self, service: Service) -> None:
+        now_s, running = self._world.scheduler.now_s, service.jobs.running
+        if running is not self._work:
+            self._work, self._work_since_s = running, now_s
+        elif running is not None and now_s - self._work_since_s > WORK_S:
+            raise Broken("work ends", f"{running.kind} runs for {now_s - self._work_since_s:.0f} s")
 
     def _alerts(self) -> None:
         world = self._world
@@ -336,6 +395,7 @@ def after_the_end(witness: Witness, service: Service, *, damaged: frozenset[str]
     rows = list(service.log.after(0))
     # What could not be written before the end is gone, and its numbers are given again.
     witness.read = next((row.number - 1 for row in reversed(rows) if row.code == "service-started"), witness.read)
+    witness.numbers_again()
     there = {row.number: row for row in rows}
     if damaged & {"kiosk/events.sqlite", "kiosk/events.sqlite-wal"}:
         witness.rows.clear()

@@ -6,7 +6,9 @@ import json
 import random
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final
+from zoneinfo import ZoneInfo
 
 from controller.simulate.lamps import LINE_TROUBLES
 from controller.simulate.player import TROUBLES
@@ -20,8 +22,12 @@ RESTLESS_S: Final = 900.0
 ZONES: Final = ("Europe/Vienna", "America/New_York", "Australia/Lord_Howe", "Asia/Kolkata", "UTC")
 FILES: Final = (
     "kiosk/events.sqlite", "kiosk/events.sqlite-wal", "kiosk/lamps.json", "schedule.toml", "stage.toml",
-    "bundles/starts.json", "lamps.json", "kiosk/stage.toml.good",
+    "bundles/starts.json", "lamps.json", "kiosk/stage.toml.good", "stage.toml",
 )  # fmt: skip
+PACES_H: Final = (1.5, 4.0, 8.0)
+WORK: Final = ("recalibrate", "compare", "test-shots")
+LEANINGS: Final = (0.0, 1.0, 1.0, 4.0)
+_Weights = tuple[tuple[str, float], ...]
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 
 
@@ -62,13 +68,15 @@ def from_json(text: str) -> list[Item]:
 
 def hours(chance: random.Random) -> list[dict[str, str]]:
     """Rows of opening hours, some over midnight, never two at a time."""
-    rows = []
+    rows, late = [], chance.choice((0.0, 0.1, 0.9))
     for day in DAYS:
         if chance.random() < 0.15:
             continue
         opens = chance.randrange(8 * 60, 18 * 60)
         # Not in the hour that summer time leaves out: what its times mean is not worked out a second time here.
         closes = min(opens + chance.randrange(60, 10 * 60), 25 * 60 + 55)
+        if chance.random() < late:
+            closes = chance.randrange(27 * 60 + 5, 31 * 60)
         rows.append({"day": day, "opens": _clock(opens), "closes": _clock(closes)})
     return rows or [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
 
@@ -77,38 +85,67 @@ def _clock(minutes: int) -> str:
     return f"{minutes // 60 % 24:02}:{minutes % 60:02}"
 
 
+def begins(chance: random.Random, zone: str) -> datetime:
+    """When a life begins; every second some two days before the clocks of the zone change."""
+    day = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(days=chance.randrange(0, 1000))
+    if chance.random() < 0.5:
+        later = [day + timedelta(days=number) for number in range(200)]
+        offsets = [one.astimezone(ZoneInfo(zone)).utcoffset() for one in later]
+        changes = [number for number in range(1, 200) if offsets[number] != offsets[number - 1]]
+        day += timedelta(days=max(0, changes[0] - 3)) if changes else timedelta()
+    return day + timedelta(minutes=chance.randrange(1440))
+
+
 def draw(seed: str, days: float) -> list[Item]:
-    """The script of a life. Many things happen alone, some several at once."""
+    """The script of a life. Many things happen alone, some several at once.
+
+    Each life has a pace and a leaning of its own: some kinds of things never happen in it, others often. What several
+    of one kind do together would hardly ever be seen otherwise.
+    """
     chance = random.Random(f"{seed} script")
+    kinds, commands, pace_s = _leaning(chance, _KINDS), _leaning(chance, _COMMANDS), chance.choice(PACES_H) * HOUR_S
     items: list[Item] = []
     at_s = chance.expovariate(1 / (5 * HOUR_S)) + 600.0
     while at_s < days * DAY_S:
         count = 1 if chance.random() < 0.75 else chance.randint(2, 5)
-        items += [_one(chance, at_s + chance.expovariate(1 / 60.0) * (number > 0)) for number in range(count)]
-        at_s += chance.expovariate(1 / (6 * HOUR_S)) + 30.0
+        for number in range(count):
+            then_s = at_s + chance.expovariate(1 / 60.0) * (number > 0)
+            items.append(_one(chance, then_s, _drawn(chance, kinds), commands))
+            if items[-1].who in WORK and chance.random() < 0.3:
+                # People think better of it.
+                items.append(Item(round(then_s + chance.uniform(1.0, 120.0), 3), "command", "cancel"))
+        at_s += chance.expovariate(1 / pace_s) + 30.0
     return sorted(items, key=lambda item: item.at_s)
 
 
-def _one(chance: random.Random, at_s: float) -> Item:  # noqa: PLR0911 - one for each kind
+def _leaning(chance: random.Random, usual: _Weights) -> _Weights:
+    return tuple((kind, weight * chance.choice(LEANINGS)) for kind, weight in usual)
+
+
+def _drawn(chance: random.Random, weights: _Weights) -> str:
+    known = any(weight for _, weight in weights)
+    return chance.choices([kind for kind, _ in weights], [weight if known else 1.0 for _, weight in weights])[0]
+
+
+def _one(chance: random.Random, at_s: float, what: str, commands: _Weights) -> Item:  # noqa: PLR0911 - one for each kind
     at_s = round(at_s, 3)
     lasts_s = round(
         chance.choice([chance.uniform(0.5, 30.0), chance.uniform(30.0, 900.0), chance.uniform(900, 30_000)]), 1
     )
     name = chance.choice(NAMES)
-    what = chance.choices([kind for kind, _ in _KINDS], [weight for _, weight in _KINDS])[0]
     match what:
         case "line":
             how = chance.choice(LINE_TROUBLES)
             return Item(at_s, what, name, how, min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s)
         case "lamp fails":
-            return Item(at_s, what, name, "", lasts_s)
+            return Item(at_s, what, name, chance.choice(["", "goes out"]), lasts_s)
         case "lamp reports":
             return Item(at_s, what, name, chance.choice(["temperature", "cover", "lamp-failed", "fan"]), lasts_s)
         case "lamp switched by hand":
             return Item(at_s, what, name, chance.choice(["off", "on"]))
         case "player":
-            how = chance.choice(["killed", "hung", "crashes", *TROUBLES])
-            count = chance.randint(1, 4) * (how == "crashes")
+            how = chance.choice(["killed", "hung", "crashes", "crashes at a picture", *TROUBLES])
+            count = chance.randint(1, 4) * how.startswith("crashes")
             return Item(at_s, what, "", how, min(lasts_s, RESTLESS_S) if how in TROUBLES else 0.0, count)
         case "file damaged":
             return Item(at_s, what, chance.choice(FILES), chance.choice(["cut", "flipped", "empty", "removed"]),
@@ -123,13 +160,13 @@ def _one(chance: random.Random, at_s: float) -> Item:  # noqa: PLR0911 - one for
         case "restarted":
             return Item(at_s, what, "", chance.choice(["lamps stay lit", "lamps off"]))
         case "command":
-            return _command(chance, at_s)
+            return _command(at_s, chance, _drawn(chance, commands))
         case _:
-            return Item(at_s, what, for_s=0.0 if what in ("killed", "drift", "bundle damaged") else lasts_s)
+            least_s = 600.0 if what == "bundle damaged" else 0.0
+            return Item(at_s, what, for_s=0.0 if what in ("killed", "drift") else max(least_s, lasts_s))
 
 
-def _command(chance: random.Random, at_s: float) -> Item:
-    who = chance.choices([kind for kind, _ in _COMMANDS], [weight for _, weight in _COMMANDS])[0]
+def _command(at_s: float, chance: random.Random, who: str) -> Item:
     values: dict[str, Any] = {}
     match who:
         case "play":
@@ -150,7 +187,7 @@ def _command(chance: random.Random, at_s: float) -> Item:
 
 _KINDS: Final = (
     ("line", 14), ("lamp fails", 4), ("lamp reports", 3), ("lamp switched by hand", 3), ("player", 8),
-    ("camera gone", 3), ("disk full", 4), ("disk low", 1), ("file damaged", 4), ("bundle damaged", 2), ("killed", 5),
+    ("camera gone", 3), ("disk full", 6), ("disk low", 1), ("file damaged", 4), ("bundle damaged", 3), ("killed", 5),
     ("killed while writing", 6), ("power cut", 5), ("restarted", 4), ("clock set", 3), ("network gone", 3),
     ("drift", 4), ("command", 28),
 )  # fmt: skip

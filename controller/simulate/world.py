@@ -33,12 +33,16 @@ from hal.values import CameraCapabilities, DeviceIdentity, OutputInfo
 
 _ADDRESSES: Final = {f"192.0.2.{number}": name for number, name in enumerate(NAMES, 1)}
 
+ANSWER_S: Final = 0.05
+EXPOSED_S: Final = (0.2, 4.0)
+"""Exposure and reading of one photograph."""
+
 
 class SimulatedCamera:
     """An opened camera; see ``hal.interfaces.Camera``. It takes no pictures: photons are not simulated."""
 
     def __init__(self, body: Body) -> None:
-        self._body, self._closed = body, False
+        self._body, self._closed, self._connection = body, False, body.connection
         if body.owner is not None:
             raise DeviceBusy("camera-taken", what="The camera is in use by another program.", remedy="Stop it.")
         body.answer()
@@ -49,6 +53,8 @@ class SimulatedCamera:
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         if self._closed:
             raise DeviceGone("camera-closed", what="The camera is no longer open.", remedy="Open it again.")
+        if self._connection != self._body.connection:
+            raise DeviceGone("camera-gone", what="The camera was away since it was opened.", remedy="Open it again.")
         self._body.answer()
         return DeviceIdentity("Simulated", "Camera")
 
@@ -58,6 +64,7 @@ class SimulatedCamera:
 
     def capture(self, destination: Path, *, deadline: Deadline) -> list[Any]:
         self.identity(deadline=deadline)
+        self._body.answer(self._body.chance.uniform(*EXPOSED_S))
         return []
 
     def close(self) -> None:
@@ -67,21 +74,22 @@ class SimulatedCamera:
 
 
 class Body:
-    """The camera itself. ``sins``: that two used it at a time."""
+    """The camera itself. ``sins``: that two used it at a time; ``connection``: another one once it was away."""
 
-    def __init__(self, scheduler: Scheduler) -> None:
-        self._scheduler = scheduler
+    def __init__(self, scheduler: Scheduler, chance: random.Random) -> None:
+        self._scheduler, self.chance = scheduler, chance
         self.gone, self.owner = False, cast("SimulatedCamera | None", None)
         self.sins: list[str] = []
+        self.connection = 0
         self._asked = False
 
-    def answer(self) -> None:
-        """Takes its time. Raises DeviceGone."""
+    def answer(self, lasts_s: float = ANSWER_S) -> None:
+        """Takes so long. Raises DeviceGone."""
         if self._asked:
             self.sins.append("the camera was used by two at a time")
         self._asked = True
         try:
-            self._scheduler.sleep(0.05)
+            self._scheduler.sleep(lasts_s)
             if self.gone:
                 raise DeviceGone("camera-gone", what="The camera does not answer.", remedy="Check its cable.")
         finally:
@@ -119,7 +127,7 @@ class SimulatedWorld(World):
         self.screen = Screen(self.scheduler, self.disk, chance)
         self.lamps = {name: Lamp(name, self.scheduler) for name in NAMES}
         self.lines = {name: Line(lamp, self.scheduler, chance) for name, lamp in self.lamps.items()}
-        self.camera = Body(self.scheduler)
+        self.camera = Body(self.scheduler, chance)
         self.alerted: list[EventRow] = []
         self.no_network = False
         self.begins_unix_s, self.clock_off_s = begins_unix_s, 0.0

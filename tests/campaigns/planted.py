@@ -24,12 +24,12 @@ PARTS = ("controller", "hal", "plugins", "firmware_configs")
 LIVES = """
 import sys, time
 from controller.simulate.life import Life
-number = 0
+number, days = 0, 0.0
 while time.process_time() < float(sys.argv[1]):
     outcome = Life(f"planted-{number}", 7.0).live()
-    number += 1
+    number, days = number + 1, days + outcome.at_s / 86400
     if outcome.broken:
-        print(f"{outcome.how} (seed {outcome.seed}, day {outcome.at_s / 86400:.2f})")
+        print(f"{outcome.how} (seed {outcome.seed}, after {days:.1f} days)")
         sys.exit(9)
 """
 

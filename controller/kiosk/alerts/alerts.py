@@ -69,9 +69,11 @@ class Alerts:
 
     def __init__(
         self, stage: Path, name: Callable[[], str], table: Callable[[], AlertsTable], log: EventLog, *,
-        monotonic: Callable[[], float] = time.monotonic, ways: Callable[[AlertsTable], dict[str, Send]] | None = None,
+        monotonic: Callable[[], float] = time.monotonic, wall: Callable[[], float] = time.time,
+        ways: Callable[[AlertsTable], dict[str, Send]] | None = None,
     ) -> None:  # fmt: skip
-        self._stage, self._name, self._table, self._log, self._monotonic = stage, name, table, log, monotonic
+        self._stage, self._name, self._table, self._log = stage, name, table, log
+        self._monotonic, self._wall = monotonic, wall
         self._ways = ways or ways_out
         self._channels: dict[str, Channel] = {}
 
@@ -88,7 +90,7 @@ class Alerts:
         if not (wanted := self._ways(table)):
             raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.",
                              remedy="Write mail_to or webhook under [alerts].")  # fmt: skip
-        row = EventRow(self._log.number, time.time(), "info", "This is a test: alerts arrive.", "alert-test")
+        row = EventRow(self._log.number, self._wall(), "info", "This is a test: alerts arrive.", "alert-test")
         for send in wanted.values():
             send(self._stage, self._name(), table, (row,))
 

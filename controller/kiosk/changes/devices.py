@@ -27,6 +27,8 @@ _EXIF, _LENS, _FOCAL_MM = 0x8769, 0xA434, 0x920A
 _PICTURES: Final = (".jpg", ".jpeg", ".dng", ".cr2", ".nef", ".arw", ".tif", ".tiff")
 _ADJUSTED: Final = ("input", "keystone", "lamp mode")
 
+InSeconds = Callable[[float], Deadline]
+
 
 class Asked(Protocol):
     """An opened projector, as far as it is asked here."""
@@ -35,24 +37,24 @@ class Asked(Protocol):
     def adjustments(self, *, deadline: Deadline) -> dict[str, str]: ...
 
 
-def projector_facts(name: str, projector: Asked | None) -> Iterator[Fact]:
+def projector_facts(name: str, projector: Asked | None, deadline: InSeconds = in_seconds) -> Iterator[Fact]:
     """Of one projector; all unknown while it is not open, or does not answer."""
-    known = _asked(None if projector is None else projector.identity)
+    known = _asked(None if projector is None else projector.identity, deadline)
     model = None if known is None else _joined(known.maker, known.model, known.serial)
     yield Fact("projector", name, model)
     yield Fact("projector firmware", name, None if known is None else printable(known.firmware))
-    told = _asked(None if projector is None else projector.adjustments) or {}
+    told = _asked(None if projector is None else projector.adjustments, deadline) or {}
     for kind in _ADJUSTED:
         yield Fact(kind, name, printable(told[kind]) if kind in told else None)
 
 
-def camera_facts(camera: Device | None) -> Iterator[Fact]:
+def camera_facts(camera: Device | None, deadline: InSeconds = in_seconds) -> Iterator[Fact]:
     """Body, firmware, and what it complains about; all unknown while it is not open, or does not answer."""
-    known = _asked(None if camera is None else camera.identity)
+    known = _asked(None if camera is None else camera.identity, deadline)
     yield Fact("camera body", "", None if known is None else _joined(known.maker, known.model, known.serial))
     yield Fact("camera firmware", "", None if known is None else printable(known.firmware))
     if isinstance(camera, WatchedCamera):
-        status = _asked(camera.status)
+        status = _asked(camera.status, deadline)
         said = None if status is None else ", ".join(sorted(status.warnings)) or "none"
         yield Fact("camera settings", "warnings", said)
 
@@ -122,12 +124,12 @@ def _flat(key: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-def _asked(question: Callable[..., Any] | None) -> Any:
+def _asked(question: Callable[..., Any] | None, deadline: InSeconds) -> Any:
     """The device's answer; None without one."""
     if question is None:
         return None
     try:
-        return question(deadline=in_seconds(ASK_S))
+        return question(deadline=deadline(ASK_S))
     except (DeviceError, VelaturaError):
         return None
 

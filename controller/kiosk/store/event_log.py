@@ -179,6 +179,8 @@ class EventLog:
                     self._trim(database)
         except (sqlite3.Error, OSError) as error:
             self.problem, self._retry_at_s = str(error), self._monotonic() + _RETRY_S
+            if isinstance(error, sqlite3.Error) and not self._unavailable and _is_corrupt(error):
+                self._put_aside()
             return
         self._waiting.clear()
         self._unwritten.clear()
@@ -204,6 +206,20 @@ class EventLog:
                     return database
             self._unavailable = True
             return self._copied()
+
+    def _put_aside(self) -> None:
+        """A file that can be read in part, but takes nothing any more: all that is known goes into a new one soon."""
+        with contextlib.suppress(sqlite3.Error):
+            self._database.close()
+        with contextlib.suppress(OSError):
+            # Another file's write-ahead log must not be read into the new one.
+            for end in ("-wal", "-shm"):
+                Path(f"{self.path}{end}").unlink(missing_ok=True)
+            self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
+        self._database, self._unavailable = self._connected(Path(":memory:")), True
+        self._waiting = deque(self._recent, SHOWN)
+        self._unwritten = {("done", key): None for key in self._done} | {("kept", key): None for key in self._kept}
+        self._retry_at_s = self._monotonic()
 
     def _copied(self) -> sqlite3.Connection:
         """An in-memory copy of a log that can be read but not opened, as on a full disk; see ``_flush``."""
@@ -257,6 +273,10 @@ def _is_damage(error: sqlite3.Error) -> bool:
     """Whether the file is damaged, and not the disk full or the file handles used up."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
     return code & 0xFF in _DAMAGE or code in _UNREADABLE
+
+
+def _is_corrupt(error: sqlite3.Error) -> bool:
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 _DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT, sqlite3.SQLITE_ERROR)

@@ -86,10 +86,11 @@ class Devices:
 
     def facts(self) -> tuple[Fact, ...]:
         """What the devices tell of themselves. Seconds; unknown what is missing, or lent to a job."""
-        found = [fact for one in self.projectors for fact in projector_facts(one.name, one.guard)]
+        in_s = self._world.deadline
+        found = [fact for one in self.projectors for fact in projector_facts(one.name, one.guard, in_s)]
         mine = self.camera.lent.acquire(blocking=False)
         try:
-            return (*found, *camera_facts(self.camera.device if mine else None))
+            return (*found, *camera_facts(self.camera.device if mine else None, in_s))
         finally:
             if mine:
                 self.camera.lent.release()
@@ -221,7 +222,7 @@ class Devices:
             circuits = mains_circuits(self._checked, self._context, stack, deadline)
             return Boards(circuits, stack)
 
-        return MainsSupervisor(drivers, open_circuits, self._tell)
+        return MainsSupervisor(drivers, open_circuits, self._tell, **self._of_the_world())
 
 
 _DARKEN: Final = "Switch the lights off and close the blinds. Other light makes the appearance pale."

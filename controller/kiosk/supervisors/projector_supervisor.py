@@ -69,7 +69,7 @@ class ProjectorSupervisor:
         self._silent_since_s: float | None = None
         self._reopen_at_s, self._reopened = 0.0, 0
         self._struck_at_s: float | None = None
-        self._failed_strikes = 0
+        self._failed_strikes, self._remembered = 0, False
         self._burning = False
         self._faulty_since_s: float | None = None
 
@@ -95,14 +95,17 @@ class ProjectorSupervisor:
 
     @want_lit.setter
     def want_lit(self, wanted: bool | None) -> None:
+        if wanted and self._want_lit is False:
+            # A lamp that stays off after failed attempts gets one more attempt at every opening. A service that begins
+            # while the stage is open is no opening.
+            self._failed_strikes, self._remembered = min(self._failed_strikes, MOST_STRIKES - 1), True
         if wanted and not self._want_lit:
-            # A lamp that stays off after failed attempts gets one more attempt at every opening.
-            self._failed_strikes, self._faulty_since_s = min(self._failed_strikes, MOST_STRIKES - 1), float("-inf")
+            self._faulty_since_s = float("-inf")
         self._want_lit = wanted
 
     def forgive(self) -> None:
         """After the technician's repair: allow all attempts again, the first at once."""
-        self._failed_strikes, self._faulty_since_s = 0, float("-inf")
+        self._failed_strikes, self._faulty_since_s, self._remembered = 0, float("-inf"), True
 
     def step(self) -> None:
         """Read the status once, and act on it. Blocks for a few answers at most; device errors are not raised."""
@@ -141,6 +144,7 @@ class ProjectorSupervisor:
                 self._darken(guard, status)
         except (DeviceError, VelaturaError) as error:
             self._see(self._view.condition, status, _decision(error))
+        guard.keep_failed(self._failed_strikes + (self._struck_at_s is not None))
 
     def close(self) -> None:
         """Close the line for good; the lamp stays as it is."""
@@ -155,6 +159,8 @@ class ProjectorSupervisor:
             if self._clock.now_s() < self._reopen_at_s:
                 return None
             self._guard = self._open_guard(self._deadline(ANSWER_S))
+            if not self._remembered:
+                self._failed_strikes, self._remembered = self._guard.failed_strikes, True
             if self._closed:
                 # Closed while it was being opened: release the line, because the next service needs it.
                 self._release(self._guard)
@@ -247,7 +253,7 @@ class ProjectorSupervisor:
         if self._failed_strikes >= MOST_STRIKES:
             return self._see(Condition.BROKEN, status, _unlit(self.name))
         try:
-            guard.switch_on(deadline=self._deadline(guard.switch_s))
+            guard.switch_on(deadline=self._deadline(guard.switch_s), failed=self._failed_strikes + 1)
         except DeviceRefused as error:
             if error.code in ("lamp-cooling", "lamp-resting"):
                 return self._see(Condition.COOLING, status, self._view.problem)

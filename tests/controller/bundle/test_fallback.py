@@ -53,6 +53,38 @@ def test_an_orderly_end_without_a_picture_is_not_counted(folder: Path) -> None:
     assert plays(folder) == 2
 
 
+def test_a_start_that_waits_is_not_counted_and_one_that_is_asked_in_vain_is(folder: Path) -> None:
+    for _ in range(10):
+        start(folder).ready()
+    assert (plays(folder), Starts.read(folder).failed) == (2, 0)
+    for _ in range(3):
+        waits = start(folder)
+        waits.ready()
+        waits.asked()
+        waits.asked()
+    assert Starts.read(folder).failed == 3
+    start(folder)
+    assert plays(folder) == 1
+
+
+def test_an_orderly_end_of_one_that_waits_changes_nothing(folder: Path) -> None:
+    start(folder)
+    waits = start(folder)
+    waits.ready()
+    waits.ended()
+    assert Starts.read(folder).failed == 1
+    waits.asked()
+    waits.ended()
+    assert Starts.read(folder).failed == 1
+
+
+def test_one_that_was_asked_before_it_was_ready_counts(folder: Path) -> None:
+    resumed = start(folder)
+    resumed.asked()
+    resumed.ready()
+    assert Starts.read(folder).failed == 1
+
+
 def test_two_bad_bundles_do_not_take_turns(folder: Path) -> None:
     for _ in range(12):
         start(folder)

@@ -58,7 +58,7 @@ def test_after_three_failed_starts_the_bundle_before_plays(start: Start, install
     player = start(bundle=installed, allow_unsigned=True)
     assert "plays again" in player.log.read_text()
     with Wire(player.socket) as wire:
-        assert starts(installed)["failed"] == 1, "until it shows a picture this start counts, too"
+        assert starts(installed)["failed"] == 0, "it waits: its end would say nothing about the bundle"
         wire.ask("play", appearance="3")
         shown = Frames(tmp_path / "out.frame").read()
         assert all(np.array_equal(shown[name], frame) for name, frame in noise(OUTPUTS, 3).items())
@@ -66,13 +66,25 @@ def test_after_three_failed_starts_the_bundle_before_plays(start: Start, install
     assert starts(installed)["failed"] == 0
 
 
-def test_a_player_that_is_killed_before_its_first_picture_is_counted_and_one_that_is_asked_to_end_is_not(
+def test_a_player_that_is_killed_is_counted_only_once_a_picture_was_asked_for(
     start: Start, installed: Path, tmp_path: Path
 ) -> None:
     install(write_noise(tmp_path / "b.vel"), installed.parent, allow_unsigned=True)
-    start(bundle=installed, allow_unsigned=True).terminate()
-    assert starts(installed)["failed"] == 0
     player = start(bundle=installed, allow_unsigned=True)
+    for operation in ("hello", "status", "stop"):
+        with Wire(player.socket) as wire:
+            wire.ask(operation)
+        os.kill(player.pid, signal.SIGKILL)
+        player.restart()
+        assert starts(installed)["failed"] == 0, "as in power cuts while the stage is closed"
+    with Wire(player.socket) as wire:
+        wire.send(b'{"op": "play", "appearance": "1", "fade_s": 30.0}\n')
+        wire.ask("status")
+        assert starts(installed)["failed"] == 1
+    player.restart()
+    assert starts(installed)["failed"] == 0, "it was asked to end"
+    with Wire(player.socket) as wire:
+        wire.ask("play", appearance="none")
     os.kill(player.pid, signal.SIGKILL)
     player.terminate()
     assert starts(installed)["failed"] == 1

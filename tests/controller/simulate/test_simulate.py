@@ -35,7 +35,12 @@ def test_another_seed_gives_another_life() -> None:
 def test_a_script_is_the_same_after_it_was_kept() -> None:
     script = draw("kept", 5.0)
     assert from_json(to_json(script)) == script
-    assert {item.what for item in draw("all", 60.0)} >= {"line", "power cut", "killed while writing", "clock set"}
+
+
+def test_each_life_leaves_some_kinds_of_things_out_and_all_of_them_have_all() -> None:
+    lives = [{item.what for item in draw(f"all-{number}", 60.0)} for number in range(8)]
+    assert set().union(*lives) >= {"line", "power cut", "killed while writing", "clock set", "command"}
+    assert all(kinds < set().union(*lives) for kinds in lives)
 
 
 @pytest.mark.parametrize("file", sorted(FOUND.glob("*.json")), ids=lambda path: path.stem)

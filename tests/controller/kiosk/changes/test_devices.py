@@ -11,6 +11,7 @@ from PIL import Image
 from controller.config import load_stage
 from controller.kiosk.changes.compare import changes, unknown
 from controller.kiosk.changes.devices import (
+    ASK_S,
     camera_facts,
     lens_facts,
     projector_facts,
@@ -19,9 +20,10 @@ from controller.kiosk.changes.devices import (
 )
 from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.install.outputs import connected
-from hal.deadline import in_seconds
+from controller.kiosk.world import World
+from hal.deadline import Deadline, in_seconds
 from hal.registry import OpenContext
-from hal.values import Power
+from hal.values import DeviceIdentity, Power
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.projectors.boards import BOARDS
@@ -206,3 +208,31 @@ def test_mode_and_order_that_the_x_server_shows_now() -> None:
         "The place of output HDMI-1 was number 1 from the left, at 0 0, and is now number 2 from the left, at 1920 0."
     )
     assert len(moved) == 2
+
+
+class Waiting(World):
+    """Whose time stands still."""
+
+    def monotonic(self) -> float:
+        return 7.0
+
+
+class Patient:
+    """Says how long it may take to answer."""
+
+    def __init__(self) -> None:
+        self.left_s: list[float] = []
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        self.left_s.append(deadline.left_s())
+        return DeviceIdentity("Model", "Lamp")
+
+    def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
+        self.left_s.append(deadline.left_s())
+        return {}
+
+
+def test_devices_are_asked_with_deadlines_of_the_time_that_the_kiosk_lives_in() -> None:
+    asked = Patient()
+    list(projector_facts("left", asked, Waiting().deadline))
+    assert asked.left_s == [ASK_S, ASK_S], "to the last bit: no real time passes between"

@@ -79,6 +79,29 @@ def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length:
     assert len(list(path.parent.glob("*.damaged-*"))) == 1
 
 
+def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for _ in range(100):
+        log.tell(Decision("before", "One. " * 50))
+    log.keep("override", "open")
+    log.close()
+    content = path.read_bytes()
+    # All pages of events are damaged; the schema and the small tables before them are sound.
+    path.write_bytes(content[: 8 * 4096] + bytes(byte ^ 0xA5 for byte in content[8 * 4096 :]))
+    log = EventLog(path, durable=False)
+    for _ in range(3):
+        log.tell(Decision("after", "Two."))
+    assert log.problem is None
+    log.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)][-3:] == ["after"] * 3
+    assert log.value("override") == "open"
+    assert log.number > 100
+    log.close()
+    assert len(list(path.parent.glob("*.damaged-*"))) == 1
+
+
 def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_path: Path) -> None:
     killed, left = EventLog(tmp_path / "before" / "events.sqlite"), tmp_path / "left" / "events.sqlite"
     killed.tell(Decision("last", "It was the last."))

@@ -58,6 +58,10 @@ class Kept:
         self.there = True
         self.told: list[Decision] = []
         self.shelf = Shelf()
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """As a service that was killed and starts."""
         self.supervisor = ProjectorSupervisor("left", self._opened, self.told.append, clock=self.world)
 
     def _opened(self, deadline: Deadline) -> LampGuard:
@@ -121,6 +125,54 @@ def test_a_lamp_that_stays_dead_and_says_so_is_struck_as_often_as_one_that_does_
     kept.supervisor.want_lit = True
     kept.run(3600)
     assert kept.lamp.strikes == struck + 1
+
+
+def test_a_service_that_is_restarted_again_and_again_strikes_no_dead_lamp_anew(kept: Kept) -> None:
+    kept.lamp.dud = True
+    for _ in range(6):
+        kept.supervisor.want_lit = True
+        kept.run(400.0)
+        kept.begin_anew()
+    assert kept.lamp.strikes == MOST_STRIKES
+    kept.supervisor.want_lit = False
+    kept.run(5.0)
+    kept.supervisor.want_lit = True
+    kept.run(400.0)
+    assert kept.lamp.strikes == MOST_STRIKES + 1, "one more at the next opening"
+    kept.lamp.dud = False
+    kept.begin_anew()
+    kept.supervisor.forgive()
+    kept.supervisor.want_lit = True
+    assert kept.run(400.0) is Condition.LIT
+    for _ in range(2):
+        kept.begin_anew()
+        kept.supervisor.want_lit = True
+        assert kept.run(5.0) is Condition.LIT
+        assert kept.lamp.strikes == MOST_STRIKES + 2
+
+
+def test_kills_soon_after_each_strike_do_not_lose_count(kept: Kept) -> None:
+    kept.lamp.dud = True
+    for _ in range(8):
+        kept.begin_anew()
+        kept.supervisor.want_lit = True
+        for _ in range(100):
+            kept.run(1.0)
+            if kept.supervisor.view.condition is Condition.LIGHTING:
+                break
+        kept.run(70.0)
+    assert kept.lamp.strikes == MOST_STRIKES
+
+
+def test_a_computer_that_was_started_anew_counts_anew(kept: Kept) -> None:
+    kept.lamp.dud = True
+    kept.supervisor.want_lit = True
+    kept.run(400.0)
+    kept.world.reboot()
+    kept.begin_anew()
+    kept.supervisor.want_lit = True
+    kept.run(800.0)
+    assert kept.lamp.strikes == 2 * MOST_STRIKES
 
 
 def test_a_technician_who_looked_after_it_needs_not_wait() -> None:
