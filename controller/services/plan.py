@@ -115,20 +115,13 @@ def _goals(figures: Mapping[str, Any], goal: PlanGoal) -> list[Goal]:
         share("Light", "share_bright_enough", f"{goal.lux:g} lx; the median is {figures['lux_median']:.0f} lx"),
         share("Detail", "share_fine_enough",
               f"{goal.detail_mm:g} mm; the median is {'-' if detail is None else format(detail, '.2f')} mm"),
-        _finest(figures),
         share("Overlap", "share_overlapped", f"{goal.overlap} projectors at each point"),
         share("Covered", "share_reached", "by at least one projector"),
     ]  # fmt: skip
 
 
-def _finest(figures: Mapping[str, Any]) -> Goal:
-    one, every = figures["wave_mm_one"], figures["wave_mm_all"]
-    reached = "-" if one is None else f"{every:.2f} mm by all, {one:.2f} mm by one projector"
-    return Goal("Finest wave", reached, "the length at which half of a faint wave's contrast is left")
-
-
 def _stands(figures: Mapping[str, Any]) -> dict[str, str]:
-    """For each projector its place, direction and settings, and its figures on its own."""
+    """For each projector its place, direction and settings, and its figures on its own; then the finest wave."""
     stands = {}
     for number, one in enumerate(figures["projectors"], start=1):
         x, y, z = one["position_m"]
@@ -138,6 +131,12 @@ def _stands(figures: Mapping[str, Any]) -> dict[str, str]:
             f"tilt {one['tilt_up_degrees']:+.1f}°, throw {one['throw_ratio']:.2f}, focus at {one['focus_m']:.2f} m. "
             f"Reaches {100 * one['share_reached']:.0f} %, {one['lux_median']:.0f} lx, {detail}; "
             f"{100 * (one['grazing_loss_mean'] or 0):.0f} % lost by oblique incidence."
+        )
+    one, every = figures["wave_mm_one"], figures["wave_mm_all"]
+    if one is not None:
+        stands["Finest wave"] = (
+            f"{every:.2f} mm from crest to crest by all projectors together, {one:.2f} mm by the sharpest alone. It is "
+            "the finest one that keeps half of its contrast."
         )
     return stands
 
