@@ -25,12 +25,17 @@ from tests.waiting import wait_for
 
 
 @pytest.fixture(scope="module", autouse=True)
-def virtual_camera(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """libgphoto2 looks at this before it is loaded, and the folder must hold a picture to take."""
+def virtual_camera(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """libgphoto2 looks at this before it is loaded, and the folder must hold a picture to take.
+
+    It is taken back: with it, later tests of the same process would find no network cameras.
+    """
     folder = tmp_path_factory.mktemp("vcamera")
     picture = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     assert cv2.imwrite(str(folder / "GPH_0001.JPG"), picture)
-    os.environ["VCAMERADIR"] = str(folder)
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("VCAMERADIR", str(folder))
+        yield
 
 
 @pytest.fixture
