@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from hal.conformance import CameraConformance, DisplayConformance
+from hal.conformance import CameraConformance, DisplayConformance, ProjectorConformance
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, DeviceRefused
 from hal.values import (
@@ -22,13 +22,17 @@ from hal.values import (
     DeviceIdentity,
     ExposureSettings,
     FileKind,
+    LampRules,
     OutputInfo,
+    Power,
     Presented,
+    ProjectorCapabilities,
+    ProjectorStatus,
 )
 
 
 class Base:
-    """What the two devices below share."""
+    """What the devices below share."""
 
     def __init__(self) -> None:
         self.closed = False
@@ -116,6 +120,50 @@ class MemoryDisplay(Base):
         raise refused("There is no bundle.")
 
 
+class MemoryProjector(Base):
+    """A lamp that warms at once; ``flaw`` names the promise that it breaks, ``answer_s`` how long a refusal takes."""
+
+    def __init__(self, flaw: str = "", answer_s: float = 0.0) -> None:
+        super().__init__()
+        self.flaw = flaw
+        self.answer_s = answer_s
+        rules = LampRules(warm_up_s=0.0, stable_s=0.0, cool_down_s=0.2, minimum_off_s=0.2)
+        self.capabilities = ProjectorCapabilities(False, False, (), False, rules)
+        self.lit = False
+        self.cool_at = 0.0
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        self.check(deadline)
+        if self.lit:
+            return ProjectorStatus(Power.ON)
+        return ProjectorStatus(Power.COOLING if time.monotonic() < self.cool_at else Power.OFF)
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        self.check(deadline)
+        time.sleep(self.answer_s)
+        if time.monotonic() < self.cool_at and self.flaw != "strikes hot":
+            raise refused("The lamp cools.")
+        self.lit = True
+
+    def switch_off(self, *, deadline: Deadline) -> None:
+        self.check(deadline)
+        if self.lit:
+            self.cool_at = time.monotonic() + self.capabilities.lamp_rules.cool_down_s
+        self.lit = False
+
+    def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
+        raise refused("It has no shutter.")
+
+
+class TestMemoryProjector(ProjectorConformance):
+    poll_s = 0.05
+
+    @pytest.fixture(params=[0.0, 0.3])
+    def projector(self, request: pytest.FixtureRequest) -> MemoryProjector:
+        """One answers at once, one only after its lamp has cooled."""
+        return MemoryProjector(answer_s=request.param)
+
+
 class TestMemoryCamera(CameraConformance):
     @pytest.fixture
     def camera(self) -> MemoryCamera:
@@ -158,3 +206,8 @@ def test_a_camera_with_unordered_steps_is_caught() -> None:
 def test_a_display_that_shows_what_does_not_fit_is_caught(flaw: str) -> None:
     with pytest.raises(FAILED):
         DisplayConformance().test_wrong_frames_are_refused_before_anything_is_shown(MemoryDisplay(flaw))
+
+
+def test_a_projector_that_strikes_a_hot_lamp_is_caught() -> None:
+    with pytest.raises(FAILED):
+        ProjectorConformance().test_on_while_the_lamp_cools_is_refused_or_kept_safe(MemoryProjector("strikes hot"))
