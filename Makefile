@@ -46,7 +46,8 @@ test: test-setup
 test-setup:
 	@.ci/setup test
 	@.ci/setup-blender
-	@.ci/setup-homeassistant
+	@.ci/setup-peer homeassistant
+	@.ci/setup-peer openapi
 	@.ci/system-packages
 	@.venv/bin/python -m hal.runtime.kernels compile
 	@.venv/bin/python -m tests.booted.trees
@@ -110,4 +111,4 @@ lock:
 clean:
 	@if [ -x .venv/bin/python ]; then python=.venv/bin/python; else python=python3; fi; \
 	  PYTHONDONTWRITEBYTECODE=1 "$$python" -m hal.runtime.caches remove
-	rm -rf .venv .venv-blender .venv-homeassistant build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-blender .venv-homeassistant .venv-openapi build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

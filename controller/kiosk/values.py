@@ -237,6 +237,13 @@ class Reach:
 
 
 @dataclass(frozen=True, slots=True)
+class NewTarget:
+    """An uploaded picture: ``target`` is its key."""
+
+    target: str
+
+
+@dataclass(frozen=True, slots=True)
 class Achieved:
     """How close the photograph of an appearance is to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
     percentile of the colour difference (CIEDE2000) on the whole visible object, ``rmse`` of the target's white,

@@ -6,9 +6,10 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args, get_type_hints
 from urllib.parse import quote
 
 from starlette.requests import Request
@@ -98,12 +99,23 @@ def _picture(path: Path | None) -> Response:
 def plain(value: Any) -> Any:
     """Values as JSON, without paths, which mean nothing outside this machine."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {key: plain(inner) for key, inner in asdict(value).items() if not isinstance(inner, Path)}
-    if isinstance(value, dict):
-        return {str(key): plain(inner) for key, inner in value.items() if not isinstance(inner, Path)}
+        return {name: plain(getattr(value, name)) for name in sent_fields(type(value))}
     if isinstance(value, list | tuple):
         return [plain(inner) for inner in value]
+    if isinstance(value, dict):
+        return {str(key): plain(inner) for key, inner in value.items()}
     return value
+
+
+@cache
+def sent_fields(kind: type) -> dict[str, Any]:
+    """The type of each field of a dataclass, by name, without those that have paths."""
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in fields(kind) if not _has_paths(hints[field.name])}
+
+
+def _has_paths(hint: Any) -> bool:
+    return hint is Path or any(_has_paths(inner) for inner in get_args(hint))
 
 
 def scalar_values(operation: Operation, request: Request) -> Values:

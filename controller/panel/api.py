@@ -17,6 +17,7 @@ from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.roles import Role
 from controller.panel import answers
+from controller.panel.answer_schemas import BYTES, Schemas
 from controller.panel.auth.identity import Endpoint, Entry, Visitor
 from controller.panel.context import Panel
 from controller.run.state_machine import State
@@ -76,12 +77,9 @@ def _document(operations: Sequence[Operation]) -> Endpoint:
 def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
     """The OpenAPI 3.1 document, made from the same table as the routes."""
     paths: dict[str, dict[str, Any]] = {}
+    schemas = Schemas()
     for operation in operations:
-        paths.setdefault(operation.path, {})[operation.method.lower()] = _described(operation)
-    error = object_schema(()) | {
-        "properties": {key: {"type": "string"} for key in ("code", "what", "remedy")},
-        "required": ["code", "what", "remedy"],
-    }
+        paths.setdefault(operation.path, {})[operation.method.lower()] = _described(operation, schemas.of(operation))
     return {
         "openapi": "3.1.0",
         "info": {
@@ -93,22 +91,26 @@ def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
         "security": [{"token": []}],
         "paths": paths,
         "components": {
+            "schemas": {name: schemas.components[name] for name in sorted(schemas.components)},
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
             "responses": {
                 "Error": {
                     "description": "What happened, and what to do",
-                    "content": {"application/json": {"schema": error}},
+                    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/Refusal"}}},
                 },
-                "Plain": {"description": "Refused before the body was read", "content": {"text/plain": {}}},
+                "Plain": {
+                    "description": "Refused before the body was read",
+                    "content": {"text/plain": {"schema": {"type": "string"}}},
+                },
             },
         },
     }
 
 
-def _described(operation: Operation) -> dict[str, Any]:
-    content: dict[str, Any] = {operation.answer.media: {"schema": {}}}
+def _described(operation: Operation, answer: dict[str, Any]) -> dict[str, Any]:
+    content: dict[str, Any] = {operation.answer.media: {"schema": answer}}
     if operation.answer is Answer.PICTURE:
-        content["image/jpeg"] = {}
+        content["image/jpeg"] = {"schema": BYTES}
     described: dict[str, Any] = {
         "operationId": operation.name,
         "summary": operation.about,
@@ -128,7 +130,7 @@ def _described(operation: Operation) -> dict[str, Any]:
         ]
     body = [field for field, where in placed if where == "body"]
     if operation.upload is not None:
-        described["requestBody"] = {"required": True, "content": {"application/octet-stream": {}}}
+        described["requestBody"] = {"required": True, "content": {"application/octet-stream": {"schema": BYTES}}}
     elif body:
         described["requestBody"] = {"required": True, "content": {"application/json": {"schema": object_schema(body)}}}
     return described

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from controller.kiosk.operations.fields import Field
@@ -22,6 +23,31 @@ _ROLE: Final = Field("role", "viewer, operator or technician", choices=("viewer"
 _PASSWORD: Final = Field("password", "10 characters or more", longest=LONGEST_PASSWORD, secret=True)
 
 
+@dataclass(frozen=True, slots=True)
+class AccountRow:
+    """An account. ``role``: viewer, operator or technician; ``one_time``: its password has to be changed first."""
+
+    name: str
+    role: str
+    one_time: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TokenRow:
+    """An API token without its secret. ``role`` as for an account."""
+
+    name: str
+    role: str
+    made_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class NewToken:
+    """The secret of a new API token. It is not stored, so nobody can read it later."""
+
+    token: str
+
+
 class AccountActions:
     """The operations on accounts and tokens. ``held`` opens the accounts at the first use; ``ended`` ends the sessions
     of an account; ``costly`` limits how many passwords are hashed at the same time.
@@ -34,18 +60,11 @@ class AccountActions:
         self._held, self._ended = held, ended
         self._costly = costly or contextlib.nullcontext()
 
-    def accounts(self) -> Sequence[dict[str, Any]]:
-        return [
-            {"name": account.name, "role": account.role.name.lower(), "one_time": account.one_time}
-            for account in self._held().all()
-        ]
+    def accounts(self) -> Sequence[AccountRow]:
+        return [AccountRow(row.name, row.role.name.lower(), row.one_time) for row in self._held().all()]
 
-    def tokens(self) -> Sequence[dict[str, Any]]:
-        """Without the secrets."""
-        return [
-            {"name": token.name, "role": token.role.name.lower(), "made_unix_s": token.made_unix_s}
-            for token in self._held().tokens()
-        ]
+    def tokens(self) -> Sequence[TokenRow]:
+        return [TokenRow(row.name, row.role.name.lower(), row.made_unix_s) for row in self._held().tokens()]
 
     def add_account(self, name: str, role: str, password: str) -> None:
         with self._costly:
@@ -64,8 +83,8 @@ class AccountActions:
         self._held().remove(name)
         self._ended(name)
 
-    def add_token(self, name: str, role: str) -> dict[str, str]:
-        return {"token": self._held().add_token(name, Role.named(role))}
+    def add_token(self, name: str, role: str) -> NewToken:
+        return NewToken(self._held().add_token(name, Role.named(role)))
 
     def remove_token(self, name: str) -> None:
         self._held().remove_token(name)

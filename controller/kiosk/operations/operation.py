@@ -59,7 +59,8 @@ class Operation:
     """One operation. It needs only this declaration and a method of its holder.
 
     ``holder``: the object with the method: the kiosk, its accounts, or the panel's uploaded targets (HTTP only);
-    ``call``: the method's name; ``take`` makes its arguments from the values, ``part`` selects from its result.
+    ``call``: the method's name; ``take`` makes its arguments from the values, ``part`` selects from its result;
+    ``gives``: the type of what ``part`` returns, where the method returns another.
     ``offline``: ``api.folder.FolderKiosk`` has it, for use without a running kiosk. ``http``: method and path below
     /api/v1; ``at_socket``, ``command``, ``verb``: its name at the socket, on the command line and for building control.
     All names default to ``name``. ``within``: the hand-written command that includes it. ``said``: the sentence shown
@@ -77,6 +78,7 @@ class Operation:
     call: str = ""
     take: Callable[[Values], Mapping[str, Any]] = values_as_they_are
     part: Callable[[Any, Values], Any] = whole_answer
+    gives: Any = None
     offline: bool = False
     http: tuple[str, str] = ("", "")
     at_socket: str = ""

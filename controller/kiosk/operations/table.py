@@ -13,7 +13,7 @@ from controller.kiosk.operations.accounts import ACCOUNT_OPERATIONS
 from controller.kiosk.operations.fields import NAME, Field, Flag
 from controller.kiosk.operations.operation import Answer, Effect, Operation, Values
 from controller.kiosk.roles import Role
-from controller.kiosk.values import Schedule, ScheduleRow
+from controller.kiosk.values import NewTarget, Schedule, ScheduleRow
 
 VIEWER, OPERATOR, TECHNICIAN = Role.VIEWER, Role.OPERATOR, Role.TECHNICIAN
 LOOKS, SHOWS, CHANGES, WORKS = Effect.LOOKS, Effect.SHOWS, Effect.CHANGES, Effect.WORKS
@@ -187,7 +187,7 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
               more="An appearance that is playing, or that is in the schedule, can't be removed."),
     Operation("upload-target", "Upload a picture as a target", OPERATOR, CHANGES,
               (Field("file", "a PNG, JPEG, TIFF or WebP", "file"), FIT), holder="targets", call="add",
-              take=_uploaded, part=lambda key, values: {"target": key},
+              take=_uploaded, part=lambda key, values: NewTarget(key), gives=NewTarget,
               http=("POST", "/targets"), within="compute", said="The picture is uploaded."),
     Operation("target-picture", "An uploaded target, as it is stored", OPERATOR, LOOKS,
               (Field("target", TARGET.about, pattern=TARGET_KEY, longest=24),), Answer.PICTURE, holder="targets",

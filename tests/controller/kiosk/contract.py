@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import jsonschema_rs
 import pytest
 from PIL import Image
 
@@ -29,6 +30,9 @@ from controller.kiosk.interface import (
     TriedDevice,
 )
 from controller.kiosk.operations.dispatch import AT_SOCKET, local_values
+from controller.kiosk.operations.operation import Answer
+from controller.panel.answer_schemas import Schemas
+from controller.panel.answers import plain
 from tests.controller.kiosk import vase
 
 PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"
@@ -246,7 +250,9 @@ class Contract:
                 ask(stage, case.op, sent)
             assert (caught.value.code, bool(caught.value.remedy)) == (case.code, True)
         else:
-            assert case.holds(ask(stage, case.op, sent), stage)
+            answer = ask(stage, case.op, sent)
+            assert case.holds(answer, stage)
+            assert schema_errors(case.op, answer) == []
 
     def test_a_job_that_was_begun_is_known_or_waits(self, stage: Stage) -> None:
         job = ask(stage, *FULL)
@@ -274,6 +280,19 @@ class Contract:
 def shows_names_after(stage: Stage) -> bool:
     stage.kiosk.identify(True)
     return shows_names(stage)
+
+
+def schema_errors(op: str, answer: Any) -> list[str]:
+    """What an answer has that the API's document does not say of it."""
+    operation = next(one for one in AT_SOCKET if one.name == op)
+    if operation.answer is not Answer.VALUE:
+        return []
+    schemas = Schemas()
+    schema = schemas.of(operation) | {"components": {"schemas": schemas.components}}
+    # An object may have more than a document says, so that a later version can; here, nothing is more.
+    for component in schemas.components.values():
+        component["additionalProperties"] = False
+    return [error.message for error in jsonschema_rs.validator_for(schema).iter_errors(plain(answer))]
 
 
 def test_every_operation_of_a_kiosk_is_in_the_contract() -> None:

@@ -35,7 +35,8 @@ from tests.controller.panel.served import served
 
 __all__ = ["port"]
 CHIME = Operation("chime", "Sound the bell", Role.OPERATOR, Effect.SHOWS,
-                  (Field("times", "how often, 1 to 5", "integer", least=1, most=5),), offline=True)  # fmt: skip
+                  (Field("times", "how often, 1 to 5", "integer", least=1, most=5),), offline=True,
+                  gives=dict[str, int | str])  # fmt: skip
 DECLARED = (*OPERATIONS, CHIME)
 
 
@@ -55,6 +56,8 @@ def test_the_document_has_it(kiosk: StageKiosk) -> None:
     body = described["requestBody"]["content"]["application/json"]["schema"]
     assert body["required"] == ["times"]
     assert (body["properties"]["times"]["minimum"], body["properties"]["times"]["maximum"]) == (1, 5)
+    answer = described["responses"]["200"]["content"]["application/json"]["schema"]
+    assert answer["additionalProperties"] == {"anyOf": [{"type": "integer"}, {"type": "string"}]}
 
 
 def test_the_api_has_it_with_its_limits_and_its_role(kiosk: StageKiosk, tmp_path: Path) -> None:

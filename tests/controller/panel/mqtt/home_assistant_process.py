@@ -1,4 +1,4 @@
-"""Home Assistant with nothing but its MQTT integration, in an environment of its own (``.ci/setup-homeassistant``).
+"""Home Assistant with nothing but its MQTT integration, in an environment that ``.ci/setup-peer homeassistant`` makes.
 
 Arguments: the broker's port, user and password, a folder. Reads one JSON object a line: ``{"wait": N}`` for the states
 of all entities once there are N, ``{"call": "switch.turn_on", "data": {...}}`` for an action. Answers with one line.

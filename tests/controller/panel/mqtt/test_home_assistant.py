@@ -90,7 +90,9 @@ def discovered(folder: Path, port: int) -> BrokerOptions:
 
 
 @needs_broker
-@pytest.mark.skipif(not PYTHON.exists(), reason="needs Home Assistant (.ci/setup-homeassistant; Python 3.11 or 3.12)")
+@pytest.mark.skipif(
+    not PYTHON.exists(), reason="needs Home Assistant (.ci/setup-peer homeassistant; Python 3.11 or 3.12)"
+)
 @pytest.mark.slow
 def test_home_assistant_finds_a_stage_reads_it_and_controls_it(tmp_path: Path, port: int) -> None:
     kiosk = MemoryKiosk(tmp_path / "pictures")
