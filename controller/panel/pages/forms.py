@@ -18,6 +18,7 @@ from controller.core.errors import UsageError
 from controller.kiosk.operations.fields import parse
 from controller.kiosk.operations.operation import Answer, Operation, Values
 from controller.kiosk.operations.table import ROW
+from controller.kiosk.values import NewTarget
 from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor, same_origin
 from controller.panel.context import Panel
@@ -231,8 +232,8 @@ def _typed_rows(sent: Sent) -> list[dict[str, str]]:
 
 
 def _then(operation: Operation, result: Any, values: Values) -> str:
-    known = result if isinstance(result, dict) else values
-    return LEADS_TO[operation.name].replace("{target}", str(known.get("target", "")))
+    target = result.target if isinstance(result, NewTarget) else values.get("target", "")
+    return LEADS_TO[operation.name].replace("{target}", str(target))
 
 
 def _back(operation: Operation, sent: Sent) -> str:

@@ -19,7 +19,7 @@ from controller.kiosk.store.accounts import Role
 from tests.controller.panel.served import Served
 from tests.controller.panel.test_uploads import jpeg
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 FILES = ROOT / "docs" / "examples" / "http-client"
 PAGE = (ROOT / "docs" / "reference" / "http-api.md").read_text()
 GENERATOR = ROOT / ".venv-openapi" / "bin" / "openapi-python-client"

@@ -18,7 +18,7 @@ from tests.controller.panel.served import Served, served
 from tests.ports import kept_port
 from tests.waiting import eventually
 
-FOLDER = Path(__file__).parents[3] / "docs" / "examples" / "monitoring"
+FOLDER = Path(__file__).parents[4] / "docs" / "examples" / "monitoring"
 pytestmark = pytest.mark.skipif(
     shutil.which("prometheus") is None or shutil.which("promtool") is None,
     reason="needs prometheus (a package of the test set-up)",
