@@ -86,7 +86,8 @@ def decode(
     position = np.full((*black.shape, 2), np.nan, np.float32)
     modulation, state = np.zeros(black.shape, np.float32), np.zeros(black.shape, np.uint8)
     seen = lit | _bright(sums, half)
-    wanted = seen & axes[0].sure & axes[1].sure
+    # A dark pixel among bright ones can be as dark under the patterns as without them; its contrast has no meaning.
+    wanted = seen & axes[0].sure & axes[1].sure & (half > 0)
     _locate(sums.waves, axes[0].cell, axes[1].cell, wanted, half, sums.noise, position, modulation, state)
     _check_order(seen, lit, state, position)
     valid = lit & ((state & CODED) > 0) & ((state & CONTRADICTED) == 0)

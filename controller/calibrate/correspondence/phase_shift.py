@@ -135,11 +135,14 @@ def locate_pixel(
     agree = True
     for axis in range(2):
         a, b = waves[2 * axis, row, column], waves[2 * axis + 1, row, column]
+        amplitude = np.sqrt(a * a + b * b)
+        if not amplitude > 0:  # a dark pixel, the same value in every photograph
+            return DARK
         coarse[axis], near = _coarse_of(
             np.arctan2(b, a) * (PERIOD_PX / (2 * np.pi)), cell_x if axis == 0 else cell_y, cell_px
         )
         agree = agree and near
-        spread[axis] = PHASE_NOISE * sigma / np.sqrt(a * a + b * b) * (PERIOD_PX / (2 * np.pi))
+        spread[axis] = PHASE_NOISE * sigma / amplitude * (PERIOD_PX / (2 * np.pi))
         best[axis] = coarse[axis]
     if not agree:
         return DARK

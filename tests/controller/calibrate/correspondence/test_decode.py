@@ -143,6 +143,25 @@ def test_pixels_that_were_saturated_in_one_capture_are_left_out_and_the_rest_is_
     assert np.mean(found.valid[far] != whole.valid[far]) < 1e-3
 
 
+@pytest.mark.parametrize("same", ["everything", "patterns", "phase-x", "phase-y", "blur-x", "blur-d"])
+def test_pixels_that_show_the_same_in_several_photographs_are_left_out_and_the_rest_is_kept(same: str) -> None:
+    """As dark paint does in a camera whose steps are coarser than its light."""
+    captures = {name: image.copy() for name, image in photographed(Scene()).items()}
+    hurt = np.zeros(captures["black"].shape[:2], bool)
+    hurt[40:120:3, 60:180:4] = True
+    for name, image in captures.items():
+        if same == "everything" or name.startswith(same) or (same == "patterns" and name[-1].isdigit()):
+            image[hurt] = captures["black"][hurt] if same == "everything" else captures["white"][hurt] / 2
+    found, whole = decode(captures, PLAN), decode(photographed(Scene()), PLAN)
+    assert whole.valid[hurt].mean() > 0.5
+    if same in ("everything", "patterns", "phase-x", "phase-y"):
+        assert not found.valid[hurt].any()
+    error = np.abs(found.projector_px - positions(Scene()))[found.valid]
+    assert rms(error) < 0.03
+    far = cv2.dilate(hurt.astype(np.uint8), np.ones((13, 13), np.uint8)) == 0
+    assert np.mean(found.valid[far] != whole.valid[far]) < 1e-3
+
+
 @settings(max_examples=8, deadline=None)
 @given(scale=st.floats(1.4, 3.2), bend=st.floats(0, 4), blur=st.floats(0.1, 1.2), seed=st.integers(0, 1000))
 def test_any_smooth_warp_is_decoded(scale: float, bend: float, blur: float, seed: int) -> None:
