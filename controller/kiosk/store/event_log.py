@@ -230,7 +230,8 @@ class EventLog:
         with contextlib.suppress(sqlite3.Error, OSError), tempfile.TemporaryDirectory(dir=folder) as name:
             copy = Path(name) / self.path.name
             for end in ("", "-wal"):
-                with contextlib.suppress(FileNotFoundError):
+                # A link to a device such as /dev/zero would be copied without an end.
+                if Path(f"{self.path}{end}").is_file():
                     shutil.copyfile(f"{self.path}{end}", f"{copy}{end}")
             with contextlib.closing(sqlite3.connect(copy)) as source:
                 source.backup(database)

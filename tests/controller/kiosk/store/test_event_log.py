@@ -123,3 +123,15 @@ def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_pat
     assert [row.code for row in log.after(0)] == ["last"]
     assert (log.value("override"), log.number) == ("[true, false]", 1)
     log.close()
+
+
+@pytest.mark.timeout(20)
+def test_a_log_that_is_a_device_is_not_read_without_an_end(tmp_path: Path) -> None:
+    path = tmp_path / "events.sqlite"
+    path.symlink_to("/dev/zero")
+    log = EventLog(path)
+    assert log.problem is not None
+    row = log.tell(Decision("begins", "It begins."))
+    assert [one.text for one in log.after(0)] == [row.text]
+    log.close()
+    assert path.is_symlink()
