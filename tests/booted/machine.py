@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -61,25 +61,41 @@ ExecStart=/bin/sh -c "ip link add net0 type bridge; ip address add {ADDRESS}/24 
 [Install]
 WantedBy=multi-user.target
 """
-_PHOTOGRAPH: Final = """
-import ctypes, sys
+_SEEING: Final = """
+import ctypes, hashlib, select, sys, time
 class Image(ctypes.Structure):
     _fields_ = [(name, ctypes.c_int) for name in ("width", "height", "offset", "format")] + [("data", ctypes.c_void_p)]
 x = ctypes.CDLL("libX11.so.6")
-x.XOpenDisplay.restype = x.XGetImage.restype = ctypes.c_void_p
+x.XOpenDisplay.restype = x.XGetImage.restype = x.XGetSubImage.restype = ctypes.c_void_p
 x.XDefaultRootWindow.restype = ctypes.c_ulong
 display = x.XOpenDisplay(b":0")
 if not display:
     sys.exit("X does not answer")
 display = ctypes.c_void_p(display)
 size = x.XDisplayWidth(display, 0), x.XDisplayHeight(display, 0)
+part = 0, 0, *size, ctypes.c_ulong(0xFFFFFFFF), 2
 root = ctypes.c_ulong(x.XDefaultRootWindow(display))
-image = Image.from_address(x.XGetImage(display, root, 0, 0, *size, ctypes.c_ulong(0xFFFFFFFF), 2))
+image = x.XGetImage(display, root, *part)
+def pixels():
+    return ctypes.string_at(Image.from_address(image).data, size[0] * size[1] * 4)
+"""
+_PHOTOGRAPH: Final = f"""{_SEEING}
 with open("/tmp/screen", "wb") as file:
-    file.write(bytes(ctypes.string_at(image.data, size[0] * size[1] * 4)))
+    file.write(pixels())
 print(*size)
 """
 """What the X server shows, read without anything of ours."""
+_WATCH: Final = f"""{_SEEING}
+before = None
+while not select.select([sys.stdin], [], [], 0.02)[0]:
+    if not x.XGetSubImage(display, root, *part, ctypes.c_void_p(image), 0, 0):
+        sys.exit("X does not answer any more")
+    seen = pixels()
+    now = "black" if not any(seen) else hashlib.sha256(seen).hexdigest()
+    if now != before:
+        print(time.monotonic(), now, flush=True)
+        before = now
+"""
 _FETCH: Final = """
 import ssl, sys, urllib.request
 context = ssl._create_unverified_context()
@@ -101,6 +117,7 @@ class Machine:
         self.write(Path("/etc/systemd/system/bench.service"), _BENCH)
         self.write(Path("/etc/systemd/system/lonely-network.service"), _NETWORK)
         self.write(Path("/opt/photograph.py"), _PHOTOGRAPH)
+        self.write(Path("/opt/watch.py"), _WATCH)
         wants = self.at(Path("/etc/systemd/system/multi-user.target.wants"))
         wants.mkdir(parents=True, exist_ok=True)
         (wants / "lonely-network.service").symlink_to("/etc/systemd/system/lonely-network.service")
@@ -163,12 +180,15 @@ class Machine:
 
     def called(self, *words: str | Path, user: str | None = None) -> subprocess.CompletedProcess[str]:
         """Run a program on the machine, as root if no other ``user`` is named."""
-        there = ["nsenter", f"--target={self._init}", "--mount", "--uts", "--ipc", "--net", "--pid"]
         identity = [] if user is None else ["runuser", "-u", user, "--"]
         return subprocess.run(
-            [*there, "env", "-i", _PATH, "LANG=C.UTF-8", *identity, *map(str, words)],
-            capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
+            [*self._there(), *identity, *map(str, words)], capture_output=True, text=True, timeout=300, check=False
+        )
+
+    def _there(self) -> list[str]:
+        """What runs the words after it on the machine."""
+        into = ["nsenter", f"--target={self._init}", "--mount", "--uts", "--ipc", "--net", "--pid"]
+        return [*into, "env", "-i", _PATH, "LANG=C.UTF-8"]
 
     def call(self, *words: str | Path, user: str | None = None) -> str:
         """As ``called``, for what has to work; what it printed."""
@@ -193,6 +213,27 @@ class Machine:
         width, height = map(int, done.stdout.split())
         data = np.frombuffer(self.read(Path("/tmp/screen")), np.uint8)
         return data.reshape(height, width, 4)[:, :, 2::-1]
+
+    @contextlib.contextmanager
+    def watched(self) -> Iterator[list[tuple[float, str]]]:
+        """Meanwhile, look at the X server fifty times a second. Filled at the end: (monotonic seconds, what it showed
+        from then on: "black" or the hash of the picture), and the end itself.
+        """
+        seen: list[tuple[float, str]] = []
+        watching = subprocess.Popen(
+            [*self._there(), "env", "XAUTHORITY=/run/velatura-x11/cookie", "python3", "/opt/watch.py"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert watching.stdout is not None
+        first = watching.stdout.readline()
+        try:
+            yield seen
+        finally:
+            # It ends with its input. A signal would end only nsenter.
+            rest, _ = watching.communicate()
+        assert watching.returncode == 0, "the X server ended meanwhile"
+        seen += [(float(at_s), what) for at_s, what in map(str.split, [first, *rest.splitlines()])]
+        seen.append((time.monotonic(), "end"))
 
     def restarts(self, unit: str) -> int:
         return int(self.call("systemctl", "show", "--value", "--property=NRestarts", unit))

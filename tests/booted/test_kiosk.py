@@ -151,10 +151,14 @@ def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kio
     second = built_package("bookworm", tmp_path, version="2")
     before = kept(playing)
     for package, wanted in ((second, "2-1~deb12"), (first, "1-1~deb12")):
-        machine.install(package)
-        assert machine.call(*version) == wanted
-        machine.wait_for(playing.shows)
-        machine.wait_for(lambda: playing.state == "playing")
+        with machine.watched() as seen:
+            machine.install(package)
+            assert machine.call(*version) == wanted
+            machine.wait_for(playing.shows)
+            machine.wait_for(lambda: playing.state == "playing")
+        shown = [what for _, what in seen[:-1]]
+        assert shown == [shown[0], "black", shown[0]], "it was black once, and never showed anything else"
+        print(f"black for {seen[2][0] - seen[1][0]:.2f} s")
         assert lost(playing, before) == []
         assert {machine.restarts(name) for name in SERVICES[1:]} == {0}
 
