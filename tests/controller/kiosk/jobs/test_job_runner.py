@@ -396,4 +396,4 @@ def test_of_two_at_the_socket_of_a_kiosk_without_panel_neither_loses_an_account(
 
     monkeypatch.setattr(Accounts, "add", slowly)
     asked_for["add-account"]("vera", "viewer", "a good long one")
-    assert [one["name"] for one in asked_for["accounts"]()] == ["otto", "vera"]
+    assert [one.name for one in asked_for["accounts"]()] == ["otto", "vera"]
