@@ -42,7 +42,7 @@ def _of_class(value: object, wanted: type) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return f"{value} is not a finite number"
     if dataclasses.is_dataclass(wanted):
-        for name, hint in _fields(wanted).items():
+        for name, hint in field_types(wanted).items():
             if problem := mismatch(getattr(value, name), hint):
                 return f"{name}: {problem}"
     return ""
@@ -57,7 +57,8 @@ def _tuple(value: tuple[Any, ...], arguments: tuple[Any, ...]) -> str:
 
 
 @functools.cache
-def _fields(kind: type) -> dict[str, Any]:
+def field_types(kind: type) -> dict[str, Any]:
+    """The type of each field of a dataclass, by name."""
     hints = get_type_hints(kind)
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 

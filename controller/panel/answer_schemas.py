@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, is_dataclass
+from functools import reduce
+from operator import or_
 from types import NoneType, UnionType
 from typing import Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -75,7 +77,7 @@ class Schemas:
         if origin is not tuple or Ellipsis in inner:
             return {"type": "array", "items": self._of(inner[0])}
         # A pair of texts: a schema with a place of its own for each is understood by few generators.
-        items = _one(self._of(each) for each in inner)
+        items = self._of(reduce(or_, inner))
         return {"type": "array", "items": items, "minItems": len(inner), "maxItems": len(inner)}
 
     def _named(self, kind: type) -> dict[str, Any]:
@@ -99,11 +101,3 @@ def _object(properties: dict[str, Any]) -> dict[str, Any]:
 
 def _reference(name: str) -> dict[str, Any]:
     return {"$ref": f"#/components/schemas/{name}"}
-
-
-def _one(schemas: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    different: list[dict[str, Any]] = []
-    for schema in schemas:
-        if schema not in different:
-            different.append(schema)
-    return different[0] if len(different) == 1 else {"anyOf": different}

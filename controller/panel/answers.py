@@ -6,10 +6,10 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, get_args, get_type_hints
+from typing import Any, Final, get_args
 from urllib.parse import quote
 
 from starlette.requests import Request
@@ -19,6 +19,7 @@ from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.operations.fields import Field, parse
 from controller.kiosk.operations.operation import Answer, Effect, Operation, Values
 from controller.panel.context import Panel
+from hal.annotations import field_types
 from hal.errors import DeviceError
 
 FAILURES: Final = (VelaturaError, DeviceError)
@@ -110,8 +111,7 @@ def plain(value: Any) -> Any:
 @cache
 def sent_fields(kind: type) -> dict[str, Any]:
     """The type of each field of a dataclass, by name, without those that have paths."""
-    hints = get_type_hints(kind)
-    return {field.name: hints[field.name] for field in fields(kind) if not _has_paths(hints[field.name])}
+    return {name: hint for name, hint in field_types(kind).items() if not _has_paths(hint)}
 
 
 def _has_paths(hint: Any) -> bool:
