@@ -27,6 +27,7 @@ import importlib
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from controller.api.benchmark import BenchmarkCalibration, BenchmarkStage, BenchmarkTarget
     from controller.api.calibration import CalibratedRun, calibrate, decode, fit_metapixels, measure_response, read_run
     from controller.api.captures import CaptureSet, draw_patterns, read_captures
     from controller.api.codes import decode_folder
@@ -64,6 +65,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Base",
+    "BenchmarkCalibration",
+    "BenchmarkStage",
+    "BenchmarkTarget",
     "CalibratedRun",
     "Calibration",
     "CameraNoise",
@@ -109,6 +113,7 @@ __all__ = [
 ]
 
 _MODULES: Final = {
+    "controller.api.benchmark": ("BenchmarkCalibration", "BenchmarkStage", "BenchmarkTarget"),
     "controller.api.photographs": ("Developed", "develop", "merge_brackets"),
     "controller.api.captures": ("CaptureSet", "draw_patterns", "read_captures"),
     "controller.api.codes": ("decode_folder",),

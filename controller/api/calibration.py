@@ -76,7 +76,7 @@ def fit_metapixels(captures: CaptureSet, correspondence: Correspondence) -> Fitt
 
     Parameters
     ----------
-    captures : needs ``black`` and ``blur-*``
+    captures : needs ``black``, ``phase-*`` and ``blur-*``
     correspondence : from ``decode``, of the same captures
 
     Returns

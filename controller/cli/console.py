@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Final, TextIO
 
 from controller.core.text import duration, printable
@@ -168,10 +169,23 @@ def prepare_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def output_lost() -> bool:
-    """Whether writing to standard output fails. If so, report it on standard error and stop writing."""
+def _is_of_printing(error: OSError) -> bool:
+    """Whether it was raised where text is printed. A long text is not kept for the next flush when its write fails."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    place = "" if trace is None else trace.tb_frame.f_code.co_filename
+    return place == __file__ or not {"click", "rich", "typer"}.isdisjoint(Path(place).parts)
+
+
+def output_lost(because: OSError | None = None) -> bool:
+    """Whether writing to standard output fails, now or as ``because`` says. If so, report it on standard error and stop
+    writing.
+    """
     try:
         sys.stdout.flush()
+        if because is not None and _is_of_printing(because):
+            raise because
     except OSError as error:
         if not isinstance(error, BrokenPipeError):
             what = f"The output could not be written: {error.strerror}."

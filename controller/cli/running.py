@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
 StageFolder = Annotated[Path, typer.Argument(metavar="STAGE", help="The stage's folder, which holds stage.toml.")]
+BenchSize = Annotated[str, typer.Option("--size", help="small, medium or paper.")]
+Seeds = Annotated[
+    list[int] | None,
+    typer.Option("--seed", help="Random seed of the stages; repeat it for more (default: 1).", min=0, max=2**32 - 1),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON lines for programs.")]
 
 
@@ -49,14 +54,20 @@ Work = Callable[["Reporter", "threading.Event"], Mapping[str, Any] | str | None]
 """The work of a command, with a reporter and the event that requests a stop; it imports what it needs."""
 
 
-def work(do: Work, *, as_json: bool) -> None:
+def work(do: Work, *, as_json: bool, stage: Path | None = None) -> None:
     """Do the work of a command, and show what it returns.
 
     ``do`` must cool the lamps itself before it returns or raises: while it runs, signals only set the event.
+    ``stage``: its stage.toml is checked first. What the work of calibrating imports takes seconds, and who made a
+    mistake shall read of it at once.
     """
     from controller.run.signals import cancelled_by_signals
 
     with cancelled_by_signals() as cancel, console.reporter(as_json=as_json) as reporter:
+        if stage is not None:
+            from controller.stage.check import check_stage
+
+            check_stage(stage)
         result = do(reporter, cancel)
     console.show_result(result, as_json=as_json)
 

@@ -23,7 +23,7 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
         "kiosk", "serve", "status", "events", "cancel", "seen", "lamps", "changes", "backup", "restore", "test-backup",
         "test-alerts", "diagnostics",
     ),
-    "Develop and study": ("emulate", "record", "study", "simulate", "states"),
+    "Develop and study": ("emulate", "record", "study", "benchmark", "simulate", "states"),
 }  # fmt: skip
 OTHERS: Final = "More"
 

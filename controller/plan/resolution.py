@@ -28,7 +28,6 @@ MARGIN_PX: Final = 4.0
 SAMPLES: Final = 5
 """For each pixel."""
 DRAWS: Final = 6
-"""Random places of the pixels, over which the contrast is averaged."""
 SEED: Final = 1
 ITERATIONS: Final = 300
 FREQUENCIES: Final = np.linspace(0.2, 1.2, 31)
@@ -53,19 +52,27 @@ def finest_wave(projectors: Sequence[LineProjector], *, smoothness: float = SMOO
 
 
 def kept_contrast(
-    projectors: Sequence[LineProjector], frequencies: Float64, *, smoothness: float = SMOOTHNESS
+    projectors: Sequence[LineProjector],
+    frequencies: Float64,
+    *,
+    smoothness: float = SMOOTHNESS,
+    draws: int = DRAWS,
+    seed: int = SEED,
 ) -> Float64:
-    """(F,) amplitude in phase with the target's, over the target's; ``frequencies`` (F,) in cycles a pixel."""
-    rng = np.random.default_rng(SEED)
+    """(F,) amplitude in phase with the target's, over the target's; ``frequencies`` (F,) in cycles a pixel.
+
+    ``draws``: random places of the pixels, over which it is averaged
+    """
+    rng = np.random.default_rng(seed)
     x = np.arange(0.0, LENGTH_PX, 1.0 / SAMPLES)
     kept = np.zeros(len(frequencies))
-    for _ in range(DRAWS):
+    for _ in range(draws):
         places = rng.uniform(0, 1, len(projectors))
         phase = 2 * np.pi * (frequencies[:, None] * x + rng.uniform(0, 1, len(frequencies))[:, None])
         lights = [_light_of(one, place, x) for one, place in zip(projectors, places, strict=True)]
         made = solved(lights, MEAN + FAINT * np.cos(phase), smoothness) @ np.hstack(lights).T
         kept += [_amplitude(*one, x) / FAINT for one in zip(made, phase, strict=True)]
-    return kept / DRAWS
+    return kept / draws
 
 
 def last_kept(frequencies: Float64, kept: Float64, *, share: float = KEPT) -> float:

@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -60,16 +61,21 @@ def study(
     and the experiments raise; the lamps are safe by then.
     """
     wanted = chosen(names)
-    if size not in SIZES:
-        raise UsageError(
-            "size-unknown", what=f"The size {size!r} is unknown.", remedy=f"Choose one of {', '.join(SIZES)}."
-        )
+    check_size(size)
     out = out.resolve()
     pages = (out / "pages" if pages is None else pages).resolve()
     index = pages / INDEX
     for seed in dict.fromkeys(seeds):
         index = _one_seed(wanted, out / f"seed-{seed}", pages, (size, seed), reporter, cancel)
     return {"index": str(index)}
+
+
+def check_size(size: str) -> None:
+    """Raises UsageError("size-unknown")."""
+    if size not in SIZES:
+        raise UsageError(
+            "size-unknown", what=f"The size {size!r} is unknown.", remedy=f"Choose one of {', '.join(SIZES)}."
+        )
 
 
 def _one_seed(
@@ -109,47 +115,81 @@ def _on_scene(
     reporter: Reporter,
     cancel: threading.Event,
 ) -> list[Path]:
+    steps = partial(_steps, experiments=experiments, scene=scene, size=size, seed=seed)
     stage = prepare_scene(out / "scenes" / scene.name, scene, size=size, seed=seed)
-    checked = check_stage(stage)
-    bench_of(stage).disturb(stage, ())  # a stopped experiment may have left files
-    bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
-    steps = partial(
-        _steps, experiments=experiments, checked=checked, scene=scene, size=size, seed=seed, disturb=bench.disturb
-    )
-    session = OwnSession(stage, around=bench, again=True)
-    run = session.run(checked, steps, name="study", reporter=reporter, cancel=cancel)
+    run = run_on_bench(stage, steps, name="study", reporter=reporter, cancel=cancel)
     return [run / RESULTS / f"{experiment.name}.json" for experiment in experiments]
 
 
-def _steps(
-    rig: Rig, run: Path, *, experiments: Sequence[Experiment], checked: Checked, scene: Scene, size: str, seed: int,
-    disturb: Callable[[Sequence[Mapping[str, Any]]], None],
-) -> Sequence[Step]:  # fmt: skip
-    """Calibrate, photograph dots where needed, and run each experiment; skip what is done already."""
+def run_on_bench(
+    stage: Path, steps: Callable[[Rig, Path, Checked, BenchProcess], Sequence[Step]], *, name: str, reporter: Reporter,
+    cancel: threading.Event,
+) -> Path:  # fmt: skip
+    """Run ``steps`` on the stage folder's emulated devices, continuing an unfinished run of this name; its folder."""
+    checked = check_stage(stage)
+    bench_of(stage).disturb(stage, ())  # a stopped experiment may have left files
+    bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
+    session = OwnSession(stage, around=bench, again=True)
+    return session.run(
+        checked, lambda rig, run: steps(rig, run, checked, bench), name=name, reporter=reporter, cancel=cancel
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """A stage on which experiments run after its calibration.
+
+    ``calibrating``: the steps of the calibration, and of the dots where an experiment needs them; ``after``: those that
+    every experiment needs, and ``dots``: those that it needs if it uses dots; ``scale`` of an experiment's cost
+    """
+
+    calibrated: Calibrated
+    longest_s: float
+    calibrating: Sequence[Step]
+    after: Sequence[StepId]
+    dots: Sequence[StepId]
+    scale: float
+
+
+def opened(rig: Rig, run: Path, checked: Checked, *, dots: bool) -> Opened:
+    """``dots``: whether any experiment needs them."""
     longest_s = checked.stage.tables.capture.longest_exposure_s
     calibrated = Calibrated(run, checked.names)
     steps = list(calibrating(rig, run, checked=checked, calibrated=calibrated))
-    after = [
-        StepId(StepKind.GEOMETRY),
-        *of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.INDIRECT),
-    ]
-    if any(experiment.dots for experiment in experiments):
+    if dots:
         steps += dot_steps(rig, longest_exposure_s=longest_s)
-    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    measured = of_projectors(checked.names, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.INDIRECT)
+    return Opened(
+        calibrated,
+        longest_s,
+        steps,
+        (StepId(StepKind.GEOMETRY), *measured),
+        tuple(of_projectors(checked.names, StepKind.STUDY_DOTS)),
+        costs.scale(projector.size_px for projector in rig.projectors),
+    )
+
+
+def _steps(
+    rig: Rig, run: Path, checked: Checked, bench: BenchProcess, *, experiments: Sequence[Experiment], scene: Scene,
+    size: str, seed: int,
+) -> Sequence[Step]:  # fmt: skip
+    """Calibrate, photograph dots where needed, and run each experiment; skip what is done already."""
+    stage = opened(rig, run, checked, dots=any(experiment.dots for experiment in experiments))
     told = {"scene": scene.title, "size": size, "seed": seed}
-    for experiment in experiments:
-        dots = of_projectors(checked.names, StepKind.STUDY_DOTS) if experiment.dots else ()
-        steps.append(
+    return [
+        *stage.calibrating,
+        *(
             Step(
-                StepId("study", item=experiment.name),
-                partial(_experiment, rig, checked, calibrated, experiment, told, longest_s, disturb),
-                inputs={"size": size, "seed": str(seed), "code": experiment.code_sha256()},
-                after=(*after, *dots),
-                title=experiment.title,
-                weight=experiment.cost_s * scale,
+                StepId("study", item=one.name),
+                partial(_experiment, rig, checked, stage.calibrated, one, told, stage.longest_s, bench.disturb),
+                inputs={"size": size, "seed": str(seed), "code": one.code_sha256()},
+                after=(*stage.after, *(stage.dots if one.dots else ())),
+                title=one.title,
+                weight=one.cost_s * stage.scale,
             )
-        )
-    return steps
+            for one in experiments
+        ),
+    ]
 
 
 def _experiment(

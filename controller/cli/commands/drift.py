@@ -21,4 +21,4 @@ def drift(stage: StageFolder, as_json: Json = False) -> None:
 
         return check_drift(session=OwnSession(stage), details=as_json, reporter=reporter, cancel=cancel)
 
-    work(do, as_json=as_json)
+    work(do, as_json=as_json, stage=stage)

@@ -30,4 +30,4 @@ def photograph(
 
         return photograph(session=OwnSession(stage), names=tuple(names or ()), reporter=reporter, cancel=cancel)
 
-    work(do, as_json=as_json)
+    work(do, as_json=as_json, stage=stage)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controller.cli.running import Json, work
+from controller.cli.running import BenchSize, Json, Seeds, work
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -19,13 +19,10 @@ def study(
     names: Annotated[
         list[str] | None, typer.Argument(help="Experiments, for example ablation (default: all except optional ones).")
     ] = None,
-    size: Annotated[str, typer.Option(help="small, medium or paper.")] = "small",
+    size: BenchSize = "small",
     out: Annotated[Path, typer.Option(help="Folder for the stages and their calibrations.")] = Path("study"),
     pages: Annotated[Path | None, typer.Option(help="Folder for the pages (default: OUT/pages).")] = None,
-    seed: Annotated[
-        list[int] | None,
-        typer.Option(help="Random seed of the stages; repeat it for more seeds (default: 1).", min=0, max=2**32 - 1),
-    ] = None,
+    seed: Seeds = None,
     as_json: Json = False,
 ) -> None:
     """Repeat the paper's experiments on emulated stages and write a page for each. Continues unfinished experiments."""

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.plan.resolution import FAINT, KEPT, MEAN, LineProjector, finest_wave, last_kept
+from controller.plan.optics import PIXEL_VARIANCE_PX2
+from controller.plan.resolution import FAINT, KEPT, MEAN, LineProjector, last_kept
+from controller.plan.resolution import kept_contrast as line_contrast
 from controller.report.pictures import crop_around
 from controller.solve.appearance import scale_frames, solve_base
 from controller.solve.bounded.solver import solve_bounded
@@ -28,6 +31,8 @@ LOWEST, HIGHEST = 0.15, 1.25
 BOLD = 0.25
 """Amplitude of waves whose sharpening needs more light than there is; ``FAINT`` ones show the resolution alone."""
 PREDICTED = 0.1
+PLACES = 40
+"""Of a band, at which the plan's contrast is calculated."""
 PLANNED = "as the plan calculates it, within 10 %"
 ASKED = 1.4
 SHARP_PX = 0.35
@@ -178,39 +183,77 @@ def blurs(subject: Subject) -> dict[str, float]:
     for part in subject.calibration.projectors:
         if part.phase_map is not None:
             spread = part.phase_map.spread_px2[..., (0, 2)].mean(axis=-1)
-            found[part.name] = float(np.sqrt(max(float(np.nanmedian(spread[spread > 0])) - 1 / 12, 0.0)))
+            found[part.name] = float(np.sqrt(max(float(np.nanmedian(spread[spread > 0])) - PIXEL_VARIANCE_PX2, 0.0)))
     return found
 
 
 def predicted(subject: Subject, wanted: ReachableTarget, waves: Waves, order: Sequence[int]) -> tuple[float, float]:
-    """F_1 and F of all in cycles a camera pixel, as ``velatura plan`` calculates them, from blur, pitch and light."""
-    box = crop_around(subject.mask, margin=0.0)
-    inside = (waves.band >= 0) & wanted.mask
-    line = []
-    for n in order:
-        pitch = _pitch_px(subject, n, box) / waves.pitch_px
-        line.append(LineProjector(pitch, _blur_there(subject, n, inside), _light_there(subject, n, wanted, inside)))
-    first, every = finest_wave(line[:1]) / waves.pitch_px, finest_wave(line) / waves.pitch_px
-    return first, every
+    """F_1 and F of all in cycles a camera pixel, as ``velatura plan`` calculates them, from blur, pitch and light.
+
+    At ``PLACES`` of each band, because they differ over the object. A median would be of a place that is sharper than
+    half of them, and the sharp half can't make up for the blurred one.
+    """
+    light = [_full_light(subject, n) / wanted.white for n in order]
+    along = [_AlongRows.of(subject, n) for n in order]
+    first, every = (np.full(waves.frequency.size, np.nan) for _ in range(2))
+    for band, frequency in enumerate(waves.frequency * waves.pitch_px):
+        rows, columns = np.nonzero((waves.band == band) & wanted.mask & along[0].known)
+        if rows.size < PLACES:
+            continue
+        some = ((np.arange(PLACES) + 0.5) / PLACES * rows.size).astype(np.int64)
+        lines = [
+            [
+                LineProjector(one.pitch_px[at] / waves.pitch_px, one.blur_px[at], lit[at])
+                for one, lit in zip(along, light, strict=True)
+                if one.known[at]
+            ]
+            for at in zip(rows[some], columns[some], strict=True)
+        ]
+        first[band], every[band] = (
+            _mean_contrast([line[:1] for line in lines], frequency),
+            _mean_contrast(lines, frequency),
+        )
+        if max(first[band], every[band]) < KEPT:
+            break
+    return last_kept(waves.frequency, first), last_kept(waves.frequency, every)
 
 
-def _blur_there(subject: Subject, n: int, inside: Mask) -> float:
-    """Median blur of projector ``n`` along rows, in its pixels without their square, where waves are measured."""
-    part = subject.calibration.projectors[n]
-    assert part.phase_map is not None
-    rows, columns = np.nonzero(part.metapixels.valid)
-    at = np.rint(part.metapixels.centre_px[rows, columns]).astype(np.int64)
-    there = inside[np.clip(at[:, 1], 0, inside.shape[0] - 1), np.clip(at[:, 0], 0, inside.shape[1] - 1)]
-    spread = part.phase_map.spread_px2[rows, columns, 0][there]
-    return float(np.sqrt(max(float(np.median(spread)) - 1 / 12, 0.0)))
+def _mean_contrast(lines: Sequence[Sequence[LineProjector]], frequency: float) -> float:
+    asked = np.array([frequency])
+    return float(np.mean([line_contrast(line, asked, draws=1, seed=seed) for seed, line in enumerate(lines)]))
 
 
-def _light_there(subject: Subject, n: int, wanted: ReachableTarget, inside: Mask) -> float:
-    """Full light of projector ``n`` over the target's white, median where waves are measured."""
-    frames = subject.frames_of(
-        [n], [np.ones((*subject.calibration.projectors[n].metapixels.valid.shape, 3), np.float32)]
-    )
-    return float(np.median(subject.transport.forward(frames)[..., GREEN][inside])) / wanted.white
+def _full_light(subject: Subject, n: int) -> FloatImage:
+    """(camera rows, columns): green light of projector ``n`` alone at full white."""
+    full = np.ones((*subject.calibration.projectors[n].metapixels.valid.shape, 3), np.float32)
+    return np.asarray(subject.transport.forward(subject.frames_of([n], [full]))[..., GREEN])
+
+
+@dataclass(frozen=True, slots=True)
+class _AlongRows:
+    """A projector's pixels as each camera pixel sees them along its row: (camera rows, columns).
+
+    ``pitch_px`` in camera pixels; ``blur_px``: standard deviation in projector pixels without their square, the
+    camera's blur and its interpolation included
+    """
+
+    pitch_px: Float64
+    blur_px: Float64
+    known: Mask
+
+    @classmethod
+    def of(cls, subject: Subject, n: int) -> Self:
+        part = subject.calibration.projectors[n]
+        assert part.phase_map is not None
+        pixels = part.metapixels
+        centre = np.where(pixels.valid, pixels.centre_px[..., 0], np.nan).astype(np.float64)
+        pitch = np.abs(np.gradient(centre, axis=1))
+        spread = pixels.covariance_px2[..., 0] / pitch**2
+        at = np.nan_to_num(np.rint(part.phase_map.projector_px), nan=-1.0).astype(np.int64)
+        x, y = (np.clip(at[..., k], 0, size - 1) for k, size in ((0, pitch.shape[1]), (1, pitch.shape[0])))
+        known = np.isfinite(part.phase_map.projector_px).all(axis=2) & np.isfinite(spread[y, x])
+        blur = np.sqrt(np.maximum(np.nan_to_num(spread) - PIXEL_VARIANCE_PX2, 0.0))
+        return cls(pitch[y, x], blur[y, x], np.asarray(known))
 
 
 def _blur_table(subject: Subject) -> ResultTable:

@@ -20,7 +20,7 @@ from controller.calibrate.metapixels.from_dots import fit_dots
 from controller.calibrate.metapixels.initial_estimate import initial_metapixels, modelled_correspondence, where_missing
 from controller.calibrate.values import PhaseMap
 from controller.capture.dots import DotPattern, dot_patterns
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.steps.appearance.publishing import take_hdr
@@ -47,7 +47,10 @@ class RigPhotographer:
     """The photographs of this run or an earlier one."""
 
     def photograph(self, name: str, frames: Sequence[FloatImage], *, white: float) -> FloatImage:
-        shown = device_frames(self.calibrated.calibration, frames)
+        return self.photograph_shown(name, device_frames(self.calibrated.calibration, frames), white=white)
+
+    def photograph_shown(self, name: str, shown: Mapping[str, ByteImage], *, white: float) -> FloatImage:
+        """As ``photograph``, of 8-bit frames by projector name as the displays get them."""
         presented = self.rig.display.show(self.rig.on_outputs(shown), deadline=self.context.deadline.within(20))
         taken, merged = take_hdr(
             self.rig, self.context, "study", f"{self.name}-{name}", white, self.longest_exposure_s,

@@ -39,7 +39,7 @@ def save_result(folder: Path, experiment: Experiment, result: Result, facts: Map
         "text": result.text,
     }
     path = folder / f"{experiment.name}.json"
-    write_atomically(path, (json.dumps(_plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_atomically(path, (json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
     return [path, *paths]
 
 
@@ -49,12 +49,12 @@ def _encoded(experiment: str, figure: Figure) -> tuple[str, bytes]:
     return f"{experiment}-{figure.name}.webp", encoded_webp(figure.picture)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """What JSON can hold: numbers of NumPy become Python's, and what is not finite becomes null."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
+        return {str(key): plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [plain(inner) for inner in value]
     if hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

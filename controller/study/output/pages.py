@@ -95,7 +95,7 @@ def page(experiment: Experiment, kept: StoredStudy) -> str:
     for file, caption in first.figures:
         parts.append(f"![{_plain(caption)}]({PICTURES}/{file})\n\n*{caption}{seed}*")
     for table in kept.tables:
-        parts += [f"## {table.title}", _markdown(table.columns, table.rows)]
+        parts += [f"## {table.title}", markdown(table.columns, table.rows)]
         parts.append(f"[{DATA}/{kept.name}-{table.name}.csv]({DATA}/{kept.name}-{table.name}.csv)")
     seeds = " ".join(f"--seed {one}" for one in kept.seeds)
     parts.append(f"Made by `velatura study {kept.name} --size {size} {seeds}`; all pages: [index]({INDEX}).")
@@ -133,7 +133,7 @@ def index_page(rows: Sequence[tuple[Experiment, StoredStudy | None]]) -> str:
     parts = [
         "# The paper's experiments, repeated",
         head,
-        _markdown(("experiment", "after", "criteria", "size", "seeds"), lines),
+        markdown(("experiment", "after", "criteria", "size", "seeds"), lines),
     ]
     if missed:
         parts += ["## Missed criteria", "\n".join(missed)]
@@ -173,10 +173,11 @@ def _criteria(kept: StoredStudy) -> str:
         each = [one.reached.get(seed, "") for seed in kept.seeds]
         rows.append((one.asked, *each, HOLDS[one.holds], reason.strip()))
     reached = ["reached"] if len(kept.seeds) == 1 else [f"seed {seed}" for seed in kept.seeds]
-    return _markdown(("asked", *reached, "holds", "why not"), rows)
+    return markdown(("asked", *reached, "holds", "why not"), rows)
 
 
-def _markdown(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
+def markdown(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
+    """A table."""
     lines = ["| " + " | ".join(map(_plain, columns)) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(_cell(cell) for cell in row) + " |" for row in rows]
     return "\n".join(lines)
