@@ -15,12 +15,9 @@ from controller.core.errors import UsageError
 
 BAND_PIXELS: Final = 1 << 18
 """Pixels compared at a time, so that memory stays bounded at any size."""
-STRONG: Final = 0.9
-STRONGEST: Final = 0.99
-SHARE_OF_STRONGEST: Final = 0.5
-"""Canny's high threshold is the ``STRONG`` quantile of the target's gradient, and at most this share of the
-``STRONGEST`` one: where a dense pattern's edges are all equally strong, the quantile would lie at their own strength,
-and a result with a tenth less contrast would have hardly an edge. The low threshold is ``WEAK`` of the high one."""
+SHARE_OF_MEDIAN: Final = 0.5
+"""Canny's high threshold is this share of the median gradient along the target's own edges, so that a result with less
+contrast still has them (docs/decisions/0058). The low threshold is ``WEAK`` of the high one."""
 WEAK: Final = 0.4
 EDGE_SIGMA_PX: Final = 1.4
 GRADIENT_SCALE: Final = 2000.0
@@ -123,13 +120,16 @@ def _lambda(ours: Mask, theirs: Mask) -> float:
 def _both_edges(achieved: FloatImage, target: FloatImage, white: float, mask: Mask) -> tuple[Mask, Mask]:
     """Edges (rows, columns) of both pictures inside the mask, by Canny."""
     gradients = [_gradient(image, white) for image in (achieved, target)]
-    strength = np.hypot(*(part.astype(np.float32) for part in gradients[1]))[mask]
-    strong, strongest = np.quantile(strength, (STRONG, STRONGEST)) if strength.size else (0.0, 0.0)
-    threshold = max(float(min(strong, SHARE_OF_STRONGEST * strongest)), FAINTEST_EDGE)
-    ours, theirs = (
-        (cv2.Canny(dx, dy, WEAK * threshold, threshold, L2gradient=True) > 0) & mask for dx, dy in gradients
-    )
+    of_target = _canny(gradients[1], FAINTEST_EDGE) & mask
+    strength = np.hypot(*(part[of_target].astype(np.float32) for part in gradients[1]))
+    median = float(np.median(strength)) if strength.size else 0.0
+    threshold = max(SHARE_OF_MEDIAN * median, FAINTEST_EDGE)
+    ours, theirs = (_canny(gradient, threshold) & mask for gradient in gradients)
     return ours, theirs
+
+
+def _canny(gradient: tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]], threshold: float) -> Mask:
+    return np.asarray(cv2.Canny(*gradient, WEAK * threshold, threshold, L2gradient=True) > 0)
 
 
 def _gradient(image: FloatImage, white: float) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]]:

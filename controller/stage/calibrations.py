@@ -15,6 +15,9 @@ from controller.run.journal import Journal
 from controller.run.journal_schema import JournalError
 from controller.stage.check import Checked
 
+KEY_FILE = "keys/stage.key"
+"""The stage's signing key, if it exists."""
+
 
 def stage_trust(stage: Stage) -> Trust:
     """Which bundles stage.toml allows."""

@@ -152,7 +152,10 @@ def terms_from(
 
 def with_terms(model: LightTransport, terms: tuple[EdgeTerm, ...]) -> EdgedTransport:
     """``model`` with the measurement at depth edges; one term for each projector."""
-    return EdgedTransport(model.mixing, model.lit, model.per_weight, model.sizes, model, terms, segments=model.segments)
+    return EdgedTransport(
+        model.mixing, model.lit, model.per_weight, model.sizes, model, terms, segments=model.segments,
+        beside=model.beside,
+    )  # fmt: skip
 
 
 def edge_term(model: LightTransport, n: int, measured: EdgeShares, white: FloatImage) -> EdgeTerm:

@@ -12,6 +12,7 @@ import numpy as np
 
 from controller.calibrate.values import Calibration, Metapixels
 from controller.core.errors import UsageError
+from controller.transport.beside_object import beside_object
 from controller.transport.gaussians.patches import Patches
 from controller.transport.gaussians.transport import PatchTransport
 from controller.transport.operator import LightTransport
@@ -34,7 +35,12 @@ def build_transport(calibration: Calibration, *, patches: Patches | None = None)
     else:
         made = PatchTransport.from_calibration(calibration, patches)
     segments = tuple(part.radiometry.segment for part in calibration.projectors)
-    return dataclasses.replace(made, segments=segments) if any(segments) else made
+    made = dataclasses.replace(made, segments=segments if any(segments) else ())
+    beside = beside_object(calibration)
+    if beside is None:
+        return made
+    # A camera pixel that sees the room by any projector's light is none of the object's.
+    return dataclasses.replace(made, lit=made.lit & ~beside.camera.any(axis=0), beside=beside.pixels)
 
 
 def check_calibration(calibration: Calibration) -> None:

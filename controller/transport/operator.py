@@ -47,6 +47,8 @@ class LightTransport(LinearOperator[np.float32], ABC):
     ``sizes``: (rows, columns) of each projector's image
     ``segments``: share of white that each projector's white segment makes (``Radiometry.segment``); T is the same, but
     its frames end earlier where they are saturated: p_c <= 1 - s + s min(p)
+    ``beside`` (pixels,) bool: pixels that light the room beside the object (``beside_object``), which solves leave
+    dark; None if there are none
     """
 
     mixing: FloatImage
@@ -54,6 +56,7 @@ class LightTransport(LinearOperator[np.float32], ABC):
     per_weight: FloatImage
     sizes: tuple[tuple[int, int], ...]
     segments: tuple[float, ...] = dataclasses.field(default=(), kw_only=True)
+    beside: Mask | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         # SciPy's own constructor assigns them, which a frozen class refuses

@@ -15,15 +15,20 @@ import numpy as np
 
 from controller.calibrate.geometry.normal_equations import CAMERA as CAMERA_PARAMETERS
 from controller.calibrate.geometry.normal_equations import PROJECTOR as PROJECTOR_PARAMETERS
-from controller.calibrate.geometry.normal_equations import accumulate, reduced, solve_positive
+from controller.calibrate.geometry.normal_equations import (
+    accumulate,
+    differentiate,
+    project,
+    reduced,
+    solve_positive,
+    undistort,
+)
 from controller.core.arrays import Float64, Mask
 
 __all__ = ["CAMERA_PARAMETERS", "PROJECTOR_PARAMETERS", "Adjusted", "AdjustmentProblem", "AdjustmentState", "adjust"]
 
-_NEAREST = 1e-4  # of a projector's view axis, in baselines: anything nearer counts as behind the projector
 _GAUGE_SIGMA = 1e-3
 _CAUCHY = 2.4
-_BEHIND_PX = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +86,7 @@ class Adjusted:
 
 def undistorted(camera: Float64, px: Float64) -> Float64:
     """(points, 2) x, y at depth 1 of camera pixels."""
-    distorted = (px - camera[1:3]) / np.exp(camera[0])
-    xy = distorted
-    for _ in range(8):
-        xy = distorted / (1.0 + camera[3] * np.sum(xy * xy, axis=1, keepdims=True))
-    return np.asarray(xy)
+    return undistort(np.ascontiguousarray(camera), np.ascontiguousarray(px))
 
 
 def camera_rays(camera: Float64, px: Float64) -> tuple[Float64, Float64]:
@@ -106,44 +107,27 @@ def camera_rays(camera: Float64, px: Float64) -> tuple[Float64, Float64]:
 
 def residuals(problem: AdjustmentProblem, state: AdjustmentState) -> Float64:
     """(points, N, 2) projected less measured projector pixels, 0 where not seen, very large behind a projector."""
-    xy = undistorted(state.camera, problem.camera_px)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    q = np.einsum("nij,pj->pni", state.rotations, rays) - state.inverse_depth[:, None, None] * _turned_centres(state)
-    behind = q[..., 2] < _NEAREST
-    depth = np.where(behind, 1.0, q[..., 2])
-    focal = np.exp(state.intrinsics[:, 0])[:, None]
-    out = focal * q[..., :2] / depth[..., None] + state.intrinsics[:, 1:] - problem.projector_px
-    out[behind] = _BEHIND_PX
-    out[~problem.seen] = 0.0
-    return np.asarray(out)
+    return _projected(problem, state, undistorted(state.camera, problem.camera_px))
 
 
 def linearise(problem: AdjustmentProblem, state: AdjustmentState) -> Linearised:
     """Residuals and analytic derivatives; those of points behind a projector are 0."""
     xy, xy_by_camera = camera_rays(state.camera, problem.camera_px)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    rho, (count, projectors) = state.inverse_depth, problem.seen.shape
-    turned = _turned_centres(state)
-    q = np.einsum("nij,pj->pni", state.rotations, rays) - rho[:, None, None] * turned
-    use = problem.seen & (q[..., 2] >= _NEAREST)
-    depth = np.where(use, q[..., 2], 1.0)
-    x = q[..., :2] / depth[..., None]
-    focal = np.exp(state.intrinsics[:, 0])
-    by_q = np.zeros((count, projectors, 2, 3))
-    by_q[..., 0, 0] = by_q[..., 1, 1] = np.where(use, focal / depth, 0.0)
-    by_q[..., 2] = -by_q[..., 0, 0, None] * x
-    by_projector = np.zeros((count, projectors, 2, PROJECTOR_PARAMETERS))
-    by_projector[..., 0] = focal[:, None] * x * use[..., None]
-    by_projector[..., 0, 1] = by_projector[..., 1, 2] = use
-    # d(exp(delta) q)/d(delta) = -[q]x, so a row g of by_q becomes q x g
-    by_projector[..., 3:6] = np.cross(q[:, :, None, :], by_q)
-    by_projector[..., 6:9] = -rho[:, None, None, None] * np.einsum("pnik,nkj->pnij", by_q, state.rotations)
-    by_xy = np.einsum("pnik,nkj->pnij", by_q, state.rotations[:, :, :2])
-    by_camera = np.einsum("pnij,pjc->pnic", by_xy, xy_by_camera)
-    by_depth = -np.einsum("pnik,nk->pni", by_q, turned)
-    residual = np.where(use[..., None], focal[:, None] * x + state.intrinsics[:, 1:] - problem.projector_px, 0.0)
-    residual[problem.seen & ~use] = _BEHIND_PX
-    return Linearised(residual, by_camera, by_projector, by_depth)
+    seen = np.ascontiguousarray(problem.seen)
+    return Linearised(_projected(problem, state, xy), *differentiate(xy, xy_by_camera, *_placed(state), seen))
+
+
+def _projected(problem: AdjustmentProblem, state: AdjustmentState, xy: Float64) -> Float64:
+    return project(xy, *_placed(state), np.ascontiguousarray(problem.projector_px), np.ascontiguousarray(problem.seen))
+
+
+def _placed(state: AdjustmentState) -> tuple[Float64, Float64, Float64, Float64]:
+    """Inverse depths, intrinsics, rotations and rotated centres, in the order in memory that was compiled ahead."""
+    turned = np.einsum("nij,nj->ni", state.rotations, state.centres)
+    depth, own, turns, turned = map(
+        np.ascontiguousarray, (state.inverse_depth, state.intrinsics, state.rotations, turned)
+    )
+    return depth, own, turns, turned
 
 
 def stepped(state: AdjustmentState, parameters: Float64, inverse_depth: Float64) -> AdjustmentState:
@@ -165,7 +149,7 @@ def cost_of(problem: AdjustmentProblem, state: AdjustmentState) -> float:
     """Half of: Cauchy loss in noise units, priors, and the gauge that holds the rms baseline at 1."""
     squared = np.sum(residuals(problem, state) ** 2, axis=2) / problem.noise_px**2
     data = _CAUCHY**2 * float(np.sum(np.log1p(squared[problem.seen] / _CAUCHY**2)))
-    own, _ = _prior_terms(problem, state)
+    own = _prior_terms(problem, state)
     return 0.5 * (data + float(own @ own))
 
 
@@ -223,17 +207,18 @@ class _Normal:
     depth_gradient: Float64
 
 
-def _turned_centres(state: AdjustmentState) -> Float64:
-    return np.asarray(np.einsum("nij,nj->ni", state.rotations, state.centres))
+def _prior_terms(problem: AdjustmentProblem, state: AdjustmentState) -> Float64:
+    """Residuals in sigmas of priors and gauge."""
+    camera = (state.camera - problem.camera_prior) / problem.camera_sigma
+    own = (state.intrinsics - problem.projector_prior) / problem.projector_sigma
+    gauge = (np.vdot(state.centres, state.centres) / len(state.centres) - 1.0) / _GAUGE_SIGMA
+    return np.concatenate([camera, own.ravel(), [gauge]])
 
 
-def _prior_terms(problem: AdjustmentProblem, state: AdjustmentState) -> tuple[Float64, Float64]:
-    """Residuals in sigmas of priors and gauge, and their Jacobian by the parameters."""
+def _prior_jacobian(problem: AdjustmentProblem, state: AdjustmentState) -> Float64:
+    """Of the prior terms, by the parameters."""
     projectors = len(state.intrinsics)
     size = CAMERA_PARAMETERS + PROJECTOR_PARAMETERS * projectors
-    values = [(state.camera - problem.camera_prior) / problem.camera_sigma]
-    values.append(((state.intrinsics - problem.projector_prior) / problem.projector_sigma).ravel())
-    values.append(np.array([(np.mean(np.sum(state.centres**2, axis=1)) - 1.0) / _GAUGE_SIGMA]))
     jacobian = np.zeros((CAMERA_PARAMETERS + 3 * projectors + 1, size))
     jacobian[np.arange(4), np.arange(4)] = 1.0 / problem.camera_sigma
     for n in range(projectors):
@@ -241,7 +226,7 @@ def _prior_terms(problem: AdjustmentProblem, state: AdjustmentState) -> tuple[Fl
         rows = CAMERA_PARAMETERS + 3 * n + np.arange(3)
         jacobian[rows, start + np.arange(3)] = 1.0 / problem.projector_sigma[n]
         jacobian[-1, start + 6 : start + 9] = 2.0 * state.centres[n] / (projectors * _GAUGE_SIGMA)
-    return np.concatenate(values), jacobian
+    return jacobian
 
 
 def _normal_equations(problem: AdjustmentProblem, state: AdjustmentState) -> _Normal:
@@ -251,7 +236,7 @@ def _normal_equations(problem: AdjustmentProblem, state: AdjustmentState) -> _No
     parameters, cross, depth, gradient, depth_gradient = accumulate(
         linear.by_camera, linear.by_projector, linear.by_depth, linear.residual_px, weight
     )
-    prior, jacobian = _prior_terms(problem, state)
+    prior, jacobian = _prior_terms(problem, state), _prior_jacobian(problem, state)
     return _Normal(parameters + jacobian.T @ jacobian, cross, depth, gradient + jacobian.T @ prior, depth_gradient)
 
 

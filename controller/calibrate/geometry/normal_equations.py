@@ -1,4 +1,4 @@
-"""The inner loops of the bundle adjustment: Gauss-Newton blocks and their Schur complement over the points.
+"""The inner loops of the bundle adjustment: projection, derivatives, Gauss-Newton blocks and their Schur complement.
 
 Compiled and single-threaded on purpose: the matrices are so small that threads cost more than they save.
 """
@@ -7,11 +7,110 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller.core.arrays import Float64
+from controller.core.arrays import Float64, Mask
 from controller.core.jit import compiled
 
 CAMERA = 4
 PROJECTOR = 9
+NEAREST = 1e-4
+"""Along a projector's view axis, in baselines: anything nearer counts as behind the projector."""
+BEHIND_PX = 1e6
+
+
+@compiled()
+def undistort(camera: Float64, px: Float64) -> Float64:
+    """(points, 2) x, y at depth 1 of camera pixels (points, 2); ``camera``: log f, cx, cy, k1."""
+    focal, k1 = np.exp(camera[0]), camera[3]
+    out = np.empty((len(px), 2))
+    for p in range(len(px)):
+        distorted_x, distorted_y = (px[p, 0] - camera[1]) / focal, (px[p, 1] - camera[2]) / focal
+        x, y = distorted_x, distorted_y
+        for _ in range(8):
+            longer = 1.0 + k1 * (x * x + y * y)
+            x, y = distorted_x / longer, distorted_y / longer
+        out[p, 0], out[p, 1] = x, y
+    return out
+
+
+@compiled()
+def project(
+    xy: Float64,
+    inverse_depth: Float64,
+    intrinsics: Float64,
+    rotations: Float64,
+    turned: Float64,
+    projector_px: Float64,
+    seen: Mask,
+) -> Float64:
+    """(points, N, 2) projected less measured projector pixels, 0 where not seen, BEHIND_PX behind a projector.
+
+    Parameters
+    ----------
+    xy (points, 2) at depth 1, inverse_depth (points,), intrinsics (N, 3) log f, cx, cy, rotations (N, 3, 3),
+    turned (N, 3) rotated centres, projector_px (points, N, 2), seen (points, N)
+    """
+    points, projectors = seen.shape
+    out, q = np.zeros((points, projectors, 2)), np.empty(3)
+    for n in range(projectors):
+        focal = np.exp(intrinsics[n, 0])
+        for p in range(points):
+            if not seen[p, n]:
+                continue
+            for i in range(3):
+                q[i] = rotations[n, i, 0] * xy[p, 0] + rotations[n, i, 1] * xy[p, 1] + rotations[n, i, 2]
+                q[i] -= inverse_depth[p] * turned[n, i]
+            for axis in range(2):
+                if q[2] < NEAREST:
+                    out[p, n, axis] = BEHIND_PX
+                else:
+                    out[p, n, axis] = focal * q[axis] / q[2] + intrinsics[n, 1 + axis] - projector_px[p, n, axis]
+    return out
+
+
+@compiled()
+def differentiate(
+    xy: Float64,
+    xy_by_camera: Float64,
+    inverse_depth: Float64,
+    intrinsics: Float64,
+    rotations: Float64,
+    turned: Float64,
+    seen: Mask,
+) -> tuple[Float64, Float64, Float64]:
+    """Derivatives of the projected pixels by camera (points, N, 2, 4), projector (points, N, 2, 9) and inverse depth.
+
+    The last is (points, N, 2). All are 0 where not seen and behind a projector. Arguments as of ``project``;
+    ``xy_by_camera`` (points, 2, 4).
+    """
+    points, projectors = seen.shape
+    by_camera = np.zeros((points, projectors, 2, CAMERA))
+    by_projector, by_depth = np.zeros((points, projectors, 2, PROJECTOR)), np.zeros((points, projectors, 2))
+    q, by_q, by_ray = np.empty(3), np.empty(3), np.empty(3)
+    for n in range(projectors):
+        focal, turn = np.exp(intrinsics[n, 0]), rotations[n]
+        for p in range(points):
+            rho = inverse_depth[p]
+            for i in range(3):
+                q[i] = turn[i, 0] * xy[p, 0] + turn[i, 1] * xy[p, 1] + turn[i, 2] - rho * turned[n, i]
+            if not seen[p, n] or q[2] < NEAREST:
+                continue
+            for axis in range(2):
+                by_q[0], by_q[1], by_q[2] = 0.0, 0.0, -focal * q[axis] / (q[2] * q[2])
+                by_q[axis] = focal / q[2]
+                for j in range(3):
+                    by_ray[j] = by_q[0] * turn[0, j] + by_q[1] * turn[1, j] + by_q[2] * turn[2, j]
+                for j in range(CAMERA):
+                    by_camera[p, n, axis, j] = by_ray[0] * xy_by_camera[p, 0, j] + by_ray[1] * xy_by_camera[p, 1, j]
+                own = by_projector[p, n, axis]
+                own[0], own[1 + axis] = focal * q[axis] / q[2], 1.0
+                # d(exp(delta) q)/d(delta) = -[q]x, so a row g of by_q becomes q x g
+                own[3] = q[1] * by_q[2] - q[2] * by_q[1]
+                own[4] = q[2] * by_q[0] - q[0] * by_q[2]
+                own[5] = q[0] * by_q[1] - q[1] * by_q[0]
+                for j in range(3):
+                    own[6 + j] = -rho * by_ray[j]
+                    by_depth[p, n, axis] -= by_q[j] * turned[n, j]
+    return by_camera, by_projector, by_depth
 
 
 @compiled()

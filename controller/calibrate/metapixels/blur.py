@@ -1,7 +1,9 @@
 """How far a projector pixel's light spreads, from the contrast that fine sinusoids lose.
 
 A sinusoid of f cycles per projector pixel, blurred by a Gaussian of covariance S, keeps the modulation
-M = exp(-2 pi^2 f' S f). Three directions give the three numbers of S. The pixel's own square is part of S.
+M = (1 - i) exp(-2 pi^2 f' S f), with the share i of light that reaches the camera by way of other surfaces and has no
+modulation. So M is taken relative to that of the coarse phase patterns, which lose the same share and hardly any more.
+Three directions give the three numbers of S. The pixel's own square is part of S.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ from controller.core.jit import compiled
 NEIGHBOURHOOD = 7
 """Projector pixels a side over which the contrast is averaged; focus changes slowly over a surface."""
 LEAST_CONTRAST = 0.02
+LEAST_COARSE = 0.2
+"""Of the phase patterns; less is left of them only where hardly any light is direct."""
 LEAST_VARIANCE_PX2 = 0.02
 MOST_VARIANCE_PX2 = 16.0
 
@@ -29,7 +33,7 @@ def measure_blur(captures: Captures, plan: PatternPlan, correspondence: Correspo
 
     Parameters
     ----------
-    captures : needs ``black`` and ``blur-*``; linear, in one unit
+    captures : needs ``black``, ``phase-*`` and ``blur-*``; linear, in one unit
     correspondence : of the same projector
 
     Returns
@@ -40,11 +44,15 @@ def measure_blur(captures: Captures, plan: PatternPlan, correspondence: Correspo
     """
     cells = cells_of(correspondence, plan.size_px)
     black = grey(captures, "black")
-    contrast = [
-        _contrast(captures, plan, f"blur-{name}", frequency, black, correspondence, cells)
-        for name, frequency in BLUR_FREQUENCIES.items()
-    ]
-    blur, measured = _covariance(np.stack(contrast), np.array(list(BLUR_FREQUENCIES.values())))
+
+    def contrast(prefix: str, frequency: tuple[float, float]) -> FloatImage:
+        return _contrast(captures, plan, prefix, frequency, black, correspondence, cells)
+
+    fine = np.stack([contrast(f"blur-{name}", frequency) for name, frequency in BLUR_FREQUENCIES.items()])
+    coarse_x, coarse_y = contrast("phase-x", (1 / PERIOD_PX, 0.0)), contrast("phase-y", (0.0, 1 / PERIOD_PX))
+    with np.errstate(invalid="ignore"):
+        both = np.sqrt(coarse_x * coarse_y)
+    blur, measured = _covariance(fine, np.stack([coarse_x, coarse_y, both]))
     coarse = _coarse_variance(correspondence.modulation, cells, plan.size_px)
     guessed = ~measured & np.isfinite(coarse)
     blur[guessed] = coarse[guessed, None] * np.array([1, 0, 1], np.float32)
@@ -120,16 +128,19 @@ def _add_step(
                 light[cell] += value
 
 
-def _covariance(contrast: FloatImage, frequencies: Float64) -> tuple[FloatImage, Mask]:
-    """Solve -ln M = 2 pi^2 (fx^2 Sxx + 2 fx fy Sxy + fy^2 Syy) for S, kept positive definite.
+def _covariance(fine: FloatImage, coarse: FloatImage) -> tuple[FloatImage, Mask]:
+    """Solve -ln(M / Mc) = 2 pi^2 ((fx^2 - gx^2) Sxx + 2 fx fy Sxy + (fy^2 - gy^2) Syy) for S, kept positive definite.
 
-    ``contrast`` (3, rows, columns); ``frequencies`` (3, 2) cycles per projector px.
+    ``fine``, ``coarse`` (3, rows, columns): contrasts M of ``BLUR_FREQUENCIES`` f, and Mc of the phase patterns g along
+    x, along y, and their geometric mean.
     """
-    fx, fy = frequencies.T
-    equations = 2 * np.pi**2 * np.stack([fx * fx, 2 * fx * fy, fy * fy], axis=1)
-    with np.errstate(invalid="ignore"):
-        valid = np.all(contrast > LEAST_CONTRAST, axis=0)
-        lost = -np.log(np.clip(np.nan_to_num(contrast, nan=1.0), LEAST_CONTRAST, 1.0))
+    fx, fy = np.array(list(BLUR_FREQUENCIES.values())).T
+    gx, gy = np.array([1.0, 0.0, 0.5]) / PERIOD_PX**2, np.array([0.0, 1.0, 0.5]) / PERIOD_PX**2
+    equations = 2 * np.pi**2 * np.stack([fx * fx - gx, 2 * fx * fy, fy * fy - gy], axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        valid = np.all((fine > LEAST_CONTRAST) & (coarse > LEAST_COARSE), axis=0)
+        kept = np.where(valid, fine / coarse, 1.0)
+        lost = -np.log(np.clip(kept, LEAST_CONTRAST, 1.0))
     solved = np.tensordot(np.linalg.inv(equations), lost, axes=1)
     xx = np.clip(solved[0], LEAST_VARIANCE_PX2, MOST_VARIANCE_PX2)
     yy = np.clip(solved[2], LEAST_VARIANCE_PX2, MOST_VARIANCE_PX2)

@@ -24,7 +24,7 @@ def fit_metapixels(captures: Captures, plan: PatternPlan, correspondence: Corres
 
     Parameters
     ----------
-    captures : needs ``black`` and ``blur-*``; linear photographs in one unit
+    captures : needs ``black``, ``phase-*`` and ``blur-*``; linear photographs in one unit
     correspondence : what ``decode`` made of the same captures
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").

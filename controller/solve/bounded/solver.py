@@ -140,6 +140,9 @@ def build_problem(
         counted *= weights
     across, down = squared_edge_weights(transport, planes_above(target, black))
     diagonal, scale = _majoriser(transport, counted)
+    if transport.beside is not None:
+        # A pixel without data stays dark: what little it lights of the object is not worth light on the wall.
+        diagonal[:, transport.beside] = 0
     tie = smoothness * scale / TIE_STEPS
     for n, (rows, columns) in enumerate(transport.sizes):
         add_smoothness(diagonal, across, down, tie, transport.span(n).start, rows, columns)

@@ -28,7 +28,7 @@ def to_device(
 ) -> ByteImage:
     """Device values (rows, columns, 3) uint8 of linear light (rows, columns, 3) in [0, 1]; beyond that it is clipped.
 
-    ``phase``: this projector's offset in the blue-noise tile; superimposed projectors should have different ones.
+    ``phase``: with blue noise, this projector's offset in its tile; superimposed projectors should have different ones.
     Raises UsageError("response-not-rising", "frame-shape-wrong").
     """
     frame = radiometry.channels(frame)

@@ -128,7 +128,9 @@ def _parametric(kind: int, parameters: list[float]) -> Float64:
         c, d, e, f = 0.0, -b / a, constant, constant
     elif kind == 3:
         e = f = 0.0
-    light = np.where(x >= d, np.maximum(a * x + b, 0) ** gamma + e, c * x + f)
+    # What a damaged profile makes infinite is refused below.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        light = np.where(x >= d, np.maximum(a * x + b, 0) ** gamma + e, c * x + f)
     if not np.isfinite(light).all():
         raise ValueError("no curve")
     return np.asarray(np.clip(light, 0, 1))

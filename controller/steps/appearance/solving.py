@@ -189,11 +189,9 @@ def _solve_appearance(
 
 
 def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dict[str, ByteImage]:
-    """8-bit frames by projector name, dithered, each projector at another offset of the dither tile."""
-    return {
-        part.name: to_device(values, part.radiometry, phase=(17 * n, 29 * n))
-        for n, (part, values) in enumerate(zip(calibration.projectors, frames, strict=True))
-    }
+    """8-bit frames by projector name, dithered."""
+    parts = zip(calibration.projectors, frames, strict=True)
+    return {part.name: to_device(values, part.radiometry) for part, values in parts}
 
 
 __all__ = ["AppearanceRequest", "SolveOptions", "device_frames", "options_of", "solve_steps"]

@@ -159,7 +159,7 @@ def test_terms_at_depth_edges_are_those_of_the_projectors_asked_for(names: list[
         for some in (names, names[::-1], names[1:] or names):
             model = cast("LightTransport", SimpleNamespace(
                 sizes=tuple(sizes[name] for name in some), pixels=sum(2 * sizes[name][1] for name in some),
-                mixing=None, lit=np.zeros((len(some), 1, 3), np.bool_), per_weight=None, segments=()
+                mixing=None, lit=np.zeros((len(some), 1, 3), np.bool_), per_weight=None, segments=(), beside=None
             ))  # fmt: skip
             found = cast("EdgedTransport", edged(model, run, some)).terms
             assert [term.differences.shape for term in found] == [(3, 2 * sizes[name][1]) for name in some]

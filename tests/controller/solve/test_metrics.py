@@ -86,6 +86,17 @@ def test_edges_of_a_dense_pattern_are_there_though_its_contrast_is_less(period_p
     assert sharpness(np.roll(paler, round(period_px / 4), 1), picture, 1.0, mask) < 0.5
 
 
+@settings(max_examples=25, deadline=None)
+@given(period_px=st.floats(12, 20), contrast=st.floats(0.8, 1.0), steps=st.integers(0, 4))
+def test_a_few_stronger_edges_do_not_hide_those_of_a_pattern(period_px: float, contrast: float, steps: int) -> None:
+    picture, mask = 0.4 + 0.4 * dotted(period_px), np.ones((150, 200), np.bool_)
+    for step in range(steps):
+        # As at an object's own folds and borders: a few of the edges, and three times as strong as the pattern's.
+        picture[:, 10 * step : 10 * step + 5] = 0.02
+    paler = picture.mean() + np.float32(contrast) * (picture - picture.mean())
+    assert sharpness(paler, picture, 1.0, mask) > 0.85
+
+
 def test_an_empty_mask_is_refused() -> None:
     picture = linear_picture()
     with pytest.raises(UsageError) as refused:

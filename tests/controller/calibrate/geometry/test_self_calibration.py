@@ -73,8 +73,11 @@ def make_stage(
         return np.asarray(1.0 + relief_m * (bumps * 2.0 + 12.0 * (x**2 + 0.5 * y**2)))
 
     depth = np.ones((height, width))
-    for _ in range(200):
+    for _ in range(10):
         depth = 0.5 * depth + 0.5 * surface(depth * xy[..., 0], depth * xy[..., 1])
+    for _ in range(5):  # near by now: Newton's steps, each by the slope along the ray
+        at, ahead = (surface(reach * xy[..., 0], reach * xy[..., 1]) for reach in (depth, depth + 1e-6))
+        depth += (at - depth) / (1 - (ahead - at) / 1e-6)
     points = depth[..., None] * np.concatenate([xy, np.ones((height, width, 1))], axis=2)
     inside = (points[..., 0] / 0.26) ** 2 + (points[..., 1] / 0.18) ** 2 < 1
     target = np.median(points[inside], axis=0)

@@ -8,10 +8,13 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.metapixels.from_dots import WIDEST_CUT, fit_dots, largest_sigma_px, peak_share
+from controller.calibrate.metapixels.gaussian_fit import PARAMETERS, fit_gaussian
 from controller.calibrate.metapixels.initial_estimate import initial_metapixels, modelled_correspondence
 from controller.calibrate.values import (
     Calibration,
@@ -51,6 +54,25 @@ def dots_of(scene: Scene, r: int) -> tuple[Mapping[str, FloatImage], FloatImage]
 @functools.cache
 def guess_of(scene: Scene) -> Metapixels:
     return initial_metapixels(decode(photographed(scene), plan_patterns(scene.projector_px)), scene.projector_px)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 6), st.sampled_from([1, 3]))
+def test_a_fit_of_whatever_a_photograph_holds_fails_or_is_finite(
+    seed: int, dark: float, unlit: float, size: float, channels: int
+) -> None:
+    rng = np.random.default_rng(seed)
+
+    def picture(share: float) -> FloatImage:
+        made = rng.random((24, 24, channels), np.float32)
+        made[rng.random((24, 24)) < share] = 0
+        return made
+
+    image, white = picture(dark), picture(unlit)
+    at, px2 = np.array([11.5, 12.25], np.float32), np.array([size, 0.1 * size, size], np.float32)
+    fit = np.empty(PARAMETERS)
+    quality = fit_gaussian(image, np.zeros_like(image), white, at, px2, at, px2, WIDEST_CUT, fit)
+    assert quality == -1 or (quality >= 0 and np.isfinite(fit).all())
 
 
 def inside(scene: Scene, margin: int = 3) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

@@ -154,14 +154,35 @@ def test_where_two_surfaces_share_a_pixel_the_one_seen_by_more_camera_pixels_is_
     position[:, 50:, 0] -= 25 - 2  # a second surface sees projector columns 2.. again, as far as 17
     valid = np.ones((rows, columns), bool)
     valid[:, 50:] = (y[:, 50:] % 2) == 0  # with half the pixels
-    blank = dict.fromkeys(
-        ("black", *(f"blur-{a}-{n}" for a in "xyd" for n in range(3))), np.ones((rows, columns), np.float32)
+    names = (
+        "black",
+        *(f"{kind}-{a}-{n}" for kind, axes in (("blur", "xyd"), ("phase", "xy")) for a in axes for n in range(3)),
     )
+    blank = dict.fromkeys(names, np.ones((rows, columns), np.float32))
     plan = plan_patterns((40, 30))
     correspondence = Correspondence(position, np.full((rows, columns), 0.9, np.float32), valid)
     found = fit_metapixels(blank, plan, correspondence)
     assert found.valid[10, 5:15].all()
     np.testing.assert_allclose(found.centre_px[10, 5:15, 0], 2 * np.arange(5, 15), atol=0.2)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_light_by_way_of_other_surfaces_makes_no_pixel_wider(share: float) -> None:
+    scene = Scene(projector_blur_px=0.6)
+    captures = photographed(scene)
+    correspondence, plain = fitted(scene)
+    # It comes from everywhere, so fine patterns are not in it: the mean of a sinusoid's steps.
+    lit = dict(captures)
+    for pattern in PLAN:
+        if pattern.name.startswith(("phase-", "blur-")):
+            steps = [captures[f"{pattern.name[:-1]}{n}"] for n in range(3)]
+            mean = np.mean(steps, axis=0, dtype=np.float32)
+            lit[pattern.name] = np.asarray((1 - share) * captures[pattern.name] + share * mean, np.float32)
+    found = fit_metapixels(lit, PLAN, correspondence)
+    use = plain.valid & found.valid & seen(scene, plain)
+    before, after = (np.sqrt(one.covariance_px2[use][:, [0, 2]].astype(float)) for one in (plain, found))
+    assert np.abs(after / before - 1).max() < 0.02
+    assert use.mean() > 0.5
 
 
 def test_nothing_seen_gives_no_pixels() -> None:
