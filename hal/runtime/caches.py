@@ -110,7 +110,8 @@ def remove() -> list[Kept]:
 
 
 def _places() -> Iterator[tuple[Path, str]]:
-    for folder, what in ((cache_folder, "compiled kernels and settings of libraries"), (state_folder, "crash reports")):
+    cached = "compiled kernels, light of the bench and settings of libraries"
+    for folder, what in ((cache_folder, cached), (state_folder, "crash reports")):
         with contextlib.suppress(RuntimeError):
             yield folder(), what
     for base in sorted({runtime_base(), temporary_folder()}):

@@ -20,6 +20,9 @@ numba.config.reload_config()  # type: ignore[no-untyped-call]
 
 
 def compiled(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Kernel], Kernel]:
-    """Compile a numeric kernel in no-Python mode, without the GIL."""
-    decorate = numba.njit(parallel=parallel, fastmath=fastmath, nogil=True, cache=True)
+    """Compile a numeric kernel in no-Python mode, without the GIL.
+
+    A division by zero gives inf or NaN, as in NumPy; an exception would end the work of all pixels for one of them.
+    """
+    decorate = numba.njit(parallel=parallel, fastmath=fastmath, nogil=True, cache=True, error_model="numpy")
     return cast("Callable[[Kernel], Kernel]", decorate)

@@ -15,7 +15,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from hal.deadline import Deadline
 from hal.errors import DeviceError
@@ -39,7 +39,6 @@ from plugins.emulated.optics.staging import (
 )
 from plugins.emulated.optics.stands import SETTINGS, Stands, read_room, read_stands
 from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
-from plugins.emulated.optics.world import World
 from plugins.emulated.projectors.boards import USUAL, board_named
 from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
@@ -49,6 +48,9 @@ from plugins.emulated.projectors.wires import projector_on_its_wire
 from plugins.emulated.scenario import ScenarioPlayer, read_scenario
 from plugins.emulated.tape.serving import serve_tape
 from plugins.emulated.usb.bench import UsbDevices, read_usb
+
+if TYPE_CHECKING:
+    from plugins.emulated.optics.world import World
 
 OBJECT_FILE: Final = f"{FOLDER}/object.npz"
 DEVICE_FAILED: Final = 3
@@ -183,6 +185,9 @@ def _start(
     stage: Path, out: _OutputLines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
 ) -> World:
     """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
+    # Not at the top: a stage that is only prepared casts no rays, and all that these need takes a second to import.
+    from plugins.emulated.optics.world import World
+
     truth, usb = read_truth(stage), read_usb(stage)
     on_usb = any(device.kind == STAGE_CAMERA for device in usb)
     if not on_usb:

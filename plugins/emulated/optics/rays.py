@@ -8,8 +8,8 @@ with the 1/cos^3 by which a flat screen's corners are reached by less dense but 
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -19,15 +19,17 @@ import numpy.typing as npt
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
+from hal.runtime.compute import usable_cpus
+from plugins.emulated.kept_light import read_kept, write_kept
 from plugins.emulated.optics.furnished import Scene, furnished
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.shapes import dot, length
 from plugins.emulated.optics.truth import BenchTruth, Lens, Pose, ProjectorTruth
 from plugins.emulated.tables import dump
 
-CACHE: Final = "rays.npz"
+KIND: Final = "rays"
 VERSION: Final = 3
-ROWS_AT_ONCE: Final = 1 << 20
+RAYS_AT_ONCE: Final = 1 << 18
 SHADOW_BIAS_M: Final = 2e-4
 SIGMA_STEP_PX: Final = 1.0 / 64.0
 """Blur is stored in these steps, in a byte: up to 4 px."""
@@ -61,17 +63,18 @@ class Samples:
 
 
 def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None, progress: Progress) -> Samples:
-    """The stage's samples, from ``cache`` (a folder) when they were cast for this very truth and object.
+    """The stage's samples, from ``cache`` (a folder) when they were cast for such a truth and object before.
 
     ``progress`` is called with the share that is done, 0..1.
     """
     key = key_of(truth, stage_object)
-    path = None if cache is None else cache / CACHE
-    found = None if path is None else _read(path, key)
-    if found is None:
+    arrays = None if cache is None else read_kept(cache, KIND, key)
+    if arrays is not None and set(arrays) == {field.name for field in fields(Samples)}:
+        found = Samples(**arrays)
+    else:
         found = cast(truth, stage_object, progress)
-        if path is not None:
-            _write(path, key, found)
+        if cache is not None:
+            write_kept(cache, KIND, key, {field.name: getattr(found, field.name) for field in fields(Samples)})
     progress(1.0)
     return found
 
@@ -82,11 +85,18 @@ def cast(truth: BenchTruth, stage_object: StageObject, progress: Progress) -> Sa
     scene = rtcore_scene.EmbreeScene(robust=True)
     TriangleMesh(scene, things.vertices, things.faces)
     width, height = truth.camera.lens.size_px
-    rows = max(1, ROWS_AT_ONCE // (width * truth.subsamples**2))
+    rows = max(1, RAYS_AT_ONCE // (width * truth.subsamples**2))
+    spans = [(first, min(first + rows, height)) for first in range(0, height, rows)]
     blocks = []
-    for first in range(0, height, rows):
-        blocks.append(_cast_rows(truth, things, scene, first, min(first + rows, height)))
-        progress(min(first + rows, height) / height)
+    with ThreadPoolExecutor(usable_cpus()) as threads:
+        casting = [threads.submit(_cast_rows, truth, things, scene, *span) for span in spans]
+        try:
+            for (_, last), block in zip(spans, casting, strict=True):
+                blocks.append(block.result())
+                progress(last / height)
+        except BaseException:
+            threads.shutdown(cancel_futures=True)
+            raise
     counts = np.concatenate([block["counts"] for block in blocks])
     pixels = np.flatnonzero(counts).astype(np.int32)
     starts = np.concatenate(([0], np.cumsum(counts[pixels]))).astype(np.int32)
@@ -220,7 +230,8 @@ def _in_shadow(lens: Floats, scene: Any, points: Floats, distance: Floats) -> np
     origin = np.broadcast_to(lens.astype(np.float32), ray.shape).copy()
     if not len(points):
         return np.zeros(0, dtype=np.bool_)
-    return np.asarray(scene.run(origin, ray, output=1)["tfar"] < distance - SHADOW_BIAS_M)
+    before = (distance - SHADOW_BIAS_M).astype(np.float32)
+    return np.asarray(scene.run(origin, ray, dists=before, query="OCCLUDED") >= 0)
 
 
 def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
@@ -234,25 +245,3 @@ def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
     for array in scene.fingerprint():
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _read(path: Path, key: str) -> Samples | None:
-    """Samples cast before; a cache that is absent, damaged or of another stage counts as none."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if str(archive["key"]) != key:
-                return None
-            return Samples(**{field.name: archive[field.name] for field in fields(Samples)})
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-
-
-def _write(path: Path, key: str, samples: Samples) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            np.savez(file, key=np.array(key), **{f.name: getattr(samples, f.name) for f in fields(Samples)})
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -105,6 +105,11 @@ def random_truth(
     )
 
 
+SLOW_PICTURE_S: Final = 120
+QUICK_PX: Final = 4_000_000
+"""Larger pictures take the bench longer than a camera."""
+
+
 def device_tables(truth: BenchTruth, stage_object: StageObject) -> dict[str, Any]:
     """The device tables for stage.toml: what a technician reads off the devices, or measures with a tape.
 
@@ -124,6 +129,8 @@ def device_tables(truth: BenchTruth, stage_object: StageObject) -> dict[str, Any
             "iso": 100,
             "intrinsics": INTRINSICS,
             "distance_m": round(distance * (1.0 + 0.01 * rng.uniform(-1.0, 1.0)), 3),
+            # The bench works some seconds on a picture of this size, and longer on a computer with other work.
+            **({"picture_s": SLOW_PICTURE_S} if camera.lens.size_px[0] * camera.lens.size_px[1] > QUICK_PX else {}),
         },
         "display": {
             "driver": "player",

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.kept_light import kept_folder
 from plugins.emulated.optics.bumps import FILE as BUMPS
 from plugins.emulated.optics.bumps import bumped, read_bumps
 from plugins.emulated.optics.dng import PictureFacts, dng, with_exif
@@ -47,8 +48,9 @@ class World:
         self._stage, self._set_up, self._truth = stage, truth, truth
         self._lamps = tuple(lamps)
         thing = object_of(stage, truth.object)
-        self._samples = samples_of(truth, thing, stage / FOLDER, progress)
-        self._indirect = Indirect(thing, stage / FOLDER)
+        kept = kept_folder(stage / FOLDER)
+        self._samples = samples_of(truth, thing, kept, progress)
+        self._indirect = Indirect(thing, kept)
         transfer = self._indirect.transfer(truth, self._samples.pixels, progress, keep=True)
         self._renderer = Renderer(truth, self._samples, transfer)
         self._bumps_seen: tuple[int, int] | None = None

@@ -19,8 +19,8 @@ from numba import types
 from hal.runtime import kernels
 from hal.runtime.kernels import TABLES, Compilation, are_compiled, decode, encode, main, record
 
-MODULE = "controller.solve.bounded.gradient"
-"""A small one."""
+MODULE = "controller.capture.encoding"
+"""A small one, with several kernels, of which some call others and some use all cores."""
 
 numbers = st.sampled_from([types.float32, types.float64, types.int64, types.uint8, types.uint16, types.boolean])
 arrays = st.builds(

@@ -1,8 +1,8 @@
-"""The transfer of a stage, worked out once and kept in a file."""
+"""The transfer of a stage, worked out once and kept for all stages that have the same."""
 
 from __future__ import annotations
 
-import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from plugins.emulated.kept_light import read_kept, write_kept
 from plugins.emulated.optics.furnished import furnished
 from plugins.emulated.optics.indirect.scattering import Scattering, scattering_of
 from plugins.emulated.optics.indirect.traced import TracedTransfer
@@ -19,7 +20,7 @@ from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import Progress, key_of
 from plugins.emulated.optics.truth import BenchTruth, SurfaceTruth
 
-CACHE: Final = "indirect.npz"
+KIND: Final = "indirect"
 VERSION: Final = 1
 
 
@@ -28,7 +29,7 @@ class Indirect:
 
     def __init__(self, thing: StageObject, cache: Path) -> None:
         self._thing = thing
-        self._path = cache / CACHE
+        self._folder = cache
         self._scattering: tuple[tuple[SurfaceTruth, ...], Scattering] | None = None
 
     def transfer(
@@ -43,14 +44,14 @@ class Indirect:
             return None
         fineness = truth.patches if truth.engine == "radiosity" else f"{truth.engine} {truth.paths}"
         key = f"{VERSION} {fineness} {truth.seed} {key_of(truth, self._thing)}"
-        found = _read(self._path, key) if keep else None
+        found = _read(self._folder, key) if keep else None
         if found is None:
             if truth.engine == "mitsuba":
                 found = traced_transfer(truth, self._thing, pixels, progress)
             else:
                 found = transfer_of(truth, self._scattered(truth, progress), pixels)
             if keep:
-                _write(self._path, key, found)
+                _write(self._folder, key, found)
         progress(1.0)
         return found
 
@@ -61,23 +62,23 @@ class Indirect:
         return self._scattering[1]
 
 
-def _read(path: Path, key: str) -> Transfer | TracedTransfer | None:
+def _read(folder: Path, key: str) -> Transfer | TracedTransfer | None:
     """A file that is absent, damaged or of another stage counts as none."""
+    arrays = read_kept(folder, KIND, key)
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if str(archive["key"]) != key:
-                return None
-            blend, projectors = _matrix(archive, "blend"), range(int(archive["projectors"]))
-            if "back" in archive:
-                arrive = tuple(_matrix(archive, f"arrive{n}") for n in projectors)
-                return Transfer(arrive, archive["back"], archive["cells"], blend)
-            parts = tuple(tuple(_matrix(archive, f"part{n}{channel}") for channel in range(3)) for n in projectors)
-            return TracedTransfer(parts, tuple(int(side) for side in archive["group"]), blend)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        if arrays is None:
+            return None
+        blend, projectors = _matrix(arrays, "blend"), range(int(arrays["projectors"]))
+        if "back" in arrays:
+            arrive = tuple(_matrix(arrays, f"arrive{n}") for n in projectors)
+            return Transfer(arrive, arrays["back"], arrays["cells"], blend)
+        parts = tuple(tuple(_matrix(arrays, f"part{n}{channel}") for channel in range(3)) for n in projectors)
+        return TracedTransfer(parts, tuple(int(side) for side in arrays["group"]), blend)
+    except (ValueError, KeyError):
         return None
 
 
-def _write(path: Path, key: str, transfer: Transfer | TracedTransfer) -> None:
+def _write(folder: Path, key: str, transfer: Transfer | TracedTransfer) -> None:
     matrices: dict[str, sparse.csr_matrix] = {"blend": transfer.blend}
     if isinstance(transfer, Transfer):
         arrays: dict[str, Any] = {"back": transfer.back, "cells": transfer.cells}
@@ -93,16 +94,9 @@ def _write(path: Path, key: str, transfer: Transfer | TracedTransfer) -> None:
         for name, matrix in matrices.items()
         for part in ("data", "indices", "indptr", "shape")
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            np.savez(file, key=np.array(key), projectors=np.array(count), **arrays)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_kept(folder, KIND, key, {"projectors": np.array(count), **arrays})
 
 
-def _matrix(archive: Any, name: str) -> sparse.csr_matrix:
-    data, indices, starts, shape = (archive[f"{name}_{part}"] for part in ("data", "indices", "indptr", "shape"))
+def _matrix(arrays: Mapping[str, npt.NDArray[Any]], name: str) -> sparse.csr_matrix:
+    data, indices, starts, shape = (arrays[f"{name}_{part}"] for part in ("data", "indices", "indptr", "shape"))
     return sparse.csr_matrix((data, indices, starts), shape=tuple(shape))

@@ -49,8 +49,14 @@ def test_a_pixel_sees_its_samples_share_of_each_blurred_panel_pixel(seed: int, m
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60_000))
-def test_the_memory_that_it_may_use_changes_no_light(seed: int, most_bytes: int) -> None:
+def test_the_memory_that_it_may_use_changes_light_by_rounding_alone(seed: int, most_bytes: int) -> None:
     lit, frame = drawn(seed, pixels=12)
     some = Footprints.of(lit, FILL, most_bytes=most_bytes)
     assert some.weights.nbytes <= most_bytes
-    np.testing.assert_allclose(some.light(frame), Footprints.of(lit, FILL).light(frame), rtol=1e-4, atol=1e-6)
+    exact = Footprints.of(lit, FILL, most_bytes=0).light(frame)
+    rounding = np.zeros((len(exact), 1))
+    rounding[: len(some.steps), 0] = 0.5 * some.steps
+    # Each weight is at most half a step off, and no colour of the frame has more light than all of it together.
+    allowed = rounding * frame.sum(axis=(0, 1)).max() + 1e-5 * exact + 1e-6
+    assert (np.abs(some.light(frame) - exact) <= allowed).all()
+    assert some.steps.max(initial=0.0) <= 2e-4
