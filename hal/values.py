@@ -88,7 +88,10 @@ class ExposureSettings:
 
 @dataclass(frozen=True, slots=True)
 class CameraCapabilities:
-    """Capabilities of a camera's driver. Lists are ascending; empty means not settable."""
+    """Capabilities of a camera's driver. Lists are ascending; empty means not settable.
+
+    ``picture_s``: so many seconds beyond twice its exposure a picture takes at most, until the driver has it
+    """
 
     exposures_s: tuple[float, ...]
     isos: tuple[int, ...]
@@ -97,6 +100,7 @@ class CameraCapabilities:
     jpeg: bool
     live_view: bool = False
     bulb: bool = False
+    picture_s: float = 15.0
 
 
 @dataclass(frozen=True, slots=True)

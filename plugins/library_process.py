@@ -75,7 +75,7 @@ class LibraryProcess:
         running = self._running
         return None if running is None else running[0].pid
 
-    def ask(self, name: str, *arguments: Any, deadline: Deadline, repeatable: bool = True) -> Any:
+    def request(self, name: str, *arguments: Any, deadline: Deadline, repeatable: bool = True) -> Any:
         """Do a request. One that is ``repeatable`` is done again if the camera was lost or the library crashed.
 
         Raises what the worker raises, DeviceGone if the process ended, DeviceTimeout or Cancelled: a request that takes

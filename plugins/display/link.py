@@ -129,7 +129,7 @@ class PlayerLink:
             raise
 
     def _greet(self, deadline: Deadline) -> None:
-        hello = self.ask({"op": "hello"}, deadline)
+        hello = self.request({"op": "hello"}, deadline)
         try:
             outputs = tuple(OutputInfo(o["name"], o["width_px"], o["height_px"]) for o in hello["outputs"])
             spoken, inbox = hello["protocol"], Path(hello["inbox"])
@@ -149,7 +149,7 @@ class PlayerLink:
             )
         self.outputs, self.inbox = outputs, Inbox(inbox, outputs)
 
-    def ask(self, request: Mapping[str, Any], deadline: Deadline) -> dict[str, Any]:
+    def request(self, request: Mapping[str, Any], deadline: Deadline) -> dict[str, Any]:
         """Send a request and return its answer; skip answers to earlier, abandoned requests.
 
         Raises as ``connect``; DeviceRefused with the player's own code and sentences if it refuses.

@@ -29,7 +29,7 @@ class PlayerDisplay:
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         """The player's name and the protocol that it speaks; its process number stands for the serial number."""
-        hello = self._link.ask({"op": "hello"}, deadline)
+        hello = self._link.request({"op": "hello"}, deadline)
         return DeviceIdentity(
             "Velatura", str(hello["player"]), serial=str(hello["pid"]), firmware=f"protocol {hello['protocol']}"
         )
@@ -44,11 +44,11 @@ class PlayerDisplay:
         self._link.connect(deadline)
         assert self._link.inbox is not None
         self._check(frames)
-        return _presented(self._link.ask({"op": "show", "sequence": self._link.inbox.put(frames)}, deadline))
+        return _presented(self._link.request({"op": "show", "sequence": self._link.inbox.put(frames)}, deadline))
 
     def play(self, appearance: str, *, deadline: Deadline) -> Presented:
         """Show an appearance of the player's bundle; see ``hal.interfaces.Display.play``."""
-        return _presented(self._link.ask({"op": "play", "appearance": appearance}, deadline))
+        return _presented(self._link.request({"op": "play", "appearance": appearance}, deadline))
 
     def close(self) -> None:
         """Disconnect from the player; its picture stays."""
@@ -69,23 +69,23 @@ class PlayerDisplay:
         ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds; None: at the player's own rate.
         """
         request = {"op": "sequence", "items": [list(item) for item in items], "repeat": repeat, "rate_hz": rate_hz}
-        return _presented(self._link.ask(request, deadline))
+        return _presented(self._link.request(request, deadline))
 
     def stop(self, *, deadline: Deadline) -> Presented:
         """Show black."""
-        return _presented(self._link.ask({"op": "stop"}, deadline))
+        return _presented(self._link.request({"op": "stop"}, deadline))
 
     def live(self, file: Path, *, deadline: Deadline, white: float | None = None) -> None:
         """Show pictures live from a shared frame file; see ``hal.interfaces.BundleDisplay.live``."""
-        self._link.ask({"op": "live", "file": str(file.resolve()), "white": white}, deadline)
+        self._link.request({"op": "live", "file": str(file.resolve()), "white": white}, deadline)
 
     def identify(self, *, deadline: Deadline) -> Presented:
         """Show each output's number, name and size."""
-        return _presented(self._link.ask({"op": "identify"}, deadline))
+        return _presented(self._link.request({"op": "identify"}, deadline))
 
     def status(self, *, deadline: Deadline) -> dict[str, Any]:
         """The player's status: the keys of "status" in docs/reference/player-protocol.md."""
-        return self._link.ask({"op": "status"}, deadline)
+        return self._link.request({"op": "status"}, deadline)
 
     def playing(self, *, deadline: Deadline) -> PlaybackStatus:
         """The picture shown now, and timing; see ``hal.interfaces.BundleDisplay.playing``."""
@@ -108,7 +108,7 @@ class PlayerDisplay:
 
     def load_bundle(self, path: Path, *, deadline: Deadline) -> str:
         """Let the player use another bundle; returns the bundle's identity (hex)."""
-        return str(self._link.ask({"op": "load-bundle", "path": str(path.resolve())}, deadline)["bundle"])
+        return str(self._link.request({"op": "load-bundle", "path": str(path.resolve())}, deadline)["bundle"])
 
     def _check(self, frames: Mapping[str, npt.NDArray[np.uint8]]) -> None:
         shapes = {output.name: (output.height_px, output.width_px, 3) for output in self._link.outputs}

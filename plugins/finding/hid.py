@@ -84,7 +84,7 @@ def _found(entry: Mapping[str, Any], deadline: Deadline) -> Found | None:
 def _relay_serial(name: str, path: bytes, channels: int, deadline: Deadline) -> str:
     """A board's serial number must be requested; its USB descriptor has none."""
 
-    def ask(hidapi: Any) -> str:
+    def query(hidapi: Any) -> str:
         handle: HidHandle = hidapi.device()
         handle.open_path(path)
         try:
@@ -94,7 +94,7 @@ def _relay_serial(name: str, path: bytes, channels: int, deadline: Deadline) -> 
 
     link = _Hidapi(name)
     try:
-        return link.call(ask, deadline=deadline)
+        return link.call(query, deadline=deadline)
     finally:
         link.close()
 

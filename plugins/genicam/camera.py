@@ -42,7 +42,7 @@ class GenicamCamera:
         )
         self._settings: ExposureSettings | None = None
         try:
-            self._capabilities: CameraCapabilities = self.process.ask("capabilities", deadline=deadline)
+            self._capabilities: CameraCapabilities = self.process.request("capabilities", deadline=deadline)
         except BaseException:
             self.close()
             raise
@@ -52,11 +52,11 @@ class GenicamCamera:
         return self._capabilities
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        identity: DeviceIdentity = self.process.ask("identity", deadline=deadline)
+        identity: DeviceIdentity = self.process.request("identity", deadline=deadline)
         return identity
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
-        confirmed: ExposureSettings = self.process.ask("configure", settings, deadline=deadline)
+        confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)
         self._settings = confirmed
         return confirmed
 
@@ -65,8 +65,8 @@ class GenicamCamera:
         try:
             if self.process.pid is None and self._settings is not None:
                 # A process that was ended by a deadline has forgotten its exposure.
-                self.process.ask("configure", self._settings, deadline=deadline)
-            files: list[CapturedFile] = self.process.ask(
+                self.process.request("configure", self._settings, deadline=deadline)
+            files: list[CapturedFile] = self.process.request(
                 "capture", destination.absolute(), deadline.left_s(), deadline=deadline, repeatable=False
             )
         except DeviceGone as error:

@@ -40,7 +40,7 @@ class Gphoto2Camera:
             note=lambda code, what: self._troubles.append((code, what)),
         )
         try:
-            self._capabilities: CameraCapabilities = self.process.ask("capabilities", deadline=deadline)
+            self._capabilities: CameraCapabilities = self.process.request("capabilities", deadline=deadline)
         except BaseException:
             self.close()
             raise
@@ -50,17 +50,17 @@ class Gphoto2Camera:
         return self._capabilities
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        identity: DeviceIdentity = self.process.ask("identity", deadline=deadline)
+        identity: DeviceIdentity = self.process.request("identity", deadline=deadline)
         return identity
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
-        confirmed: ExposureSettings = self.process.ask("configure", settings, deadline=deadline)
+        confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)
         return confirmed
 
     def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
         """See ``hal.interfaces.Camera.capture``. Raises DeviceGone("camera-shot-lost") where the connection broke."""
         try:
-            files: list[CapturedFile] = self.process.ask(
+            files: list[CapturedFile] = self.process.request(
                 "capture", destination.absolute(), deadline.left_s(), deadline=deadline, repeatable=False
             )
         except DeviceGone as error:
@@ -68,7 +68,7 @@ class Gphoto2Camera:
         return files
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
-        status: CameraStatus = self.process.ask("status", deadline=deadline)
+        status: CameraStatus = self.process.request("status", deadline=deadline)
         return status
 
     def troubles(self) -> list[tuple[str, str]]:
@@ -81,12 +81,12 @@ class Gphoto2Camera:
                 what="The camera has no live view over its cable.",
                 remedy="Use its viewfinder, or take a test picture to aim.",
             )
-        frame: bytes = self.process.ask("live_view", deadline=deadline)
+        frame: bytes = self.process.request("live_view", deadline=deadline)
         return frame
 
     def end_live_view(self, *, deadline: Deadline) -> None:
         if self._capabilities.live_view:
-            self.process.ask("end_live_view", deadline=deadline)
+            self.process.request("end_live_view", deadline=deadline)
 
     def close(self) -> None:
         self.process.close()

@@ -39,12 +39,12 @@ class ColorHugLightSensor:
             raise
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        def ask(sensor: OpenHid) -> DeviceIdentity:
+        def query(sensor: OpenHid) -> DeviceIdentity:
             # Read its settings, so that an answer never comes from an unplugged sensor.
             parse_settings(sensor.handle.get_feature_report(REPORT, SETTINGS_LENGTH))
             return DeviceIdentity(sensor.found.maker, sensor.found.product, sensor.serial)
 
-        return self._link.call(ask, deadline=deadline)
+        return self._link.call(query, deadline=deadline)
 
     def illuminance_lux(self, *, deadline: Deadline) -> float:
         """See ``hal.interfaces.LightSensor``. Raises DeviceBusy("light-sensor-not-ready") at the deadline."""

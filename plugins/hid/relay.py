@@ -41,10 +41,10 @@ class RelayBoard:
             raise
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        def ask(board: OpenHid) -> DeviceIdentity:
+        def query(board: OpenHid) -> DeviceIdentity:
             return DeviceIdentity(board.found.maker, board.found.product, _state(board.handle, board.found).serial)
 
-        return self._link.call(ask, deadline=deadline)
+        return self._link.call(query, deadline=deadline)
 
     def channels(self, *, deadline: Deadline) -> int:
         return len(self._link.call(lambda board: _state(board.handle, board.found), deadline=deadline).closed)
@@ -52,12 +52,12 @@ class RelayBoard:
     def state(self, channel: int, *, deadline: Deadline) -> bool:
         """See ``hal.interfaces.PowerSwitch.state``. Raises DeviceRefused("relay-no-channel")."""
 
-        def ask(board: OpenHid) -> bool:
+        def query(board: OpenHid) -> bool:
             closed = _state(board.handle, board.found).closed
             _require(channel, len(closed))
             return closed[channel - 1]
 
-        return self._link.call(ask, deadline=deadline)
+        return self._link.call(query, deadline=deadline)
 
     def switch(self, channel: int, closed: bool, *, deadline: Deadline) -> None:
         """Close or open a relay, and check it at the board; no effect if it is so already.

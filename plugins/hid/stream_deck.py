@@ -55,11 +55,11 @@ class StreamDeckPanel(WorkerLink[Any]):
         return self._capabilities
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        def ask(deck: Any) -> DeviceIdentity:
+        def query(deck: Any) -> DeviceIdentity:
             return DeviceIdentity("Elgato", deck.deck_type(), _text(deck.get_serial_number()),
                                   _text(deck.get_firmware_version()))  # fmt: skip
 
-        return self.call(ask, deadline=deadline)
+        return self.call(query, deadline=deadline)
 
     def show(self, key: int, picture: npt.NDArray[np.uint8], *, deadline: Deadline) -> None:
         """See ``hal.interfaces.ButtonPanel.show``. Raises DeviceRefused("panel-no-key", "panel-picture")."""

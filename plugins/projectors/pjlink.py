@@ -129,7 +129,7 @@ class PjLinkProjector:
         with self._turn(deadline) as talk:
 
             def is_open() -> bool:
-                told = talk.ask("AVMT", deadline)
+                told = talk.query("AVMT", deadline)
                 if isinstance(told, Failure):
                     raise talk.no_answer()
                 return pjlink.parse_mute(told).video is not closed
@@ -169,7 +169,7 @@ class PjLinkProjector:
         the state is ``unchanged``. Then the projector had closed it after the previous answer, and never read this.
         """
         try:
-            return talk.tell(name, parameter, deadline)
+            return talk.set(name, parameter, deadline)
         except DeviceTimeout:
             if deadline.passed:
                 raise
@@ -181,7 +181,7 @@ class PjLinkProjector:
                 return None
         with contextlib.suppress(DeviceBusy, DeviceTimeout, DeviceGone, ProtocolError):
             if unchanged():
-                return talk.tell(name, parameter, deadline)
+                return talk.set(name, parameter, deadline)
         return None
 
     def _accepted(self, told: str | Failure | None, doing: str) -> bool:

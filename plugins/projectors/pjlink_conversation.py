@@ -43,7 +43,7 @@ class PjLinkConversation:
         """Whether the last query or command used a connection that was used before."""
 
     def power(self, deadline: Deadline) -> Power:
-        told = self.ask("POWR", deadline)
+        told = self.query("POWR", deadline)
         if isinstance(told, Failure):
             raise DeviceBusy(
                 "projector-busy",
@@ -88,7 +88,7 @@ class PjLinkConversation:
         """An optional text; "" if unknown."""
         return self.optional(name, pjlink.parse_text, deadline, pj_class) or ""
 
-    def ask(self, name: str, deadline: Deadline, pj_class: PjClass = 1) -> str | Failure:
+    def query(self, name: str, deadline: Deadline, pj_class: PjClass = 1) -> str | Failure:
         """A query, repeated over a new connection if its answer is lost."""
         try:
             return self._say(name, "?", deadline, self._answer_s, pj_class)
@@ -97,7 +97,7 @@ class PjLinkConversation:
                 raise
             return self._say(name, "?", deadline, self._answer_s, pj_class)
 
-    def tell(self, name: str, parameter: str, deadline: Deadline) -> str | Failure:
+    def set(self, name: str, parameter: str, deadline: Deadline) -> str | Failure:
         """A command, sent once. After one that switches, the projector is busy with its lamp."""
         try:
             return self._say(name, parameter, deadline, self._command_s, 1)

@@ -194,7 +194,7 @@ class SerialProjector:
         if "power" not in self._table.queries:
             return self._power_untold(deadline)
         try:
-            answer = parse_power(self._talk.ask("power", deadline=deadline))
+            answer = parse_power(self._talk.query("power", deadline=deadline))
         except DeviceBusy as busy:
             if busy.code != COOLS:
                 raise
@@ -205,7 +205,7 @@ class SerialProjector:
     def _power_untold(self, deadline: Deadline) -> Power:
         """The power state if the family has no query for it: any other query shows that it is there, or cools."""
         try:
-            self._talk.ask(next(iter(self._table.queries)), deadline=deadline)
+            self._talk.query(next(iter(self._table.queries)), deadline=deadline)
         except DeviceBusy as busy:
             return Power.COOLING if busy.code == COOLS else Power.UNKNOWN
         return Power.UNKNOWN
@@ -236,7 +236,7 @@ class SerialProjector:
         if question not in self._table.queries or not self._optional.may_ask(question):
             return None
         try:
-            told = parse(self._talk.ask(question, deadline=deadline))
+            told = parse(self._talk.query(question, deadline=deadline))
         except DeviceBusy:
             return None
         except DeviceTimeout:

@@ -82,7 +82,7 @@ class SerialConversation:
         if link is not None:
             link.close()
 
-    def ask(self, question: str, *, deadline: Deadline) -> str:
+    def query(self, question: str, *, deadline: Deadline) -> str:
         """The value of the answer to a query of the profile; repeated if the answer is lost.
 
         Raises

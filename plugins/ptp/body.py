@@ -52,7 +52,7 @@ class Channel:
     def has(self, operation: int) -> bool:
         return operation in self._operations
 
-    def ask(
+    def request(
         self,
         operation: int,
         *parameters: int,
@@ -112,7 +112,8 @@ class Channel:
 
     def handles(self, deadline: Deadline) -> frozenset[int]:
         """Every object on every card."""
-        reply = self.ask(Operation.GET_OBJECT_HANDLES, _EVERY_STORE, 0, 0, doing="list its pictures", deadline=deadline)
+        listing = (Operation.GET_OBJECT_HANDLES, _EVERY_STORE, 0, 0)
+        reply = self.request(*listing, doing="list its pictures", deadline=deadline)
         return frozenset(parse_handles(reply.data))
 
     def battery_percent(self, deadline: Deadline) -> int | None:
@@ -161,7 +162,7 @@ class Channel:
         if not 0 < picture.size <= LARGEST_PICTURE:
             raise broken(f"a picture of {picture.size} bytes")
         if partly is None:
-            self.ask(
+            self.request(
                 Operation.GET_OBJECT,
                 picture.handle,
                 doing="send a picture",
@@ -172,7 +173,7 @@ class Channel:
             )
         while partly is not None and file.size < picture.size:
             start, count = file.size, min(block, picture.size - file.size)
-            self.ask(
+            self.request(
                 partly,
                 picture.handle,
                 start,

@@ -38,4 +38,4 @@ def choose_body(channel: Channel, info: DeviceInfo, *, to_card: bool, keep_on_ca
 
 def device_info(channel: Channel, deadline: Deadline) -> DeviceInfo:
     """The camera's identity and capabilities."""
-    return DeviceInfo.parse(channel.ask(Operation.GET_DEVICE_INFO, doing="identify itself", deadline=deadline).data)
+    return DeviceInfo.parse(channel.request(Operation.GET_DEVICE_INFO, doing="identify itself", deadline=deadline).data)

@@ -13,15 +13,21 @@ from hal.transcript import Transcript
 from plugins.ptp.ip.link import PtpIpLink
 from plugins.ptp.ip.wire import PtpIpAddress
 from plugins.ptp.recording import TRACK, RecordedLink
+from plugins.ptp.shot import Timing
 from plugins.ptp.still import Connect, PtpCamera
 
+LONGEST_PICTURE_S: Final = 600.0
 
-def _settings(settings: Mapping[str, Any]) -> tuple[str, bool, bool, bool]:
-    """Address, whether pictures go to the card first, whether they stay there, RAW and JPEG. Raises PluginError."""
+
+def _settings(settings: Mapping[str, Any]) -> tuple[str, bool, bool, bool, Timing]:
+    """Address, whether pictures go to the card first, whether they stay there, RAW and JPEG, and time limits.
+
+    Raises PluginError.
+    """
     address = str(settings["address"])
     _way(address, None)
     to_card = _choice(settings, "target", "computer", "card") == "card"
-    return address, to_card, _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg")
+    return address, to_card, _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg"), _timing(settings)
 
 
 def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
@@ -31,7 +37,7 @@ def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
 
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
     """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
-    address, to_card, keep_on_card, both = _settings(settings)  # a wrong address leaves no file
+    address, to_card, keep_on_card, both, timing = _settings(settings)  # a wrong address leaves no file
     transcript = context.transcript(TRACK, _named(address), keep=1000)
     connect = _way(address, None if context.tape is not None else transcript)
     if context.tape is not None and transcript is not None:
@@ -42,6 +48,7 @@ def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Dea
         to_card=to_card,
         keep_on_card=keep_on_card,
         both=both,
+        timing=timing,
         transcript=transcript,
         deadline=deadline,
     )
@@ -84,6 +91,15 @@ def _flag(settings: Mapping[str, Any], key: str) -> bool:
     return value
 
 
+def _timing(settings: Mapping[str, Any]) -> Timing:
+    if "picture_s" not in settings:
+        return Timing()
+    value = settings["picture_s"]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= LONGEST_PICTURE_S:
+        raise _wrong_setting("picture_s", value, f"a number of seconds from 1 to {LONGEST_PICTURE_S:g}")
+    return Timing(margin_s=float(value))
+
+
 def _wrong_setting(key: str, value: object, allowed: str) -> PluginError:
     return PluginError(
         "camera-setting",
@@ -102,6 +118,7 @@ DRIVER: Final = Driver(
         "serial": "serial number that the camera must have (default: any)",
         "target": '"computer" (default) or "card": where a Canon EOS stores its pictures first',
         "raw_and_jpeg": "true to get a JPEG with each RAW file, if the camera can (default false; not Sony)",
+        "picture_s": "seconds that a picture may take beyond twice its exposure (default 15): more for large files",
         "keep_on_card": "true to keep pictures on the card after the transfer (default false)",
     },
     required=("address",),

@@ -204,14 +204,14 @@ class GenericBody:
 
     def _describe(self, code: int, deadline: Deadline) -> PropertyDescription:
         doing = f"describe its setting 0x{code:04x}"
-        reply = self._channel.ask(Operation.GET_PROPERTY_DESCRIPTION, code, doing=doing, deadline=deadline)
+        reply = self._channel.request(Operation.GET_PROPERTY_DESCRIPTION, code, doing=doing, deadline=deadline)
         description = PropertyDescription.parse(reply.data)
         if description.code != code or not isinstance(description.current, int):
             raise broken(f"a description of setting 0x{description.code:04x} instead of 0x{code:04x}")
         return description
 
     def _set(self, description: PropertyDescription, value: int, deadline: Deadline) -> None:
-        self._channel.ask(
+        self._channel.request(
             Operation.SET_PROPERTY,
             description.code,
             data=pack_value(description.data_type, value),
@@ -221,7 +221,7 @@ class GenericBody:
 
     def _read(self, description: PropertyDescription, deadline: Deadline) -> int:
         doing = f"read its setting 0x{description.code:04x}"
-        reply = self._channel.ask(Operation.GET_PROPERTY, description.code, doing=doing, deadline=deadline)
+        reply = self._channel.request(Operation.GET_PROPERTY, description.code, doing=doing, deadline=deadline)
         value = parse_value(reply.data, description.data_type)
         if not isinstance(value, int):
             raise broken(f"a setting 0x{description.code:04x} that is not a number")

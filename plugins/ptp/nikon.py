@@ -97,7 +97,7 @@ class NikonBody(GenericBody):
         if not self.capabilities.live_view:
             raise no_live_view()
         if not self._viewing:
-            self._channel.ask(Operation.NIKON_START_VIEW, doing="start live view", deadline=deadline)
+            self._channel.request(Operation.NIKON_START_VIEW, doing="start live view", deadline=deadline)
             self._viewing = True
         until = deadline.within(self._channel.timing.busy_s)
         while True:
@@ -116,7 +116,7 @@ class NikonBody(GenericBody):
 
     def end_live_view(self, *, deadline: Deadline) -> None:
         if self._viewing:
-            self._channel.ask(Operation.NIKON_END_VIEW, doing="end live view", deadline=deadline)
+            self._channel.request(Operation.NIKON_END_VIEW, doing="end live view", deadline=deadline)
             self._viewing = False
 
     def leave(self, *, deadline: Deadline) -> None:

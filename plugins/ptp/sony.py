@@ -139,10 +139,10 @@ class SonyBody:
         self._let_go(deadline)
 
     def _connect(self, phase: int, deadline: Deadline) -> None:
-        self._channel.ask(Operation.SONY_CONNECT, phase, 0, 0, doing="accept remote control", deadline=deadline)
+        self._channel.request(Operation.SONY_CONNECT, phase, 0, 0, doing="accept remote control", deadline=deadline)
 
     def _refresh(self, deadline: Deadline) -> None:
-        reply = self._channel.ask(Operation.SONY_GET_ALL_PROPERTIES, doing="report its settings", deadline=deadline)
+        reply = self._channel.request(Operation.SONY_GET_ALL_PROPERTIES, doing="report its settings", deadline=deadline)
         self._known = sony.parse_properties(reply.data)
 
     def _waiting(self, deadline: Deadline) -> bool:
@@ -151,7 +151,7 @@ class SonyBody:
         return bool(self._number(SonyProperty.OBJECT_IN_MEMORY) & sony.IN_MEMORY)
 
     def _picture(self, deadline: Deadline) -> Picture | None:
-        reply = self._channel.ask(
+        reply = self._channel.request(
             Operation.GET_OBJECT_INFO, sony.MEMORY_HANDLE, doing="describe its picture", deadline=deadline
         )
         info = ObjectInfo.parse(reply.data)
@@ -165,7 +165,7 @@ class SonyBody:
             if not self._waiting(deadline):
                 return
             self._picture(deadline)
-            self._channel.ask(
+            self._channel.request(
                 Operation.GET_OBJECT, sony.MEMORY_HANDLE, doing="forget an old picture", sink=len, most=1 << 30,
                 patience_s=deadline.left_s(), deadline=deadline,
             )  # fmt: skip
@@ -196,7 +196,8 @@ class SonyBody:
         if self._number(code) == value:
             return
         data = pack_value(self._known[code].data_type, value)
-        self._channel.ask(Operation.SONY_SET_PROPERTY, code, data=data, doing=f"set 0x{code:04x}", deadline=deadline)
+        doing = f"set 0x{code:04x}"
+        self._channel.request(Operation.SONY_SET_PROPERTY, code, data=data, doing=doing, deadline=deadline)
         until = deadline.within(self._channel.timing.confirm_s)
         while self._number(code) != value:
             if until.passed:

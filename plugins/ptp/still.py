@@ -6,6 +6,7 @@ import contextlib
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
@@ -74,7 +75,7 @@ class PtpCamera:
         self._diary = Diary(transcript)
         self._lock = threading.RLock()
         self._leaving = threading.Event()
-        self._capabilities = self._open(deadline).capabilities
+        self._capabilities = replace(self._open(deadline).capabilities, picture_s=self._timing.margin_s)
         threading.Thread(target=self._stay_awake, name="ptp-keep-alive", daemon=True).start()
 
     @property
@@ -82,11 +83,11 @@ class PtpCamera:
         return self._capabilities
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        def ask(body: Body) -> DeviceInfo:
+        def query(body: Body) -> DeviceInfo:
             assert self._channel is not None
             return device_info(self._channel, deadline)
 
-        info = self._with_body(ask, deadline)
+        info = self._with_body(query, deadline)
         return DeviceIdentity(info.manufacturer, info.model, info.serial, info.version)
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:

@@ -56,7 +56,7 @@ class EosBody:
 
     def prepare(self, *, deadline: Deadline) -> None:
         for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
-            self._channel.ask(operation, 1, doing="accept remote control", deadline=deadline)
+            self._channel.request(operation, 1, doing="accept remote control", deadline=deadline)
         # Also at the first connection: a program that was killed may have left both as they were.
         self._shutter.close()
         self._shutter.let_go()
@@ -228,7 +228,7 @@ class EosBody:
     def _tell_space(self, deadline: Deadline) -> None:
         """Some bodies refuse it and expose all the same; one that needs it refuses the release, with its reason."""
         try:
-            self._channel.ask(
+            self._channel.request(
                 Operation.EOS_HOST_CAPACITY,
                 *_HOST_SPACE,
                 doing="accept this computer's free space",
@@ -250,7 +250,7 @@ class EosBody:
     def _look_again(self, shot: Shot, deadline: Deadline) -> None:
         """A record may have been lost: list the card, or let the body report everything again."""
         if not self._to_card:
-            self._channel.ask(Operation.EOS_SET_EVENT_MODE, 1, doing="report everything", deadline=deadline)
+            self._channel.request(Operation.EOS_SET_EVENT_MODE, 1, doing="report everything", deadline=deadline)
             self._talk.drain(deadline)
             self._take_in(shot)
         for handle in sorted(self._channel.handles(deadline) - shot.known - shot.found.keys()):

@@ -27,7 +27,7 @@ class EosTalk:
     def drain(self, deadline: Deadline) -> None:
         """Read records until an answer has none."""
         for _ in range(_MOST_DRAINS):
-            reply = self.channel.ask(Operation.EOS_GET_EVENT, doing="report its changes", deadline=deadline)
+            reply = self.channel.request(Operation.EOS_GET_EVENT, doing="report its changes", deadline=deadline)
             records = parse_records(reply.data)
             self.state.take(records)
             if self.state.falls_asleep:
@@ -54,7 +54,7 @@ class EosTalk:
         if not again and self.state.is_set(code, wanted):
             return self.state.number(code)
         self.state.forget(code)
-        self.channel.ask(
+        self.channel.request(
             Operation.EOS_SET_PROPERTY,
             data=pack_setting(code, value),
             doing=f"set 0x{code:04x}",
@@ -84,7 +84,7 @@ class EosTalk:
             return True
         if deadline.passed:
             return False
-        self.channel.ask(Operation.EOS_SET_EVENT_MODE, 1, doing="report everything", deadline=deadline)
+        self.channel.request(Operation.EOS_SET_EVENT_MODE, 1, doing="report everything", deadline=deadline)
         return self._await_value(code, deadline.within(self.channel.timing.confirm_s))
 
     def _await_value(self, code: EosProperty, until: Deadline) -> bool:

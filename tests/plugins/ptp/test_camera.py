@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
@@ -17,10 +18,11 @@ from hal.errors import (
 from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
+from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
 from plugins.ptp.camera import DRIVER, open_camera
 from plugins.ptp.ip.wire import PtpIpAddress
 from plugins.ptp.still import PtpCamera
-from tests.plugins.ptp.ptp_rig import Rig, Studio, card_rig, left_behind, rig, running
+from tests.plugins.ptp.ptp_rig import SHORT, Rig, Studio, card_rig, left_behind, rig, running
 
 __all__ = ["card_rig", "rig"]
 
@@ -130,11 +132,46 @@ def test_addresses_may_leave_out_the_ports(text: str, expected: PtpIpAddress) ->
     assert PtpIpAddress.parse(text) == expected
 
 
-@pytest.mark.parametrize("settings", [{"target": "moon"}, {"keep_on_card": "yes"}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"target": "moon"},
+        {"keep_on_card": "yes"},
+        {"picture_s": 0},
+        {"picture_s": 601},
+        {"picture_s": "20"},
+        {"picture_s": True},
+    ],
+)
 def test_a_wrong_setting_is_refused_by_its_key(settings: dict[str, object]) -> None:
     with pytest.raises(PluginError) as caught:
         open_camera({"address": "ptpip:127.0.0.1:1", **settings}, OpenContext(Path()), in_seconds(20))
     assert next(iter(settings)) in caught.value.what
+
+
+class SlowStudio(Studio):
+    """A camera that works on a picture for a while."""
+
+    def expose(self, settings: ShotSettings) -> ShotFiles:
+        time.sleep(1.5)
+        return super().expose(settings)
+
+
+@pytest.mark.parametrize("flavour", ["generic", "eos-new", "sony"])
+def test_a_camera_that_works_long_on_a_picture_gets_the_time_that_it_is_given(flavour: Flavour, tmp_path: Path) -> None:
+    with EmulatedPtpCamera(SlowStudio().expose, flavour=flavour, time_scale=0.0) as emulator:
+        for picture_s, code in ((1, "camera-no-picture"), (30, "")):
+            settings = {"address": emulator.address, "picture_s": picture_s}
+            camera = open_camera(settings, OpenContext(tmp_path), in_seconds(20))
+            camera.configure(SHORT, deadline=in_seconds(20))
+            assert camera.capabilities.picture_s == picture_s
+            if not code:
+                assert camera.capture(tmp_path / "shot", deadline=in_seconds(60))
+            else:
+                with pytest.raises(DeviceError) as caught:
+                    camera.capture(tmp_path / "late", deadline=in_seconds(60))
+                assert caught.value.code == code
+            camera.close()
 
 
 def test_the_driver_explains_every_setting_and_ignores_what_is_not_its_own() -> None:
