@@ -27,6 +27,7 @@ except ModuleNotFoundError as missing:  # an installation with only the player
     sys.exit(run_without_commands(sys.argv[1:], missing.name))
 
 from controller.cli import console, derived
+from controller.cli.benchmark_command import benchmark
 from controller.cli.commands import accounts as account_commands
 from controller.cli.commands import bundle as bundle_commands
 from controller.cli.commands import camera as camera_commands
@@ -89,12 +90,18 @@ def demo(
     """Run a complete job on an emulated stage, from cold lamps to the report."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.demo.stage import DEFAULT_ROOM, prepare
+
+        stage = prepare(out.resolve(), size=size, object_file=object, seed=seed, room=room or DEFAULT_ROOM)
+        if prepare_only:
+            from controller.stage.check import check_stage
+
+            check_stage(stage)
+            return {"stage": str(stage)}
+        # Only now: all that the job uses takes seconds to import.
         from controller.demo.job import demo
 
-        return demo(
-            size=size, object_file=object, out=out, seed=seed, room=room, prepare_only=prepare_only,
-            reporter=reporter, cancel=cancel,
-        )  # fmt: skip
+        return demo(stage, reporter=reporter, cancel=cancel)
 
     work(do, as_json=as_json)
 
@@ -161,7 +168,7 @@ def calibrate(
             reporter=reporter, cancel=cancel,
         )  # fmt: skip
 
-    work(do, as_json=as_json)
+    work(do, as_json=as_json, stage=stage)
 
 
 def appearance(
@@ -198,7 +205,7 @@ def appearance(
             refinement=refinement_of(stage, refine, quick=quick), reporter=reporter, cancel=cancel,
         )  # fmt: skip
 
-    work(do, as_json=as_json)
+    work(do, as_json=as_json, stage=stage)
 
 
 def play(
@@ -223,7 +230,7 @@ def play(
             fade_s=fade, repeat=repeat, reporter=reporter, cancel=cancel,
         )  # fmt: skip
 
-    work(do, as_json=as_json)
+    work(do, as_json=as_json, stage=stage)
 
 
 COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
@@ -242,6 +249,7 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     plan,
     report,
     study,
+    benchmark,
     simulate,
     states,
     *serve_commands.COMMANDS,
@@ -292,7 +300,7 @@ def _told(error: BaseException, *, as_json: bool) -> int:
     """Show ``error`` as two sentences and return the exit code. If output was lost, show that instead."""
     if isinstance(error, typer.Exit):
         return error.exit_code
-    if isinstance(error, OSError) and console.output_lost():
+    if isinstance(error, OSError) and console.output_lost(error):
         return FAILED
     try:
         shown = _explained(error)

@@ -5,6 +5,7 @@ The index holds the SHA-256 of every stripe, so what is signed fixes every pixel
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import struct
@@ -79,8 +80,12 @@ def generate_key(path: Path) -> bytes:
 
 
 def write_public_key(path: Path, public: bytes) -> None:
-    """Write the 32 bytes of a public key as a key file."""
-    write_atomically(path, f"{_PUBLIC_PREFIX}{public.hex()}\n".encode())
+    """Write the 32 bytes of a public key as a key file, unless it is one already: a full disk stops nothing then."""
+    text = f"{_PUBLIC_PREFIX}{public.hex()}\n".encode()
+    with contextlib.suppress(OSError):
+        if path.read_bytes() == text:
+            return
+    write_atomically(path, text)
 
 
 def load_signing_key(path: Path) -> SigningKey:

@@ -14,7 +14,7 @@ from hal.errors import DeviceError
 from hal.interfaces import Camera, Display
 from hal.values import CapturedFile, ExposureSettings, FileKind
 
-TRANSFER_MARGIN_S = 20.0
+STORE_MARGIN_S = 5.0
 """Longest time that a camera may need beyond the exposure itself: mirror, write-out and transfer."""
 
 DISK_CODES = ("no-space", "cannot-write")
@@ -108,7 +108,7 @@ class Acquirer:
         confirmed = self._set(exposure_s, deadline)
         waited_s = self.wait_s if wait_s is None else wait_s
         deadline.sleep(max(0.0, shown_at_s + waited_s - time.monotonic()))
-        bound = deadline.within(2 * confirmed.exposure_s + TRANSFER_MARGIN_S)
+        bound = deadline.within(2 * confirmed.exposure_s + self._camera.capabilities.picture_s + STORE_MARGIN_S)
         try:
             files = self._camera.capture(folder / name, deadline=bound)
         except DeviceError as error:

@@ -15,7 +15,6 @@ from controller.artefacts.kinds import StepKind, of_projectors
 from controller.artefacts.published import Dimmed, write_photograph
 from controller.artefacts.solved import read_solved
 from controller.core.arrays import FloatImage
-from controller.demo.stage import DEFAULT_ROOM, prepare
 from controller.report.demo import write_demo_report
 from controller.rig.rig import Rig
 from controller.run.progress import Reporter
@@ -45,30 +44,18 @@ from controller.steps.calibrate.grade import gate_step
 PLAYBACK_S = 4.0
 
 
-def demo(
-    *,
-    size: str,
-    object_file: Path | None,
-    out: Path,
-    seed: int,
-    room: str | None = None,
-    prepare_only: bool,
-    reporter: Reporter,
-    cancel: threading.Event,
-) -> Mapping[str, Any]:
-    """Run the complete job in ``out``, or continue an unfinished demo; return the paths of stage and report.
+def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+    """Run the complete job on a stage of ``demo.stage.prepare``, or continue an unfinished one.
 
-    Raises what ``demo.stage.prepare``, the configuration, the devices and the steps raise; the lamps are safe by then.
+    Returns the paths of the stage and of the report beside it. Raises what the configuration, the devices and the
+    steps raise; the lamps are safe by then.
     """
-    stage = prepare(out.resolve(), size=size, object_file=object_file, seed=seed, room=room or DEFAULT_ROOM)
-    checked = check_stage(stage)
-    if prepare_only:
-        return {"stage": str(stage)}
+    checked, out = check_stage(stage), stage.parent
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
     session = OwnSession(stage, around=bench)
     run = session.run(checked, partial(demo_steps, checked=checked), name="demo", reporter=reporter, cancel=cancel)
     reporter.say("Writing the report.")
-    html, machine = write_demo_report(out.resolve(), run, checked)
+    html, machine = write_demo_report(out, run, checked)
     return {"report": str(html), "figures": str(machine), "stage": str(stage)}
 
 

@@ -81,11 +81,11 @@ class Service:
         attach = partial(AttachedPlayer, kiosk_places.PLAYER_SOCKET, kiosk_places.PLAYER_OPTIONS)
         installed = kiosk_places.is_installed(stage.folder)
         self.player = PlayerSupervisor(
-            self.runtime, self._settings, log.tell, monotonic=world.monotonic, attach=attach if installed else None,
+            self.runtime, self._settings, log.add, monotonic=world.monotonic, attach=attach if installed else None,
             launch=world.launch, channel=world.channel(),
         )  # fmt: skip
         self.alive: Callable[[], None] = lambda: None
-        self.bundle_watch = BundleWatch(self.bundles, log.tell)
+        self.bundle_watch = BundleWatch(self.bundles, log.add)
         self.devices = Devices(checked, self.runtime, self._tell, world)
         self.devices.scene = self._scene
         self.lamp_history = LampHistory(stage.folder, monotonic=world.monotonic)
@@ -127,12 +127,12 @@ class Service:
 
     def start(self) -> None:
         """Start; the player first, so that it shows pictures before any device has answered."""
-        self.log.tell(beginning(self.log))
+        self.log.add(beginning(self.log))
         if self.schedule.problem is not None:
             problem = self.schedule.problem
-            self.log.tell(Decision(problem.code, problem.what, problem.remedy, "error"))
+            self.log.add(Decision(problem.code, problem.what, problem.remedy, "error"))
         if self.problem is not None:
-            self.log.tell(self.problem)
+            self.log.add(self.problem)
         self.reconciler.step()
         self._thread("player", self.player.step, STEP_S)
         self._thread("bundles", self.bundle_watch.step, LOOK_S)
@@ -157,7 +157,7 @@ class Service:
             except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
                 # The watchdog is not fed, so systemd restarts the service if the error persists.
                 what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
-                self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
+                self.log.add(Decision("crash", what, "Export the diagnostics.", "error"))
                 cancel.wait(AFTER_CRASH_S)
                 continue
             self.alive()
@@ -190,7 +190,7 @@ class Service:
         self.lamp_history.note(self.lamps, self._world.today(), now=True)
         self.player.close()
         self.devices.close()
-        self.log.tell(Decision("service-ended", "The kiosk has stopped."))
+        self.log.add(Decision("service-ended", "The kiosk has stopped."))
 
     def use(self, checked: Checked) -> None:
         """Use settings that differ only in what no device depends on (``settings_change``)."""
@@ -206,8 +206,8 @@ class Service:
         """What the kiosk consists of now; ``run``: what graded well before. Seconds."""
         return self._world.inventory(self.stage, self.checked.stage.tables, self.devices.facts(), run)
 
-    def ask(self, *requests: Request) -> None:
-        self.reconciler.ask(*requests)
+    def submit(self, *requests: Request) -> None:
+        self.reconciler.submit(*requests)
 
     # -- inside
 
@@ -216,7 +216,7 @@ class Service:
         if decision.code == DISK_FULL:
             self.disk.suspect(decision)
         else:
-            self.log.tell(decision)
+            self.log.add(decision)
 
     def _settings(self, with_bundle: bool) -> PlayerSettings:
         return player_settings(self.checked.stage, self.runtime, plays=with_bundle)
@@ -261,7 +261,7 @@ class Service:
             self._world.sleep(0.1)
         names = [projector.name for projector in projectors if projector.view.maybe_lit]
         if names:
-            self.log.tell(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
+            self.log.add(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
                                    "Switch it off with its remote control.", "error"))  # fmt: skip
 
     def _thread(self, name: str, step: Callable[[], None], every_s: float, *, first_s: float = 0.0) -> None:
@@ -272,7 +272,7 @@ class Service:
                     step()
                 except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
                     what = f"{name} met an unexpected error ({type(error).__name__}: {error})."
-                    self.log.tell(Decision("crash", what, "Export the diagnostics.", "error"))
+                    self.log.add(Decision("crash", what, "Export the diagnostics.", "error"))
                     self._stop.wait(AFTER_CRASH_S)
                 self._stop.wait(every_s)
 
@@ -292,12 +292,12 @@ class Service:
                 yield panel
 
         presses = (self.reconciler.open, self.reconciler.shut, self._recalibrate)
-        return KeysSupervisor(table.driver, opened, presses, lambda: self.reconciler.machine.state, self.log.tell)
+        return KeysSupervisor(table.driver, opened, presses, lambda: self.reconciler.machine.state, self.log.add)
 
     def _recalibrate(self) -> None:
         # The log has the refusal; a key can't show it.
         with contextlib.suppress(WorkError):
-            self.reconciler.ask(Request("quick", light=True))
+            self.reconciler.submit(Request("quick", light=True))
 
 
 def _usable(stage: Path, world: World) -> tuple[Checked, Decision | None]:

@@ -63,7 +63,7 @@ async def run(panel: Panel, operation: Operation, values: Values, who: str) -> A
         files = {name: panel.targets.path(values[name]) for name in targets}
         return operation.of(panel.holders[operation.holder], values | files)
 
-    return await panel.ask(do)
+    return await panel.in_thread(do)
 
 
 def response(operation: Operation, answer: Any, values: Values) -> Response:

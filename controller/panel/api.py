@@ -194,7 +194,7 @@ def _metrics(panel: Panel) -> Endpoint:
     registry.register(KioskFigures(panel))
 
     async def answer(_: Request, __: Visitor) -> Response:
-        text = await panel.ask(lambda: generate_latest(registry))
+        text = await panel.in_thread(lambda: generate_latest(registry))
         return Response(text, media_type=CONTENT_TYPE_PLAIN_1_0_0)
 
     return answer

@@ -81,6 +81,6 @@ class Panel:
         accounts = AccountActions(lambda: self.accounts, self.sessions.end_all, self.costly)
         return {"kiosk": self.kiosk, "accounts": accounts, "targets": self.targets}
 
-    async def ask(self, question: Callable[[], T]) -> T:
+    async def in_thread(self, question: Callable[[], T]) -> T:
         """Call ``question`` in a thread, because the kiosk is not asynchronous."""
         return await anyio.to_thread.run_sync(question, limiter=self.working)

@@ -183,6 +183,11 @@ class Journal:
         """Number of photographs in the journal."""
         return int(self._read("SELECT COUNT(*) FROM shots")[0][0])
 
+    def shot_counts(self) -> dict[tuple[str, str], int]:
+        """Number of photographs by kind and projector ("" where they are of none alone)."""
+        rows = self._read("SELECT kind, projector, COUNT(*) FROM shots GROUP BY kind, projector")
+        return {(str(kind), str(projector or "")): int(count) for kind, projector, count in rows}
+
     # -- events
 
     def record(self, code: str, text: str, level: Level = Level.INFO) -> None:

@@ -23,6 +23,7 @@ from controller.run.runner import Runner, Step
 from controller.run.state_machine import Event
 from controller.services.refine import Refinement, refine
 from controller.stage.calibrations import (
+    KEY_FILE,
     finished_calibration,
     finished_calibrations,
     output_sizes,
@@ -50,9 +51,6 @@ from controller.steps.calibrate.grade import (
 )
 from controller.steps.capture.device_checks import device_checks
 from hal.deadline import in_seconds
-
-KEY_FILE = "keys/stage.key"
-"""The stage's signing key, if it exists."""
 
 
 def calibrate(

@@ -41,7 +41,7 @@ class Living(Protocol):
 
     def restart(self, *, lit: bool) -> None: ...
 
-    def ask(self, item: Item) -> None: ...
+    def command(self, item: Item) -> None: ...
 
 
 PLAYER_S: Final = 120.0
@@ -310,7 +310,7 @@ def _bundle_damaged(life: Living, item: Item) -> None:
 
 
 def _command(life: Living, item: Item) -> None:
-    life.ask(item)
+    life.command(item)
 
 
 _DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {

@@ -257,7 +257,7 @@ class Life:
 
     # -- people
 
-    def ask(self, item: Item) -> None:
+    def command(self, item: Item) -> None:
         """A person's command, in a thread of the service, as the panel's."""
         kiosk, program = self.kiosk, self.program
         if kiosk is None or program is None:

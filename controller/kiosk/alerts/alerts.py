@@ -50,12 +50,12 @@ class Channel:
             self._send(stage, name, table, rows[-MOST_EVENTS:])
         except WorkError as error:
             if not self._failed:
-                self._log.tell(Decision(error.code, error.what, error.remedy, "warning"))
+                self._log.add(Decision(error.code, error.what, error.remedy, "warning"))
             self._next_s = self._monotonic() + AGAIN_S[min(self._failed, len(AGAIN_S) - 1)]
             self._failed += 1
             return
         if self._failed:
-            self._log.tell(Decision("alert-sent", "Alerts are sent again."))
+            self._log.add(Decision("alert-sent", "Alerts are sent again."))
         self._failed, self._due_s = 0, None
         self._next_s = self._monotonic() + PAUSE_S
         self._sent(rows[-1].number)

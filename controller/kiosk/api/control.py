@@ -105,8 +105,13 @@ class ControlServer:
 
 
 def _user_of(channel: socket.socket) -> str:
-    """The name of the user whose program is at the other end, or the number of one without a name."""
+    """The user whose program is at the other end, as ``user_name`` says it."""
     _, uid, _ = struct.unpack("3i", channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    return user_name(uid)
+
+
+def user_name(uid: int) -> str:
+    """The name of a user, or the number of one without a name."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -137,7 +142,7 @@ def is_running(stage: Path) -> bool:
     return False
 
 
-def ask(stage: Path, op: str, *, timeout_s: float = 30.0, **arguments: Any) -> Any:
+def call_kiosk(stage: Path, op: str, *, timeout_s: float = 30.0, **arguments: Any) -> Any:
     """Send a request to the running kiosk of ``stage`` and return its result.
 
     Raises UsageError("not-serving") if none runs, and VelaturaError with the kiosk's own code and sentences.

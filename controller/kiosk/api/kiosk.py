@@ -100,7 +100,7 @@ class StageKiosk(FolderKiosk):
                 self._last = replace(self._last, revision=starts * _REVISIONS)
                 service.changed = self._refresh
                 while self._unlogged:
-                    service.log.tell(self._unlogged.popleft())
+                    service.log.add(self._unlogged.popleft())
                 self._show_notice()
         self._notify()
 
@@ -166,7 +166,7 @@ class StageKiosk(FolderKiosk):
         decision = Decision(code, what, "", level)
         with self._lock:
             if self._service is not None:
-                self._service.log.tell(decision)
+                self._service.log.add(decision)
             else:
                 self._unlogged.append(decision)
 
@@ -209,7 +209,7 @@ class StageKiosk(FolderKiosk):
     def _begun(self, service: Service, asked: Request, name: str) -> Job:
         # Before it is queued, because it may start at once.
         number = service.jobs.reserve()
-        service.ask(replace(asked, number=number))
+        service.submit(replace(asked, number=number))
         return Job(number, name)
 
     def job(self, number: int) -> Job | None:
@@ -301,7 +301,7 @@ class StageKiosk(FolderKiosk):
         with service.reconciler.idle():
             settings.remove_picture(self.stage, name)
             settings.forget_solved(self.stage, name)
-            service.ask(Request("publish"))
+            service.submit(Request("publish"))
 
     def lamp_history(self) -> Sequence[LampDay]:
         return () if self._service is None else self._service.lamp_history.days()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Final
 from controller.config import load_stage
 from controller.core.errors import UsageError
 from controller.core.text import printable
-from controller.kiosk.api.control import ask, is_running, plain
+from controller.kiosk.api.control import call_kiosk, is_running, plain, user_name
 from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.decide.days import expanded
 from controller.kiosk.decide.hours import check_schedule
@@ -20,6 +21,7 @@ from controller.kiosk.operations.accounts import AccountActions
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
 from controller.kiosk.store.bundle_store import BundleStore
+from controller.kiosk.store.event_log import Decision, EventLog
 from controller.stage.calibrations import stage_trust
 from controller.stage.run import stage_lock
 
@@ -30,15 +32,24 @@ LONG_S: Final = 600.0
 def call(stage: Path, op: str, **arguments: Any) -> Any:
     """Ask the running kiosk, or do it here. Raises UsageError("not-serving") for operations that need a running one."""
     if is_running(stage):
-        return ask(stage, op, timeout_s=LONG_S, **arguments)
+        return call_kiosk(stage, op, timeout_s=LONG_S, **arguments)
     folder = load_stage(stage).folder
     operation = offline_operation(op)
     if operation is None:
         raise UsageError("not-serving", what="No kiosk runs on this stage.", remedy="Start it with `velatura serve`.")
     values = local_values(operation, arguments)
-    # A starting kiosk reads these files before it answers, and would miss a change.
-    with contextlib.nullcontext() if operation.effect is Effect.LOOKS else stage_lock(folder):
+    if operation.effect is Effect.LOOKS:
         return plain(operation.of(_holder(operation, folder), values))
+    # A starting kiosk reads these files before it answers, and would miss a change.
+    with stage_lock(folder):
+        _record(folder, operation.done_by(f"User {user_name(os.getuid())}, while no kiosk ran", values))
+        return plain(operation.of(_holder(operation, folder), values))
+
+
+def _record(folder: Path, text: str) -> None:
+    """Add a line to the event log, as a running kiosk does before it changes something."""
+    with contextlib.closing(EventLog(folder / EventLog.FILE)) as log:
+        log.add(Decision("done-by", text))
 
 
 def _holder(operation: Operation, folder: Path) -> object:
@@ -53,7 +64,7 @@ def _holder(operation: Operation, folder: Path) -> object:
 def status_of(stage: Path) -> dict[str, Any]:
     """The running kiosk's state, or a state that says that none runs."""
     if is_running(stage):
-        return dict(ask(stage, "status"))
+        return dict(call_kiosk(stage, "status"))
     loaded = load_stage(stage)
     bundles = BundleStore(loaded.folder, stage_trust(loaded))
     reason = "No kiosk runs on this stage."

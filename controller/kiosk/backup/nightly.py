@@ -77,7 +77,7 @@ class NightlyBackup:
                     self._fail(key, place, error)
                     continue
                 self._log.mark_done(key, "made")
-                self._log.tell(told)
+                self._log.add(told)
         finally:
             source.unlink()
 
@@ -96,7 +96,7 @@ class NightlyBackup:
         try:
             for place in found:
                 try:
-                    self._log.tell(place.store(source, day, table.keep))
+                    self._log.add(place.store(source, day, table.keep))
                 except OSError as error:
                     raise _explained(error) from error
         finally:
@@ -108,7 +108,7 @@ class NightlyBackup:
             # Once a day for each place: it is tried again many times.
             self._failed_keys.add(key)
             said = _explained(error) if isinstance(error, OSError) else error
-            self._log.tell_failure(Decision("backup-failed", f"No backup was made. {said.what}", said.remedy, "error"))
+            self._log.add_failure(Decision("backup-failed", f"No backup was made. {said.what}", said.remedy, "error"))
 
 
 def _key(place: Place, day: str) -> str:

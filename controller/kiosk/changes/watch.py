@@ -104,9 +104,7 @@ class InventoryWatch:
         inventory.keep_good(self._stage, taken)
         found = () if before is None else compare.changes(before, taken)
         more = f" It differs in {len(found)} points from the good day before." if found else ""
-        self._log.tell(
-            Decision("inventory-taken", f"What the kiosk consists of was recorded after a good grade.{more}")
-        )
+        self._log.add(Decision("inventory-taken", f"What the kiosk consists of was recorded after a good grade.{more}"))
 
     def _complete(self, good: Inventory) -> None:
         """Add what could not be read on the good day: many projectors tell their settings only while lit."""
@@ -131,4 +129,4 @@ class InventoryWatch:
             text = " ".join(one.sentence for one in told[:MOST_TOLD])
             more = f" And {len(told) - MOST_TOLD} more." if len(told) > MOST_TOLD else ""
             remedy = "See `velatura changes`, or the page Changes in the panel."
-            self._log.tell(Decision("stage-changed", f"Since the last good day: {text}{more}", remedy, "warning"))
+            self._log.add(Decision("stage-changed", f"Since the last good day: {text}{more}", remedy, "warning"))

@@ -55,7 +55,7 @@ class TrustedClock:
         self._check_jump(wall_s - self._monotonic())
         now_s = believed(wall_s, self._latest, synchronised=self._synchronised())
         if (now_s is not None) is not self._known and (self._known is not None or now_s is None):
-            self._log.tell(_LOST if now_s is None else _FOUND)
+            self._log.add(_LOST if now_s is None else _FOUND)
         self._known = now_s is not None
         if now_s is not None and self._proven(now_s):
             self._latest = now_s
@@ -76,7 +76,7 @@ class TrustedClock:
     def _check_jump(self, offset_s: float) -> None:
         before_s, self._offset_s = self._offset_s, offset_s
         if before_s is not None and abs(offset_s - before_s) > _SET_S:
-            self._log.tell(_set(offset_s - before_s))
+            self._log.add(_set(offset_s - before_s))
 
     def _proven(self, now_s: float) -> bool:
         if self._latest is None or now_s - self._latest <= DOUBT_S or self._synchronised():

@@ -29,7 +29,7 @@ class ContentSelector:
         """Whether the stage is ``wanted`` open and has a bundle to play; a missing bundle is logged once."""
         installed = self._bundles.bundle() is not None
         if wanted and not installed and not self._empty:
-            self._log.tell(_EMPTY)
+            self._log.add(_EMPTY)
         self._empty = wanted and not installed
         return wanted and installed
 

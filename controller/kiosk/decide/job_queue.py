@@ -43,11 +43,11 @@ class JobQueue:
         """Whether the job of this number waits to start."""
         return any(request.number == number for request in self._queue)
 
-    def ask(self, *requests: Request) -> None:
+    def submit(self, *requests: Request) -> None:
         """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         self.check_idle()
         if (why := self._jobs.refusal(requests[0])) is not None:
-            self._log.tell(why)
+            self._log.add(why)
             raise WorkError(why.code, what=why.reason, remedy=why.remedy)
         self._queue.extend(requests)
 
@@ -77,7 +77,7 @@ class JobQueue:
         """Drop the waiting jobs and cancel the running one, with its follow-up jobs."""
         if self._queue:
             self._settle("cancelled")
-            self._log.tell(_CANCELLED)
+            self._log.add(_CANCELLED)
         if self._jobs.running is not None:
             self._cancelled = True
             self._jobs.cancel()
@@ -90,7 +90,7 @@ class JobQueue:
         self._tell(finished.outcome)
         if self._cancelled and finished.then:
             finished = replace(finished, then=())
-            self._log.tell(_CANCELLED)
+            self._log.add(_CANCELLED)
         self._cancelled = False
         key = finished.request.key
         if key and not any(request.key == key for request in finished.then):
@@ -102,7 +102,7 @@ class JobQueue:
         """Queue the tasks that are due, except while ``playing``, and record the expired ones."""
         for task in plan.expired:
             self._log.mark_done(task.key, "left out")
-            self._log.tell(_expired(task))
+            self._log.add(_expired(task))
         for task in plan.due:
             request = Request("drift", light=True, key=task.key)
             if playing or self.head is not None or self._holder is not None:
@@ -110,9 +110,9 @@ class JobQueue:
             if (why := self._jobs.refusal(request)) is not None:
                 self._log.mark_done(task.key, why.code)
                 reason = f"The {task.what} ({task.key}) is skipped. {why.reason}"
-                self._log.tell(replace(why, reason=reason, level="warning"))
+                self._log.add(replace(why, reason=reason, level="warning"))
             else:
-                self._log.tell(Decision("task-due", f"The {task.what} ({task.key}) is due."))
+                self._log.add(Decision("task-due", f"The {task.what} ({task.key}) is due."))
                 self._queue.append(request)
 
     def ready(self, views: Sequence[ProjectorView]) -> Request | None:
@@ -151,7 +151,7 @@ class JobQueue:
 
     def _tell(self, outcome: Decision) -> None:
         """Log it; a failure stays on the panel until an operator confirms it."""
-        (self._log.tell_failure if outcome.level == "error" else self._log.tell)(outcome)
+        (self._log.add_failure if outcome.level == "error" else self._log.add)(outcome)
 
     def _settle(self, how: str) -> None:
         for request in self._queue:

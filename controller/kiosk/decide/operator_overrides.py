@@ -47,7 +47,7 @@ class OperatorOverrides:
         """Open or closed until the next scheduled change."""
         self._set(Override(wanted, self._says(plan), plan.changes_s) if wanted is not self._says(plan) else None)
         action = "open" if wanted else "close"
-        self._log.tell(Decision("asked", f"An operator asked to {action} the stage."))
+        self._log.add(Decision("asked", f"An operator asked to {action} the stage."))
 
     def follow(self, plan: Plan) -> None:
         """Apply the newest plan of the schedule."""
@@ -66,7 +66,7 @@ class OperatorOverrides:
         slept = self._restored and now_s is not None and then_s is not None and now_s > then_s
         if override.said is not self._says(plan) or slept:
             self._set(None)
-            self._log.tell(Decision("schedule-rules", "The stage follows the schedule again."))
+            self._log.add(Decision("schedule-rules", "The stage follows the schedule again."))
         elif plan.open is not None:
             self._restored = False
             if plan.changes_s != override.until_s:
@@ -75,7 +75,7 @@ class OperatorOverrides:
     def choose(self, appearance: str, plan: Plan) -> None:
         self._choose(appearance)
         what = "all appearances in turn" if appearance == IN_TURN else f"the appearance {appearance}"
-        self._log.tell(Decision("asked", f"An operator chose {what}."))
+        self._log.add(Decision("asked", f"An operator chose {what}."))
 
     def appearance(self, plan: Plan, names: Sequence[str]) -> str:
         """The chosen one if the bundle has it, else the scheduled one, else ``IN_TURN``; empty if there is none."""

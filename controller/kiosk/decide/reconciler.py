@@ -187,10 +187,10 @@ class Reconciler:
         with self._lock:
             self._lit_until_s, self._lit_closed = self._monotonic() + seconds, closed_too
 
-    def ask(self, *requests: Request) -> None:
+    def submit(self, *requests: Request) -> None:
         """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         with self._lock:
-            self._queue.ask(*requests)
+            self._queue.submit(*requests)
 
     @contextlib.contextmanager
     def idle(self) -> Iterator[None]:
@@ -347,7 +347,7 @@ class Reconciler:
         remedy = "See the devices for what to do." if bad else ""
         text = f"The stage is {machine.state.value}" + (f": {machine.reason}" if machine.reason else "")
         level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
-        self._log.tell(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
+        self._log.add(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
 
     # -- the player
 

@@ -155,7 +155,7 @@ def _numbers(player: Path, say: Callable[[str], None]) -> Iterator[None]:
     """Numbers on the projectors meanwhile; a player that does not answer is no reason to stop."""
     channel = PlayerChannel()
     try:
-        channel.ask(player, {"op": "identify"}, ANSWER_S)
+        channel.request(player, {"op": "identify"}, ANSWER_S)
     except (OSError, ValueError, VelaturaError):
         say("The projectors can't show numbers now. Distinguish them by their connectors.")
     try:
@@ -180,7 +180,7 @@ def _with_places(text: str, found: Mapping[str, str], there: Sequence[Connected]
 def _with_own_key(stage: Path, text: str) -> str:
     """stage.toml that trusts a new signing key of this computer, too: keys are in no backup."""
     from controller.services.bundle import make_key
-    from controller.services.calibrate import KEY_FILE
+    from controller.stage.calibrations import KEY_FILE
 
     content = tomlkit.parse(text)
     trusted = content.get("bundle", {}).get("trusted_keys")

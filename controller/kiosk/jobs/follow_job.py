@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import VelaturaError, WorkError
-from controller.kiosk.api.control import ask
+from controller.kiosk.api.control import call_kiosk
 from controller.run.progress import Phase, Progress, Reporter
 from hal.deadline import Cancelled
 
@@ -32,10 +32,10 @@ def ask_and_follow(
     (the lamps did not light, it was cancelled, the kiosk restarted), WorkError("job-failed") with the kiosk's own
     sentence, and Cancelled.
     """
-    number, began_s = int(ask(stage, op, **arguments)["number"]), time.monotonic()
+    number, began_s = int(call_kiosk(stage, op, **arguments)["number"]), time.monotonic()
     last: object = None
     while True:
-        job = ask(stage, "job", number=number)
+        job = call_kiosk(stage, "job", number=number)
         if job is not None and job["ended"]:
             return _ended(job)
         if job is not None and job["steps"] != last and job["steps"]:
@@ -43,7 +43,7 @@ def ask_and_follow(
             reporter.progress(_progress(job, time.monotonic() - began_s))
         if cancel.wait(every_s):
             with contextlib.suppress(VelaturaError):  # it may have ended in the meantime
-                ask(stage, "cancel")
+                call_kiosk(stage, "cancel")
             raise Cancelled
 
 

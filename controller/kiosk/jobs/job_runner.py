@@ -60,7 +60,7 @@ class JobReporter:
         self._changed()
 
     def say(self, text: str, level: Level = Level.INFO) -> None:
-        self._log.tell(Decision("work-told", text, "", level.value))
+        self._log.add(Decision("work-told", text, "", level.value))
         self._changed()
 
 
@@ -134,7 +134,7 @@ class JobRunner:
         made = request.arguments[0] if request.kind == "compute" and request.arguments else ""
         job = Job(request.number or self.reserve(), title, appearance=made)
         self._reporter = JobReporter(job, self._log, self._changed)
-        self._log.tell(Decision("work-begins", f"Started: {title}."))
+        self._log.add(Decision("work-begins", f"Started: {title}."))
         run = partial(self._run, request, self._reporter, self._cancel)
         thread = self._world.thread(run, f"work-{request.kind}")
         try:

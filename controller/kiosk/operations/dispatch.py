@@ -47,13 +47,13 @@ def socket_table(
 def _bound(operation: Operation, holder: Any, kiosk: Any) -> Callable[..., Any]:
     names = [field.name for field in operation.fields]
 
-    def ask(*given: Any, **sent: Any) -> Any:
+    def call(*given: Any, **sent: Any) -> Any:
         values = local_values(operation, dict(zip(names, given, strict=False)) | sent)
         if operation.effect is not Effect.LOOKS and kiosk is not None:
             kiosk.record("done-by", operation.done_by(f"User {CALLER.get()}", values))
         return operation.of(holder, values)
 
-    return ask
+    return call
 
 
 def offline_operation(op: str) -> Operation | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import json
 import re
@@ -17,7 +18,7 @@ from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from controller.core.digests import digest_of
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, WorkError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.roles import ACCOUNT_NAME, LONGEST_PASSWORD, Role
@@ -77,7 +78,9 @@ class Accounts:
             if self.entered:
                 return None
             password = "-".join("".join(secrets.choice(_READABLE) for _ in range(4)) for _ in range(4))
-            self._put(Account(FIRST_ACCOUNT, Role.TECHNICIAN, self._hasher.hash(password), one_time=True))
+            # Every start makes another one, so a disk that is full must not keep the service from starting.
+            with contextlib.suppress(WorkError):
+                self._put(Account(FIRST_ACCOUNT, Role.TECHNICIAN, self._hasher.hash(password), one_time=True))
             return password
 
     @property

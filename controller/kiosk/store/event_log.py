@@ -80,7 +80,7 @@ class EventLog:
 
     # -- events
 
-    def tell(self, decision: Decision) -> EventRow:
+    def add(self, decision: Decision) -> EventRow:
         """Add one line. A disk error is not raised."""
         with self._lock:
             self._number += 1
@@ -92,10 +92,10 @@ class EventLog:
             self._also(row)
         return row
 
-    def tell_failure(self, decision: Decision) -> None:
+    def add_failure(self, decision: Decision) -> None:
         """Add one line, which stays in ``failures`` until it is confirmed."""
         with self._lock:
-            self._failures = (*self._failures, self.tell(decision))[-MOST_FAILURES:]
+            self._failures = (*self._failures, self.add(decision))[-MOST_FAILURES:]
             self._keep_failures()
 
     @property

@@ -84,8 +84,8 @@ def purge_old_photographs(stage: Path, log: EventLog, clock: Callable[[], float]
     try:
         freed = purge(runs)
     except OSError as error:
-        log.tell(Decision("photographs-kept", f"Old photographs could not be deleted: {error.strerror}.",
+        log.add(Decision("photographs-kept", f"Old photographs could not be deleted: {error.strerror}.",
                           "Check the disk and the permissions of the stage's folder.", "warning"))  # fmt: skip
         return
-    log.tell(Decision("photographs-removed", f"The photographs of {len(runs)} old runs were deleted, "
+    log.add(Decision("photographs-removed", f"The photographs of {len(runs)} old runs were deleted, "
                       f"which freed {freed / 1e6:.0f} MB. Their results are kept."))  # fmt: skip

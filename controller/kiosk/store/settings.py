@@ -75,7 +75,7 @@ def with_own_key(stage: Path, content: str) -> str:
     """
     from controller.bundle.signing import load_signing_key
     from controller.services.bundle import make_key
-    from controller.services.calibrate import KEY_FILE
+    from controller.stage.calibrations import KEY_FILE
 
     validate(content)
     if tables_of(content).bundle.trusted_keys:

@@ -82,7 +82,7 @@ class DiskSupervisor:
         try:
             removed = make_room(self._stage, enough, keep_runs=self._table().keep_runs, used=runs_of(*indexes))
         except OSError as error:
-            self._log.tell(Decision("disk-not-cleared", f"Old runs could not be removed: {error.strerror}.",
+            self._log.add(Decision("disk-not-cleared", f"Old runs could not be removed: {error.strerror}.",
                                     "Check the permissions of the stage's folder.", "warning"))  # fmt: skip
             return
         if removed:
@@ -90,14 +90,14 @@ class DiskSupervisor:
             what = ", ".join(removed[:5]) + (f" and {len(removed) - 5} more" if len(removed) > 5 else "")
             freed = max(0, self.free_bytes - before) / GB
             text = f"The disk was filling. Removed: {what}, which freed {freed:.2f} GB."
-            self._log.tell(Decision("disk-cleared", text))
+            self._log.add(Decision("disk-cleared", text))
 
     def _judge(self) -> None:
         before, self.problem = self.problem, self._problem()
         if self.problem is not None and (before is None or before.code != self.problem.code):
-            self._log.tell(self.problem)
+            self._log.add(self.problem)
         elif self.problem is None and before is not None:
-            self._log.tell(Decision("disk-well", f"The disk has {self.free_bytes / GB:.1f} GB of free space again."))
+            self._log.add(Decision("disk-well", f"The disk has {self.free_bytes / GB:.1f} GB of free space again."))
 
     def _problem(self) -> Decision | None:
         low = self.free_bytes < self._level
@@ -105,7 +105,7 @@ class DiskSupervisor:
             return _full(why)
         suspected, self._suspected = self._suspected, None
         if suspected is not None:
-            self._log.tell(suspected)
+            self._log.add(suspected)
         if low:
             text = f"Only {self.free_bytes / GB:.1f} GB are free on the disk of the stage."
             remedy = "Remove old runs, or copy them elsewhere. When the disk is full, no lamp is switched on."

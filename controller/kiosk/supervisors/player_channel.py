@@ -36,7 +36,7 @@ class PlayerChannel:
         self._socket: socket.socket | None = None
         self._numbers = 0
 
-    def ask(self, path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
+    def request(self, path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
         """The answer of the player that serves ``path``.
 
         Raises TimeoutError, OSError, ValueError, and WorkError for what the player refuses.

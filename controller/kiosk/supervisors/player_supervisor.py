@@ -292,9 +292,9 @@ class PlayerSupervisor:
         self._view = replace(self._view, problem=problem, shown=None)
 
     def _ask(self, request: dict[str, Any], timeout_s: float = ANSWER_S) -> dict[str, Any]:
-        """Raises as ``PlayerChannel.ask``."""
+        """Raises as ``PlayerChannel.request``."""
         assert self._process is not None
-        return self._channel.ask(self._process.socket, request, timeout_s)
+        return self._channel.request(self._process.socket, request, timeout_s)
 
 
 _SKIPPED: Final = Decision(

@@ -87,7 +87,7 @@ async def guarded(panel: Panel, entry: Entry, request: Request) -> Response:  # 
             if (wait_s := panel.by_token.wait_s(address)) > 0:
                 return _too_many(wait_s)
             panel.by_token.failed(address)
-            panel.refused.tell(f"A wrong token from {address} was refused")
+            panel.refused.add(f"A wrong token from {address} was refused")
         return _api_error(401, "not-known", "The request has no valid token.", "Send 'Authorization: Bearer ...'.")
     # Deny by default: an entry without a role is a mistake in the table, and must not grant access.
     if entry.role is None or who.role < entry.role:

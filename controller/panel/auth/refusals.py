@@ -18,7 +18,7 @@ class Refusals:
         self._lock = threading.Lock()
         self._told_s, self._untold = float("-inf"), 0
 
-    def tell(self, what: str) -> None:
+    def add(self, what: str) -> None:
         """``what`` without its full stop; one line in ``EVERY_S``, which counts those in between."""
         with self._lock:
             if self._clock() - self._told_s < EVERY_S:

@@ -98,7 +98,7 @@ class Entrance:
         panel.by_account.failed(name)
         account = await anyio.to_thread.run_sync(panel.accounts.verify, name, password, limiter=panel.hashing)
         if account is None:
-            panel.refused.tell(f"A log-in as {printable(name)[:32]} from {address} was refused")
+            panel.refused.add(f"A log-in as {printable(name)[:32]} from {address} was refused")
             return self._form(_WRONG, 403)
         panel.kiosk.record("logged-in", f"{account.name} logged in from {address}.")
         panel.by_address.succeeded(address)
@@ -137,7 +137,7 @@ class Entrance:
                 raise UsageError("too-many-tries", what="Too many wrong passwords.", remedy="Wait a minute.")
             if await anyio.to_thread.run_sync(panel.accounts.verify, visitor.name, old, limiter=panel.hashing) is None:
                 panel.by_address.failed(address)
-                panel.refused.tell(f"A change of the password of {visitor.name} from {address} was refused")
+                panel.refused.add(f"A change of the password of {visitor.name} from {address} was refused")
                 raise UsageError("password-wrong", what="The old password is wrong.", remedy="Type it again.")
             if new != sent.texts.get("again", ""):
                 raise UsageError("password-wrong", what="The two new passwords differ.", remedy="Type them again.")

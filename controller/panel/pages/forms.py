@@ -92,11 +92,11 @@ class Forms:
     async def _question(self, operation: Operation, values: Values) -> str:
         """What a person has to agree to first, or nothing."""
         if operation.name == "save-settings":
-            effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_settings(values["text"]))
+            effect = await self._panel.in_thread(lambda: self._panel.kiosk.effect_of_settings(values["text"]))
             return " ".join((gettext("Save these settings now?"), effect)) if effect else ""
         if operation.name == "set-schedule":
             schedule = operation.take(values)["schedule"]
-            effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_schedule(schedule))
+            effect = await self._panel.in_thread(lambda: self._panel.kiosk.effect_of_schedule(schedule))
             return " ".join((gettext("Save these hours now?"), effect)) if effect else ""
         return gettext(operation.asks).format_map(values)
 
@@ -114,7 +114,7 @@ class Forms:
             return RedirectResponse(back, 303)
         typed = {**sent.texts, "rows": _typed_rows(sent)}
         try:
-            facts = await self._panel.ask(lambda: page.facts(typed))
+            facts = await self._panel.in_thread(lambda: page.facts(typed))
         except answers.FAILURES as gone:
             shown = {"error": gone, "here": back}
             return await self._pages.show("problem.html", visitor, shown, answers.status_of(gone))
@@ -140,11 +140,11 @@ class Forms:
     async def _check(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         text = sent.texts.get("text", "").replace("\r\n", "\n")
         try:
-            await self._panel.ask(lambda: self._panel.kiosk.validate_settings(text))
+            await self._panel.in_thread(lambda: self._panel.kiosk.validate_settings(text))
         except answers.FAILURES as error:
             return await self._settings(visitor, sent, error)
         assert visitor.session is not None
-        effect = await self._panel.ask(lambda: self._panel.kiosk.effect_of_settings(text))
+        effect = await self._panel.in_thread(lambda: self._panel.kiosk.effect_of_settings(text))
         if effect:
             visitor.session.notes.append(("warn", " ".join((gettext("When you save them:"), effect))))
         return await self._settings(visitor, sent, None)

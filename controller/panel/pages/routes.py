@@ -47,6 +47,7 @@ FRAMED: Final = {
     "x-frame-options": "SAMEORIGIN",
 }
 """Of a report that a page shows in a frame."""
+EVENT_STREAM: Final = "text/event-stream"
 _SEEN: Final = (Answer.PICTURE, Answer.JPEG, Answer.PAGE)
 
 Facts = Callable[[Request], dict[str, Any]]
@@ -131,7 +132,7 @@ class Pages:
 
     async def show(self, template: str, visitor: Visitor, facts: dict[str, Any], status: int = 200) -> Response:
         """Render a page with the values that every page needs."""
-        return HTMLResponse(await self._panel.ask(lambda: self._drawn(template, visitor, facts)), status)
+        return HTMLResponse(await self._panel.in_thread(lambda: self._drawn(template, visitor, facts)), status)
 
     def _drawn(self, template: str, visitor: Visitor, facts: dict[str, Any]) -> str:
         kiosk, session = self._panel.kiosk, visitor.session
@@ -151,7 +152,7 @@ class Pages:
     def _page(self, template: str, facts: Facts) -> Callable[[Request, Visitor], Awaitable[Response]]:
         async def answer(request: Request, visitor: Visitor) -> Response:
             try:
-                values = await self._panel.ask(lambda: facts(request))
+                values = await self._panel.in_thread(lambda: facts(request))
                 return await self.show(template, visitor, {"here": request.url.path} | values)
             except answers.FAILURES as error:
                 return await self.show(
@@ -165,11 +166,11 @@ class Pages:
 
         async def answer(request: Request, _: Visitor) -> Response:
             try:
-                values, status = await self._panel.ask(lambda: facts(request)), 200
+                values, status = await self._panel.in_thread(lambda: facts(request)), 200
             except answers.FAILURES as error:
                 values, status = {"error": error}, answers.status_of(error)
             name = template if status == 200 else "late_problem.html"
-            return HTMLResponse(await self._panel.ask(lambda: self._drawing.page(name, values)), status)
+            return HTMLResponse(await self._panel.in_thread(lambda: self._drawing.page(name, values)), status)
 
         return answer
 
@@ -189,20 +190,20 @@ class Pages:
     async def _report(self, request: Request, _: Visitor) -> Response:
         """A report inside its page. It is one file with its own styles and pictures, and must not run anything."""
         try:
-            path = await self._panel.ask(lambda: self._panel.kiosk.report(request.path_params["run"]))
+            path = await self._panel.in_thread(lambda: self._panel.kiosk.report(request.path_params["run"]))
         except answers.FAILURES as error:
             return answers.failure(error)
         return FileResponse(path, media_type="text/html", headers=FRAMED)
 
-    async def _live(self, _: Request, visitor: Visitor) -> Response:
+    async def _live(self, request: Request, visitor: Visitor) -> Response:
         def alive() -> bool:
             return self._panel.sessions.get(visitor.secret, touch=False) is not None
 
-        return StreamingResponse(
-            self._panel.hub.stream(alive, language()),
-            media_type="text/event-stream",
-            headers={"x-accel-buffering": "no"},
-        )
+        headers = {"x-accel-buffering": "no"}
+        if request.method == "HEAD":
+            # A stream that nobody reads would never end, and the next request on its connection would wait for it.
+            return Response(media_type=EVENT_STREAM, headers=headers)
+        return StreamingResponse(self._panel.hub.stream(alive, language()), media_type=EVENT_STREAM, headers=headers)
 
     def _settings(self, _: Request) -> dict[str, Any]:
         kiosk, problem = self._panel.kiosk, None

@@ -33,8 +33,8 @@ class Setup:
         assert visitor.session is not None
         chosen = sent.many.get("key", [])
         try:
-            devices = await self._panel.ask(lambda: list(self._panel.kiosk.find_devices()))
-            tried = await self._panel.ask(lambda: self._tried(devices, chosen))
+            devices = await self._panel.in_thread(lambda: list(self._panel.kiosk.find_devices()))
+            tried = await self._panel.in_thread(lambda: self._tried(devices, chosen))
         except answers.FAILURES as error:
             visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
             kept: dict[str, Any] = {
@@ -65,9 +65,9 @@ class Setup:
         chosen = sent.many.get("key", [])
         text = ""
         try:
-            devices = await self._panel.ask(lambda: list(self._panel.kiosk.find_devices()))
+            devices = await self._panel.in_thread(lambda: list(self._panel.kiosk.find_devices()))
             text = stage_text(sent.texts.get("name", ""), [device for device in devices if device.key in chosen])
-            await self._panel.ask(lambda: self._panel.kiosk.save_settings(text))
+            await self._panel.in_thread(lambda: self._panel.kiosk.save_settings(text))
         except answers.FAILURES as error:
             return await self._pages.show(
                 "settings.html", visitor, {"text": text, "problem": error, "here": "/settings"}, 422

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.bundle.signing import generate_key, load_public_key, load_signing_key
-from controller.core.errors import UsageError
+from controller.bundle.signing import generate_key, load_public_key, load_signing_key, write_public_key
+from controller.core.errors import UsageError, WorkError
+from tests.full_disk import full_disk
 
 
 def test_a_new_key_is_private_and_is_read_back(tmp_path: Path) -> None:
@@ -24,6 +25,16 @@ def test_a_key_is_never_replaced(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="already"):
         generate_key(tmp_path / "k")
     assert (tmp_path / "k").read_bytes() == before
+
+
+def test_a_full_disk_is_in_the_way_of_another_public_key_only(tmp_path: Path) -> None:
+    write_public_key(tmp_path / "k.pub", bytes(32))
+    with full_disk():
+        write_public_key(tmp_path / "k.pub", bytes(32))
+        with pytest.raises(WorkError) as caught:
+            write_public_key(tmp_path / "k.pub", bytes([1]) * 32)
+    assert caught.value.code == "no-space"
+    assert load_public_key(tmp_path / "k.pub") == bytes(32)
 
 
 def test_a_signing_key_that_others_may_read_is_refused(tmp_path: Path) -> None:

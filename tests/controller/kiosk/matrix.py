@@ -144,7 +144,7 @@ def reach(kiosk: Kiosk, step: str) -> None:
         return
     kiosk.run_until(State.PLAYING)
     if step == "calibrating":
-        kiosk.reconciler.ask(Request("quick", light=True))
+        kiosk.reconciler.submit(Request("quick", light=True))
         kiosk.run_until(State.CALIBRATING)
     elif step == "degraded":
         kiosk.lamps["right"].burst()

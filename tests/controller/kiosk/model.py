@@ -157,7 +157,7 @@ class Kiosk:
     def boot(self) -> None:
         """The service begins, after whatever ended it; lamps, ledger and disk are as they were."""
         self.log = EventLog(self.folder / "events.sqlite", wall=self.wall, durable=False)
-        self.log.tell(beginning(self.log))
+        self.log.add(beginning(self.log))
         self.jobs = ModelJobs(self.world, camera=self.jobs.camera, done=self.jobs.done, drifted=self.jobs.drifted)
         self.player = ModelPlayer(self.world)
         self.supervisors = [self._supervisor(name) for name in NAMES]
@@ -179,7 +179,7 @@ class Kiosk:
                 raise DeviceGone("port-gone", what=f"The cable of {name} is away.", remedy="Plug it in.")
             return LampGuard(name, self.lamps[name], self.shelf, clock=self.world)
 
-        return ProjectorSupervisor(name, open_guard, self.log.tell, clock=self.world)
+        return ProjectorSupervisor(name, open_guard, self.log.add, clock=self.world)
 
     def power_cut(self, seconds: float) -> None:
         """Everything goes dark for so long."""

@@ -78,7 +78,7 @@ class TestStageKiosk(Contract):
         (stage / "runs" / RUN / "geometry.json").write_text('{"camera": {"size_px": [240, 160]}}')
         install_two(stage)
         log = EventLog(stage / EventLog.FILE, durable=False)
-        log.tell(Decision("first", "It begins."))
+        log.add(Decision("first", "It begins."))
         service = Service(check_stage(stage), log)
         # Work that only devices can do waits for its end instead; whether it may begin is the kiosk's own to say.
         runner = vars(service.jobs)
@@ -103,6 +103,25 @@ class TestStageKiosk(Contract):
         told = stage.kiosk.effect_of_schedule(Schedule("UTC", rows))
         assert told.startswith("The stage closes at once")
         assert stage.kiosk.schedule().rows == ()
+
+    def test_a_closed_stage_that_computes_says_so(self, stage: Real) -> None:
+        kiosk, service = stage.kiosk, stage.kiosk.service
+        hour = datetime.now(UTC) + timedelta(hours=3)
+        later = [f"{(hour + timedelta(minutes=n)):%H:%M}" for n in (0, 10)]
+        kiosk.set_schedule(Schedule("UTC", tuple(ScheduleRow(day, *later) for day in WEEKDAYS)))
+        service.reconciler.step()
+        stage.settle()
+        assert (kiosk.snapshot().state, kiosk.snapshot().job) == ("off", None)
+        target = stage.folder / "target.png"
+        target.write_bytes(png(np.full((160, 240, 3), 90, np.uint8)))
+        kiosk.compute("grey", target)
+        service.reconciler.step()
+        stage.settle()
+        shown = kiosk.snapshot()
+        assert shown.job is not None
+        assert (shown.state, shown.reason) == (
+            "solving", f"{shown.job.name}. The stage is closed, and the lamps are off.",
+        )  # fmt: skip
 
 
 class TestMemoryKiosk(Contract):

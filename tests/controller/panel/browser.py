@@ -27,9 +27,10 @@ DESK: Final = {"width": 1100, "height": 900}
 
 
 @contextlib.contextmanager
-def chromium() -> Iterator[Browser]:
+def chromium(*flags: str, program: Path = CHROMIUM) -> Iterator[Browser]:
+    """``program``: what starts it."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=list(FLAGS))
+        browser = playwright.chromium.launch(executable_path=str(program), args=[*FLAGS, *flags])
         try:
             yield browser
         finally:

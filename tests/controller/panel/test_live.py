@@ -173,6 +173,18 @@ def test_who_logs_out_is_told_nothing_more(fresh: Served) -> None:
         assert sum("Each projector shows" in line for line in rest) <= 1
 
 
+def test_asking_only_for_the_headers_leaves_the_connection_free(fresh: Served) -> None:
+    with fresh.entered("vera") as vera:
+        cookies = vera.cookies
+    limits = httpx.Limits(max_connections=1)
+    with httpx.Client(base_url=fresh.address, cookies=cookies, limits=limits, timeout=20, trust_env=False) as client:
+        for _ in range(3):
+            answer = client.head("/live")
+            assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
+        with client.stream("GET", "/live") as stream:
+            assert any(line.startswith("data:") for line in stream.iter_lines())
+
+
 def test_too_many_panels_are_refused_and_come_back_later(tmp_path: Path) -> None:
     options = PanelOptions(tmp_path / "private", most_open_panels=1)
     kiosk = MemoryKiosk(tmp_path / "pictures")

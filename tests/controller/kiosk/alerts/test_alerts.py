@@ -52,10 +52,10 @@ class Alerting:
 def test_events_of_the_level_are_gathered_into_one_message_for_each_and_sent_once(tmp_path: Path) -> None:
     with MailServer() as mail, WebServer() as web:
         one = Alerting(tmp_path, **MAIL, mail_port=mail.port, mail_security="none", webhook=web.address)
-        one.log.tell(Decision("state", "The stage is playing."))
-        one.log.tell(BROKEN)
+        one.log.add(Decision("state", "The stage is playing."))
+        one.log.add(BROKEN)
         one.alerts.step()
-        one.log.tell(Decision("camera-missing", "The camera is gone.", "Plug it in.", "error"))
+        one.log.add(Decision("camera-missing", "The camera is gone.", "Plug it in.", "error"))
         assert (mail.mails, web.posts) == ([], [])
         one.after(GATHER_S)
         one.after(GATHER_S)
@@ -66,7 +66,7 @@ def test_events_of_the_level_are_gathered_into_one_message_for_each_and_sent_onc
         assert "The camera is gone." in mail.bodies[0]
         assert "playing" not in mail.bodies[0]
         assert [event["code"] for event in post["events"]] == ["lamp-given-up", "camera-missing"]
-        one.log.tell(BROKEN)
+        one.log.add(BROKEN)
         one.after(GATHER_S)
         one.after(GATHER_S)
         assert len(web.posts) == 1, "not a message for each event of a device that fails all the time"
@@ -83,7 +83,7 @@ def test_events_of_the_level_are_gathered_into_one_message_for_each_and_sent_onc
 def test_a_server_that_takes_nothing_is_told_once_and_gets_it_later(tmp_path: Path) -> None:
     with MailServer(refuses=True) as mail, WebServer(code=500) as web:
         one = Alerting(tmp_path, **MAIL, mail_port=mail.port, mail_security="none", webhook=web.address)
-        one.log.tell(BROKEN)
+        one.log.add(BROKEN)
         one.alerts.step()
         for _ in range(4):
             one.after(max(AGAIN_S))

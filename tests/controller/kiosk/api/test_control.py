@@ -15,7 +15,7 @@ import pytest
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api import control
-from controller.kiosk.api.control import MOST_CONNECTIONS, NAME, ControlServer, ask, is_running, plain
+from controller.kiosk.api.control import MOST_CONNECTIONS, NAME, ControlServer, call_kiosk, is_running, plain
 from hal.errors import DeviceGone
 
 
@@ -59,11 +59,11 @@ def said(stage: Path, line: bytes) -> dict[str, Any]:
 
 
 def test_operations_are_done_by_name_with_arguments(stage: Path) -> None:
-    assert ask(stage, "status") == {"state": "playing"}
-    assert ask(stage, "add", one=2) == 3
-    assert ask(stage, "add", one=2, other=3) == 5
-    assert ask(stage, "answer") == {"path": "a", "numbers": [1, 2]}
-    assert ask(stage, "stop") is None
+    assert call_kiosk(stage, "status") == {"state": "playing"}
+    assert call_kiosk(stage, "add", one=2) == 3
+    assert call_kiosk(stage, "add", one=2, other=3) == 5
+    assert call_kiosk(stage, "answer") == {"path": "a", "numbers": [1, 2]}
+    assert call_kiosk(stage, "stop") is None
 
 
 @pytest.mark.parametrize(("op", "code"), [("refuse", "busy"), ("lose", "port-gone"), ("break", "crash")])
@@ -71,11 +71,11 @@ def test_what_is_raised_comes_back_with_code_and_sentences_and_the_kiosk_goes_on
     stage: Path, op: str, code: str
 ) -> None:
     with pytest.raises(VelaturaError) as error:
-        ask(stage, op)
+        call_kiosk(stage, op)
     assert error.value.code == code
     assert error.value.what
     assert error.value.remedy
-    assert ask(stage, "status")
+    assert call_kiosk(stage, "status")
 
 
 WRONG = (
@@ -89,7 +89,7 @@ def test_wrong_requests_are_told_and_cost_nothing(stage: Path, line: bytes) -> N
     answer = said(stage, line)
     assert answer["ok"] is False
     assert answer["error"]["code"] == "request-wrong"
-    assert ask(stage, "status")
+    assert call_kiosk(stage, "status")
 
 
 def test_an_endless_line_is_cut_off(stage: Path) -> None:
@@ -111,7 +111,7 @@ def test_those_who_hold_too_many_lines_are_turned_away_and_keep_nobody_out_after
         assert channel.recv(1) == b""
     for _ in range(1000):
         try:
-            assert ask(stage, "status")
+            assert call_kiosk(stage, "status")
             break
         except VelaturaError:
             continue
@@ -122,7 +122,7 @@ def test_those_who_hold_too_many_lines_are_turned_away_and_keep_nobody_out_after
 def test_where_no_kiosk_runs_it_is_told(tmp_path: Path) -> None:
     assert not is_running(tmp_path)
     with pytest.raises(UsageError) as error:
-        ask(tmp_path, "status")
+        call_kiosk(tmp_path, "status")
     assert error.value.code == "not-serving"
 
 
@@ -131,7 +131,7 @@ def test_a_kiosk_that_was_killed_leaves_a_socket_that_the_next_one_takes(tmp_pat
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left_behind:
         left_behind.bind(str(path))
     with ControlServer(path, OPERATIONS):
-        assert ask(tmp_path, "status")
+        assert call_kiosk(tmp_path, "status")
     assert not path.exists()
 
 
@@ -152,5 +152,5 @@ def test_a_moment_without_free_file_handles_does_not_end_the_socket(
     monkeypatch.setattr(control, "AGAIN_S", 0.01)
     monkeypatch.setattr(socket.socket, "accept", accepting)
     with ControlServer(runtime_folder(tmp_path) / NAME, OPERATIONS):
-        assert ask(tmp_path, "status", timeout_s=20) == {"state": "playing"}
+        assert call_kiosk(tmp_path, "status", timeout_s=20) == {"state": "playing"}
     assert not failures

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import pwd
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,8 +42,8 @@ def test_a_stage_that_nobody_serves_answers_from_its_folder(tmp_path: Path) -> N
     stage = vase(tmp_path)
     run = graded_run(stage, "20260101-100000-calibrate", {"left": 0.0123})
     log = EventLog(stage / EventLog.FILE)
-    log.tell(Decision("first", "One."))
-    log.tell(Decision("second", "Two.", "Look.", "warning"))
+    log.add(Decision("first", "One."))
+    log.add(Decision("second", "Two.", "Look.", "warning"))
     log.close()
     assert [row["code"] for row in call(stage, "events", after=1)] == ["second"]
     assert call(stage, "runs") == [run.name]
@@ -134,6 +136,20 @@ def test_hours_are_not_changed_behind_the_back_of_a_kiosk_that_begins(tmp_path: 
         call(stage, "set-schedule", time_zone="UTC", rows=[], drift_check="03:00")
     assert caught.value.code == "already-running"
     assert not (stage / "schedule.toml").exists()
+
+
+def test_the_log_names_who_changes_something_while_no_kiosk_runs(tmp_path: Path) -> None:
+    stage = vase(tmp_path)
+    (stage / "kiosk/panel/accounts.json").unlink()
+    call(stage, "schedule")
+    assert call(stage, "events") == []
+    call(stage, "set-schedule", time_zone="UTC", rows=[], drift_check="")
+    call(stage, "add-account", name="otto", role="operator", password="a long enough one")
+    user = pwd.getpwuid(os.getuid()).pw_name
+    lines = [row["text"] for row in call(stage, "events") if row["code"] == "done-by"]
+    assert [line.split(",")[0] for line in lines] == [f"User {user}"] * 2
+    assert "otto" in lines[1]
+    assert "a long enough one" not in str(lines)
 
 
 def test_of_two_who_make_accounts_at_once_neither_loses_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,15 +127,15 @@ def test_the_stages_first_time_is_kept(clocks: Clocks) -> None:
 
 
 def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
-    assert clocks.log.tell(beginning(clocks.log)).level == "info"
+    assert clocks.log.add(beginning(clocks.log)).level == "info"
     clocks.wait(600.0)
     clocks.reboot(without_s=5 * HOUR_S)
-    cut = clocks.log.tell(beginning(clocks.log))
+    cut = clocks.log.add(beginning(clocks.log))
     assert cut.level == "warning"
     assert "ended unexpectedly after 2026-05-05 17:03 UTC" in cut.text
-    clocks.log.tell(Decision("service-ended", "The kiosk has stopped."))
+    clocks.log.add(Decision("service-ended", "The kiosk has stopped."))
     clocks.reboot(without_s=5 * HOUR_S)
-    assert clocks.log.tell(beginning(clocks.log)).text == "The kiosk is starting."
+    assert clocks.log.add(beginning(clocks.log)).text == "The kiosk is starting."
 
 
 def test_asking_the_kernel_gives_an_answer() -> None:

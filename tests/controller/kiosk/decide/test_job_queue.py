@@ -86,7 +86,7 @@ def desk() -> Iterator[Desk]:
 
 
 def test_what_follows_comes_before_what_waits_and_in_its_order(desk: Desk) -> None:
-    desk.queue.ask(FULL, REPORT)
+    desk.queue.submit(FULL, REPORT)
     assert desk.begin(LIT) == FULL
     desk.jobs.end(PUBLISH, QUICK)
     desk.queue.take_finished()
@@ -100,10 +100,10 @@ def test_what_follows_comes_before_what_waits_and_in_its_order(desk: Desk) -> No
 
 
 def test_other_work_is_refused_while_some_waits_or_runs_and_a_refusal_is_told(desk: Desk) -> None:
-    desk.queue.ask(FULL)
+    desk.queue.submit(FULL)
     for _ in range(2):
         with pytest.raises(WorkError) as caught:
-            desk.queue.ask(QUICK)
+            desk.queue.submit(QUICK)
         assert caught.value.code == "busy"
         assert not desk.queue.offer(PUBLISH)
         desk.begin(LIT)
@@ -111,7 +111,7 @@ def test_other_work_is_refused_while_some_waits_or_runs_and_a_refusal_is_told(de
     desk.queue.take_finished()
     desk.jobs.refused = Decision("camera-gone", "No camera.", "Plug it in.", "error")
     with pytest.raises(WorkError) as caught:
-        desk.queue.ask(QUICK)
+        desk.queue.submit(QUICK)
     assert (caught.value.code, desk.told[-1]) == ("camera-gone", "camera-gone")
     assert not desk.queue.offer(PUBLISH)
     assert desk.queue.head is None
@@ -121,22 +121,22 @@ def test_other_work_is_refused_while_some_waits_or_runs_and_a_refusal_is_told(de
 
 
 def test_only_what_failed_stays_in_sight(desk: Desk) -> None:
-    desk.queue.ask(QUICK)
+    desk.queue.submit(QUICK)
     desk.begin(LIT)
     desk.jobs.end()
     desk.queue.take_finished()
     assert not desk.log.failures
-    desk.queue.ask(QUICK)
+    desk.queue.submit(QUICK)
     desk.begin(LIT)
     desk.jobs.result = Finished(QUICK, Decision("lost", "The camera is gone.", "Plug it in.", "error"), True)
     desk.queue.take_finished()
-    desk.queue.ask(QUICK)
+    desk.queue.submit(QUICK)
     desk.queue.drop(Decision("dark", "A lamp is not lit.", "", "error"))
     assert [row.code for row in desk.log.failures] == ["lost", "dark"]
 
 
 def test_nothing_follows_from_work_that_was_cancelled_though_it_ended_well(desk: Desk) -> None:
-    desk.queue.ask(replace(FULL, key="night"), REPORT)
+    desk.queue.submit(replace(FULL, key="night"), REPORT)
     desk.begin(LIT)
     desk.queue.cancel()
     assert desk.jobs.cancelled == 1
@@ -148,7 +148,7 @@ def test_nothing_follows_from_work_that_was_cancelled_though_it_ended_well(desk:
     assert desk.queue.head is None
     assert desk.log.done() == {"night"}
     # The next work is another matter.
-    desk.queue.ask(QUICK)
+    desk.queue.submit(QUICK)
     desk.begin(LIT)
     desk.jobs.end(PUBLISH)
     desk.queue.take_finished()
@@ -200,7 +200,7 @@ def test_a_task_that_can_not_be_done_is_left_out_with_the_reason(desk: Desk) -> 
 def test_work_waits_for_its_light_so_long_and_is_then_given_up(
     desk: Desk, views: tuple[ProjectorView, ...], code: str
 ) -> None:
-    desk.queue.ask(replace(FULL, key="night"), REPORT)
+    desk.queue.submit(replace(FULL, key="night"), REPORT)
     coming = replace(LIT, condition=Condition.LIGHTING)
     assert desk.begin(coming, LIT) is None
     desk.now_s = PATIENCE_S
@@ -214,16 +214,16 @@ def test_work_waits_for_its_light_so_long_and_is_then_given_up(
 
 
 def test_the_next_work_has_all_the_patience_again(desk: Desk) -> None:
-    desk.queue.ask(FULL)
+    desk.queue.submit(FULL)
     assert desk.begin(WARM) is None
     desk.queue.cancel()
     desk.now_s = 2 * PATIENCE_S
-    desk.queue.ask(QUICK)
+    desk.queue.submit(QUICK)
     assert desk.begin(WARM) is None
     assert desk.begin(LIT) == QUICK
 
 
 def test_work_without_light_begins_in_the_dark(desk: Desk) -> None:
-    desk.queue.ask(PUBLISH)
+    desk.queue.submit(PUBLISH)
     assert not desk.queue.needs_light
     assert desk.begin(DARK) == PUBLISH

@@ -126,16 +126,16 @@ def test_without_a_camera_playback_goes_on_and_recalibration_says_why_it_cannot(
     kiosk.jobs.camera = False
     kiosk.run_until(State.PLAYING)
     with pytest.raises(WorkError, match="no camera"):
-        kiosk.reconciler.ask(Request("quick", light=True))
+        kiosk.reconciler.submit(Request("quick", light=True))
     kiosk.run(5)
     assert kiosk.state is State.PLAYING
 
 
 def test_recalibrates_on_request_and_plays_again(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.reconciler.ask(Request("quick", light=True))
+    kiosk.reconciler.submit(Request("quick", light=True))
     with pytest.raises(WorkError, match="Another job"):
-        kiosk.reconciler.ask(Request("quick", light=True))
+        kiosk.reconciler.submit(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
     assert kiosk.player.want is None
     kiosk.run_until(State.PLAYING)
@@ -144,7 +144,7 @@ def test_recalibrates_on_request_and_plays_again(kiosk: Kiosk) -> None:
 
 def test_work_is_cancelled_and_playing_goes_on(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.reconciler.ask(Request("quick", light=True))
+    kiosk.reconciler.submit(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
     kiosk.reconciler.cancel()
     kiosk.run_until(State.PLAYING, within_s=5)
@@ -154,7 +154,7 @@ def test_work_is_cancelled_and_playing_goes_on(kiosk: Kiosk) -> None:
 
 def test_a_camera_that_dies_in_a_calibration_ends_the_work_and_not_the_playing(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.reconciler.ask(Request("quick", light=True))
+    kiosk.reconciler.submit(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
     kiosk.jobs.camera = False
     kiosk.run_until(State.PLAYING, within_s=5)

@@ -295,7 +295,7 @@ def test_an_event_that_is_told_while_the_panel_is_brought_up_to_date_reaches_it(
     for _ in range(2):
         service.changed()
     found.subscribe(lambda: heard.append(found.events()[-1].number))
-    log.meanwhile = lambda: log.tell(Decision("lamp-went-off", "The lamp went off."))
+    log.meanwhile = lambda: log.add(Decision("lamp-went-off", "The lamp went off."))
     for _ in range(2):
         service.changed()
     assert heard[-1:] == [log.number]
@@ -336,7 +336,7 @@ def test_no_work_begins_while_a_backup_takes_the_place_of_what_it_reads(
     refused: list[str] = []
 
     def restore(stage: Path, backup: Path) -> None:
-        refused.append(elsewhere(lambda: kiosk.service.ask(Request("publish"))))
+        refused.append(elsewhere(lambda: kiosk.service.submit(Request("publish"))))
         kiosk.service.reconciler.step()
 
     monkeypatch.setattr(archive, "restore", restore)

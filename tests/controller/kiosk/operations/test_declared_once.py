@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from controller.cli import derived
 from controller.cli.running import group
 from controller.core.storage import runtime_folder
-from controller.kiosk.api.control import NAME, ControlServer, ask
+from controller.kiosk.api.control import NAME, ControlServer, call_kiosk
 from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.operations import dispatch
@@ -74,7 +74,7 @@ def test_socket_and_command_line_have_it(kiosk: StageKiosk) -> None:
     program = group("velatura", "For this test.", derived.commands(operations=DECLARED))
     table = socket_table(kiosk.holders(), DECLARED)
     with ControlServer(runtime_folder(kiosk.stage.resolve()) / NAME, table):
-        assert ask(kiosk.stage, "chime", times=2) == {"rung": 2, "at": "hall"}
+        assert call_kiosk(kiosk.stage, "chime", times=2) == {"rung": 2, "at": "hall"}
         shown = CliRunner().invoke(program, ["chime", str(kiosk.stage), "4", "--json"])
         assert json.loads(shown.output) == {"result": {"rung": 4, "at": "hall"}}
         refused = CliRunner().invoke(program, ["chime", str(kiosk.stage), "9"])

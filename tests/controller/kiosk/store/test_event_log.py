@@ -16,7 +16,7 @@ def test_what_failed_is_kept_until_it_was_seen_over_starts_and_nonsense(tmp_path
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
     for number in range(MOST_FAILURES + 2):
-        log.tell_failure(Decision(f"failed-{number}", "It failed.", "Look.", "error"))
+        log.add_failure(Decision(f"failed-{number}", "It failed.", "Look.", "error"))
     assert len(log.failures) == MOST_FAILURES
     log.close()
     again = EventLog(path, durable=False)
@@ -33,7 +33,7 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
 ) -> None:
     path, is_full = tmp_path / EventLog.FILE, [True]
     log = EventLog(path, durable=False)
-    log.tell(Decision("first", "One."))
+    log.add(Decision("first", "One."))
     log.keep("chosen", "glass")
     log.close()
 
@@ -46,7 +46,7 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
         return found
 
     log = EventLog(path, durable=False, connect=full)
-    log.tell(Decision("second", "Two."))
+    log.add(Decision("second", "Two."))
     log.mark_done("drift-check 2026-01-01", "drift-none")
     assert log.problem == "disk I/O error"
     assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
@@ -66,11 +66,11 @@ def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length:
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
     for _ in range(100):
-        log.tell(Decision("before", "One. " * 50))
+        log.add(Decision("before", "One. " * 50))
     log.close()
     path.write_bytes(path.read_bytes()[:length])
     log = EventLog(path, durable=False)
-    log.tell(Decision("after", "Two."))
+    log.add(Decision("after", "Two."))
     assert log.problem is None
     log.close()
     log = EventLog(path, durable=False)
@@ -83,7 +83,7 @@ def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) 
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
     for _ in range(100):
-        log.tell(Decision("before", "One. " * 50))
+        log.add(Decision("before", "One. " * 50))
     log.keep("override", "open")
     log.close()
     content = path.read_bytes()
@@ -91,7 +91,7 @@ def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) 
     path.write_bytes(content[: 8 * 4096] + bytes(byte ^ 0xA5 for byte in content[8 * 4096 :]))
     log = EventLog(path, durable=False)
     for _ in range(3):
-        log.tell(Decision("after", "Two."))
+        log.add(Decision("after", "Two."))
     assert log.problem is None
     log.close()
     log = EventLog(path, durable=False)
@@ -104,7 +104,7 @@ def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) 
 
 def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_path: Path) -> None:
     killed, left = EventLog(tmp_path / "before" / "events.sqlite"), tmp_path / "left" / "events.sqlite"
-    killed.tell(Decision("last", "It was the last."))
+    killed.add(Decision("last", "It was the last."))
     killed.keep("override", "[true, false]")
     left.parent.mkdir()
     for end in ("", "-wal"):
@@ -131,7 +131,7 @@ def test_a_log_that_is_a_device_is_not_read_without_an_end(tmp_path: Path) -> No
     path.symlink_to("/dev/zero")
     log = EventLog(path)
     assert log.problem is not None
-    row = log.tell(Decision("begins", "It begins."))
+    row = log.add(Decision("begins", "It begins."))
     assert [one.text for one in log.after(0)] == [row.text]
     log.close()
     assert path.is_symlink()

@@ -38,9 +38,9 @@ kill $daemon
 
 def tell() -> None:
     log = EventLog(Path(sys.argv[1]) / "events.sqlite", also=journal_of("Head of a boy", os.environ))
-    log.tell(Decision("opened", "The stage opens."))
-    log.tell(Decision("sensor-dark", "The sensor sees nothing.", "Uncover it.", "warning"))
-    log.tell_failure(Decision("projector-missing", TEXT, level="error"))
+    log.add(Decision("opened", "The stage opens."))
+    log.add(Decision("sensor-dark", "The sensor sees nothing.", "Uncover it.", "warning"))
+    log.add_failure(Decision("projector-missing", TEXT, level="error"))
     log.close()
 
 

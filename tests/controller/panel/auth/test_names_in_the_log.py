@@ -112,9 +112,9 @@ def test_who_tries_many_names_does_not_fill_the_log() -> None:
     now, lines = [0.0], list[str]()
     refusals = Refusals(lambda code, what, level: lines.append(what), lambda: now[0])
     for number in range(1000):
-        refusals.tell(f"A log-in as {number} was refused")
+        refusals.add(f"A log-in as {number} was refused")
     now[0] += EVERY_S
-    refusals.tell("A log-in as x was refused")
+    refusals.add("A log-in as x was refused")
     assert lines == ["A log-in as 0 was refused.", "A log-in as x was refused, and 999 before it."]
 
 

@@ -14,6 +14,7 @@ from controller.core.errors import UsageError
 from controller.kiosk.store.accounts import Account, Accounts, Role
 from controller.panel.auth.sessions import IDLE_S, LONGEST_S, MOST_SESSIONS, LoginLimit, Sessions
 from tests.controller.panel.served import PASSWORD, QUICK_HASH, Served, csrf, log_in
+from tests.full_disk import full_disk
 
 
 class Clock:
@@ -62,6 +63,16 @@ def test_the_one_time_password_ends_with_the_first_real_one(tmp_path: Path) -> N
     assert second not in (tmp_path / "a.json").read_text()
     accounts.set_password("technician", "seven tall horses")
     assert accounts.first_start() is None
+
+
+def test_on_a_full_disk_somebody_can_log_in_first_all_the_same(tmp_path: Path) -> None:
+    accounts = Accounts(tmp_path / "a.json", hasher=QUICK_HASH)
+    with full_disk():
+        password = accounts.first_start()
+    assert password
+    assert accounts.verify("technician", password) is not None
+    accounts.set_password("technician", "seven tall horses")
+    assert Accounts(tmp_path / "a.json", hasher=QUICK_HASH).first_start() is None
 
 
 def test_a_damaged_file_of_accounts_does_not_open_the_door(tmp_path: Path) -> None:
