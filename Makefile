@@ -9,6 +9,9 @@
 # make nightly COUNT=3   every experiment of the study at size small, for so many seeds; about an hour for each
 # All do their own set-up.
 
+# A demo or a test run starts many Python programs, each of which would compile all of its modules anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 SIZE ?= small
 # The mesh's name without its folder and ending; make's own functions would split it at its spaces.
 empty :=

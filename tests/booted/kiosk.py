@@ -8,17 +8,19 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.install.steps import PYTHON
 from tests.booted.machine import STAGE, Machine
 from tests.booted.trees import ROOT, built_package, tree
@@ -29,6 +31,14 @@ OUTPUTS: Final = [(name, 280, 210) for name in ("P1", "P2", "P3")]
 SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
 APPEARANCE: Final = "1"
 _SEED: Final = 1
+_HOURS: Final = STAGE / "schedule.toml"
+_DEVICES_FIRST: Final = Path("/etc/systemd/system/bench.service.d/first.conf")
+_UNTIL_THERE: Final = f"""
+[Unit]
+Before=velatura-x11.service
+[Service]
+ExecStartPost=/bin/sh -c 'until test -e {STAGE}/run/tty-above; do sleep 0.1; done'
+"""
 
 
 @dataclass(frozen=True)
@@ -59,6 +69,28 @@ class Kiosk:
         wanted[: beside.shape[0], : beside.shape[1]] = beside
         return bool(np.array_equal(screen, wanted))
 
+    def problems(self) -> dict[str, str]:
+        """What the panel says of the devices that have one, by name."""
+        return {row["name"]: row["problem"] for row in self.machine.velatura("status")["devices"] if row["problem"]}
+
+    def events(self) -> list[dict[str, Any]]:
+        """Of the log, oldest first."""
+        return sorted(self.machine.velatura("events")["events"], key=lambda row: int(row["number"]))
+
+    def codes(self, after: int = 0) -> list[str]:
+        """Of the events with a larger number."""
+        return [row["code"] for row in self.events() if row["number"] > after]
+
+    def put_hours(self, *, around_s: float, without_time: str) -> None:
+        """Be open every day for two hours before and after this time of day, from the controller's next start on."""
+        opens, closes = (time.strftime("%H:%M", time.gmtime(around_s + by_s)) for by_s in (-7200, 7200))
+        rows = "".join(f'[[hours]]\nday = "{day}"\nopens = "{opens}"\ncloses = "{closes}"\n' for day in WEEKDAYS)
+        self.machine.write(_HOURS, f'time_zone = "UTC"\nwithout_time = "{without_time}"\n{rows}')
+        self.machine.call("chown", "velatura:velatura", _HOURS)
+
+    def remove_hours(self) -> None:
+        self.machine.call("rm", _HOURS)
+
     def answers(self) -> bool:
         """Whether a command reaches the service, and not the folder alone."""
         done = self.machine.called("velatura", "status", STAGE, "--json", user="velatura")
@@ -68,6 +100,20 @@ class Kiosk:
         """What a telephone reads from the projectors; empty without a QR code."""
         screen = self.machine.screen()
         return "" if screen is None else str(cv2.QRCodeDetector().detectAndDecode(np.ascontiguousarray(screen))[0])
+
+    def boot_beside_devices(self) -> float:
+        """Boot where the devices are on before X starts, as projectors are that stand around a real computer.
+
+        Returns the seconds from an X server that listens to the appearance.
+        """
+        machine = self.machine
+        machine.write(_DEVICES_FIRST, _UNTIL_THERE)
+        machine.cut_off()
+        machine.switch_on()
+        machine.wait_for(self.shows)
+        now_s = time.monotonic()
+        machine.at(_DEVICES_FIRST).unlink()
+        return now_s - machine.active_since_s("velatura-x11")
 
     def put_stage(self, stage: Path) -> None:
         """Copy a stage of ``prepared_stage`` there, as somebody does; then it plays."""

@@ -203,7 +203,11 @@ class Machine:
 
     def read(self, path: Path) -> bytes:
         """A file of the machine that runs."""
-        return Path(f"/proc/{self._init}/root", path.relative_to("/")).read_bytes()
+        return self.seen_here(path).read_bytes()
+
+    def seen_here(self, path: Path) -> Path:
+        """Where a path of the machine that runs lies here, with all that is mounted there."""
+        return Path(f"/proc/{self._init}/root", path.relative_to("/"))
 
     def screen(self) -> npt.NDArray[np.uint8] | None:
         """What the X server shows, (rows, columns, 3) RGB; None while there is none."""
@@ -238,6 +242,11 @@ class Machine:
     def restarts(self, unit: str) -> int:
         return int(self.call("systemctl", "show", "--value", "--property=NRestarts", unit))
 
+    def active_since_s(self, unit: str) -> float:
+        """When systemd called this unit active, in the seconds of ``time.monotonic``, which the machine shares."""
+        since = self.call("systemctl", "show", "--value", "--property=ActiveEnterTimestampMonotonic", unit)
+        return int(since) / 1e6
+
     def fetched(self, url: str) -> str:
         """A page of the machine, asked for by a program outside it that is in its network."""
         asking = [sys.executable, "-c", _FETCH, url]
@@ -251,7 +260,12 @@ class Machine:
         began_s = time.monotonic()
         while not so():
             if time.monotonic() > began_s + within_s:
-                told = self.called("journalctl", "--boot", "--no-pager", "--lines=60").stdout
-                raise AssertionError(f"it did not happen within {within_s:g} s\n{told}")
+                raise AssertionError(f"it did not happen within {within_s:g} s\n{self._told()}")
             time.sleep(0.2)
         return time.monotonic() - began_s
+
+    def _told(self) -> str:
+        """The kiosk's status, and the end of the journal without the sessions of this class's own commands."""
+        services = "--facility=kern,user,daemon,syslog"
+        journal = self.called("journalctl", "--boot", "--no-pager", "--lines=60", services).stdout
+        return self.called("velatura", "status", STAGE, user="velatura").stdout + journal

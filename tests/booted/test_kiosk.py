@@ -5,6 +5,7 @@ real; the devices are emulated on pseudo-terminals and TCP.
 from __future__ import annotations
 
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -13,15 +14,21 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from playwright.sync_api import expect
 
 from controller.kiosk.install.steps import DEBIAN
-from tests.booted.kiosk import SERVICES, Kiosk, installed, prepared_stage
+from tests.booted.faults import Disk, clock_of_its_own, disk_of_its_own
+from tests.booted.kiosk import APPEARANCE, SERVICES, Kiosk, installed, prepared_stage
 from tests.booted.machine import ADDRESS, STAGE
 from tests.booted.trees import built_package, obstacle
+from tests.booted.visitor import visiting
 from tests.campaigns.power_cuts import cut, kept, lost
+from tests.controller.panel.browser import CHROMIUM
 
 PICTURE_S = 60.0
 """From the boot of a bare Debian with the package to a picture."""
+APPEARANCE_S = 10.0
+"""From an X server that listens to the appearance."""
 RESTORED_S = 900.0
 """From a blank Debian with the package to the picture of a backup."""
 OBSTACLE = obstacle()
@@ -95,6 +102,24 @@ def test_user_and_root_reach_the_running_kiosk(playing: Kiosk) -> None:
     assert "playing" in playing.machine.call("velatura", "status", STAGE)
 
 
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+@pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
+def test_a_browser_on_another_computer_logs_in_and_sees_it_play(playing: Kiosk, tmp_path: Path) -> None:
+    with visiting(playing.machine, tmp_path) as page:
+        page.goto("/login")
+        page.get_by_label("Name").fill("technician")
+        page.get_by_label("Password").fill(playing.password)
+        page.get_by_role("button", name="Log in").click()
+        page.wait_for_url("**/password")
+        page.get_by_label("The one-time password").fill(playing.password)
+        for label in ("New password, 10 characters or more", "New password again"):
+            page.get_by_label(label).fill("seven tall horses")
+        page.get_by_role("button", name="Change").click()
+        page.wait_for_url("**/")
+        expect(page.locator("p.state")).to_contain_text(f"Playing {APPEARANCE}")
+        expect(page.locator("#live-devices")).to_contain_text("left")
+
+
 @pytest.mark.parametrize("service", SERVICES)
 def test_a_killed_service_is_back_with_the_picture_and_nothing_restarts_in_a_loop(playing: Kiosk, service: str) -> None:
     machine, before = playing.machine, {name: playing.machine.restarts(name) for name in SERVICES}
@@ -141,6 +166,75 @@ def test_after_a_power_cut_the_picture_is_back_by_itself_and_nothing_is_lost(pla
     playing.machine.wait_for(lambda: playing.state == "playing")
     assert lost(playing, before) == []
     assert {playing.machine.restarts(name) for name in SERVICES} == {0}
+
+
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+def test_the_appearance_is_there_soon_after_the_x_server(playing: Kiosk) -> None:
+    took_s = playing.boot_beside_devices()
+    print(f"{took_s:.1f} s from X to the appearance")
+    assert took_s <= APPEARANCE_S
+
+
+def told_full(playing: Kiosk, disk: Disk) -> bool:
+    """Whether the panel says that the disk is full, where another program takes all that becomes free."""
+    disk.fill()
+    return "is full" in playing.problems().get("disk", "")
+
+
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+def test_a_full_disk_is_told_once_and_the_picture_stays(playing: Kiosk) -> None:
+    machine = playing.machine
+    with disk_of_its_own(machine) as disk:
+        machine.wait_for(playing.answers)
+        machine.wait_for(lambda: playing.state == "playing")
+        before, number = kept(playing), playing.events()[-1]["number"]
+        with machine.watched() as seen:
+            machine.wait_for(lambda: told_full(playing, disk))
+            assert set(playing.problems()) == {"disk"}
+            disk.clear()
+            machine.wait_for(lambda: playing.problems() == {})
+        assert len(seen) == 2, "it showed one picture, until the end"
+        codes = playing.codes(number)
+        # What an earlier test left to remove makes room first.
+        assert set(codes[: codes.index("disk-full")]) <= {"disk-filling", "disk-cleared"}
+        assert codes[codes.index("disk-full") :] == ["disk-full", "disk-well"]
+        disk.fill()
+        machine.call("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "velatura-player", "velatura-controller")
+        machine.wait_for(playing.shows)
+        machine.wait_for(playing.answers)
+        machine.wait_for(lambda: told_full(playing, disk) and playing.state == "playing")
+        disk.clear()
+        machine.wait_for(lambda: playing.problems() == {})
+        assert lost(playing, before) == []
+    machine.wait_for(playing.shows)
+    machine.wait_for(playing.answers)
+    machine.wait_for(lambda: playing.state == "playing")
+
+
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler (a package of the test set-up)")
+def test_hours_are_not_followed_by_a_clock_that_was_lost(playing: Kiosk) -> None:
+    machine = playing.machine
+    playing.put_hours(around_s=time.time(), without_time="open")
+    with clock_of_its_own(machine) as clock:
+        machine.wait_for(playing.answers)
+        machine.wait_for(lambda: playing.state == "playing")
+        number = playing.events()[-1]["number"]
+        with machine.watched() as seen:
+            clock.lose()
+            machine.wait_for(lambda: "clock-unknown" in playing.codes(number))
+            machine.call("systemctl", "restart", "velatura-controller")
+            machine.wait_for(playing.answers)
+            machine.wait_for(lambda: playing.state == "playing")
+            clock.find()
+            machine.wait_for(lambda: "clock-known" in playing.codes(number))
+            assert playing.state == "playing"
+        assert len(seen) == 2, "it showed one picture, until the end"
+        clocks = [code for code in playing.codes(number) if code.startswith("clock")]
+        assert clocks == ["clock-set", "clock-unknown", "clock-unknown", "clock-set", "clock-known"]
+        playing.remove_hours()
+    machine.wait_for(playing.answers)
+    machine.wait_for(lambda: playing.state == "playing")
 
 
 @pytest.mark.parametrize("bare", ["bookworm"], indirect=True)

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from controller.demo import stage as demo_stage
 from plugins.emulated import bench
 from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
-from plugins.emulated.optics import staging
+from plugins.emulated.optics import staging, world
 from plugins.emulated.optics.staging import Size
 from plugins.emulated.optics.stands import Stands
 from plugins.emulated.optics.world import World
@@ -100,7 +100,8 @@ def note(record: dict[str, Any]) -> None:
 def serve(stage: Path, exposures: Path | None) -> int:
     """The devices, until a signal."""
     SteadyWorld.exposures = exposures
-    vars(bench).update(World=SteadyWorld, EmulatedLamp=HonestLamp)
+    vars(bench).update(EmulatedLamp=HonestLamp)
+    vars(world).update(World=SteadyWorld)
     return bench.EmulatedBench().serve(stage, json_lines=True)
 
 

@@ -52,7 +52,8 @@ def planted(patch: Path | None, folder: Path) -> Path:
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     if patch is not None:
-        subprocess.run(["patch", "-p1", "--quiet", "-i", str(patch)], cwd=folder, check=True)
+        # Without an offset or a line that differs: a patch of older code may plant another bug, or none.
+        subprocess.run(["git", "apply", str(patch)], cwd=folder, check=True)
     return folder
 
 

@@ -89,7 +89,7 @@ def reach(kiosk: WiredKiosk, step: str) -> None:
         state(State.DEGRADED)
     if step == "calibrating":
         assert kiosk.until(lambda: kiosk.service.devices.missing_for_work() is None, REACH_S), "nothing to work with"
-        reconciler.ask(Request("full", light=True))
+        reconciler.submit(Request("full", light=True))
         state(State.CALIBRATING)
 
 

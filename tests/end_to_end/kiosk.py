@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from controller.core.errors import VelaturaError
-from controller.kiosk.api.control import ask
+from controller.kiosk.api.control import call_kiosk
 from tests import waiting
 from tests.end_to_end.program import LONGEST_S
 from tests.ports import free_port
@@ -48,6 +48,6 @@ def wait_for(what: Callable[[], bool]) -> None:
 def codes(stage: Path) -> list[str]:
     """Of the kiosk's events so far."""
     try:
-        return [row["code"] for row in ask(stage, "events")]
+        return [row["code"] for row in call_kiosk(stage, "events")]
     except VelaturaError:  # it is not there yet
         return []

@@ -18,7 +18,7 @@ from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.config.loader import FILE
 from controller.core.storage import runtime_folder
-from controller.kiosk.api.control import ask
+from controller.kiosk.api.control import call_kiosk
 from controller.services.calibrate import KEY_FILE, output_sizes
 from controller.stage.check import check_stage
 from tests.campaigns.mini_stage import prepare_mini
@@ -58,7 +58,7 @@ def install_bundle(stage: Path, revision: int, *names: str) -> Path:
 
 
 def status(stage: Path) -> dict[str, Any]:
-    return dict(ask(stage, "status"))
+    return dict(call_kiosk(stage, "status"))
 
 
 def until(stage: Path, so: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
@@ -105,30 +105,30 @@ def test_appearances_in_turn_a_damaged_bundle_and_changed_settings(tmp_path: Pat
         assert len({one["appearance"] for one in seen}) == 3
         share = np.mean([one["fading"] for one in seen])
         assert 0.1 < share < 0.7, "a third of the time one fades into the next"
-        ask(stage, "play", name="new-2")
+        call_kiosk(stage, "play", name="new-2")
         until(stage, lambda now: now["playing"] == "new-2" and not now["in_turn"])
         assert {one["appearance"] for one in watched(stage, 1.5 * SHOWN_MS / 1000)} == {"new-2"}
-        ask(stage, "rotate")
+        call_kiosk(stage, "rotate")
         until(stage, lambda now: now["playing"] in ("new-1", "new-3"))
 
         # Settings: a comment restarts nothing, what a device is opened with restarts the devices, and no lamp.
-        struck, pid, text = strikes(stage), player_pid(stage), ask(stage, "settings")
-        assert ask(stage, "effect-of-settings", text=f"# a comment\n{text}") == ""
-        ask(stage, "save-settings", text=f"# a comment\n{text}")
-        assert ask(stage, "settings").startswith("# a comment")
+        struck, pid, text = strikes(stage), player_pid(stage), call_kiosk(stage, "settings")
+        assert call_kiosk(stage, "effect-of-settings", text=f"# a comment\n{text}") == ""
+        call_kiosk(stage, "save-settings", text=f"# a comment\n{text}")
+        assert call_kiosk(stage, "settings").startswith("# a comment")
         time.sleep(1.0)
         assert (strikes(stage), player_pid(stage), all(lamps(stage).values())) == (struck, pid, True)
         assert "service-ended" not in codes(stage)
         reopened = text.replace("iso = ", "iso = 1", 1)
-        assert "The lamps stay lit" in ask(stage, "effect-of-settings", text=reopened)
+        assert "The lamps stay lit" in call_kiosk(stage, "effect-of-settings", text=reopened)
         moved = text.replace('"left"', '"links"')
-        assert "left" in ask(stage, "effect-of-settings", text=moved)
-        assert "cools" in ask(stage, "effect-of-settings", text=moved)
-        ask(stage, "save-settings", text=text.replace("\n[safety]\n", "\n[safety]\nminimum_off_s = 0.5\n"))
+        assert "left" in call_kiosk(stage, "effect-of-settings", text=moved)
+        assert "cools" in call_kiosk(stage, "effect-of-settings", text=moved)
+        call_kiosk(stage, "save-settings", text=text.replace("\n[safety]\n", "\n[safety]\nminimum_off_s = 0.5\n"))
         wait_for(lambda: "playing" in since_second_start(stage))
         until(stage, playing)
         assert (strikes(stage), all(lamps(stage).values())) == (struck, True)
-        assert any("User " in row["text"] for row in ask(stage, "events") if row["code"] == "done-by")
+        assert any("User " in row["text"] for row in call_kiosk(stage, "events") if row["code"] == "done-by")
 
         # The newest bundle is damaged where only the pictures are, and its player dies soon after its start.
         data = bytearray(newest.read_bytes())
@@ -173,38 +173,38 @@ def test_a_damaged_stage_toml_lamps_that_are_awaited_and_a_full_disk_are_said_as
             (disk,) = [row for row in now["devices"] if row["kind"] == "disk"]
             assert "are free on the disk" in disk["problem"]
             assert now["disk_free_bytes"] > 0
-            ask(stage, "save-settings", text=f"{good}\n{alerts}")
+            call_kiosk(stage, "save-settings", text=f"{good}\n{alerts}")
             until(stage, lambda now: not any(row["problem"] for row in now["devices"]))
 
             # A job that waits for its lamps is shown, and can be cancelled.
-            ask(stage, "stop")
+            call_kiosk(stage, "stop")
             until(stage, lambda now: now["state"] == "off")
-            ask(stage, "recalibrate", kind="full")
+            call_kiosk(stage, "recalibrate", kind="full")
             now = until(stage, lambda now: now["job"] is not None and now["job"]["waits"])
             assert (now["job"]["name"], now["job"]["ended"]) == ("Full recalibration", False)
-            ask(stage, "cancel")
+            call_kiosk(stage, "cancel")
             until(stage, lambda now: now["job"] is None)
             until(stage, lambda now: now["state"] == "off")
 
             # Nothing can be written: no lamp is switched on, and that is said once, of the disk.
             wait_for(lambda: all(not lit for lit in lamps(stage).values()))
             time.sleep(2.0)  # the lamps' minimum off time, on this bench
-            before = ask(stage, "events")[-1]["number"]
+            before = call_kiosk(stage, "events")[-1]["number"]
             kiosk.limit_files_to(0)
-            ask(stage, "start")
+            call_kiosk(stage, "start")
             now = until(stage, lambda now: now["state"] == "fault")
             assert now["reason"].count("disk") >= 1
             assert "lamp of" not in now["reason"]
             problems = {row["name"]: row["problem"] for row in now["devices"] if row["problem"]}
             wait_for(lambda: "disk-full" in codes(stage))
             assert set(problems) <= {"disk"}
-            new = [row for row in ask(stage, "events") if row["number"] > before and row["level"] == "error"]
+            new = [row for row in call_kiosk(stage, "events") if row["number"] > before and row["level"] == "error"]
             assert sorted(row["code"] for row in new) == ["disk-full", "state"]
             assert not any(lamps(stage).values())
             wait_for(lambda: any("disk" in one for one in mail.bodies) and bool(web.events))
             assert "disk-full" in {event["code"] for event in web.events}
             kiosk.limit_files_to(-1)
-            ask(stage, "start")
+            call_kiosk(stage, "start")
             until(stage, playing)
             assert kiosk.interrupt().code == 0
     assert processes_on(stage) == []

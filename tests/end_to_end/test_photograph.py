@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.api.control import ask
+from controller.kiosk.api.control import call_kiosk
 from controller.stage.bench import BenchProcess
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import codes, copied, wait_for
@@ -27,12 +27,12 @@ def test_the_kiosk_photographs_an_appearance_and_finds_what_the_demo_found(
     (then,) = (row for row in rows if row["name"] == NAME)
     with BenchProcess(stage, cancel=threading.Event()), Command("serve", stage, "--no-panel") as kiosk:
         wait_for(lambda: bool(codes(stage)))
-        wait_for(lambda: ask(stage, "status")["state"] == "playing")
+        wait_for(lambda: call_kiosk(stage, "status")["state"] == "playing")
         outcome = velatura("compare", stage, NAME)
         assert outcome.code == 0, outcome.records[-1]
-        (found,) = ask(stage, "comparisons")
-        report = ask(stage, "report", run=found["history"][0]["run"])
-        wait_for(lambda: ask(stage, "status")["state"] == "playing")
+        (found,) = call_kiosk(stage, "comparisons")
+        report = call_kiosk(stage, "report", run=found["history"][0]["run"])
+        wait_for(lambda: call_kiosk(stage, "status")["state"] == "playing")
         assert kiosk.interrupt().code == 0
     newest = found["history"][0]
     assert newest["in_reach"] == pytest.approx(then["delta_e00_median"], rel=0.1)

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.serve import NAME, install_grey, wait_for
 from controller.core.storage import runtime_folder
-from controller.kiosk.api.control import ask
+from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.panel_address import FIRST_LOGIN
 from controller.stage.bench import BenchProcess
 from tests import waiting
@@ -32,7 +32,7 @@ def test_boots_to_playing_survives_its_own_death_and_ends_with_cool_lamps(prepar
         with Command("serve", prepared, "--no-panel") as second:
             state = wait_for(prepared, "playing")
             assert [lamp["strikes"] for lamp in state["lamps"]] == [1, 1, 1]
-            ask(prepared, "stop")
+            call_kiosk(prepared, "stop")
             wait_for(prepared, "off")
             assert not any(lamps(prepared).values())
             assert second.interrupt().code == 0

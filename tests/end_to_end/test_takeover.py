@@ -12,7 +12,7 @@ import pytest
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.solved import read_solved
 from controller.core.arrays import FloatImage
-from controller.kiosk.api.control import ask
+from controller.kiosk.api.control import call_kiosk
 from controller.run.progress import Silent
 from controller.services.calibrate import make_appearances
 from controller.stage.bench import BenchProcess
@@ -67,7 +67,7 @@ def test_the_others_take_over_for_a_dead_lamp(finished_demo: FinishedDemo, tmp_p
     with BenchProcess(stage, cancel=threading.Event()), Command("serve", stage, "--no-panel") as kiosk:
         wait_for(lambda: "takeover-solved" in codes(stage))
         wait_for(lambda: shown(stage) == [True, True, False])
-        state = ask(stage, "status")
+        state = call_kiosk(stage, "status")
         assert (state["state"], state["playing"]) == ("degraded", NAME)
         assert kiosk.interrupt().code == 0
     run, names = finished_calibration(stage), check_stage(stage).names
