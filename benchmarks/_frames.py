@@ -8,7 +8,7 @@ from benchmarks._synthetic import synthetic_calibration, synthetic_target
 from controller.core.arrays import ByteImage, FloatImage
 from controller.solve.bounded.solver import solve_bounded
 from controller.solve.feasibility import choose_exposure, target_radiance
-from controller.solve.scaling.dither import to_device
+from controller.steps.appearance.solving import device_frames
 from controller.transport import build_transport
 
 OUTPUTS = ("P1", "P2", "P3")
@@ -27,10 +27,7 @@ def compensation_frames(size: str, appearances: int) -> list[dict[str, ByteImage
         exposure = choose_exposure(transport, target, calibration.black)
         wanted = target_radiance(target, calibration.black, exposure)
         solution = solve_bounded(transport, wanted, calibration.black, most_iterations=MOST_ITERATIONS)
-        frames = [
-            to_device(frame, part.radiometry, phase=(17 * n, 29 * n))
-            for n, (part, frame) in enumerate(zip(calibration.projectors, solution.frames, strict=True))
-        ]
+        frames = device_frames(calibration, solution.frames).values()
         found.append(dict(zip(OUTPUTS, frames, strict=True)))
     return found
 

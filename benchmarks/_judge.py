@@ -9,15 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks._stage import CalibratedStage
 from benchmarks._truth import Truth, developed, footprints, moments, window_around
+from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.geometry import read_geometry
 from controller.artefacts.photographs import codes_of
 from controller.artefacts.projectors import Pixels
-from controller.calibrate.values import Calibration, Metapixels, Radiometry
+from controller.calibrate.values import Metapixels, Radiometry
 from controller.calibrate.verify.grade import verify
 from controller.capture.patterns import device_frame, frame
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.steps.appearance.solving import random_pattern
-from controller.transport import build_transport
 
 SPACING_PX = 16
 OFFSETS = ((2, 3), (7, 11), (12, 6), (14, 14))
@@ -96,24 +96,29 @@ def metapixel_errors(truth: Truth, n: int, metapixels: Metapixels) -> dict[str, 
     }
 
 
-def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibration) -> list[dict[str, float]]:
-    """Predicted pictures of each projector against its photograph, and against pictures without noise."""
-    transport = build_transport(calibration)
+def pattern_errors(stage: CalibratedStage, truth: Truth) -> list[dict[str, float]]:
+    """Predicted pictures of each projector against its photograph, and against pictures without noise.
+
+    All of them with what other surfaces throw back, as the solves predict it.
+    """
+    calibrated = Calibrated(stage.run, stage.names)
+    calibration = calibrated.calibration
     found = []
     for n, part in enumerate(calibration.projectors):
         rows, columns = part.metapixels.valid.shape
-        lit = transport.lit[n]
+        lit = calibrated.transport.lit[n]
         white = truth.white(n)
         full = 1.02 * float(white.max())
         clean_white = developed(white, full)
-        unit = float(part.white[lit].sum(dtype=np.float64) / clean_white[lit].sum(dtype=np.float64))
+        known = part.white if part.indirect is None else part.white + part.indirect
+        unit = float(known[lit].sum(dtype=np.float64) / clean_white[lit].sum(dtype=np.float64))
 
         def clean(shown: ByteImage, n: int = n, full: float = full, unit: float = unit) -> FloatImage:
             return developed(truth.light(n, shown), full) * np.float32(unit)
 
         pattern = random_pattern((columns, rows))
         photograph = codes_of(part.name).by_name(stage.run)[pattern.name].per_second()
-        predicted = transport.forward_part(n, frame(pattern, (columns, rows)))
+        predicted = predicted_light(calibrated, n, frame(pattern, (columns, rows)))
         real = clean(device_frame(pattern, (columns, rows), part.radiometry.response))
         figures = {
             "random photographed": verify(
@@ -125,14 +130,21 @@ def pattern_errors(stage: CalibratedStage, truth: Truth, calibration: Calibratio
         y, x = np.mgrid[0:rows, 0:columns]
         for name, on in (("chequers", (x + y) % 2), ("columns", (x // 2) % 2)):
             light = np.repeat(on.astype(np.float32)[..., None], 3, axis=2)
-            figures[name] = relative(transport.forward_part(n, light), clean((light * 255).astype(np.uint8)), lit)
+            predicted = predicted_light(calibrated, n, light)
+            figures[name] = relative(predicted, clean((light * 255).astype(np.uint8)), lit)
         single = np.zeros((rows, columns, 3), np.uint8)
         single[3::SPACING_PX, 5::SPACING_PX] = 255
-        predicted, real = transport.forward_part(n, (single / 255).astype(np.float32)), clean(single)
+        predicted, real = predicted_light(calibrated, n, (single / 255).astype(np.float32)), clean(single)
         figures["column of T"] = relative(predicted, real, lit)
         figures["column of T, one surface"] = relative(predicted, real, lit & truth.one_surface(n, EDGE_PX))
         found.append(figures)
     return found
+
+
+def predicted_light(calibrated: Calibrated, n: int, light: FloatImage) -> FloatImage:
+    """(camera rows, columns, 3): what the camera sees of a linear frame of projector ``n``, thrown-back light in it."""
+    direct, back = calibrated.transport.forward_part(n, light), calibrated.indirect_of(n, light)
+    return direct if back is None else direct + back
 
 
 def relative(predicted: FloatImage, seen: FloatImage, mask: Mask) -> float:

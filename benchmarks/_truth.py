@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from embreex.mesh_construction import TriangleMesh
 
 from controller.capture.raw import develop
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from plugins.emulated.kept_light import kept_folder
 from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import SIGMA_STEP_PX, directions, samples_of
@@ -32,32 +34,36 @@ class Truth:
     def __init__(self, stage: Path) -> None:
         self.bench: BenchTruth = read_truth(stage)
         self.stage_object: StageObject = object_of(stage, self.bench.object)
-        self.samples = samples_of(self.bench, self.stage_object, stage / FOLDER, lambda share: None)
-        indirect = Indirect(self.stage_object, stage / FOLDER)
+        kept = kept_folder(stage / FOLDER)
+        self.samples = samples_of(self.bench, self.stage_object, kept, lambda share: None)
+        indirect = Indirect(self.stage_object, kept)
         transfer = indirect.transfer(self.bench, self.samples.pixels, lambda share: None, keep=True)
         self._renderer = Renderer(self.bench, self.samples, transfer)
-        self._direct = self._renderer if transfer is None else Renderer(self.bench, self.samples)
+        self._direct = Renderer(_direct_alone(self.bench), self.samples)
         width, height = self.bench.camera.lens.size_px
         self.shape = (height, width)
 
-    def picture(self, frames: Sequence[ByteImage], *, bounced: bool = True) -> FloatImage:
-        """Linear light (rows, columns, 3) before the sensor of a frame for each projector, all of them lit."""
-        renderer = self._renderer if bounced else self._direct
+    def picture(self, frames: Sequence[ByteImage], *, direct: bool = False) -> FloatImage:
+        """Linear light (rows, columns, 3) before the sensor of a frame for each projector, all of them lit.
+
+        ``direct``: without what other surfaces throw back and what goes astray in lenses.
+        """
+        renderer = self._direct if direct else self._renderer
         return np.asarray(renderer.light(frames, [1.0] * len(frames)), np.float32)
 
-    def light(self, n: int, frame: ByteImage, *, bounced: bool = True) -> FloatImage:
-        """Linear light (rows, columns, 3) before the sensor, of projector ``n`` alone less that of its black."""
-        renderer = self._renderer if bounced else self._direct
+    def light(self, n: int, frame: ByteImage, *, direct: bool = False) -> FloatImage:
+        """As ``picture``, of projector ``n`` alone less that of its black."""
+        renderer = self._direct if direct else self._renderer
         levels = [float(index == n) for index in range(len(self.bench.projectors))]
         black = [np.zeros((p.lens.size_px[1], p.lens.size_px[0], 3), np.uint8) for p in self.bench.projectors]
         shown = [frame if index == n else dark for index, dark in enumerate(black)]
         lit = renderer.light(shown, levels)
         return np.asarray(lit - renderer.light(black, levels), np.float32)
 
-    def white(self, n: int, *, bounced: bool = True) -> FloatImage:
+    def white(self, n: int, *, direct: bool = False) -> FloatImage:
         """``light`` of full white."""
         width, height = self.bench.projectors[n].lens.size_px
-        return self.light(n, np.full((height, width, 3), 255, np.uint8), bounced=bounced)
+        return self.light(n, np.full((height, width, 3), 255, np.uint8), direct=direct)
 
     def response(self, n: int) -> Float64:
         """(3, 256): 0 at black, 1 at white."""
@@ -124,6 +130,12 @@ class Truth:
         return mean.reshape(*self.shape, -1)
 
 
+def _direct_alone(truth: BenchTruth) -> BenchTruth:
+    clear = [dataclasses.replace(one, light=dataclasses.replace(one.light, glare=0.0)) for one in truth.projectors]
+    camera = dataclasses.replace(truth.camera, glare=0.0)
+    return dataclasses.replace(truth, indirect=0.0, camera=camera, projectors=tuple(clear))
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """Rows and columns around a footprint, and (rows, columns) which of these pixels belong to its ellipse."""
@@ -167,12 +179,12 @@ def developed(light: FloatImage, full: float) -> FloatImage:
 def footprints(
     truth: Truth, n: int, spacing_px: int, offsets: Sequence[tuple[int, int]]
 ) -> list[tuple[tuple[int, int], FloatImage]]:
-    """Shares of single projector pixels at camera pixels, without noise: grids of lit pixels over white.
+    """Shares of single projector pixels at camera pixels, without noise: grids of lit pixels over white, both direct.
 
     Returns for each offset (row, column) of the grid the image (rows, columns), grey, as developed.
     """
     width, height = truth.bench.projectors[n].lens.size_px
-    white = truth.white(n)
+    white = truth.white(n, direct=True)
     full = 1.02 * float(white.max())
     grey = developed(white, full).sum(axis=2)
     lit = grey > 0.01 * grey.max()
@@ -180,7 +192,7 @@ def footprints(
     for row, column in offsets:
         frame = np.zeros((height, width, 3), np.uint8)
         frame[row::spacing_px, column::spacing_px] = 255
-        dots = developed(truth.light(n, frame), full).sum(axis=2)
+        dots = developed(truth.light(n, frame, direct=True), full).sum(axis=2)
         share = np.divide(dots, grey, out=np.zeros_like(dots), where=lit)
         found.append(((row, column), np.asarray(share, np.float32)))
     return found

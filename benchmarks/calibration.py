@@ -67,7 +67,7 @@ def _judge(stage: CalibratedStage, found: Found) -> None:
         found.add(radiometry_errors(truth, n, part.radiometry))
         found.add(map_errors(truth, n, stage.run))
         found.add(metapixel_errors(truth, n, part.metapixels))
-    for figures in pattern_errors(stage, truth, calibration):
+    for figures in pattern_errors(stage, truth):
         found.add(figures)
     found.add(_timed(stage.run, stage.names[0]))
 

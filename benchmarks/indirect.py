@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from benchmarks import Row, at_most
+from benchmarks._judge import predicted_light
 from benchmarks._scenes import SCENES, write_scene
 from benchmarks._truth import Truth, developed
 from controller.artefacts.calibrated import Calibrated
@@ -156,7 +157,7 @@ class Judge:
         for part in self.calibration_.projectors:
             known = known if part.indirect is None else known + part.indirect
         self.unit = float(known[self.lit].sum(dtype=np.float64) / seen[self.lit].sum(dtype=np.float64))
-        direct = [self.clean(self.truth.white(n, bounced=False)) for n in projectors]
+        direct = [self.clean(self.truth.white(n, direct=True)) for n in projectors]
         self.light = np.zeros((*self.lit.shape, 3, 3))
         for n, white in enumerate(direct):
             self.light += self.unit * white[..., None] * self.truth.mixing(n)
@@ -189,9 +190,7 @@ class Judge:
         coarse = np.random.default_rng(5).choice((0, 255), (-(-rows // side), -(-columns // side), 3))
         frame = np.repeat(np.repeat(coarse, side, axis=0), side, axis=1)[:rows, :columns].astype(np.uint8)
         light = (frame / 255).astype(np.float32)
-        predicted = self.calibrated.transport.forward_part(n, light)
-        back = self.calibrated.indirect_of(n, light)
-        predicted = predicted if back is None else predicted + back
+        predicted = predicted_light(self.calibrated, n, light)
         real = self.unit * self.clean(self.truth.light(n, frame))
         use = self.calibrated.transport.lit[n]
         return float(np.sqrt(np.mean((predicted - real)[use] ** 2) / np.mean(real[use] ** 2)))
@@ -199,7 +198,7 @@ class Judge:
     def appearance(self, solved: Solved, frames: Sequence[ByteImage]) -> dict[str, float]:
         """Colour differences, over pixels said to be in reach; and what they are in reach of."""
         shown = self.unit * self.clean(self.truth.picture(frames))
-        direct = self.unit * self.clean(self.truth.picture(frames, bounced=False))
+        direct = self.unit * self.clean(self.truth.picture(frames, direct=True))
         mask = solved.reachable & self.lit
         to_xyz = self.calibration_.camera_to_xyz
         error = colour_difference(shown, solved.target, to_xyz, solved.exposure, self.lit)
@@ -220,7 +219,7 @@ class Judge:
     def _needed(self, solved: Solved, shown: FloatImage, direct: FloatImage) -> Float64:
         """Direct light that the target asks of the projectors, while what bounces is as it is now."""
         dark = [np.zeros((p.lens.size_px[1], p.lens.size_px[0], 3), np.uint8) for p in self.truth.bench.projectors]
-        black = self.unit * self.clean(self.truth.picture(dark, bounced=False))
+        black = self.unit * self.clean(self.truth.picture(dark, direct=True))
         return np.asarray(solved.target - (shown - direct) - black, np.float64)
 
     def _block_error(self, shown: FloatImage, wanted: FloatImage, mask: Mask) -> float:

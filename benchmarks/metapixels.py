@@ -101,10 +101,13 @@ def _judged(label: str, truth: Truth, calibration: Calibration, transport: Light
 def _predicted(
     truth: Truth, n: int, calibration: Calibration, transport: LightTransport
 ) -> dict[str, tuple[float, float]]:
-    """Relative rms error of a random pattern, of columns of T (a grid of single pixels) and of one-pixel chequers."""
+    """Relative rms error of a random pattern, of columns of T (a grid of single pixels) and of one-pixel chequers.
+
+    Of direct light alone: these transports hold nothing else.
+    """
     part = calibration.projectors[n]
     rows, columns = part.metapixels.valid.shape
-    white, response = truth.white(n), truth.response(n)
+    white, response = truth.white(n, direct=True), truth.response(n)
     full = 1.02 * float(white.max())
     lit = transport.lit[n] & (developed(white, full).sum(axis=2) > 0)
     unit = _unit(part.white, developed(white, full), lit)
@@ -116,7 +119,7 @@ def _predicted(
     random = device_frame(random_pattern((columns, rows)), (columns, rows), response)
     found = {}
     for name, shown in (("random pattern", random), ("column of T", grid), ("chequers", chequers)):
-        real = developed(truth.light(n, shown), full) * np.float32(unit)
+        real = developed(truth.light(n, shown, direct=True), full) * np.float32(unit)
         seen = transport.forward_part(n, _light(shown, response))
         found[name] = relative(seen, real, lit), relative(seen, real, edge)
     return found

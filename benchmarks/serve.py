@@ -29,7 +29,7 @@ from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.errors import VelaturaError
 from controller.core.storage import runtime_folder
-from controller.kiosk.api.control import ask
+from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.decide.hours import WEEKDAYS
 from controller.services.calibrate import KEY_FILE, output_sizes
 from controller.stage.bench import BenchProcess
@@ -156,7 +156,7 @@ def _changing(stage: Path) -> Iterator[None]:
 
 def _close_at(stage: Path, closes: str) -> None:
     hours = {"opens": "00:00", "closes": closes, "appearance": NAME}
-    ask(stage, "set-schedule", time_zone="UTC", rows=[{"day": day, **hours} for day in WEEKDAYS])
+    call_kiosk(stage, "set-schedule", time_zone="UTC", rows=[{"day": day, **hours} for day in WEEKDAYS])
 
 
 def _told_after(stage: Path, panels: OpenPanels) -> list[float]:
@@ -205,7 +205,7 @@ def wait_for(stage: Path, state: str) -> dict[str, Any]:
     until_s, last = time.monotonic() + LONGEST_S, {}
     while time.monotonic() < until_s:
         with contextlib.suppress(VelaturaError):
-            last = dict(ask(stage, "status", timeout_s=2.0))
+            last = dict(call_kiosk(stage, "status", timeout_s=2.0))
             if last["state"] == state:
                 return last
         time.sleep(0.02)
