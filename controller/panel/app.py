@@ -14,7 +14,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -110,7 +110,11 @@ def _routes(panel: Panel, table: list[Entry]) -> list[Route]:
 def _route(panel: Panel, path: str, entries: dict[str, Entry]) -> Route:
     async def answer(request: Request) -> Response:
         method = "GET" if request.method == "HEAD" else request.method
-        return await guarded(panel, entries[method], request)
+        response = await guarded(panel, entries[method], request)
+        if request.method == "HEAD" and isinstance(response, StreamingResponse):
+            # Nobody reads its content. An endless one would keep the connection from the next request.
+            return Response(status_code=response.status_code, headers=dict(response.headers))
+        return response
 
     return Route(path, answer, methods=list(entries))
 

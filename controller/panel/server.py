@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import socket
@@ -17,6 +18,24 @@ from controller.kiosk.panel_address import is_loopback
 from controller.panel.context import PanelOptions
 
 START_S = 10.0
+ACCEPTING_S = 0.05
+"""In so long, what is being accepted has become a connection that can be closed."""
+
+
+class _Server(uvicorn.Server):
+    """Leaves no connection behind. Uvicorn does: one that was being accepted when it began to stop stays open, nobody
+    reads it, and a browser that sends its next request there waits for good.
+    """
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        for server in self.servers:
+            server.close()
+        await asyncio.sleep(ACCEPTING_S)
+        await super().shutdown(sockets)
+        for connection in tuple(self.server_state.connections):
+            connection.transport.abort()
+        # The loop closes them in its next turn.
+        await asyncio.sleep(0)
 
 
 class PanelServer:
@@ -43,7 +62,7 @@ class PanelServer:
             limit_concurrency=options.most_open_panels + 100,
             h11_max_incomplete_event_size=32 << 10,
         )
-        self._server, self._options, self._app = uvicorn.Server(config), options, app
+        self._server, self._options, self._app = _Server(config), options, app
         self._thread = threading.Thread(target=self._run, name="panel", daemon=True)
 
     def _run(self) -> None:

@@ -47,7 +47,6 @@ FRAMED: Final = {
     "x-frame-options": "SAMEORIGIN",
 }
 """Of a report that a page shows in a frame."""
-EVENT_STREAM: Final = "text/event-stream"
 _SEEN: Final = (Answer.PICTURE, Answer.JPEG, Answer.PAGE)
 
 Facts = Callable[[Request], dict[str, Any]]
@@ -200,10 +199,9 @@ class Pages:
             return self._panel.sessions.get(visitor.secret, touch=False) is not None
 
         headers = {"x-accel-buffering": "no"}
-        if request.method == "HEAD":
-            # A stream that nobody reads would never end, and the next request on its connection would wait for it.
-            return Response(media_type=EVENT_STREAM, headers=headers)
-        return StreamingResponse(self._panel.hub.stream(alive, language()), media_type=EVENT_STREAM, headers=headers)
+        return StreamingResponse(
+            self._panel.hub.stream(alive, language()), media_type="text/event-stream", headers=headers
+        )
 
     def _settings(self, _: Request) -> dict[str, Any]:
         kiosk, problem = self._panel.kiosk, None

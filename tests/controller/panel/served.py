@@ -1,17 +1,16 @@
-"""A panel that is really served: uvicorn in a thread, on a port of its own."""
+"""A panel that is really served, on a port of its own."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import re
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
-import uvicorn
 from argon2 import PasswordHasher
 from starlette.applications import Starlette
 
@@ -21,6 +20,7 @@ from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.store.accounts import Accounts, Role
 from controller.panel.app import make_panel
 from controller.panel.context import PanelOptions
+from controller.panel.server import PanelServer
 
 QUICK_HASH = PasswordHasher(time_cost=1, memory_cost=64, parallelism=1)
 """Argon2id all the same; the real cost has a test of its own."""
@@ -79,22 +79,12 @@ def served(
     operations: Sequence[Operation] = OPERATIONS,
 ) -> Iterator[Served]:  # fmt: skip
     accounts = accounts or accounts_in(folder)
-    app = make_panel(kiosk, accounts, options or PanelOptions(folder=folder, frames_per_s=20), operations)
-    config = uvicorn.Config(
-        app, host="127.0.0.1", port=port, log_level="error", ws="none", server_header=False, timeout_graceful_shutdown=1
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    until = time.monotonic() + 20
-    while not server.started:
-        assert thread.is_alive(), "the panel did not start"
-        assert time.monotonic() < until, "the panel did not start in time"
-        time.sleep(0.01)
-    found = server.servers[0].sockets[0].getsockname()[1]
+    options = dataclasses.replace(options or PanelOptions(folder=folder, frames_per_s=20), port=port)
+    app = make_panel(kiosk, accounts, options, operations)
+    # A panel for a network is tried out on the loopback, too.
+    server = PanelServer(app, dataclasses.replace(options, host="127.0.0.1"))
+    address = server.start()
     try:
-        yield Served(app, kiosk, accounts, f"http://127.0.0.1:{found}")
+        yield Served(app, kiosk, accounts, address.rstrip("/"))
     finally:
-        server.should_exit = True
-        thread.join(20)
-        assert not thread.is_alive(), "the panel did not stop"
+        server.stop()

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
+import socket
 import ssl
 import subprocess
+import threading
+import time
 from pathlib import Path
 
 import httpx
@@ -17,6 +21,7 @@ from controller.panel.context import PanelOptions
 from controller.panel.server import PanelServer, check_exposure
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import PASSWORD, accounts_in, csrf
+from tests.waiting import wait_for
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.4", "kiosk.local", ""])
@@ -67,6 +72,40 @@ def test_a_stop_ends_the_pages_that_follow_live_without_waiting_for_them(
             assert list(lines)
     # A server that had to lose its patience with an open page would say so as an error.
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+@pytest.mark.parametrize("again", range(5))
+def test_a_stop_closes_connections_that_begin_at_that_moment(tmp_path: Path, again: int) -> None:
+    """A browser opens spare connections, and would wait for good on one that is open and that nobody reads.
+
+    Without the closing, about every second time is caught.
+    """
+    options = PanelOptions(tmp_path / "p", port=0)
+    server = PanelServer(make_panel(MemoryKiosk(tmp_path / "pictures"), accounts_in(tmp_path / "p"), options), options)
+    address = server.start()
+    port = int(address.rstrip("/").rpartition(":")[2])
+    lines: list[socket.socket] = []
+    stopped = threading.Event()
+
+    def connect() -> None:
+        while not stopped.is_set():
+            with contextlib.suppress(OSError):
+                lines.append(socket.create_connection(("127.0.0.1", port), timeout=5))
+            time.sleep(0.0002)
+
+    browsers = [threading.Thread(target=connect) for _ in range(2)]
+    for browser in browsers:
+        browser.start()
+    wait_for(lambda: len(lines) > 5)
+    server.stop()
+    stopped.set()
+    for browser in browsers:
+        browser.join()
+    with contextlib.ExitStack() as closing:
+        for line in lines:
+            closing.enter_context(line)
+            with contextlib.suppress(ConnectionResetError):
+                assert line.recv(1) == b""
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl to make a certificate")
