@@ -5,6 +5,7 @@ those that Debian cares for.
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -31,7 +32,7 @@ _CAUSES: Final = (
      "Check the user in ssh, and that the server knows the public key of ssh_key_file. Other users "
      "must not be able to read that file."),
     (re.compile(r"connection (refused|timed out|closed|reset)|could not resolve|no route|unreachable|lost connection"
-                r"|broken pipe|not responding|timed out", re.IGNORECASE),
+                r"|closed by remote host|broken pipe|not responding|timed out", re.IGNORECASE),
      "backup-unreachable", "can't be reached, or the connection was lost",
      "Check the network, and that the server is on. It is tried again."),
     (re.compile(r"no such file|not found", re.IGNORECASE),
@@ -110,7 +111,9 @@ class Server:
             except subprocess.TimeoutExpired as error:
                 raise self._failed("the connection timed out") from error
         if done.returncode:
-            raise self._failed(done.stderr)
+            # Its own `ssh` may end first, and then it ends by this signal and says nothing.
+            lost = "broken pipe" if done.returncode == -signal.SIGPIPE else ""
+            raise self._failed(f"{done.stderr}\n{lost}")
         return [line for line in done.stdout.splitlines() if not line.startswith("sftp> ")]
 
     def _failed(self, said: str) -> WorkError:

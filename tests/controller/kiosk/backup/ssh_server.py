@@ -85,21 +85,33 @@ class CutLine:
         self._to, self._after = port, after
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
-        threading.Thread(target=self._serve, daemon=True).start()
+        self._ends: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._serve)]
 
     def __enter__(self) -> CutLine:
+        self._threads[0].start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._listener.close()
+        # A thread that waits on a socket is woken by its end, and not by its close.
+        for one in (self._listener, *self._ends):
+            _end(one)
+        for thread in self._threads:
+            thread.join()
+        for one in (self._listener, *self._ends):
+            one.close()
 
     def _serve(self) -> None:
         with contextlib.suppress(OSError):
             while True:
                 client, _ = self._listener.accept()
+                self._ends.append(client)
                 server = socket.create_connection(("127.0.0.1", self._to))
-                threading.Thread(target=self._pass, args=(server, client, None), daemon=True).start()
-                threading.Thread(target=self._pass, args=(client, server, self._after), daemon=True).start()
+                self._ends.append(server)
+                for way in ((server, client, None), (client, server, self._after)):
+                    thread = threading.Thread(target=self._pass, args=way)
+                    self._threads.append(thread)
+                    thread.start()
 
     def _pass(self, source: socket.socket, sink: socket.socket, left: int | None) -> None:
         with contextlib.suppress(OSError):
@@ -107,5 +119,9 @@ class CutLine:
                 sink.sendall(data)
                 left = None if left is None else left - len(data)
         for one in (source, sink):
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+            _end(one)
+
+
+def _end(one: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        one.shutdown(socket.SHUT_RDWR)

@@ -76,11 +76,24 @@ def test_a_connection_that_is_lost_on_the_way_replaces_nothing(server: SshServer
     (server.folder / "velatura-20260504.tar.gz").write_bytes(b"the one of before")
     with server.running(), CutLine(server.port, 100_000) as line:
         error = refused(Server(server.address(line.port), server.key_file, server.host_key), source)
-        assert error.code == "backup-unreachable"
+        assert error.code == "backup-unreachable", error.what
         assert (server.folder / "velatura-20260504.tar.gz").read_bytes() == b"the one of before"
         # The rest of it does not stand in the way of the next one.
         Server(server.address(), server.key_file, server.host_key).store(source, "20260504", 2)
     assert server.names() == ["velatura-20260504.tar.gz"]
+
+
+@pytest.mark.parametrize("says", ["", "echo 'Connection to 127.0.0.1 closed by remote host.' >&2; "])
+def test_a_program_that_its_lost_connection_ends_is_no_fault_of_the_server(
+    server: SshServer, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, says: str
+) -> None:
+    """OpenSSH's `sftp` ends so where its `ssh` ends first: about once in eight times on a busy machine."""
+    program = tmp_path / "programs" / "sftp"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\n{says}kill -PIPE $$\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
+    assert refused(Server(server.address(), server.key_file, server.host_key), source).code == "backup-unreachable"
 
 
 def test_a_server_that_does_not_answer_is_given_up(server: SshServer, source: Path) -> None:
