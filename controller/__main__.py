@@ -292,11 +292,11 @@ def run(arguments: Sequence[str]) -> int:
     except SystemExit as exiting:  # raised by the command-line library when the reader of our output has closed it
         return exiting.code if isinstance(exiting.code, int) else FAILED
     except BaseException as error:  # noqa: BLE001 - the last boundary: no caller could show it
-        return _told(error, as_json=as_json)
+        return _report_error(error, as_json=as_json)
     return outcome if isinstance(outcome, int) else DONE
 
 
-def _told(error: BaseException, *, as_json: bool) -> int:
+def _report_error(error: BaseException, *, as_json: bool) -> int:
     """Show ``error`` as two sentences and return the exit code. If output was lost, show that instead."""
     if isinstance(error, typer.Exit):
         return error.exit_code

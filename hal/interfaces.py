@@ -200,7 +200,7 @@ class Douser(Device, Protocol):
         """Block or pass the light; returns when the blades are there, as far as the driver can know. Repeatable."""
 
     def closed(self, *, deadline: Deadline) -> bool | None:
-        """Whether it is closed, or was told to be if it can't be read; None: unknown, because it has not been told.
+        """Whether it is closed, or was last set so if it can't be read; None: unknown, because it was never set.
 
         Raises DeviceGone if it can't be commanded now.
         """

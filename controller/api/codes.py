@@ -88,7 +88,7 @@ class _Reader:
                 remedy="Correct its name in captures.toml, or copy the file into the folder.",
             )
         image = np.asarray(develop(path, camera=self._camera).image.mean(axis=2), np.float32)
-        image = np.where(np.isfinite(image), image, np.float32(1))  # saturated: as bright as can be told
+        image = np.where(np.isfinite(image), image, np.float32(1))  # saturated: as bright as can be measured
         if self._shape is not None and image.shape != self._shape:
             raise CalibrationError(
                 "capture-shape-wrong",

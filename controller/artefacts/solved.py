@@ -116,7 +116,7 @@ class Solved:
 
     @property
     def requested(self) -> RequestedTarget:
-        """What results are judged by; of a run from before adaptation was told, all pixels say something."""
+        """What results are judged by; of a run from before adaptation was recorded, all pixels say something."""
         if self.asked is not None:
             return self.asked
         return RequestedTarget(self.target, self.reachable, np.ones_like(self.reachable))
@@ -159,8 +159,8 @@ def write_refined(
     arrays = npz_path(run, StepKind.REFINED, name)
     parts = {**_named("device", frames), **_named("linear", linear)}
     save_arrays(arrays, parts)
-    told = {"of": solving_digest(run, name), "refined": dict(figures)}
-    return [arrays, write_json(json_path(run, StepKind.REFINED, name), told)]
+    content = {"of": solving_digest(run, name), "refined": dict(figures)}
+    return [arrays, write_json(json_path(run, StepKind.REFINED, name), content)]
 
 
 def remove_refined(run: Path, name: str) -> None:
@@ -244,9 +244,9 @@ class Refining:
             arrays |= {**_named("best", self.best), "error": self.error}
         if self.equations is not None:
             arrays["equations"] = self.equations
-        told = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
-        save_arrays(told.with_suffix(".npz"), arrays)
-        return [told.with_suffix(".npz"), write_json(told, {"photographs": self.photographs, "ended": self.ended})]
+        path = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
+        save_arrays(path.with_suffix(".npz"), arrays)
+        return [path.with_suffix(".npz"), write_json(path, {"photographs": self.photographs, "ended": self.ended})]
 
     @classmethod
     def read(cls, run: Path, name: str, number: int, projectors: Sequence[str]) -> Self:
@@ -255,8 +255,8 @@ class Refining:
         frames = {projector: arrays[f"frame-{projector}"] for projector in projectors}
         error = arrays.get("error")
         best = None if error is None else {projector: arrays[f"best-{projector}"] for projector in projectors}
-        told = tuple(figures["photographs"]), str(figures["ended"])
-        return cls(frames, best, error, *told, arrays.get("equations"))
+        recorded = tuple(figures["photographs"]), str(figures["ended"])
+        return cls(frames, best, error, *recorded, arrays.get("equations"))
 
 
 def write_causes(run: Path, figures: Mapping[str, Any]) -> Path:

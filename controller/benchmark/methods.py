@@ -33,7 +33,7 @@ LIT: Final = 0.05
 STEPS: Final = 40
 """Of LSMR. Further ones let the noise of the dots grow: on `dark` 5, 15, 40, 100 and 200 were compared by the model."""
 SINGULAR: Final = 1e-6
-"""A pixel's colours are too alike to be told apart if the determinant is below this share of its light cubed."""
+"""A pixel's colours are too alike to be separated if the determinant is below this share of its light cubed."""
 
 
 def ours(stage: CountedStage) -> MakeFrames:
@@ -113,7 +113,7 @@ def divided(part: ProjectorCalibration, colours: Float64, light: FloatImage) -> 
     """The linear frame (rows, columns, 3) of one projector that makes ``light`` (camera rows, columns, 3) alone.
 
     At each metapixel's centre the 3x3 matrix of ``colours`` (camera rows, columns, 3 camera, 3 projector channels) is
-    read bilinearly and inverted; clipped to [0, 1]. A pixel whose colours can't be told apart is at white where light
+    read bilinearly and inverted; clipped to [0, 1]. A pixel whose colours can't be separated is at white where light
     is wanted.
     """
     frame = np.zeros((*part.metapixels.valid.shape, 3), np.float32)

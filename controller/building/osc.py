@@ -162,17 +162,17 @@ async def _answer(
 
 async def _tell(channel: asyncio.DatagramTransport, listeners: Sequence[Address], verbs: Verbs) -> None:
     """Send each value to the listeners when it has changed; all at the beginning."""
-    told: State = {}
+    last_sent: State = {}
     with changes(verbs) as changed:
         while listeners:
             await changed.wait()
             changed.clear()
             now = state_of(verbs.status())
             for name, value in now.items():
-                if told.get(name) != value:
+                if last_sent.get(name) != value:
                     for listener in listeners:
                         channel.sendto(message(name, value), listener)
-            told = now
+            last_sent = now
             await asyncio.sleep(EVERY_S)
 
 

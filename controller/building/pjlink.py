@@ -136,7 +136,7 @@ class _Session:
             # A stage that is not set up has none; all else is answered.
             _LOG.debug("PJLink has no inputs.", exc_info=True)
         if lines.is_question(command):
-            return lines.told(command, self._verbs.status(), names, metadata.version("velatura"))
+            return lines.answer(command, self._verbs.status(), names, metadata.version("velatura"))
         wanted = lines.meant(command, names)
         if isinstance(wanted, str):
             return wanted

@@ -62,21 +62,21 @@ def inputs(names: Sequence[str]) -> dict[str, str]:
 
 def meant(command: Asked, names: Sequence[str]) -> Wanted | str:
     """What a command that changes something means, or the error code of the specification (2.2)."""
-    told, coded = command.parameter, inputs(names)
+    value, coded = command.parameter, inputs(names)
     if not _known(command):
         return "ERR1"
-    if command.name == "POWR" and told in ("0", "1"):
-        return Wanted("open" if told == "1" else "close", {})
-    if command.name == "INPT" and told.upper() in coded:
-        return Wanted("play", {"name": coded[told.upper()]})
-    if command.name == "AVMT" and told in _MUTES:
-        return Wanted("black", {"on": _MUTES[told]})
-    if command.name == "FREZ" and told in ("0", "1"):
-        return Wanted("pause", {"on": told == "1"})
+    if command.name == "POWR" and value in ("0", "1"):
+        return Wanted("open" if value == "1" else "close", {})
+    if command.name == "INPT" and value.upper() in coded:
+        return Wanted("play", {"name": coded[value.upper()]})
+    if command.name == "AVMT" and value in _MUTES:
+        return Wanted("black", {"on": _MUTES[value]})
+    if command.name == "FREZ" and value in ("0", "1"):
+        return Wanted("pause", {"on": value == "1"})
     return "ERR2" if command.name in ("POWR", "INPT", "AVMT", "FREZ") else "ERR1"
 
 
-def told(command: Asked, now: KioskState, names: Sequence[str], version: str) -> str:
+def answer(command: Asked, now: KioskState, names: Sequence[str], version: str) -> str:
     """What a question is answered, or the error code of the specification."""
     if not _known(command):
         return "ERR1"

@@ -47,6 +47,6 @@ def record(
         ).wait()
     finally:
         signal.signal(signal.SIGINT, before)
-    told = f"The tape is {tape}." if tape.is_file() else "The command opened no device, so there is no tape."
-    console.show_result(told, as_json=False)
+    text = f"The tape is {tape}." if tape.is_file() else "The command opened no device, so there is no tape."
+    console.show_result(text, as_json=False)
     return code

@@ -119,7 +119,7 @@ def serve(
 
 
 def _protocols(kiosk: StageKiosk, reporter: Reporter) -> Sequence[Configured]:
-    """Those of building.toml. A damaged one must not keep the stage dark, so it is only told."""
+    """Those of building.toml. A damaged one must not keep the stage dark, so it is only reported."""
     try:
         return read_protocols(kiosk.stage)
     except VelaturaError as error:

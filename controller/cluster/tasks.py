@@ -78,7 +78,7 @@ class Outcome(Generic[Value]):
         return self.value
 
 
-def _told(work: Callable[[], Value]) -> Outcome[Value]:
+def _outcome_of(work: Callable[[], Value]) -> Outcome[Value]:
     try:
         with _RUNNING:
             return Outcome(work(), None)
@@ -102,7 +102,7 @@ def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions)
             stage.transport, base, stage.black, asked, options, drive=drive, indirect=stage.indirect
         )
 
-    return _told(work)
+    return _outcome_of(work)
 
 
 def code_digest() -> str:

@@ -55,7 +55,7 @@ class BackupTable(ConfigTable):
 
 
 class AlertsTable(ConfigTable):
-    """Who is told of events: people by mail, programs by a webhook."""
+    """Who gets the events: people by mail, programs by a webhook."""
 
     least: Literal["warning", "error"] = Field(
         default="error", description='"warning" or "error": the least level of an event that is sent'

@@ -154,7 +154,7 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
 
 
 def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
-    told = []
+    missing = []
     for device in new:
         if device.kind == "power_switch":
             remedy = (
@@ -165,8 +165,8 @@ def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
             remedy = f"If it is the one to use, write address = {device.settings.get('address', '')!r} into [camera]."
         else:
             remedy = "Add it with `velatura doctor STAGE --write`, or unplug it if it is not part of this stage."
-        told.append(Finding(device.address, Problem("not-in-stage", f"{device.what} is not in stage.toml.", remedy)))
-    return told
+        missing.append(Finding(device.address, Problem("not-in-stage", f"{device.what} is not in stage.toml.", remedy)))
+    return missing
 
 
 def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Finding]:

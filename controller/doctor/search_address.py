@@ -24,11 +24,11 @@ def search_address(interface: str) -> str:
     if interface in names and len(interface) <= _LONGEST:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
             try:
-                told = fcntl.ioctl(any_socket, _SIOCGIFBRDADDR, struct.pack("256s", interface.encode()))
+                reply = fcntl.ioctl(any_socket, _SIOCGIFBRDADDR, struct.pack("256s", interface.encode()))
             except OSError:
-                told = b""
-        if told and told[20:24] != bytes(4):
-            return socket.inet_ntoa(told[20:24])
+                reply = b""
+        if reply and reply[20:24] != bytes(4):
+            return socket.inet_ntoa(reply[20:24])
         raise UsageError(
             "interface-unknown",
             what=f"The network interface {interface} has no broadcast address.",

@@ -75,16 +75,16 @@ def write_dataset(content: Content, folder: Path) -> dict[str, int]:
 
 def _photographs(run: Path) -> Iterator[_Photograph]:
     """All photographs that an index in the run lists, each once."""
-    profile, told = load_profile(run), set[Path]()
+    profile, known = load_profile(run), set[Path]()
     for file in sorted(run.glob("*.json")):
         rows = read_json(file)
         if not isinstance(rows, list) or not all(isinstance(row, dict) and "path" in row for row in rows):
             continue
         for row in rows:
             path = run / row["path"]
-            if path in told:
+            if path in known:
                 continue
-            told.add(path)
+            known.add(path)
             given_s = float(row["exposure_s"])
             seconds = given_s if profile is None else profile.true_exposure(given_s)
             taken = Taken(row["name"], path, seconds, profile=profile, projector=row.get("projector"))

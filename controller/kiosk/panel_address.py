@@ -37,32 +37,32 @@ def own_addresses() -> tuple[str, ...]:
         for _, name in socket.if_nameindex():
             # An interface without an address has nothing to tell.
             with contextlib.suppress(OSError):
-                told = fcntl.ioctl(channel, _GET_ADDRESS, struct.pack("256s", name.encode()[:15]))
-                found.append(ipaddress.ip_address(told[20:24]))
+                reply = fcntl.ioctl(channel, _GET_ADDRESS, struct.pack("256s", name.encode()[:15]))
+                found.append(ipaddress.ip_address(reply[20:24]))
     return tuple(str(one) for one in found if not one.is_loopback)
 
 
-def addresses(told: str) -> tuple[str, ...]:
-    """The addresses for people, of a panel that listens at ``told`` (``https://0.0.0.0:8377/``)."""
+def addresses(address: str) -> tuple[str, ...]:
+    """The addresses for people, of a panel that listens at ``address`` (``https://0.0.0.0:8377/``)."""
     for host in EVERYWHERE:
-        if f"//{host}:" in told or f"//[{host}]:" in told:
-            at = told.rpartition(":")[2]
-            scheme = told.partition(":")[0]
+        if f"//{host}:" in address or f"//[{host}]:" in address:
+            at = address.rpartition(":")[2]
+            scheme = address.partition(":")[0]
             return tuple(f"{scheme}://{own}:{at}" for own in own_addresses())
-    return (told,)
+    return (address,)
 
 
 @dataclass(frozen=True, slots=True)
 class PanelAccess:
-    """Where the panel is (``told``: as its server says), and the account and one-time password until ``entered``."""
+    """Where the panel is (``served_at``: by its server), and the account and one-time password until ``entered``."""
 
-    told: str
+    served_at: str
     login: tuple[str, ...]
     entered: Callable[[], bool]
 
     def lines(self) -> tuple[str, ...]:
         """For a projector."""
-        where = addresses(self.told)[:1] or ("connect this computer to a network",)
+        where = addresses(self.served_at)[:1] or ("connect this computer to a network",)
         return ("velatura", *where, *(() if self.entered() else self.login))
 
 

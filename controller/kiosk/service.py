@@ -212,7 +212,7 @@ class Service:
     # -- inside
 
     def _tell(self, decision: Decision) -> None:
-        """A device's event. That nothing can be written is told once, not by each device."""
+        """A device's event. That nothing can be written is one event, not one of each device."""
         if decision.code == DISK_FULL:
             self.disk.suspect(decision)
         else:

@@ -154,7 +154,7 @@ class LampGuard:
         return self._record.failed
 
     def keep_failed(self, count: int) -> None:
-        """Keep how many attempts in a row gave no light, so that a restart does not begin to count anew."""
+        """Keep how many attempts in a row gave no light, so that a restart does not start the count again."""
         with self._lock:
             if self._record.failed != count:
                 self._write_quietly(replace(self._record, failed=count))

@@ -38,7 +38,7 @@ class TimeLeft:
         """Seconds, or None as long as nobody can know.
 
         ``worked``: the cost of what this run did in ``worked_s`` seconds; ``left``: the cost of the rest. ``reason``
-        says why it is more than a fifth above the least that was told, as long as it is.
+        says why it is more than a fifth above the least that was shown, as long as it is.
         """
         found = self._found(worked, worked_s, left)
         if found is None:

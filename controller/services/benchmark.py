@@ -94,7 +94,7 @@ def _on_scene(
     cancel: threading.Event,
 ) -> list[Mapping[str, Any]]:  # fmt: skip
     size, seed = what
-    steps = partial(_steps, entered=entered, size=size, told={"scene": scene.name, "seed": seed})
+    steps = partial(_steps, entered=entered, size=size, conditions={"scene": scene.name, "seed": seed})
     stage = prepare_scene(_stage_folder(out, scene.name, seed), scene, size=size, seed=seed)
     run = run_on_bench(stage, steps, name=KIND, reporter=reporter, cancel=cancel)
     return [json.loads((run / KIND / f"{entry.name}.json").read_bytes()) for entry in entered]
@@ -102,11 +102,11 @@ def _on_scene(
 
 def _steps(
     rig: Rig, run: Path, checked: Checked, _: BenchProcess, *, entered: Sequence[Entry], size: str,
-    told: Mapping[str, Any],
+    conditions: Mapping[str, Any],
 ) -> Sequence[Step]:  # fmt: skip
     """Calibrate, photograph dots where a method needs them, let each method take part; skip what is done."""
     stage = opened(rig, run, checked, dots=any(entry.dots for entry in entered))
-    arena = _Arena(rig, stage.calibrated, stage.longest_s, size, told)
+    arena = _Arena(rig, stage.calibrated, stage.longest_s, size, conditions)
     return [
         *stage.calibrating,
         *(
@@ -136,7 +136,7 @@ class _Arena:
     calibrated: Calibrated
     longest_s: float
     size: str
-    told: Mapping[str, Any]
+    conditions: Mapping[str, Any]
     _targets: dict[str, ReachableTarget] = field(default_factory=dict)
 
     @cached_property
@@ -149,7 +149,7 @@ class _Arena:
         names = self.calibrated.projectors
         effort = calibration_effort(context.journal.shot_counts(), names, own=(SHOTS,), dots=StepKind.STUDY_DOTS)
         light = RigPhotographer(self.rig, context, self.calibrated, entry.name, self.longest_s)
-        subject = subject_of(self.size, int(self.told["seed"]), context)(self.calibrated, light, context.folder)
+        subject = subject_of(self.size, int(self.conditions["seed"]), context)(self.calibrated, light, context.folder)
         shower = _RigShower(light, names)
         stage = CountedStage(subject, shower, self.camera, effort, "own", check=context.check)
         targets = self._made(subject)
@@ -157,7 +157,7 @@ class _Arena:
         judged = judge(entry, stage, targets, shower)
         folder = context.folder / KIND
         folder.mkdir(exist_ok=True)
-        content = {**self.told, "method": entry.name, "about": entry.about, **board.as_content(judged)}
+        content = {**self.conditions, "method": entry.name, "about": entry.about, **board.as_content(judged)}
         path = folder / f"{entry.name}.json"
         write_atomically(path, board.encoded(content))
         return [path, *board.save_pictures(folder, entry.name, subject, targets, judged)]

@@ -77,11 +77,11 @@ def live(
     open_it = partial(_opened, source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
     open_it().close()
     ready = _ready(checked, calibrated, reporter)
-    told: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
 
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
         def show(context: Context) -> Sequence[Path]:
-            told.update(_show(rig, context, ready, open_it, rate_hz=rate_hz, seconds=seconds))
+            figures.update(_show(rig, context, ready, open_it, rate_hz=rate_hz, seconds=seconds))
             return ()
 
         return [
@@ -89,7 +89,7 @@ def live(
         ]
 
     session.run(checked, steps, name="live", reporter=reporter, cancel=cancel)
-    return told
+    return figures
 
 
 def _opened(source: Path, target_px: tuple[int, int], *, loop: bool, rate_hz: float) -> LiveSource:
@@ -160,10 +160,10 @@ def _show(
         context.reporter.say(
             f"{figures.bad} pictures could not be shown. The last error: {figures.trouble}", Level.WARNING
         )
-    return figures.told() | _told(figures, status)
+    return figures.as_json() | _delivered(figures, status)
 
 
-def _told(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any]:
+def _delivered(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any]:
     """The player's figures. Pictures that it did not show were replaced by newer ones."""
     if status is None:
         return {"shown": 0, "by": None, "shown_after_p50_ms": None, "shown_after_p99_ms": None}
@@ -270,7 +270,7 @@ def feed(
                 raise Cancelled
 
         figures = run_live(pictures, maker, write, rate_hz=rate_hz, seconds=seconds, tell=tell)
-    return {"white": ready.brightness, **figures.told()}
+    return {"white": ready.brightness, **figures.as_json()}
 
 
 def _target_writer(file: FrameFile) -> Callable[[Frames], object]:

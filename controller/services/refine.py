@@ -89,8 +89,8 @@ def refine(
             "refine = 0 under [solve] in stage.toml.",
             Level.WARNING,
         )
-    told = {name: read_refining(folder, name) for name in titles}
-    return {"refined": " ".join(sentence(name, figures) for name, figures in told.items() if figures is not None)}
+    by_name = {name: read_refining(folder, name) for name in titles}
+    return {"refined": " ".join(sentence(name, figures) for name, figures in by_name.items() if figures is not None)}
 
 
 def _enough(run: Path, name: str, photographs: int) -> bool:

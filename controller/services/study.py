@@ -175,13 +175,13 @@ def _steps(
 ) -> Sequence[Step]:  # fmt: skip
     """Calibrate, photograph dots where needed, and run each experiment; skip what is done already."""
     stage = opened(rig, run, checked, dots=any(experiment.dots for experiment in experiments))
-    told = {"scene": scene.title, "size": size, "seed": seed}
+    conditions = {"scene": scene.title, "size": size, "seed": seed}
     return [
         *stage.calibrating,
         *(
             Step(
                 StepId("study", item=one.name),
-                partial(_experiment, rig, checked, stage.calibrated, one, told, stage.longest_s, bench.disturb),
+                partial(_experiment, rig, checked, stage.calibrated, one, conditions, stage.longest_s, bench.disturb),
                 inputs={"size": size, "seed": str(seed), "code": one.code_sha256()},
                 after=(*stage.after, *(stage.dots if one.dots else ())),
                 title=one.title,
@@ -197,13 +197,13 @@ def _experiment(
     checked: Checked,
     calibrated: Calibrated,
     one: Experiment,
-    told: Mapping[str, Any],
+    conditions: Mapping[str, Any],
     longest_s: float,
     disturb: Callable[[Sequence[Mapping[str, Any]]], None],
     context: Context,
 ) -> Sequence[Path]:
     before, began_s = context.journal.shot_count(), time.perf_counter()
-    make = subject_of(str(told["size"]), int(told["seed"]), context)
+    make = subject_of(str(conditions["size"]), int(conditions["seed"]), context)
     hand = RigStageControl(rig, context, calibrated, one.name, checked.prior, longest_s, disturb, make)
     light = RigPhotographer(rig, context, calibrated, one.name, longest_s)
     subject = make(calibrated, light, context.folder)
@@ -213,7 +213,7 @@ def _experiment(
     finally:
         disturb(())
     facts = {
-        **told,
+        **conditions,
         "code": one.code_sha256(),
         # Photographs of an earlier run count, too; those of an experiment itself are not in ``used``.
         "photographs": max(len(light.used), context.journal.shot_count() - before),

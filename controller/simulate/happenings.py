@@ -33,7 +33,7 @@ class Living(Protocol):
     repaired_s: float
     news: Event
 
-    def later(self, seconds: float, mend: Callable[[], None]) -> None: ...
+    def later(self, seconds: float, repair: Callable[[], None]) -> None: ...
 
     def boot(self) -> None: ...
 
@@ -64,10 +64,10 @@ def _line(life: Living, item: Item) -> None:
     line.connection += item.how == "gone"
     life.witness.disturb(item.for_s + 120.0)
 
-    def mend() -> None:
+    def repair() -> None:
         line.trouble = ""
 
-    life.later(item.for_s, mend)
+    life.later(item.for_s, repair)
 
 
 def _lamp_fails(life: Living, item: Item) -> None:
@@ -127,10 +127,10 @@ def _player(life: Living, item: Item) -> None:
     else:
         screen.trouble = item.how
 
-        def mend() -> None:
+        def repair() -> None:
             screen.trouble = ""
 
-        life.later(item.for_s, mend)
+        life.later(item.for_s, repair)
     witness.player_disturbed_until_s = max(witness.player_disturbed_until_s, now_s + item.for_s + PLAYER_S)
     witness.disturb(item.for_s, PLAYER_S)
     if fell:
@@ -142,10 +142,10 @@ def _camera(life: Living, item: Item) -> None:
     camera.gone = True
     camera.connection += 1
 
-    def mend() -> None:
+    def repair() -> None:
         camera.gone = False
 
-    life.later(item.for_s, mend)
+    life.later(item.for_s, repair)
 
 
 def _disk_full(life: Living, item: Item) -> None:
@@ -153,20 +153,20 @@ def _disk_full(life: Living, item: Item) -> None:
     disk.full = True
     life.witness.disturb(item.for_s)
 
-    def mend() -> None:
+    def repair() -> None:
         disk.full = False
 
-    life.later(item.for_s, mend)
+    life.later(item.for_s, repair)
 
 
 def _disk_low(life: Living, item: Item) -> None:
     disk = life.world.disk
     disk.free_bytes = 1_000_000_000
 
-    def mend() -> None:
+    def repair() -> None:
         disk.free_bytes = TOTAL_BYTES // 2
 
-    life.later(item.for_s, mend)
+    life.later(item.for_s, repair)
 
 
 def _killed(life: Living, item: Item) -> None:
@@ -207,13 +207,13 @@ def _clock(life: Living, item: Item) -> None:
     world.clock_off_s, world.is_synchronised = item.number, False
     _unsure(life, item.for_s + HOLD_S + REPAIR_S)
 
-    def mend() -> None:
+    def repair() -> None:
         world.clock_off_s, world.is_synchronised = 0.0, True
         _unsure(life, HOLD_S + REPAIR_S)
         if witness.override is not None:
             _unsure_until_hours(life)
 
-    life.later(item.for_s, mend)
+    life.later(item.for_s, repair)
 
 
 def _unsure(life: Living, for_s: float) -> None:
@@ -233,10 +233,10 @@ def _no_network(life: Living, item: Item) -> None:
     world = life.world
     world.no_network = True
 
-    def mend() -> None:
+    def repair() -> None:
         world.no_network = False
 
-    life.later(item.for_s, mend)
+    life.later(item.for_s, repair)
 
 
 def _drift(life: Living, item: Item) -> None:
@@ -295,18 +295,18 @@ def _bundle_damaged(life: Living, item: Item) -> None:
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2] + bytes(byte ^ 0xA5 for byte in content[len(content) // 2 :]))
     _player(life, Item(item.at_s, "player", "", "killed"))
-    mended_s = item.for_s or MEND_FILE_S
-    life.witness.disturb(mended_s)
+    repaired_s = item.for_s or MEND_FILE_S
+    life.witness.disturb(repaired_s)
     world, witness = life.world, life.witness
     witness.player_disturbed_until_s = max(
-        witness.player_disturbed_until_s, world.scheduler.now_s + mended_s + PLAYER_S
+        witness.player_disturbed_until_s, world.scheduler.now_s + repaired_s + PLAYER_S
     )
 
-    def mend() -> None:
+    def repair() -> None:
         publish(STAGE, int(world.truth_s))
         witness.disturb(0.0)
 
-    life.later(mended_s, mend)
+    life.later(repaired_s, repair)
 
 
 def _command(life: Living, item: Item) -> None:

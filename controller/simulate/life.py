@@ -88,7 +88,7 @@ class Life:
         self.damaged: set[str] = set()
         self.unreadable: set[str] = set()
         self.repaired_s = 0.0
-        self._mends: list[tuple[float, int, Callable[[], None]]] = []
+        self._repairs: list[tuple[float, int, Callable[[], None]]] = []
         self._last: tuple[Any, ...] = ()
 
     # -- living
@@ -124,7 +124,7 @@ class Life:
         while scheduler.now_s < self.days * DAY_S and self.broken is None:
             soon = [self.days * DAY_S, self.witness.next_edge_s()]
             soon += [left[0].at_s] if left else []
-            soon += [self._mends[0][0]] if self._mends else []
+            soon += [self._repairs[0][0]] if self._repairs else []
             self.news.wait(max(0.0, min(soon) - scheduler.now_s))
             self.news.clear()
             if scheduler.crashes and self.broken is None:
@@ -138,15 +138,15 @@ class Life:
                 self.end_of_program()
                 scheduler.sleep(3.0)
                 self.boot()
-            while self._mends and self._mends[0][0] <= scheduler.now_s:
-                heapq.heappop(self._mends)[2]()
+            while self._repairs and self._repairs[0][0] <= scheduler.now_s:
+                heapq.heappop(self._repairs)[2]()
             while left and left[0].at_s <= scheduler.now_s and self.broken is None:
                 happenings.happen(self, left.pop(0))
                 scheduler.rush()
 
-    def later(self, seconds: float, mend: Callable[[], None]) -> None:
+    def later(self, seconds: float, repair: Callable[[], None]) -> None:
         """Do this after so many seconds."""
-        heapq.heappush(self._mends, (self.world.scheduler.now_s + seconds, len(self._mends), mend))
+        heapq.heappush(self._repairs, (self.world.scheduler.now_s + seconds, len(self._repairs), repair))
 
     # -- the service
 
@@ -177,7 +177,7 @@ class Life:
         self.witness.disturb(0.0)
 
     def restart(self, *, lit: bool) -> None:
-        """As systemd does: asked to end, then started anew. Raises Broken."""
+        """As systemd does: asked to end, then started again. Raises Broken."""
         program, scheduler = self.program, self.world.scheduler
         assert program is not None
         self.stop.restarting = lit

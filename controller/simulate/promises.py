@@ -93,7 +93,7 @@ class Witness:
         self.rows: dict[int, EventRow] = {}
         self._held: deque[EventRow] = deque(maxlen=SHOWN)
         self.digested: list[str] = []
-        self._told = ""
+        self._logged_state = ""
         self._black_since_s: float | None = None
         self._back_by_s: float | None = None
         self._missing_since_s: float | None = None
@@ -146,7 +146,7 @@ class Witness:
         self._began_s = self._stepped_s = self._world.scheduler.now_s
         self.paused_long = True
         self._held.clear()
-        self._told = State.OFF.value
+        self._logged_state = State.OFF.value
 
     def player_fell(self) -> None:
         """The player died or hangs, and nothing else is wrong."""
@@ -161,7 +161,7 @@ class Witness:
         self._missing_since_s = None
 
     def numbers_again(self) -> None:
-        """What was told from ``read`` on has numbers that others had, which were never written."""
+        """What was logged from ``read`` on has numbers that others had, which were never written."""
         self._alerted_number = min(self._alerted_number, self.read)
 
     def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
@@ -177,11 +177,11 @@ class Witness:
         return {name: lamp.lit_at_s for name, lamp in self._world.lamps.items() if lamp.shines}
 
     def forgive(self) -> None:
-        """Lamps may be tried anew."""
+        """Lamps may be tried again."""
         self._strikes_since = {name: lamp.strikes for name, lamp in self._world.lamps.items()}
 
     def ledger_lost(self) -> None:
-        """The counts of strikes begin anew."""
+        """The counts of strikes start again."""
         self.forgive()
         self._uncounted = {name: line.lamp.strikes + line.delayed for name, line in self._world.lines.items()}
 
@@ -211,8 +211,8 @@ class Witness:
             if wanted:
                 self.forgive()
         state = service.reconciler.machine.state
-        if self._told != state.value:
-            raise Broken("state", f"it says {self._told}, but it is {state.value}")
+        if self._logged_state != state.value:
+            raise Broken("state", f"it says {self._logged_state}, but it is {state.value}")
         self._strikes(service)
         self._stay_lit(wanted)
         self._works(service)
@@ -227,7 +227,7 @@ class Witness:
     def _listen(self, service: Service) -> bool:
         number, now_s = service.log.number, self._world.scheduler.now_s
         if service.log.problem is None:
-            # What was told while nothing could be written has been written now.
+            # What was logged while nothing could be written has been written now.
             self.rows.update((row.number, row) for row in self._held)
             self._held.clear()
         if number == self.read:
@@ -246,7 +246,7 @@ class Witness:
                 raise Broken("remedy", f"{row.code}: {row.text}")
             if row.code == "state":
                 self._off(row)
-                self._told = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
+                self._logged_state = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
             elif row.code == "task-due":
                 open_s = now_s - self.changed_s
                 if self._wanted and self.wanted_open() and open_s > BLACK_S and now_s > self.clock_wrong_until_s:
@@ -380,18 +380,18 @@ class Witness:
             self._back_by_s = None
 
     def _explained(self, kiosk: StageKiosk, state: State) -> bool:
-        told = kiosk.snapshot()
-        if state in (State.FAULT, State.DEGRADED) and told.reason:
+        snapshot = kiosk.snapshot()
+        if state in (State.FAULT, State.DEGRADED) and snapshot.reason:
             return True
         return (
-            bool(told.warnings)
-            or any(row.problem for row in told.devices)
+            bool(snapshot.warnings)
+            or any(row.problem for row in snapshot.devices)
             or any(row.code == "nothing-installed" for row in self.rows.values())
         )
 
 
 def after_the_end(witness: Witness, service: Service, *, damaged: frozenset[str]) -> None:
-    """A service has begun anew: what the one before told is there. ``damaged``: files that were. Raises Broken."""
+    """A service has started again: what the one before logged is there. ``damaged``: files that were. Raises Broken."""
     rows = list(service.log.after(0))
     # What could not be written before the end is gone, and its numbers are given again.
     witness.read = next((row.number - 1 for row in reversed(rows) if row.code == "service-started"), witness.read)

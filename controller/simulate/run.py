@@ -44,7 +44,7 @@ def simulate(
         events += outcome.events
         digest.update(outcome.digest.encode())
         if outcome.broken:
-            _told(outcome, shrink_s, keep, reporter)
+            _report(outcome, shrink_s, keep, reporter)
         if cancel.is_set():
             raise Cancelled
         reporter.say(f"{days / YEAR_DAYS:.2f} years, {events} events")
@@ -55,7 +55,7 @@ def simulate(
     }  # fmt: skip
 
 
-def _told(outcome: Outcome, shrink_s: float, keep: Path | None, reporter: Reporter) -> None:
+def _report(outcome: Outcome, shrink_s: float, keep: Path | None, reporter: Reporter) -> None:
     reporter.say(f"{outcome.how} (seed {outcome.seed}, day {outcome.at_s / DAY_S:.3f})", Level.ERROR)
     short = shortened(outcome, within_s=shrink_s)
     for item in short.items:

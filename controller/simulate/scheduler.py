@@ -61,7 +61,7 @@ class Task:
                     self._run()
             except Killed:
                 pass
-            except BaseException as error:  # noqa: BLE001 - told as what the life found
+            except BaseException as error:  # noqa: BLE001 - reported as what the life found
                 scheduler.crashes.append((self.name, error))
             self.done = True
             for task in self._joining:

@@ -31,13 +31,13 @@ CORRELATED: Final = 25.0
 RIDGE: Final = 1e-6
 """Of a cause's own energy: keeps causes apart that no photograph tells apart."""
 SURE: Final = 4.0
-"""Standard errors from which an amount is told."""
+"""Standard errors from which an amount is reported."""
 LEAST: Final[dict[Kind, float]] = {
     "brightness": 0.02, "response": 0.015, "indirect": 0.01, "ambient": 0.003, "focus": 0.15,
 }  # fmt: skip
-"""Amounts from which a cause is told: below, a calibration is as good as it gets."""
+"""Amounts from which a cause is reported: below, a calibration is as good as it gets."""
 LEAST_SHARE: Final = 0.03
-"""Of the squared error: what explains less is not told, since it may stand for something that no cause describes."""
+"""Of the squared error: what explains less is left out, since it may stand for something that no cause describes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ _Group = tuple[Kind, int | None]
 
 
 def _groups(projectors: int) -> list[_Group]:
-    """Causes that are told together: the colours of one, in the order of ``equations``."""
+    """Causes that are reported together: the colours of one, in the order of ``equations``."""
     groups: list[_Group] = [("brightness", n) for n in range(projectors)]
     groups += [("response", n) for n in range(projectors)]
     return [*groups, ("indirect", None), ("ambient", None), ("focus", None)]

@@ -1,4 +1,4 @@
-"""How much memory a base image takes at its peak, told before it begins (docs/decisions/0055).
+"""How much memory a base image takes at its peak, calculated before it begins (docs/decisions/0055).
 
 Counted are arrays of the process itself. A calibration's own arrays lie in files, and what of them is in memory can be
 had back by the system at any time.
@@ -16,8 +16,8 @@ from controller.core.errors import WorkError
 WINDOW: Final = 15
 """Bytes of one camera sample's share of one projector."""
 LEAST_OBJECT: Final = 0.25
-"""Share of the camera's picture; an object that needs less memory can't be told from one that needs more, before it is
-photographed, and what is refused then must certainly not fit."""
+"""Share of the camera's picture; how much an object needs is not known before it is photographed, and what is refused
+then must certainly not fit."""
 SPARE: Final = 1.1
 """Small arrays, stacks and tables of threads."""
 PROGRAM: Final = 300 * 1024 * 1024

@@ -91,8 +91,8 @@ class BenchProcess:
             elif "device" in record:
                 self.addresses[record["device"]] = record["address"]
             elif "error" in record:
-                told = record["error"]
-                raise DeviceError(told["code"], what=told["what"], remedy=told["remedy"])
+                failure = record["error"]
+                raise DeviceError(failure["code"], what=failure["what"], remedy=failure["remedy"])
             elif record.get("ready"):
                 return
         if self._cancel.is_set():

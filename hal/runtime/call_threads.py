@@ -42,7 +42,7 @@ class _Job:
         with self._turn:
             self.done.set()
         if self.left and self.error is None:
-            with contextlib.suppress(Exception):  # nobody is left who could be told
+            with contextlib.suppress(Exception):  # nothing is left that could take it
                 self.late(self.result)
 
     def leave(self) -> bool:

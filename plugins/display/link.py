@@ -168,11 +168,13 @@ class PlayerLink:
             raise DeviceGone("player-gone", what="The player ended during the command.", remedy=_RESTARTED) from error
         if answer.get("ok") is True:
             return answer
-        told = answer.get("error")
-        if not isinstance(told, dict) or not all(isinstance(told.get(k), str) for k in ("code", "what", "remedy")):
+        failure = answer.get("error")
+        if not isinstance(failure, dict) or not all(
+            isinstance(failure.get(k), str) for k in ("code", "what", "remedy")
+        ):
             self.hang_up()
             raise broken("one of its errors lacks code, what or remedy")
-        raise DeviceRefused(told["code"], what=told["what"], remedy=told["remedy"])
+        raise DeviceRefused(failure["code"], what=failure["what"], remedy=failure["remedy"])
 
     def _send(self, line: bytes, deadline: Deadline) -> None:
         assert self._channel is not None

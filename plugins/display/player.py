@@ -135,11 +135,11 @@ def _presented(answer: Mapping[str, Any]) -> Presented:
     return Presented(sequence, at_s)
 
 
-def _live(told: Mapping[str, Any] | None) -> LiveStatus | None:
-    if told is None:
+def _live(live: Mapping[str, Any] | None) -> LiveStatus | None:
+    if live is None:
         return None
     return LiveStatus(
-        int(told["shown"]), told["source"] == "there", str(told["by"]), told["delay_p50_s"], told["delay_p99_s"]
+        int(live["shown"]), live["source"] == "there", str(live["by"]), live["delay_p50_s"], live["delay_p99_s"]
     )
 
 

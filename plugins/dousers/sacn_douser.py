@@ -32,7 +32,7 @@ class SacnDouser:
         self._channel = channel
         self._levels = levels
         self._travel_s = travel_s
-        self._told: bool | None = None
+        self._sent_closed: bool | None = None
         self._over = False
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
@@ -42,7 +42,7 @@ class SacnDouser:
     def move(self, closed: bool, *, deadline: Deadline) -> None:
         """See ``hal.interfaces.Douser.move``. Raises DeviceGone("douser-gone"); the node still gets it later."""
         self._check(deadline)
-        before, self._told = self._told, closed
+        before, self._sent_closed = self._sent_closed, closed
         self._stream.put(self._channel, self._levels[closed], deadline=deadline)
         if before is not closed:
             deadline.sleep(self._travel_s)
@@ -52,7 +52,7 @@ class SacnDouser:
         """What was sent last. Raises DeviceGone("douser-gone") if it does not reach the node now."""
         self._check(deadline)
         self._stream.verify(deadline=deadline)
-        return self._told
+        return self._sent_closed
 
     def close(self) -> None:
         """End the stream if this is the last douser of its universe: the node then does what it is set to do."""

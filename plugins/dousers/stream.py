@@ -78,7 +78,7 @@ class Stream:
         patience = deadline.within(_STARTED_S)
         while running.sent < self._number:
             if running.ended and again:
-                # It was told in the moment in which it ended.
+                # It ended in the moment in which it was written to.
                 again = False
                 self._tell()
                 running = self._process()
@@ -136,7 +136,7 @@ class _Running:
         return self._process.poll() is not None
 
     def write(self, line: object) -> bool:
-        """Whether the process could be told."""
+        """Whether the process took it."""
         try:
             self._input.write((json.dumps(line) + "\n").encode())
             self._input.flush()

@@ -140,7 +140,7 @@ class _OutputLines:
 
     def __init__(self, json_lines: bool) -> None:
         self._json = json_lines
-        self._told = -1
+        self._reported_percent = -1
 
     def say(self, record: Mapping[str, Any], sentence: str) -> None:
         # A reader that went away must not take the bench with it.
@@ -149,8 +149,8 @@ class _OutputLines:
             sys.stdout.flush()
 
     def progress(self, share: float) -> None:
-        if (percent := int(100 * share) // 10 * 10) > self._told:
-            self._told = percent
+        if (percent := int(100 * share) // 10 * 10) > self._reported_percent:
+            self._reported_percent = percent
             self.say({"progress": percent / 100, "what": "rays"}, f"Casting rays through the stage: {percent} %")
 
     def served(self, device: str, kind: str, address: str) -> None:

@@ -112,7 +112,7 @@ def _wrong(file: str, number: int, why: str) -> DeviceError:
 class ScenarioPlayer:
     """Plays the events of one device. Its emulator calls ``tick`` often, and ``heard`` for every message.
 
-    ``told`` holds what happened, as (seconds since the start, deed).
+    ``happened``: what happened, as (seconds since the start, deed).
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class ScenarioPlayer:
         self._bytes = self._messages = 0
         self._timed = [event for event in self._events if event.at_s >= 0.0]
         self._ends: list[tuple[float, Callable[[], None]]] = []
-        self.told: list[tuple[float, str]] = []
+        self.happened: list[tuple[float, str]] = []
 
     def tick(self) -> None:
         """Begin and end what is due by the clock."""
@@ -156,7 +156,7 @@ class ScenarioPlayer:
                 self._begin(event, now_s)
 
     def _begin(self, event: FaultEvent, now_s: float) -> None:
-        self.told.append((now_s, event.do))
+        self.happened.append((now_s, event.do))
         begin, end = self._deed(event)
         begin()
         if event.for_s and end is not None:
@@ -167,7 +167,7 @@ class ScenarioPlayer:
         if event.do in LAMP_ACTIONS:
             if self._lamp is None:
                 return (lambda: None), None
-            return (self._lamp.fail if event.do == "lamp-failure" else self._lamp.overheat), self._lamp.mend
+            return (self._lamp.fail if event.do == "lamp-failure" else self._lamp.overheat), self._lamp.repair
         if event.do == "unplug":
             return (self._plug.unplug, self._plug.replug) if self._plug is not None else (lambda: None, None)
         if event.do == "slow":

@@ -189,8 +189,8 @@ def _still_open(deck: Any) -> None:
         raise TransportError("unplugged")
 
 
-def _text(told: str) -> str:
-    return printable(told[:64])
+def _text(text: str) -> str:
+    return printable(text[:64])
 
 
 def open_key_panel(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> StreamDeckPanel:

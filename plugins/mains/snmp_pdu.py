@@ -45,8 +45,8 @@ class SnmpPdu:
         self._values = {True: on, False: off}
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        told = self._outlets.run(self._asked(_DESCRIPTION), deadline)
-        words = "".join(character for character in str(told) if character.isprintable()).strip()
+        reply = self._outlets.run(self._asked(_DESCRIPTION), deadline)
+        words = "".join(character for character in str(reply) if character.isprintable()).strip()
         return DeviceIdentity("", words[:80] or "PDU")
 
     def channels(self, *, deadline: Deadline) -> int:

@@ -19,7 +19,7 @@ class OptionalAnswers:
         self._silent_until_s: dict[str, float] = {}
         self._unknown: set[str] = set()
         self._noted: set[str] = set()
-        self._untold: list[tuple[str, str]] = []
+        self._unreported: list[tuple[str, str]] = []
 
     def may_ask(self, question: str) -> bool:
         """Whether to send an optional query now."""
@@ -34,8 +34,8 @@ class OptionalAnswers:
     def odd(self, question: str, what: str) -> None:
         """The answer to an optional query was not understood; ``what``: a sentence that shows it."""
         if question not in self._noted:
-            told = f"The {self._fields.get(question, question)} of the projector at {self._name} stay unknown,"
-            self._untold.append(("projector-answer-odd", f"{told} everything else works. {what}"))
+            lead = f"The {self._fields.get(question, question)} of the projector at {self._name} stay unknown,"
+            self._unreported.append(("projector-answer-odd", f"{lead} everything else works. {what}"))
         self._noted.add(question)
         self._unknown.add(question)
 
@@ -48,5 +48,5 @@ class OptionalAnswers:
 
     def troubles(self) -> list[tuple[str, str]]:
         """As ``hal.interfaces.WatchedProjector.troubles``."""
-        told, self._untold = self._untold, []
-        return told
+        pending, self._unreported = self._unreported, []
+        return pending

@@ -103,8 +103,8 @@ class PjLinkProjector:
         with self._turn(deadline) as talk:
             if talk.power(deadline) is not Power.ON:
                 return {}
-            told = talk.optional("INPT", pjlink.parse_input, deadline)
-            return {} if told is None else {"input": told}
+            reply = talk.optional("INPT", pjlink.parse_input, deadline)
+            return {} if reply is None else {"input": reply}
 
     def switch_on(self, *, deadline: Deadline) -> None:
         with self._turn(deadline) as talk:
@@ -129,19 +129,19 @@ class PjLinkProjector:
         with self._turn(deadline) as talk:
 
             def is_open() -> bool:
-                told = talk.query("AVMT", deadline)
-                if isinstance(told, Failure):
+                reply = talk.query("AVMT", deadline)
+                if isinstance(reply, Failure):
                     raise talk.no_answer()
-                return pjlink.parse_mute(told).video is not closed
+                return pjlink.parse_mute(reply).video is not closed
 
-            told = self._sent(talk, "AVMT", f"{self._habits.mute}{closed:d}", deadline, is_open)
-            if told in (Failure.PARAMETER, Failure.UNDEFINED):
+            reply = self._sent(talk, "AVMT", f"{self._habits.mute}{closed:d}", deadline, is_open)
+            if reply in (Failure.PARAMETER, Failure.UNDEFINED):
                 # Some projectors mute picture and sound together or not at all.
                 other = "3" if self._habits.mute == "1" else "1"
-                told = self._sent(talk, "AVMT", f"{other}{closed:d}", deadline, is_open)
-                if isinstance(told, str):
+                reply = self._sent(talk, "AVMT", f"{other}{closed:d}", deadline, is_open)
+                if isinstance(reply, str):
                     self._habits.mute = other
-            if not self._accepted(told, "move its shutter") and is_open():
+            if not self._accepted(reply, "move its shutter") and is_open():
                 raise talk.no_answer()
 
     def troubles(self) -> list[tuple[str, str]]:
@@ -184,14 +184,14 @@ class PjLinkProjector:
                 return talk.set(name, parameter, deadline)
         return None
 
-    def _accepted(self, told: str | Failure | None, doing: str) -> bool:
-        if told is Failure.UNAVAILABLE:
+    def _accepted(self, reply: str | Failure | None, doing: str) -> bool:
+        if reply is Failure.UNAVAILABLE:
             raise self._refused("projector-not-now", f"refuses to {doing} in its present state")
-        if isinstance(told, Failure):
-            raise self._refused("projector-refused", f"cannot {doing}: it answered {told.value}")
-        if told is not None:
-            pjlink.accepted(told)
-        return told is not None
+        if isinstance(reply, Failure):
+            raise self._refused("projector-refused", f"cannot {doing}: it answered {reply.value}")
+        if reply is not None:
+            pjlink.accepted(reply)
+        return reply is not None
 
     def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
         """Wait until the power state shows the effect of a command, even if its answer was lost."""

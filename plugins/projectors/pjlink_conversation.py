@@ -43,14 +43,14 @@ class PjLinkConversation:
         """Whether the last query or command used a connection that was used before."""
 
     def power(self, deadline: Deadline) -> Power:
-        told = self.query("POWR", deadline)
-        if isinstance(told, Failure):
+        reply = self.query("POWR", deadline)
+        if isinstance(reply, Failure):
             raise DeviceBusy(
                 "projector-busy",
-                what=f"The projector at {self._name} did not report its power state: it answered {told.value}.",
+                what=f"The projector at {self._name} did not report its power state: it answered {reply.value}.",
                 remedy="Wait until it has finished starting or cooling, then try again.",
             )
-        power = pjlink.parse_power(told)
+        power = pjlink.parse_power(reply)
         self._habits.slow = power in (Power.WARMING, Power.COOLING)
         return power
 
@@ -62,8 +62,8 @@ class PjLinkConversation:
         if not self._habits.may_ask(name):
             return None
         try:
-            told = self._once_more_if_closed(name, deadline, pj_class)
-            answer = None if isinstance(told, Failure) else parse(told.strip())
+            reply = self._once_more_if_closed(name, deadline, pj_class)
+            answer = None if isinstance(reply, Failure) else parse(reply.strip())
         except (DeviceTimeout, DeviceGone):
             if not deadline.passed:
                 self._habits.silent(name)

@@ -115,11 +115,11 @@ class SerialProjector:
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         with self._turn(deadline):
-            model = self._told("model", deadline, str)
+            model = self._answer("model", deadline, str)
             if model is None:
                 self._power(deadline)  # a projector that answers belongs to this family
             known = f"{self._profile.family}, model code {model}" if model else self._profile.family
-            return DeviceIdentity(self._profile.maker, known, firmware=self._told("firmware", deadline, str) or "")
+            return DeviceIdentity(self._profile.maker, known, firmware=self._answer("firmware", deadline, str) or "")
 
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
         with self._turn(deadline):
@@ -135,8 +135,8 @@ class SerialProjector:
             if not asked or self._power(deadline) is not Power.ON:
                 return {}
             # Models of a family differ in their menus, so that a missing answer is nothing to report.
-            told = {name.replace("_", " "): self._told(name, deadline, str, lit=False) for name in asked}
-            return {name: value for name, value in told.items() if value is not None}
+            parsed = {name.replace("_", " "): self._answer(name, deadline, str, lit=False) for name in asked}
+            return {name: value for name, value in parsed.items() if value is not None}
 
     def switch_on(self, *, deadline: Deadline) -> None:
         with self._turn(deadline):
@@ -225,9 +225,9 @@ class SerialProjector:
             return None
         per_hour = self._table.queries["lamp_hours"].per_hour
         lit = power is Power.ON
-        return self._told("lamp_hours", deadline, lambda text: parse_hours(text, per_hour), lit=lit)
+        return self._answer("lamp_hours", deadline, lambda text: parse_hours(text, per_hour), lit=lit)
 
-    def _told(self, question: str, deadline: Deadline, parse: Callable[[str], T], *, lit: bool = True) -> T | None:
+    def _answer(self, question: str, deadline: Deadline, parse: Callable[[str], T], *, lit: bool = True) -> T | None:
         """The answer to an optional query; None if it is refused, missing or not understood.
 
         Raises only Cancelled and the loss of the port. In standby (not ``lit``) some models do not answer queries
@@ -236,7 +236,7 @@ class SerialProjector:
         if question not in self._table.queries or not self._optional.may_ask(question):
             return None
         try:
-            told = parse(self._talk.query(question, deadline=deadline))
+            parsed = parse(self._talk.query(question, deadline=deadline))
         except DeviceBusy:
             return None
         except DeviceTimeout:
@@ -248,7 +248,7 @@ class SerialProjector:
                 self._optional.odd(question, error.what)
             return None
         self._optional.understood(question)
-        return told
+        return parsed
 
     def troubles(self) -> list[tuple[str, str]]:
         """As ``hal.interfaces.WatchedProjector.troubles``."""

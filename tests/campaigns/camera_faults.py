@@ -4,7 +4,7 @@
 
 Half of the cameras are on PTP/IP, half on the emulated USB bus. Prints one line for each camera, and ends with 0 where
 no picture was lost or taken twice, none was another one than the newest, every call ended in time, and the driver told
-of every fault that it had to mend.
+of every fault that it had to repair.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ def _exchanged(
         outcome.late_s = max(outcome.late_s, time.monotonic() - started - DEADLINE_S * pace)
         if lamp.strikes - strikes > 1:
             outcome.wrong.append("struck twice by one call")
-    outcome.faults = len(player.told)
+    outcome.faults = len(player.happened)
     driver.close()
     return outcome
 

@@ -111,9 +111,9 @@ class NinetyDays:
                 self._incident()
                 next_incident_s = self.now_s + self._pause()
                 next_minute_s = max(next_minute_s, self.now_s)
-            for at_s, mend in [one for one in self.mends if one[0] <= self.now_s]:
-                self.mends.remove((at_s, mend))
-                mend()
+            for at_s, repair in [one for one in self.mends if one[0] <= self.now_s]:
+                self.mends.remove((at_s, repair))
+                repair()
                 self._excuse(REPAIR_S, "repair")
             settled = self.kiosk.state in OPEN | DARK
             self.kiosk.step(20.0 if settled else 2.0)

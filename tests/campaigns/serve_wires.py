@@ -4,11 +4,11 @@
 
 The faults are the emulators' own lists of knobs and deeds: a new knob is a new row of the matrix. Each case: bring the
 kiosk to the step, turn the knob, wait until the kiosk has settled (playing, degraded, fault or off), look whether it
-says why and what to do; then mend, and see it play again. CASES of the matrix are drawn (all of them without a number)
+says why and what to do; then repair, and see it play again. CASES of the matrix are drawn (without a number: all)
 and shared among LANES processes, each with a kiosk of its own that goes on from case to case; SKIP leaves out so many
 of the first that are drawn, so that a campaign can be done in parts, and WORD all whose names begin with another word
 ("board", "wire" ...). A new row does not change the order of the others. Ends with 0 where every case was explained and
-mended before its deadline, nothing hung, no lamp was struck while it cooled, and none lost its mains while it was hot.
+repaired before its deadline, nothing hung, no lamp was struck while it cooled, and none lost its mains while it was hot.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def reach(kiosk: WiredKiosk, step: str) -> None:
 
 
 def judge(kiosk: WiredKiosk, step: str, fault: Fault) -> None:
-    """Reach, strike, wait, look; mend, wait, look again. Raises AssertionError."""
+    """Reach, strike, wait, look; repair, wait, look again. Raises AssertionError."""
     assert kiosk.until(lambda: kiosk.state is State.PLAYING, REACH_S), f"not playing before: {kiosk.reason}"
     kiosk.longest_gap_s = kiosk.starved_s = 0.0
     before = kiosk.service.log.number
@@ -107,7 +107,7 @@ def judge(kiosk: WiredKiosk, step: str, fault: Fault) -> None:
     _end_the_work(kiosk)
     assert kiosk.until_settled(SETTLED, SETTLE_S), f"does not settle: {kiosk.state.value} {kiosk.reason}"
     _explained(kiosk, before)
-    mend(kiosk, fault)
+    repair(kiosk, fault)
     assert kiosk.until_settled((State.PLAYING,), MENDED_S), f"not mended: {kiosk.state.value} {kiosk.reason}"
     assert kiosk.until(lambda: not usb_well(kiosk), MENDED_S), f"not mended: {usb_well(kiosk)}"
     if kiosk.starved_s < STARVED_S:
@@ -117,9 +117,9 @@ def judge(kiosk: WiredKiosk, step: str, fault: Fault) -> None:
     assert gap_s < GAP_S, f"nothing was decided for {gap_s:.0f} s"
 
 
-def mend(kiosk: WiredKiosk, fault: Fault) -> None:
+def repair(kiosk: WiredKiosk, fault: Fault) -> None:
     """What a technician does: whatever is broken is whole again, and then Start."""
-    fault.mend(kiosk)
+    fault.repair(kiosk)
     mend_usb(kiosk)
     mend_projectors(kiosk)
     kiosk.service.reconciler.open()
@@ -174,7 +174,7 @@ def lane(stage: Path, most_s: float, numbers: list[int]) -> int:
                 judge(kiosk, step, fault)
             except (AssertionError, WorkError) as error:
                 why, failed = str(error) or type(error).__name__, failed + 1
-                mend(kiosk, fault)
+                repair(kiosk, fault)
                 kiosk.sins.clear()
             row = {"case": f"{step}, {fault.name}", "seconds": round(time.monotonic() - began_s, 1),
                    "starved_s": round(kiosk.starved_s, 1), "wrong": why}  # fmt: skip

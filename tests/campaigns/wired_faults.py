@@ -33,7 +33,7 @@ class Fault:
 
     name: str
     strike: Turn
-    mend: Turn
+    repair: Turn
     lasts: bool = True
     told: str = ""
     tethered: bool = False
@@ -106,7 +106,7 @@ def mend_projectors(kiosk: WiredKiosk) -> None:
         wire.replug()
         if wire.wedged:
             wire.power_cycle()
-        kiosk.lamps[name].mend()
+        kiosk.lamps[name].repair()
     for keeper in kiosk.service.devices.projectors:
         keeper.forgive()
 

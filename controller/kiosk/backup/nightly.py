@@ -72,12 +72,12 @@ class NightlyBackup:
         try:
             for key, place in due.items():
                 try:
-                    told = place.store(source, f"{now:%Y%m%d}", table.keep)
+                    stored = place.store(source, f"{now:%Y%m%d}", table.keep)
                 except (VelaturaError, OSError) as error:
                     self._fail(key, place, error)
                     continue
                 self._log.mark_done(key, "made")
-                self._log.add(told)
+                self._log.add(stored)
         finally:
             source.unlink()
 

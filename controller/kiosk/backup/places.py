@@ -70,8 +70,10 @@ class Stick:
 
     def store(self, source: Path, day: str, keep: int) -> Decision:
         """As ``Place.store``. Raises WorkError("backup-stick-missing") as well."""
-        told = Folder(self._mounted(), self._stage).store(source, day, keep)
-        return Decision(told.code, f"{told.reason} It is on the USB stick {self._label}.", told.remedy, told.level)
+        stored = Folder(self._mounted(), self._stage).store(source, day, keep)
+        return Decision(
+            stored.code, f"{stored.reason} It is on the USB stick {self._label}.", stored.remedy, stored.level
+        )
 
     def _mounted(self) -> Path:
         device = next((link.resolve() for link in self._links() if _unescaped(link.name) == self._label), None)

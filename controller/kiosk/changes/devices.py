@@ -43,9 +43,9 @@ def projector_facts(name: str, projector: Asked | None, deadline: InSeconds = in
     model = None if known is None else _joined(known.maker, known.model, known.serial)
     yield Fact("projector", name, model)
     yield Fact("projector firmware", name, None if known is None else printable(known.firmware))
-    told = _asked(None if projector is None else projector.adjustments, deadline) or {}
+    adjustments = _asked(None if projector is None else projector.adjustments, deadline) or {}
     for kind in _ADJUSTED:
-        yield Fact(kind, name, printable(told[kind]) if kind in told else None)
+        yield Fact(kind, name, printable(adjustments[kind]) if kind in adjustments else None)
 
 
 def camera_facts(camera: Device | None, deadline: InSeconds = in_seconds) -> Iterator[Fact]:
@@ -106,7 +106,7 @@ def outputs_of_x() -> list[Connected]:
 
 
 def settings_facts(tables: StageTables) -> Iterator[Fact]:
-    """Every value of stage.toml by its key. Passwords and keys are told apart, and not kept."""
+    """Every value of stage.toml by its key. Passwords and keys are compared, and not kept."""
     for key, value in _flat("", tables.model_dump(mode="json")):
         secret = any(word in key.rpartition(".")[2] for word in ("password", "webhook", "user"))
         text = json.dumps(value)

@@ -26,7 +26,7 @@ from controller.stage.calibrations import finished_calibrations
 NIGHT_H: Final = range(3, 15)
 """Local hours in which a night's inventory is taken: a computer that is off at night takes it in the morning."""
 COMPLETE_S: Final = 600.0
-MOST_TOLD: Final = 5
+MOST_NAMED: Final = 5
 _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
 
 
@@ -121,12 +121,12 @@ class InventoryWatch:
         taken = self._taken("")
         before = list(inventory.nights_after(self._stage, 0.0))[-1:]
         inventory.keep_night(self._stage, day, taken)
-        # Each change is told in its first night.
+        # Each change is reported in its first night.
         fresh = compare.changes(before[0], taken) if before else ()
-        told = [one for one in since_good(self._stage, taken).changes if (one.kind, one.name) in
+        unreported = [one for one in since_good(self._stage, taken).changes if (one.kind, one.name) in
                 {(new.kind, new.name) for new in fresh}]  # fmt: skip
-        if told:
-            text = " ".join(one.sentence for one in told[:MOST_TOLD])
-            more = f" And {len(told) - MOST_TOLD} more." if len(told) > MOST_TOLD else ""
+        if unreported:
+            text = " ".join(one.sentence for one in unreported[:MOST_NAMED])
+            more = f" And {len(unreported) - MOST_NAMED} more." if len(unreported) > MOST_NAMED else ""
             remedy = "See `velatura changes`, or the page Changes in the panel."
             self._log.add(Decision("stage-changed", f"Since the last good day: {text}{more}", remedy, "warning"))

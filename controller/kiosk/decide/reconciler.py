@@ -164,7 +164,7 @@ class Reconciler:
         with self._lock:
             self._require_open()
             shown = self._player.view.shown
-            # A list begins anew with another brightness; it goes on where it is.
+            # A list starts again with another brightness; it goes on where it is.
             first = self._live.now.first if shown is None or not shown.appearance else shown.appearance
             self._live.change(brightness=round(share, 3), first=first, fade_s=BRIGHTNESS_FADE_S)
 

@@ -117,8 +117,8 @@ def check(system: System, prefix: Path) -> None:
 def _packages(system: System) -> None:
     cards = system.look("sh", "-c", "cat /sys/class/drm/card*/device/vendor") or ""
     wanted = (*PACKAGES, *((AMD,) if "0x1002" in cards else ()))
-    told = system.look("dpkg-query", "--show", "--showformat", "${Package} ${db:Status-Status}\n") or ""
-    there = {line.split()[0] for line in told.splitlines() if line.endswith(" installed")}
+    listed = system.look("dpkg-query", "--show", "--showformat", "${Package} ${db:Status-Status}\n") or ""
+    there = {line.split()[0] for line in listed.splitlines() if line.endswith(" installed")}
     # Debian 13 calls some libraries with 64-bit times by another name, and provides the old one.
     missing = [name for name in wanted if name not in there and f"{name}t64" not in there]
     if missing:
@@ -204,8 +204,8 @@ def _first_login(system: System, say: Callable[[str], None]) -> None:
             say("The controller is not ready yet. `systemctl status velatura-controller` tells why.")
             return
         time.sleep(0.5)
-    told = system.read(RUNTIME / FIRST_LOGIN)
-    if told is not None:
-        account, password = told.split()
+    first_login = system.read(RUNTIME / FIRST_LOGIN)
+    if first_login is not None:
+        account, password = first_login.split()
         say(f"First login: {account}, password {password} (once).")
         system.at(RUNTIME / FIRST_LOGIN).unlink()

@@ -60,7 +60,7 @@ class JobReporter:
         self._changed()
 
     def say(self, text: str, level: Level = Level.INFO) -> None:
-        self._log.add(Decision("work-told", text, "", level.value))
+        self._log.add(Decision("work-message", text, "", level.value))
         self._changed()
 
 

@@ -114,8 +114,8 @@ def displays_of(file: Path) -> dict[str, tuple[str, ...]]:
             content = None if first is None or first.name != MARK else archive.extractfile(first)
             if content is None:
                 raise _not_ours()
-            told = json.loads(content.read(LARGEST_BYTES)).get("displays", {})
-            return {str(name): tuple(str(serial) for serial in serials) for name, serials in told.items()}
+            table = json.loads(content.read(LARGEST_BYTES)).get("displays", {})
+            return {str(name): tuple(str(serial) for serial in serials) for name, serials in table.items()}
     except (tarfile.TarError, OSError, EOFError, ValueError, AttributeError, TypeError) as error:
         raise _not_ours() from error
 

@@ -53,7 +53,7 @@ class EventLog:
 
     ``durable``: events survive a power cut, too, not only the end of the process. Events that can't be written are kept
     in memory until there is space again. A damaged file is renamed and replaced. ``connect``: as ``sqlite3.connect``;
-    ``also``: is told every new event.
+    ``also``: gets every new event.
     """
 
     FILE: Final = "kiosk/events.sqlite"

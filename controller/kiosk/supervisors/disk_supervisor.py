@@ -43,7 +43,7 @@ class DiskSupervisor:
         self._suspected: Decision | None = None
 
     def suspect(self, problem: Decision) -> None:
-        """A device could not write; ``problem`` is told where the disk is not the reason."""
+        """A device could not write; ``problem`` is reported where the disk is not the reason."""
         self._suspected = problem
 
     def step(self) -> None:

@@ -247,10 +247,10 @@ class PlayerSupervisor:
         return running and same and self._turns in (None, want.in_turn)
 
     def _warning(self, status: dict[str, Any]) -> Decision | None:
-        told = status.get("warning")
-        if told is None:
+        reported = status.get("warning")
+        if reported is None:
             return None
-        warning = Decision(str(told["code"]), str(told["what"]), str(told["remedy"]), "warning")
+        warning = Decision(str(reported["code"]), str(reported["what"]), str(reported["remedy"]), "warning")
         if self._view.warning != warning:
             self._tell(warning)
         return warning

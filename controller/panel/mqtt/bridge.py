@@ -23,7 +23,7 @@ from controller.kiosk.operations.table import OPERATIONS
 from controller.panel.answers import FAILURES
 from controller.panel.mqtt import home_assistant
 from controller.panel.mqtt.options import BrokerOptions
-from controller.panel.mqtt.state import told
+from controller.panel.mqtt.state import published
 
 LONGEST_PAUSE_S: Final = 60.0
 MOST_COMMANDS_WAITING: Final = 20
@@ -158,7 +158,7 @@ class BuildingControl:
                 names = []  # a stage that is not set up
             version = metadata.version("velatura")
             retained |= home_assistant.messages(options.discovery, options.topic, now, names, version)
-        return retained | {f"{options.topic}/state": json.dumps(told(now))}
+        return retained | {f"{options.topic}/state": json.dumps(published(now))}
 
     async def _execute(self, client: aiomqtt.Client, message: aiomqtt.Message) -> None:
         if message.retain:

@@ -11,7 +11,7 @@ _OPEN: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State
 _OPEN_NAMES: Final = frozenset(state.value for state in _OPEN)
 
 
-def told(now: KioskState) -> dict[str, Any]:
+def published(now: KioskState) -> dict[str, Any]:
     """``open``: whether it shows appearances or its lamps warm up for that. Lamps in tenths of an hour, so that a
     lit lamp alone does not change the state every second.
     """

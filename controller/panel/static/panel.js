@@ -17,18 +17,18 @@
     if (measured && running && !line) location.reload();
     running = Boolean(line);
     // What is not possible now is hidden; without the script the page is drawn so.
-    const told = document.querySelector("[data-flags]");
-    const flags = new Set(told ? told.dataset.flags.split(" ") : []);
+    const now = document.querySelector("[data-flags]");
+    const flags = new Set(now ? now.dataset.flags.split(" ") : []);
     for (const place of document.querySelectorAll("[data-if]")) {
       place.hidden = !place.dataset.if.split(" ").every((word) => word[0] === "!" ? !flags.has(word.slice(1)) : flags.has(word));
     }
     for (const form of document.querySelectorAll("[data-plays]")) {
-      form.querySelector("button").setAttribute("aria-pressed", String(Boolean(told) && told.dataset.playing === form.dataset.plays));
+      form.querySelector("button").setAttribute("aria-pressed", String(Boolean(now) && now.dataset.playing === form.dataset.plays));
     }
     if (sees && !running && !(camera && camera.dataset.always)) sees.hidden = true;
     if (photograph && !running) photograph.hidden = true;
     const made = document.querySelector("#made [name=name]");
-    if (made && told && told.dataset.made) made.value = told.dataset.made;
+    if (made && now && now.dataset.made) made.value = now.dataset.made;
   }
 
   function draw(parts) {
@@ -100,8 +100,8 @@
   for (const place of document.querySelectorAll("[data-late]")) late(place);
 
   for (const range of document.querySelectorAll("input[type=range]")) {
-    const told = document.querySelector(`output[for=${range.id}]`);
-    if (told) range.addEventListener("input", () => { told.textContent = told.textContent.replace(/[0-9]+/, range.value); });
+    const shown = document.querySelector(`output[for=${range.id}]`);
+    if (shown) range.addEventListener("input", () => { shown.textContent = shown.textContent.replace(/[0-9]+/, range.value); });
   }
 
   // A second press before the first one is answered would start the job twice.

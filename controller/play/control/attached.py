@@ -65,8 +65,8 @@ class AttachedPlayer:
         )
 
     def _fits(self, answer: Mapping[str, Any]) -> bool:
-        told = [(row["name"], row["width_px"], row["height_px"]) for row in answer["outputs"]]
-        return self._outputs is None or self._outputs == told
+        actual = [(row["name"], row["width_px"], row["height_px"]) for row in answer["outputs"]]
+        return self._outputs is None or self._outputs == actual
 
     def kill(self) -> None:
         """End it at once, without asking; its starter starts it again."""

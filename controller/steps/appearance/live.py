@@ -17,7 +17,7 @@ from controller.live.sources import LivePicture, LiveSource, fitted
 from controller.solve.scaling.interactive import Interactive
 
 IDLE_S: Final = 0.002
-TOLD_EVERY_S: Final = 1.0
+REPORT_EVERY_S: Final = 1.0
 DELAYS: Final = 4096
 """The delays of this many latest pictures are kept."""
 BUFFERS: Final = 3
@@ -76,7 +76,7 @@ class LiveFigures:
     seconds: float = 0.0
     delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
 
-    def told(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """As a dictionary for output; ``delay`` is from a picture's due time to the delivery of its frames."""
         delays = np.array(self.delays_s or [0.0])
         return {
@@ -167,7 +167,7 @@ def run_live(
     worker = threading.Thread(target=_make, args=(source, maker, box, stop, rate_hz, began_s), name="live")
     worker.start()
     figures = LiveFigures()
-    told_s = began_s
+    reported_s = began_s
     try:
         while seconds is None or time.monotonic() - began_s < seconds:
             taken = box.take(0.1)
@@ -182,8 +182,8 @@ def run_live(
                 break
             figures.seconds = time.monotonic() - began_s
             figures.bad, figures.trouble = box.bad, box.trouble
-            if time.monotonic() - told_s >= TOLD_EVERY_S:
-                told_s = time.monotonic()
+            if time.monotonic() - reported_s >= REPORT_EVERY_S:
+                reported_s = time.monotonic()
                 tell(figures)
     finally:
         stop.set()

@@ -37,7 +37,7 @@ def blender_request(
     blender = find_blender()
     usual = RenderSettings()
     settings = RenderSettings(int(options.get("samples", usual.samples)), int(options.get("seed", usual.seed)))
-    told = dict(inputs) if file is None else {**inputs, "file": sha256_of(file)}
+    facts = dict(inputs) if file is None else {**inputs, "file": sha256_of(file)}
 
     def prepare(context: Context) -> Sequence[Path]:
         work = render_folder(context.folder, name)
@@ -52,7 +52,7 @@ def blender_request(
     def target() -> Target:
         return read_target(calibrated.folder, name)
 
-    return AppearanceRequest(name, f"{name}, rendered by Blender", target, told, prepare, RENDER_S)
+    return AppearanceRequest(name, f"{name}, rendered by Blender", target, facts, prepare, RENDER_S)
 
 
 def scene_request(calibrated: Calibrated, scene: str, *, folder: Path) -> AppearanceRequest:

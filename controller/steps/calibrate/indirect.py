@@ -24,7 +24,7 @@ from controller.steps import costs
 PASSES: Final = 2
 """The share follows from the response by which sinusoids were shown, the response from the share."""
 TOLD_AT: Final = 64
-"""Device value at which the change of the response is told."""
+"""Device value at which the change of the response is reported."""
 
 
 def indirect_step(projector: RigProjector) -> Step:

@@ -272,10 +272,10 @@ def _needed(blur: dict[str, float]) -> str:
     if not blur:
         return ""
     widest = max(blur.values())
-    told = (
+    text = (
         f"These optics blur by {min(blur.values()):.2f} to {widest:.2f} projector pixels, without the pixel's square. "
     )
-    return told + (f"At most {SHARP_PX} px would be needed." if widest > SHARP_PX else "That is sharp enough.")
+    return text + (f"At most {SHARP_PX} px would be needed." if widest > SHARP_PX else "That is sharp enough.")
 
 
 def _criteria(
@@ -294,8 +294,8 @@ def _criteria(
         ("a base low-passed at F_1 falls to F_1, within 15 %", low <= 1.15 * first, f"{low / first:.2f} of it"),
     )
     as_planned = tuple(
-        (f"{name} {PLANNED}", abs(told / found - 1) <= PREDICTED, f"{told / found:.2f} of it")
-        for name, told, found in (("F_1", planned[0], first), (f"F_{count}", planned[1], every))
+        (f"{name} {PLANNED}", abs(planned_px / found - 1) <= PREDICTED, f"{planned_px / found:.2f} of it")
+        for name, planned_px, found in (("F_1", planned[0], first), (f"F_{count}", planned[1], every))
     )
     why = _needed(blur)
     return tuple(

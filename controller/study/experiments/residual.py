@@ -161,27 +161,27 @@ def _as_in_paper(result: ResidualResult, noise: float) -> Criterion:
 
 def _reason(result: ResidualResult, noise: float, asked: float) -> str:
     lacking = 1 - result.wanted.mask.sum() / max((result.wanted.valid).sum(), 1)
-    told = (
+    text = (
         f"In regions without an edge it is {result.plain:.4f}; the photograph's noise alone is {noise:.4f} rms."
         f" {lacking:.1%} of the pixels are brighter than all projectors together can be."
     )
     if mean_of(result.by_model) <= asked:
-        return f"The solve itself is below {asked}; the rest is the calibration's error and noise. {told}"
+        return f"The solve itself is below {asked}; the rest is the calibration's error and noise. {text}"
     return (
-        f"The solve itself is above {asked}: light is lacking, or edges are finer than the projectors' pixels. {told}"
+        f"The solve itself is above {asked}: light is lacking, or edges are finer than the projectors' pixels. {text}"
     )
 
 
 def _falls(results: Sequence[ResidualResult], exposure: str) -> Criterion:
     by_count = [result.figures for result in results]
     rising = [name for name in by_count[0] if not all(b[name] < a[name] for a, b in pairwise(by_count))]
-    told = "; ".join(
+    text = "; ".join(
         f"{name} {' > '.join(f'{one[name]:.2f}' if name == 'CIEDE2000' else f'{one[name]:.4f}' for one in by_count)}"
         for name in by_count[0]
     )
     return Criterion(
         f"mean, median region, 95 % of regions and CIEDE2000 fall with each projector, as bright as {exposure}",
-        told,
+        text,
         not rising,
         f"Does not fall each time: {', '.join(rising)}." if rising else "",
     )

@@ -34,11 +34,11 @@ def span(cells: list[Cell], form: str) -> str:
 
 def _names(cells: tuple[Cell, ...], row: str) -> bool:
     """Whether a row's first cell, or its first few, are ``row``."""
-    told = ""
+    start = ""
     for cell in cells:
-        told = f"{told}, {cell}" if told else f"{cell}"
-        if told == row:
+        start = f"{start}, {cell}" if start else f"{cell}"
+        if start == row:
             return True
-        if not row.startswith(told):
+        if not row.startswith(start):
             return False
     return False

@@ -157,13 +157,13 @@ def _reached(one: JudgedCriterion) -> str:
 def _facts(kept: StoredStudy) -> str:
     words = {"scene": "Stage: {}", "size": "size {}", "photographs": "{} photographs", "seconds": "{} s of work"}
     facts = kept.results[0].facts
-    told = [text.format(facts[key]) for key, text in words.items() if key in facts]
+    phrases = [text.format(facts[key]) for key, text in words.items() if key in facts]
     if "seed" in facts:
         several = len(kept.seeds) > 1
-        told.append(f"seed{'s' * several} {', '.join(map(str, kept.seeds))}")
-        if several and len(told) > 2:
-            told.append("photographs and seconds of the first")
-    return "; ".join(told) + "." if told else ""
+        phrases.append(f"seed{'s' * several} {', '.join(map(str, kept.seeds))}")
+        if several and len(phrases) > 2:
+            phrases.append("photographs and seconds of the first")
+    return "; ".join(phrases) + "." if phrases else ""
 
 
 def _criteria(kept: StoredStudy) -> str:

@@ -165,13 +165,13 @@ def parse_errors(text: str) -> tuple[str, ...]:
     """
     if not re.fullmatch(r"[012]{6}", text, re.ASCII):
         raise _broken(text.encode(), "an error status")
-    told = []
+    troubles = []
     for part, digit in zip(_TROUBLES, text, strict=True):
         if digit == "1":
-            told.append(f"{part}-warning")
+            troubles.append(f"{part}-warning")
         elif digit == "2":
-            told.append(_TROUBLES[part])
-    return tuple(told)
+            troubles.append(_TROUBLES[part])
+    return tuple(troubles)
 
 
 def parse_lamps(text: str) -> tuple[LampStatus, ...]:

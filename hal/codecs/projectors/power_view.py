@@ -23,7 +23,7 @@ class PowerView:
         self._last: Power | None = None
         self._phase: Power | None = None
         self._since_s = 0.0
-        self._told = False
+        self._reported = False
         self._trouble: dict[str, None] = {}
 
     @property
@@ -39,16 +39,16 @@ class PowerView:
     def switched_on(self, now_s: float) -> None:
         """The projector accepted an on command; earlier reports no longer count."""
         self._trouble.clear()
-        self._enter(Power.WARMING, now_s, told=False)
+        self._enter(Power.WARMING, now_s, reported=False)
 
     def switched_off(self, now_s: float) -> None:
         """The projector accepted an off command."""
-        self._enter(Power.COOLING, now_s, told=False)
+        self._enter(Power.COOLING, now_s, reported=False)
 
     def noticed_power(self, power: Power, now_s: float) -> None:
         """The projector reported its power unasked."""
         if power in (Power.WARMING, Power.COOLING):
-            self._enter(power, now_s, told=True)
+            self._enter(power, now_s, reported=True)
         else:
             self._phase = None
             self._last = power
@@ -60,9 +60,9 @@ class PowerView:
         """Whether the lamp warms or cools, as far as is known."""
         return self._phase_at(now_s) is not None or self._last in (Power.WARMING, Power.COOLING)
 
-    def told(self, power: Power, now_s: float) -> bool:
+    def reported(self, power: Power, now_s: float) -> bool:
         """Whether the projector itself reported ``power``, unasked."""
-        return self._told and self._phase_at(now_s) is power
+        return self._reported and self._phase_at(now_s) is power
 
     def answered(self, answer: Power, now_s: float) -> Power:
         """The power state, given a fresh ``answer``."""
@@ -83,7 +83,7 @@ class PowerView:
             # It is on again, or still: when it goes off, its cooling starts again.
             self._phase = None
         elif changed and phase is None:
-            self._enter(Power.WARMING, now_s, told=False)
+            self._enter(Power.WARMING, now_s, reported=False)
         return Power.WARMING if self._phase is Power.WARMING else Power.ON
 
     def _dark(self, changed: bool, now_s: float) -> Power:
@@ -91,14 +91,14 @@ class PowerView:
             self._phase = None if self._phase is Power.COOLING else self._phase
             return Power.FAULT if self.failed else Power.OFF
         if changed and self._phase_at(now_s) is not Power.COOLING:
-            self._enter(Power.COOLING, now_s, told=False)
+            self._enter(Power.COOLING, now_s, reported=False)
         phase = self._phase_at(now_s)
-        if phase is Power.COOLING or (phase is Power.WARMING and self._told and not self.failed):
+        if phase is Power.COOLING or (phase is Power.WARMING and self._reported and not self.failed):
             return phase
         return Power.FAULT if self.failed else Power.OFF
 
-    def _enter(self, phase: Power, now_s: float, *, told: bool) -> None:
-        self._phase, self._since_s, self._told = phase, now_s, told
+    def _enter(self, phase: Power, now_s: float, *, reported: bool) -> None:
+        self._phase, self._since_s, self._reported = phase, now_s, reported
 
     def _phase_at(self, now_s: float) -> Power | None:
         lasts_s = self._rules.warm_up_s if self._phase is Power.WARMING else self._rules.cool_down_s

@@ -71,7 +71,7 @@ class EmulatedEosBody(EmulatedBody):
         self._format: tuple[tuple[int, int, int], ...] = FORMATS[0]
         self._reports: list[bytes] = []
         self._reporting = False
-        self._told: set[int] = set()
+        self._announced: set[int] = set()
         self._pressed = 0
         self._view_at = 0.0
 
@@ -248,9 +248,9 @@ class EmulatedEosBody(EmulatedBody):
         self._reporting = on
         self._reports.clear()
         for code, value in {**self._values, 0xD111: self._battery_code()}.items():
-            if code in self.faults.unconfirmed and code in self._told:
+            if code in self.faults.unconfirmed and code in self._announced:
                 continue
-            self._told.add(code)
+            self._announced.add(code)
             self._report(0xC189, struct.pack("<II", code, value))
         self._report(0xC189, struct.pack("<I", 0xD120) + format_bytes(self._format))
         self._report(0xC189, struct.pack("<I", 0xD1AF) + self.names.serial.encode("ascii", "replace") + b"\0")

@@ -52,9 +52,9 @@ class EmulatedNikonBody(EmulatedGenericBody):
             case 0x90C2:
                 return PtpOutcome()
             case 0x90C7:
-                told, self._happened = self._happened, []
-                events = b"".join(struct.pack("<HI", *event) for event in told)
-                return PtpOutcome(data=struct.pack("<H", len(told)) + events)
+                happened, self._happened = self._happened, []
+                events = b"".join(struct.pack("<HI", *event) for event in happened)
+                return PtpOutcome(data=struct.pack("<H", len(happened)) + events)
             case 0x90C8:
                 return PtpOutcome(BUSY) if self.exposing else PtpOutcome()
             case 0x90CA:

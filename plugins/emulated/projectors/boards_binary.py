@@ -73,8 +73,8 @@ class NecBoard:
                 return None
             self._lamp.shutter_closed = code in (b"\x02\x10", b"\x02\x16")
             return b""
-        told = {b"\x00\x85\x01": self._running, b"\x00\xbf\x02": self._basic}
-        if (tell := told.get(code + data)) is not None:
+        replies = {b"\x00\x85\x01": self._running, b"\x00\xbf\x02": self._basic}
+        if (tell := replies.get(code + data)) is not None:
             return tell()
         return self._information() if code == b"\x03\x8a" else None
 

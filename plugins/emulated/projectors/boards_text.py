@@ -201,7 +201,7 @@ class ChristieBoard:
         if busy:
             return self._error(b"00007", bare[:3], b"Could not be executed")
         if bare.endswith(b"?"):
-            return self._told(bare[:-1])
+            return self._answer(bare[:-1])
         name, _, parameter = bare.partition(b" ")
         if name not in (b"PWR", b"SHU"):
             return self._error(b"00009", name, b"Unknown request")
@@ -221,7 +221,7 @@ class ChristieBoard:
         self._lamp.extinguish()
         return True
 
-    def _told(self, name: bytes) -> bytes:
+    def _answer(self, name: bytes) -> bytes:
         values = {
             b"PWR": self._WORDS[self._lamp.phase],
             b"SHU": b"%d" % self._lamp.shutter_closed,

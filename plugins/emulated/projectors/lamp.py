@@ -147,18 +147,18 @@ class EmulatedLamp:
             return self._hot
 
     def fail(self) -> None:
-        """The lamp bursts: dark from now, and at every later strike until ``mend``."""
+        """The lamp bursts: dark from now, and at every later strike until ``repair``."""
         with self._lock:
             self._failed = True
             self.extinguish()
 
     def overheat(self) -> None:
-        """The thermal switch puts the lamp out and refuses strikes until ``mend``."""
+        """The thermal switch puts the lamp out and refuses strikes until ``repair``."""
         with self._lock:
             self._hot = True
             self.extinguish()
 
-    def mend(self) -> None:
+    def repair(self) -> None:
         """A new lamp is in, or the housing has cooled."""
         with self._lock:
             self._failed = self._hot = False

@@ -66,14 +66,14 @@ class PjLinkBoard:
         if len(line) < 8 or line[:1] != b"%" or line[1:2] not in b"12" or line[6:7] != b" ":
             return b""
         pj_class, name, parameter = line[1:2], line[2:6].upper(), line[7:]
-        told: bytes | None = b"ERR3" if busy else self._act(pj_class, name, parameter)
+        reply: bytes | None = b"ERR3" if busy else self._act(pj_class, name, parameter)
         if parameter == b"?":
-            told = self.odd.answers.get(name.decode("ascii", "replace"), told)
-        return b"" if told is None else b"%" + pj_class + name + b"=" + told + self.odd.ending
+            reply = self.odd.answers.get(name.decode("ascii", "replace"), reply)
+        return b"" if reply is None else b"%" + pj_class + name + b"=" + reply + self.odd.ending
 
     def _act(self, pj_class: bytes, name: bytes, parameter: bytes) -> bytes:
         if parameter == b"?":
-            return self._told(pj_class, name)
+            return self._answer(pj_class, name)
         actions: dict[bytes, Callable[[bytes], bytes]] = {
             b"POWR": self._switch,
             b"AVMT": self._mute,
@@ -81,7 +81,7 @@ class PjLinkBoard:
         }
         return actions[name](parameter) if name in actions else b"ERR1"
 
-    def _told(self, pj_class: bytes, name: bytes) -> bytes:
+    def _answer(self, pj_class: bytes, name: bytes) -> bytes:
         if name in _FIXED:
             return _FIXED[name]
         if pj_class == b"2" and name in _SECOND:

@@ -65,10 +65,10 @@ class UsbBusProcess:
         """End the scenario of a device; what it has done stays done."""
         self._ask({"do": "rest", "name": name})
 
-    def told(self, name: str) -> list[list[Any]]:
+    def happened(self, name: str) -> list[list[Any]]:
         """What a scenario has done so far: [seconds, deed] each."""
-        told: list[list[Any]] = self._ask({"do": "told", "name": name})
-        return told
+        happened: list[list[Any]] = self._ask({"do": "happened", "name": name})
+        return happened
 
     def plug(self, name: str) -> None:
         self._ask({"do": "plug", "name": name})
@@ -162,8 +162,8 @@ class _Commands:
                 self._play(name, device, command["scenario"])
             case "rest":
                 self._rest(name)
-            case "told":
-                return self._scenarios[name].told
+            case "happened":
+                return self._scenarios[name].happened
             case "plug":
                 self._bus.plug(device)
             case "unplug":

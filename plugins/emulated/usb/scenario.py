@@ -45,9 +45,9 @@ class UsbScenario:
         self._thread.start()
 
     @property
-    def told(self) -> list[tuple[float, str]]:
+    def happened(self) -> list[tuple[float, str]]:
         """What happened, as (seconds since the start, deed)."""
-        return self._player.told
+        return self._player.happened
 
     def set(self, **knobs: Any) -> None:
         """Turn knobs by the names of ``faults.WireFaults``."""

@@ -80,12 +80,12 @@ class _Line:
         self._transcript = transcript
 
     def open(self, deadline: Deadline) -> ByteLink:
-        told = self._settings
-        if not told.wake:
+        parsed = self._settings
+        if not parsed.wake:
             return self._once(deadline)
         with contextlib.suppress(DeviceGone, DeviceTimeout):
             return self._once(deadline.within(min(WAKING_S, deadline.left_s() / 4)))
-        wake(told.wake, told.wake_to)
+        wake(parsed.wake, parsed.wake_to)
         patience = deadline.within(WAKING_S)
         while True:
             try:
@@ -96,18 +96,18 @@ class _Line:
                 patience.sleep(0.5)
 
     def _once(self, deadline: Deadline) -> ByteLink:
-        told = self._settings
+        parsed = self._settings
         return open_logged_in(
-            told.host, told.port, told.network, told.account, deadline=deadline, transcript=self._transcript
+            parsed.host, parsed.port, parsed.network, parsed.account, deadline=deadline, transcript=self._transcript
         )
 
 
 def open_network_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
-    told = read_settings(settings, context)
-    transcript = context.transcript("tcp", f"{told.host}-{told.port}", secret=told.account.password or "")
+    parsed = read_settings(settings, context)
+    transcript = context.transcript("tcp", f"{parsed.host}-{parsed.port}", secret=parsed.account.password or "")
     projector = SerialProjector(
-        _Line(told, transcript).open, told.profile, name=told.account.name, transcript=transcript, check=CHECK
+        _Line(parsed, transcript).open, parsed.profile, name=parsed.account.name, transcript=transcript, check=CHECK
     )
     try:
         projector.open(deadline)

@@ -22,17 +22,17 @@ SETTLED = (State.PLAYING, State.DEGRADED, State.FAULT, State.OFF)
 class Fault:
     name: str
     strike: Callable[[Kiosk], None]
-    mend: Callable[[Kiosk], None]
+    repair: Callable[[Kiosk], None]
 
 
 def _trouble(name: str, kind: str) -> Fault:
     def strike(kiosk: Kiosk) -> None:
         kiosk.lamps[name].trouble = kind
 
-    def mend(kiosk: Kiosk) -> None:
+    def repair(kiosk: Kiosk) -> None:
         kiosk.lamps[name].trouble = ""
 
-    return Fault(f"{name} {kind}", strike, mend)
+    return Fault(f"{name} {kind}", strike, repair)
 
 
 def _reports(name: str, word: str) -> Fault:
@@ -42,10 +42,10 @@ def _reports(name: str, word: str) -> Fault:
         power = Power.ON if word.endswith("-warning") else Power.FAULT
         kiosk.lamps[name].reports = ProjectorStatus(power, (word,))
 
-    def mend(kiosk: Kiosk) -> None:
+    def repair(kiosk: Kiosk) -> None:
         kiosk.lamps[name].reports = None
 
-    return Fault(f"{name} reports {word}", strike, mend)
+    return Fault(f"{name} reports {word}", strike, repair)
 
 
 def words() -> list[str]:
@@ -57,12 +57,12 @@ def words() -> list[str]:
 
 
 def _burst(name: str) -> Fault:
-    def mend(kiosk: Kiosk) -> None:
+    def repair(kiosk: Kiosk) -> None:
         kiosk.lamps[name].dud = False
         for supervisor in kiosk.supervisors:
             supervisor.forgive()
 
-    return Fault(f"{name} bursts", lambda kiosk: kiosk.lamps[name].burst(), mend)
+    return Fault(f"{name} bursts", lambda kiosk: kiosk.lamps[name].burst(), repair)
 
 
 def _unplugged(name: str) -> Fault:
@@ -70,11 +70,11 @@ def _unplugged(name: str) -> Fault:
         kiosk.gone.add(name)
         kiosk.lamps[name].trouble = "gone"
 
-    def mend(kiosk: Kiosk) -> None:
+    def repair(kiosk: Kiosk) -> None:
         kiosk.gone.discard(name)
         kiosk.lamps[name].trouble = ""
 
-    return Fault(f"{name} unplugged", strike, mend)
+    return Fault(f"{name} unplugged", strike, repair)
 
 
 def _slow(name: str) -> Fault:
@@ -161,13 +161,13 @@ def cases() -> Iterator[tuple[str, Fault]]:
 
 
 def judge(kiosk: Kiosk, step: str, fault: Fault) -> None:
-    """Strike, wait, look; mend, wait, look again."""
+    """Strike, wait, look; repair, wait, look again."""
     reach(kiosk, step)
     fault.strike(kiosk)
     kiosk.run(DEADLINE_S)
     kiosk.run_until(*SETTLED, within_s=DEADLINE_S)
     _explained(kiosk, f"{step}, {fault.name}")
-    fault.mend(kiosk)
+    fault.repair(kiosk)
     kiosk.lamps["right"].dud = False
     for supervisor in kiosk.supervisors:
         supervisor.forgive()

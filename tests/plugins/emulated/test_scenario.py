@@ -52,7 +52,7 @@ def test_an_event_begins_at_its_time_and_ends_after_its_duration() -> None:
         seen.append(stand.plug.plugged)
         stand.after(1.0)
     assert seen == [True] * 5 + [False] * 2 + [True] * 2
-    assert stand.player.told == [(5.0, "unplug")]
+    assert stand.player.happened == [(5.0, "unplug")]
 
 
 def test_an_event_without_a_duration_concerns_one_answer() -> None:
@@ -93,7 +93,7 @@ def test_chance_follows_the_seed_and_the_device() -> None:
         counts = []
         for _ in range(400):
             stand.player.heard(5)
-            counts.append(len(stand.player.told))
+            counts.append(len(stand.player.happened))
         return counts
 
     assert rolled("left") == rolled("left")

@@ -340,4 +340,4 @@ def test_every_call_ends_in_a_noisy_hour_of_a_board(bus: UsbBusProcess, open_rel
         assert time.monotonic() - started < 10
     assert all(failure.remedy for failure in failures)
     assert 5 < len(failures) < 75
-    assert {"cut", "silence", "garbage", "unplug"} == {deed for _, deed in bus.told("relay")}
+    assert {"cut", "silence", "garbage", "unplug"} == {deed for _, deed in bus.happened("relay")}

@@ -145,7 +145,7 @@ def test_a_scenario_pulls_the_plug_at_its_time_and_puts_it_back(bus: UsbBusProce
     while found() is None and time.monotonic() < deadline:
         time.sleep(0.01)
     assert found() is not None
-    assert [deed for _, deed in bus.told("echo")] == ["unplug"]
+    assert [deed for _, deed in bus.happened("echo")] == ["unplug"]
 
 
 def test_a_scenario_stalls_just_the_message_it_names(bus: UsbBusProcess, echo: Any) -> None:

@@ -132,7 +132,7 @@ def test_a_lamp_that_does_not_light_is_refused_and_reported(open_serial: Any) ->
         pair.driver.switch_on(deadline=in_seconds(SOON))
     status = pair.driver.status(deadline=in_seconds(SOON))
     assert (status.power, status.faults) == (Power.FAULT, ("lamp-failed",))
-    pair.emulator.lamp.mend()
+    pair.emulator.lamp.repair()
     pair.driver.switch_on(deadline=in_seconds(SOON))
     assert pair.driver.status(deadline=in_seconds(SOON)).faults == ()
 

@@ -165,7 +165,7 @@ def test_a_christies_status_lines_are_heard_and_confuse_nothing(open_serial: Any
     while "system-error" not in pair.driver.status(deadline=in_seconds(SOON)).faults:
         assert not until.passed
         time.sleep(0.02)
-    pair.emulator.lamp.mend()
+    pair.emulator.lamp.repair()
     wait_for_end = in_seconds(SOON)
     while pair.driver.status(deadline=in_seconds(SOON)).power is Power.COOLING:
         assert not wait_for_end.passed

@@ -11,7 +11,7 @@ from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 
 class AcerBoard:
-    """Warming is told as lit, cooling as dark; a strike while it cools is refused."""
+    """Warming is reported as lit, cooling as dark; a strike while it cools is refused."""
 
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp

@@ -21,7 +21,7 @@ _STATES: Final = {
 
 
 class BarcoPulseBoard:
-    """Power commands between two states do nothing, and are not refused. A change of state is told unasked.
+    """Power commands between two states do nothing, and are not refused. A change of state is reported unasked.
 
     ``tells``: whether it tells; real ones do that to those who subscribed.
     """
@@ -80,13 +80,13 @@ class BarcoPulseBoard:
         if method == "property.set" and params.get("property") == "optics.shutter.target" and lamp.phase in BURNING:
             lamp.shutter_closed = params.get("value") == "Closed"
             return True
-        told = {
+        replies = {
             "system.state": self._now(),
             "system.modelname": "UDX-4K32",
             "system.firmwareversion": "2.5.2",
             "statistics.laserruntime.value": lamp.hours * 3600,
             "optics.shutter.position": "Closed" if lamp.shutter_closed else "Open",
         }
-        if method == "property.get" and params.get("property") in told:
-            return told[str(params["property"])]
+        if method == "property.get" and params.get("property") in replies:
+            return replies[str(params["property"])]
         return {"code": -32601, "message": f"Property not found: {params.get('property')}"}

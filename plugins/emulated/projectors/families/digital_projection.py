@@ -39,12 +39,12 @@ class DigitalProjectionBoard:
     def _act(self, name: bytes, value: bytes) -> bytes | None:
         lamp = self._lamp
         if value == b"?":
-            told = {
+            replies = {
                 b"status": b"4" if broken(lamp) else _STATES[lamp.phase],
                 b"laser.hours": b"%d" % lamp.hours,
                 b"shutter": b"%d" % lamp.shutter_closed,
             }
-            return told.get(name)
+            return replies.get(name)
         if name == b"power.on":
             return b"" if lamp.strike() else None
         if name == b"power.off":
@@ -57,7 +57,7 @@ class DigitalProjectionBoard:
 
 
 class DigitalProjectionVBoard:
-    """``V``, two digits of the projector's number, S or G, four digits, CR; P or F back. Warming is told as on."""
+    """``V``, two digits of the projector's number, S or G, four digits, CR; P or F back. Warming is reported as on."""
 
     _STATES: Final = {LampPhase.STANDBY: b"1", LampPhase.WARMING: b"2", LampPhase.LIT: b"2", LampPhase.COOLING: b"3"}
 

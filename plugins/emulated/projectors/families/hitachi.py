@@ -18,7 +18,7 @@ _GET: Final = 2
 
 
 class HitachiBoard:
-    """06 done, 15 not known, 1C an error, 1D data, 1F busy. Warming is told as on."""
+    """06 done, 15 not known, 1C an error, 1D data, 1F busy. Warming is reported as on."""
 
     _PHASES: Final = {LampPhase.STANDBY: 0, LampPhase.WARMING: 1, LampPhase.LIT: 1, LampPhase.COOLING: 2}
 
@@ -48,8 +48,8 @@ class HitachiBoard:
         action, kind, value = struct.unpack("<HHH", message[7:])
         lamp = self._lamp
         if action == _GET:
-            told = {0x6000: self._PHASES[lamp.phase], 0x1090: lamp.hours & 0xFFFF, 0x3020: int(lamp.shutter_closed)}
-            return b"\x1d" + struct.pack("<H", told[kind]) if kind in told else b"\x15"
+            replies = {0x6000: self._PHASES[lamp.phase], 0x1090: lamp.hours & 0xFFFF, 0x3020: int(lamp.shutter_closed)}
+            return b"\x1d" + struct.pack("<H", replies[kind]) if kind in replies else b"\x15"
         if action == _SET and kind == 0x6000:
             if not value:
                 lamp.extinguish()

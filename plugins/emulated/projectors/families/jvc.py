@@ -32,9 +32,9 @@ class JvcBoard:
                 continue
             if head == b"!" and self._do(command):
                 answers.append(b"\x06" + _UNIT + command[:2] + b"\n")
-            elif head == b"?" and (told := self._told(command)) is not None:
+            elif head == b"?" and (reply := self._answer(command)) is not None:
                 answers.append(b"\x06" + _UNIT + command[:2] + b"\n")
-                answers.append(b"@" + _UNIT + command[:2] + told + b"\n")
+                answers.append(b"@" + _UNIT + command[:2] + reply + b"\n")
         return answers
 
     def notices(self) -> list[bytes]:
@@ -51,7 +51,7 @@ class JvcBoard:
             return True
         return command == b""  # a check of the connection
 
-    def _told(self, command: bytes) -> bytes | None:
+    def _answer(self, command: bytes) -> bytes | None:
         power = b"4" if broken(self._lamp) else _PHASES[self._lamp.phase]
-        told = {b"PW": power, b"MD": b"ILAFPJ -- B5B1", b"IFLT": b"%04X" % self._lamp.hours}
-        return (told | self._menu if self._lamp.phase in BURNING else told).get(command)
+        replies = {b"PW": power, b"MD": b"ILAFPJ -- B5B1", b"IFLT": b"%04X" % self._lamp.hours}
+        return (replies | self._menu if self._lamp.phase in BURNING else replies).get(command)

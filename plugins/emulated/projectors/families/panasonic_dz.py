@@ -40,7 +40,7 @@ class PanasonicDzBoard:
 
     def _act(self, command: bytes) -> bytes:
         lamp = self._lamp
-        told = {
+        replies = {
             b"Q$S": _PHASES[lamp.phase],
             b"Q$L:1": b"%d" % lamp.hours,
             b"QID": b"DZ870",
@@ -48,13 +48,13 @@ class PanasonicDzBoard:
             b"QSH": b"%d" % lamp.shutter_closed,
         }
         if lamp.phase in BURNING:
-            told |= {b"QIN": self._menu[b"IIS"], b"QSL": self._menu[b"LPM"]}
+            replies |= {b"QIN": self._menu[b"IIS"], b"QSL": self._menu[b"LPM"]}
             key, _, value = command.partition(b":")
             if key in self._menu and value:
                 self._menu[key] = value
                 return command
-        if command in told:
-            return told[command]
+        if command in replies:
+            return replies[command]
         if command == b"POF":
             lamp.extinguish()
             return b"POF"

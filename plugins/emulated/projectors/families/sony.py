@@ -41,13 +41,13 @@ class AdcpBoard:
 
     def _act(self, line: bytes) -> bytes:
         lamp = self._lamp
-        told = {
+        replies = {
             b"power_status ?": b'"%s"' % _ADCP[lamp.phase],
             b"timer ?": b'[{"operation":%d},{"light_src":%d},{"prev_light_src":7}]' % (lamp.hours + 9, lamp.hours),
             b"modelname ?": b'"VPL-FHZ75"',
         }
-        if line in told:
-            return told[line]
+        if line in replies:
+            return replies[line]
         key, _, value = line.partition(b" ")
         if key == b"blank" or key in self._menu:
             return self._chosen(key, value)
@@ -107,8 +107,8 @@ class SdcpBoard:
         if community != self._community:
             return False, b"\x02\x01"
         if get:
-            told = {b"\x01\x02": _SDCP[lamp.phase], b"\x01\x13": lamp.hours, b"\x00\x30": int(lamp.shutter_closed)}
-            return (True, struct.pack(">H", told[item])) if item in told else (False, self._OF_ITEM)
+            replies = {b"\x01\x02": _SDCP[lamp.phase], b"\x01\x13": lamp.hours, b"\x00\x30": int(lamp.shutter_closed)}
+            return (True, struct.pack(">H", replies[item])) if item in replies else (False, self._OF_ITEM)
         if item == b"\x01\x30" and data in (b"\0\0", b"\0\1"):
             if data == b"\0\0":
                 lamp.extinguish()

@@ -46,12 +46,12 @@ class ViewSonicBoard:
     def _reply(self, message: bytes) -> bytes:
         lamp = self._lamp
         if message[0] == 0x07:
-            told = {
+            replies = {
                 b"\x11\x00": struct.pack("<B", _PHASES[lamp.phase]),
                 b"\x15\x01": struct.pack("<I", lamp.hours),
                 b"\x12\x09": struct.pack("<B", lamp.shutter_closed),
             }
-            body = told.get(message[8:10])
+            body = replies.get(message[8:10])
             return _REFUSED if body is None else _framed(b"\0\0" + body)
         item, value = message[6:8], message[8]
         if item == b"\x11\x00":

@@ -144,19 +144,19 @@ class JvcGate(OpenGate):
     def _expected(self) -> tuple[bytes, ...]:
         if not self._password:
             return (b"PJREQ",)
-        told = b"PJREQ_" + self._password.encode()
-        return (told.ljust(16, b"\0"), told.ljust(22, b"\0"))
+        request = b"PJREQ_" + self._password.encode()
+        return (request.ljust(16, b"\0"), request.ljust(22, b"\0"))
 
     def hear(self, data: bytes) -> Heard:
         if self._passed:
             return Heard(commands=data)
         self._kept += data
-        told = bytes(self._kept)
+        received = bytes(self._kept)
         for expected in sorted(self._expected(), key=len, reverse=True):
-            if told.startswith(expected):
+            if received.startswith(expected):
                 self._passed = True
-                return Heard(b"PJACK", told[len(expected) :])
-        if told != b"PJREQ" and any(expected.startswith(told) for expected in self._expected()):
+                return Heard(b"PJACK", received[len(expected) :])
+        if received != b"PJREQ" and any(expected.startswith(received) for expected in self._expected()):
             return Heard()
         self._kept.clear()
         return Heard(b"PJNAK")

@@ -81,7 +81,7 @@ def test_a_slow_display_drops_what_came_too_late_and_counts_it(maker: FrameMaker
     figures = run_live(source, maker, lambda frames: time.sleep(0.08), rate_hz=100)
     assert figures.made + figures.late == 40
     assert figures.late > 10
-    told = figures.told()
+    told = figures.as_json()
     assert told["pictures_per_s"] < 14
     assert told["delay_p50_ms"] > 0
 
@@ -105,7 +105,7 @@ def test_a_bad_picture_is_passed_over_and_told_of(maker: FrameMaker) -> None:
     source = Patient(9, fails_at=3)
     figures = run_live(source, maker, source.show, rate_hz=100)
     assert (figures.made, figures.bad) == (8, 1)
-    assert figures.told()["trouble"] == "Damaged. Write it again."
+    assert figures.as_json()["trouble"] == "Damaged. Write it again."
 
 
 def test_targets_are_handed_on_at_their_size() -> None:
@@ -167,7 +167,7 @@ def test_a_run_of_months_keeps_no_more_of_its_delays_than_it_tells_of() -> None:
     figures = run_live(Prompt(4200), Small(), lambda frames: shown.release(), rate_hz=1e6)
     assert figures.made == 4200
     assert len(figures.delays_s) == 4096
-    assert figures.told()["delay_p99_ms"] > 0
+    assert figures.as_json()["delay_p99_ms"] > 0
 
 
 def test_it_ends_after_the_time_that_was_asked_for(maker: FrameMaker) -> None:

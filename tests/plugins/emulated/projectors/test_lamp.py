@@ -65,7 +65,7 @@ def test_a_burst_lamp_takes_strikes_and_stays_dark(lamp: EmulatedLamp, clock: Cl
     assert lamp.strike()
     assert lamp.light_level() == 0.0
     assert lamp.phase.name == "STANDBY"
-    lamp.mend()
+    lamp.repair()
     assert lamp.strike()
     assert lamp.light_level() > 0.0
 
@@ -75,7 +75,7 @@ def test_an_overheated_lamp_goes_out_and_refuses(lamp: EmulatedLamp, clock: Cloc
     lamp.overheat()
     clock.now_s += 121
     assert not lamp.strike()
-    lamp.mend()
+    lamp.repair()
     assert lamp.strike()
 
 
