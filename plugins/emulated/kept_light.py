@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -73,14 +73,20 @@ def _path(folder: Path, kind: str, key: str) -> Path:
 
 
 def _remove_oldest(folder: Path, newest: Path) -> None:
-    for part in folder.glob("*.part"):
-        if part.stat().st_mtime < newest.stat().st_mtime - UNFINISHED_S:
-            part.unlink(missing_ok=True)
-    found = sorted(
-        ((path.stat(), path) for path in folder.glob("*.npz") if path != newest), key=lambda one: -one[0].st_mtime
-    )
-    total = newest.stat().st_size
-    for status, path in found:
+    now = newest.stat()
+    for path, status in _files(folder, "*.part"):
+        if status.st_mtime < now.st_mtime - UNFINISHED_S:
+            path.unlink(missing_ok=True)
+    found = [(path, status) for path, status in _files(folder, "*.npz") if path != newest]
+    total = now.st_size
+    for path, status in sorted(found, key=lambda one: -one[1].st_mtime):
         total += status.st_size
         if total > MOST_BYTES:
             path.unlink(missing_ok=True)
+
+
+def _files(folder: Path, pattern: str) -> Iterator[tuple[Path, os.stat_result]]:
+    for path in folder.glob(pattern):
+        # Another bench may finish or remove one meanwhile.
+        with contextlib.suppress(FileNotFoundError):
+            yield path, path.stat()
