@@ -8,7 +8,7 @@ says why and what to do; then repair, and see it play again. CASES of the matrix
 and shared among LANES processes, each with a kiosk of its own that goes on from case to case; SKIP leaves out so many
 of the first that are drawn, so that a campaign can be done in parts, and WORD all whose names begin with another word
 ("board", "wire" ...). A new row does not change the order of the others. Ends with 0 where every case was explained and
-repaired before its deadline, nothing hung, no lamp was struck while it cooled, and none lost its mains while it was hot.
+repaired before its deadline, nothing hung, no lamp was struck while it cooled, and none lost its mains while hot.
 """
 
 from __future__ import annotations
