@@ -23,7 +23,7 @@ LONGEST: Final = 25
 
 PLAIN: Final = {
     r"anew|afresh": "again",
-    r"repair(s|ed|ing)?": "repair, or correct",
+    r"mend(s|ed|ing)?": "repair, or correct",
     r"told|tells? (of|that|whether|apart)": "reported, shows",
     r"tell\w* .{0,40}\bapart": "distinguish",
     r"nobody": "no one is there, unknown, or the passive",
