@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.demo.stage import prepare
+from controller.demo.stage import DEFAULT_ROOM, prepare
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId
@@ -36,16 +36,16 @@ class CalibratedStage:
 
 
 @contextmanager
-def prepared_stage(size: str, seed: int) -> Iterator[Path]:
+def prepared_stage(size: str, seed: int, *, room: str = DEFAULT_ROOM) -> Iterator[Path]:
     """A stage folder of a random truth, removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="velatura-bench-") as folder:
-        yield prepare(Path(folder), size=size, object_file=None, seed=seed)
+        yield prepare(Path(folder), size=size, object_file=None, seed=seed, room=room)
 
 
 @contextmanager
-def calibrated_stage(size: str, seed: int) -> Iterator[CalibratedStage]:
+def calibrated_stage(size: str, seed: int, *, room: str = DEFAULT_ROOM) -> Iterator[CalibratedStage]:
     """A stage calibrated as the command line would, its bench a process of its own; removed afterwards."""
-    with prepared_stage(size, seed) as stage:
+    with prepared_stage(size, seed, room=room) as stage:
         cancel = threading.Event()
         began = time.perf_counter()
         with BenchProcess(stage, cancel=cancel):

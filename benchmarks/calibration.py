@@ -25,6 +25,7 @@ from controller.calibrate.metapixels.from_phase import fit_metapixels
 from controller.capture.patterns import plan_patterns
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
+from controller.demo.stage import DEFAULT_ROOM
 from controller.run.step_id import StepId
 
 STAGES = {"small": 5, "medium": 3, "paper": 1}
@@ -43,12 +44,12 @@ class Found:
             self.values.setdefault(name, []).append(value)
 
 
-def measure(size: str) -> list[Row]:
-    """Calibrate ``STAGES`` random stages of a size and compare with their truths."""
+def measure(size: str, *, room: str = DEFAULT_ROOM) -> list[Row]:
+    """Calibrate ``STAGES`` random stages of a size in a room of the bench and compare with their truths."""
     found, stages = Found(), STAGES[size]
     for seed in range(FIRST_SEED, FIRST_SEED + stages):
         try:
-            with calibrated_stage(size, seed) as stage:
+            with calibrated_stage(size, seed, room=room) as stage:
                 _judge(stage, found)
         except VelaturaError as error:
             found.failed.append(f"seed {seed}: {error.what}")

@@ -1,0 +1,10 @@
+"""As ``calibration``, in a dark room without indirect light, glare or flicker: the errors of the method alone."""
+
+from __future__ import annotations
+
+from benchmarks import Row, calibration
+
+
+def measure(size: str) -> list[Row]:
+    """As ``calibration.measure``."""
+    return calibration.measure(size, room="dark")
