@@ -111,7 +111,8 @@ def _paler(lifted: FloatImage, lowest: FloatImage, floor: FloatImage, drive: Dri
         limit = sheet.above(np.where(lacking[..., channel] & (own < 1), need, 0).astype(np.float32))
         raised = np.minimum(_soft_maximum(own, limit), 1)
         chroma = np.minimum(chroma, _quotient(1 - raised, 1 - own, otherwise=1.0, where=own < 1))
-    return np.asarray(grey + np.clip(chroma, 0, 1)[..., None] * (lifted - grey), np.float32)
+    # Written so that full chroma leaves every bit as it is.
+    return np.asarray(lifted + (1 - np.clip(chroma, 0, 1))[..., None] * (grey - lifted), np.float32)
 
 
 def _dimmed(target: FloatImage, floor: FloatImage, drive: DriveLevels, sheet: Sheet) -> FloatImage:
@@ -139,7 +140,9 @@ def _shoulder(value: FloatImage) -> FloatImage:
 
 def _soft_maximum(value: FloatImage, level: FloatImage) -> FloatImage:
     """At least the larger of both; ``value`` itself where ``level`` is 0."""
-    return np.asarray((np.maximum(value, 0) ** POWER + level**POWER) ** np.float32(1 / POWER), np.float32)
+    value = np.maximum(value, 0)
+    # A root of a power is not the number itself, by a bit or two that differ from processor to processor.
+    return np.where(level > 0, (value**POWER + level**POWER) ** np.float32(1 / POWER), value)
 
 
 def _quotient(above: FloatImage, below: FloatImage, *, otherwise: float, where: Mask | None = None) -> FloatImage:

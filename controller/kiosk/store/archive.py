@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gzip
 import io
 import json
 import os
@@ -13,7 +14,8 @@ import sqlite3
 import tarfile
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
@@ -43,6 +45,8 @@ LARGEST_TAPE: Final = 64 << 20
 MOST_FILES: Final = 100_000
 ROOM_SHARE: Final = 0.9
 """The share of the free space that an unpacked backup may fill; the event log needs some, too."""
+_DAMAGED: Final = (tarfile.TarError, zlib.error, OSError, EOFError, ValueError)
+"""What reading a file raises that is damaged or is not a backup."""
 _SECRET: Final = ("keys", "kiosk", "run")
 _BACKED_UP: Final = ("stage.toml", "schedule.toml", "profiles", "appearances", "bundles", "bundles-without")
 
@@ -94,12 +98,13 @@ def check_backup(file: Path) -> None:
     Raises UsageError("not-a-backup") and what ``load_stage`` raises.
     """
     try:
-        with tarfile.open(file, "r:gz") as archive, tempfile.TemporaryDirectory() as folder:
+        with _opened(file) as (archive, finish), tempfile.TemporaryDirectory() as folder:
             names = [_read_through(archive, member, Path(folder)) for member in archive]
+            finish()
             if names[:1] != [MARK]:
                 raise _not_ours()
             load_stage(Path(folder))
-    except (tarfile.TarError, OSError, EOFError, ValueError) as error:
+    except _DAMAGED as error:
         raise _not_ours() from error
 
 
@@ -116,8 +121,24 @@ def displays_of(file: Path) -> dict[str, tuple[str, ...]]:
                 raise _not_ours()
             table = json.loads(content.read(LARGEST_BYTES)).get("displays", {})
             return {str(name): tuple(str(serial) for serial in serials) for name, serials in table.items()}
-    except (tarfile.TarError, OSError, EOFError, ValueError, AttributeError, TypeError) as error:
+    except (*_DAMAGED, AttributeError, TypeError) as error:
         raise _not_ours() from error
+
+
+@contextlib.contextmanager
+def _opened(file: Path) -> Iterator[tuple[tarfile.TarFile, Callable[[], None]]]:
+    """A backup to read, and a function that reads what is left of it and compares its checksum.
+
+    tarfile itself stops at the first header that is not one, so that it takes a damaged header for the end.
+    """
+    require_regular(file)
+    with gzip.open(file, "rb") as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
+
+        def finish() -> None:
+            while stream.read(1 << 20):
+                pass
+
+        yield archive, finish
 
 
 def _read_through(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> str:
@@ -240,19 +261,19 @@ def _harmless(info: tarfile.TarInfo) -> tarfile.TarInfo | None:
 
 def _unpack(file: Path, folder: Path) -> None:
     try:
-        require_regular(file)
-        with tarfile.open(file, "r:gz") as archive:
+        with _opened(file) as (archive, finish):
             members = []
             for count, member in enumerate(archive):
                 if count >= MOST_FILES or _harmless(member) is None:
                     raise _not_ours()
                 members.append(member)
+            finish()
             if not members or members[0].name != MARK:
                 raise _not_ours()
             _require_room(folder, sum(member.size for member in members))
             for member in members:
                 _unpack_one(archive, member, folder)
-    except (tarfile.TarError, OSError, EOFError, ValueError) as error:
+    except _DAMAGED as error:
         raise _not_ours() from error
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import zlib
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -129,7 +131,7 @@ def test_stage_toml_names_the_places(tmp_path: Path) -> None:
             BackupTable(ssh=wrong)
 
 
-@pytest.mark.parametrize("how", ["cut", "a flipped bit", "no settings"])
+@pytest.mark.parametrize("how", ["cut", "a wrong checksum", "no settings"])
 def test_what_does_not_read_back_as_a_backup_gets_no_name(tmp_path: Path, how: str) -> None:
     stage = vase(tmp_path / "stage")
     if how == "no settings":
@@ -138,8 +140,8 @@ def test_what_does_not_read_back_as_a_backup_gets_no_name(tmp_path: Path, how: s
     data = bytearray(source.read_bytes())
     if how == "cut":
         del data[len(data) * 2 // 3 :]
-    elif how == "a flipped bit":
-        data[len(data) // 2] ^= 16
+    elif how == "a wrong checksum":
+        data[-8] ^= 16
     source.write_bytes(data)
     target = tmp_path / "velatura-20260504.tar.gz"
     target.write_bytes(b"the one of before")
@@ -147,6 +149,34 @@ def test_what_does_not_read_back_as_a_backup_gets_no_name(tmp_path: Path, how: s
         copied(source, target)
     assert target.read_bytes() == b"the one of before"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["stage", target.name]
+
+
+def test_a_bit_that_flips_anywhere_is_noticed_before_anything_is_replaced(tmp_path: Path) -> None:
+    stage = vase(tmp_path / "stage")
+    sound = archive.backup(stage).read_bytes()
+    settings, bad = (stage / "stage.toml").read_bytes(), tmp_path / "bad.tar.gz"
+    start = 10 + sound[10:].index(b"\0") + 1  # Before it is the name in gzip's header, which nobody reads.
+    judged = 0
+    for place in range(start, len(sound), 3):
+        data = bytearray(sound)
+        data[place] ^= 1 << place % 8
+        if _content(bytes(data)) == _content(sound):
+            continue  # Some bits mean nothing, as which of many zeros a zero is copied from.
+        judged += 1
+        bad.write_bytes(data)
+        with pytest.raises(UsageError, match="damaged"):
+            archive.check_backup(bad)
+        with pytest.raises(UsageError, match="damaged"):
+            archive.restore(stage, bad)
+    assert judged > 150
+    assert (stage / "stage.toml").read_bytes() == settings
+
+
+def _content(data: bytes) -> bytes:
+    try:
+        return gzip.decompress(data)
+    except (OSError, EOFError, zlib.error):
+        return b""
 
 
 def test_a_sound_backup_passes_and_others_do_not(tmp_path: Path) -> None:
