@@ -19,8 +19,11 @@ from controller.capture.patterns import device_frame, frame
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.steps.appearance.solving import random_pattern
 
-SPACING_PX = 16
-OFFSETS = ((2, 3), (7, 11), (12, 6), (14, 14))
+SPACING_PX = 48
+"""Between single pixels whose footprints are measured: the widest, on a wall behind the object, must not touch."""
+OFFSETS = tuple((row, column) for row in (2, 14, 26, 38) for column in (3, 15, 27, 39))
+DOTS_PX = 16
+"""Between the lit pixels of the picture that columns of T are judged by."""
 IN_FOCUS_PX = 0.40
 """Defocus up to this many projector px counts as in focus (the emulated lenses' best is 0.28 to 0.36)."""
 EDGE_PX = 3
@@ -133,7 +136,7 @@ def pattern_errors(stage: CalibratedStage, truth: Truth) -> list[dict[str, float
             predicted = predicted_light(calibrated, n, light)
             figures[name] = relative(predicted, clean((light * 255).astype(np.uint8)), lit)
         single = np.zeros((rows, columns, 3), np.uint8)
-        single[3::SPACING_PX, 5::SPACING_PX] = 255
+        single[3::DOTS_PX, 5::DOTS_PX] = 255
         predicted, real = predicted_light(calibrated, n, (single / 255).astype(np.float32)), clean(single)
         figures["column of T"] = relative(predicted, real, lit)
         figures["column of T, one surface"] = relative(predicted, real, lit & truth.one_surface(n, EDGE_PX))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +22,8 @@ BORDER_SHARE = 0.28
 FEWEST_PIXELS = 4
 NOISE = 1e-4
 """Variance of a photograph's value at the white of the brightest pixels, relative; shot noise falls with the light."""
+DOUBT = 0.1
+"""Standard deviation of a tile's indirect light, relative: dark tiles count where little of their light is indirect."""
 SYSTEMATIC = 0.002
 """Of full scale: differences from tile to tile besides noise."""
 
@@ -30,13 +33,19 @@ class TileMeasurements:
     """Measurements of all colour tiles, one for each tile.
 
     ``levels`` (tiles, 3) int64 device values shown; ``ratio`` (tiles, 3) light per camera channel, white being 1;
-    ``weight`` (tiles, 3): inverse of its variance; ``pixels``: camera pixels that they come from
+    ``weight`` (tiles, 3): inverse of its variance; ``photograph`` (tiles,) int64: which one of the tiles' photographs
+    it is from, from 0; ``pixels``: camera pixels that they come from
     """
 
     levels: npt.NDArray[np.int64]
     ratio: Float64
     weight: Float64
+    photograph: npt.NDArray[np.int64]
     pixels: int
+
+    def at(self, strength: Float64) -> TileMeasurements:
+        """As they would be had the lamp been as strong as at white; ``strength`` of it in each photograph."""
+        return dataclasses.replace(self, ratio=self.ratio / strength[self.photograph][:, None])
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,21 +99,26 @@ def measure_tiles(
     total = _sums(white[inside], which, number)
     full = np.maximum(np.percentile(white[inside], 99, axis=0), 1e-12) if which.size else np.ones(3)
     used = np.flatnonzero((count >= FEWEST_PIXELS) & np.all(total > 0, axis=1))
-    levels, ratios, weights = [], [], []
-    for pattern in tiles_patterns:
+    levels, ratios, weights, photographs = [], [], [], []
+    for photograph, pattern in enumerate(tiles_patterns):
         shown = tile_levels(pattern, plan.size_px)
         light = coloured(captures, pattern.name, black.shape[:2])[inside] - black[inside]
+        doubt = np.zeros((number, 3))
         if indirect is not None:
-            light -= indirect.of(shown)[inside]
+            known = indirect.of(shown)[inside]
+            light -= known
+            doubt = DOUBT * _sums(known, which, number)
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = (_sums(light, which, number) / total)[used]
             variance = NOISE * (np.maximum(ratio, 0) + ratio**2 + 0.02) * full / total[used] + SYSTEMATIC**2
+            variance += (doubt / total)[used] ** 2
         measured = np.isfinite(ratio).all(axis=1)
         levels.append(_levels_of(shown, side)[used][measured])
         ratios.append(ratio[measured])
         weights.append(1 / variance[measured])
+        photographs.append(np.full(np.count_nonzero(measured), photograph, np.int64))
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)
-    return TileMeasurements(np.concatenate(levels), ratio, weight, int(which.size))
+    return TileMeasurements(np.concatenate(levels), ratio, weight, np.concatenate(photographs), int(which.size))
 
 
 def _levels_of(cells: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.int64]:

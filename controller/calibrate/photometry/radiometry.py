@@ -2,7 +2,8 @@
 
 Every tile of a mosaic shows a triple of device values of its own, so that two photographs hold some hundreds to
 thousands of measurements: M r(levels), with M the mixing and r the three responses, divided by white. Both are fitted
-together, each with the other held, until neither changes; tiles that do not fit are left out.
+together, each with the other held, until neither changes; tiles that do not fit are left out. A lamp is never equally
+strong in two photographs; the tiles that show full channels tell how strong it was in theirs.
 """
 
 from __future__ import annotations
@@ -31,6 +32,10 @@ WORST_SCATTER = 0.05
 WORST_ADDITIVITY = 0.08
 LEAST_INDEPENDENCE = 0.01
 MOST_STRAY = 0.3
+MOST_FLICKER = 0.03
+"""A lamp that differs more from one photograph to the next is not stable; then it is not the lamp."""
+FEWEST_FULL = 8
+"""Tiles with a full channel that tell the lamp's strength."""
 STIFFNESS = 1e-3
 WORST_FALL = 0.03
 SUSPECT_ADDITIVITY = 0.02
@@ -51,7 +56,8 @@ class RadiometryReport:
     ``pixels`` camera pixels used; ``tiles`` that were measured, of all patterns together; ``scatter`` median absolute
     deviation of the tiles from the fit, of full scale; ``stray`` share of a tile's white that comes from other tiles;
     ``additivity`` largest relative difference between white and what the tiles say of it, over the camera's channels
-    ``segment``: see ``Radiometry``; 0 where colours add
+    ``segment``: see ``Radiometry``; 0 where colours add; ``flicker``: largest difference of a photograph's light from
+    white's, relative
     """
 
     pixels: int
@@ -60,6 +66,7 @@ class RadiometryReport:
     stray: float
     additivity: float
     segment: float = 0.0
+    flicker: float = 0.0
 
 
 def measure_radiometry(
@@ -107,7 +114,8 @@ def measure_radiometry(
             remedy=REMEDY,
         )
     stray = float(fit.stray.mean())
-    report = RadiometryReport(tiles.pixels, tiles.ratio.shape[0], scatter, stray, fit.additivity, fit.segment)
+    flicker = float(np.abs(fit.strength - 1).max())
+    report = RadiometryReport(tiles.pixels, tiles.ratio.shape[0], scatter, stray, fit.additivity, fit.segment, flicker)
     return Radiometry(fit.response, fit.mixing, fit.segment), report
 
 
@@ -123,12 +131,13 @@ def white_segment(name: str, share: float) -> str:
 class _RadiometryFit:
     """``response`` (3, 256), ``mixing`` (3, 3), ``stray`` (3,), ``residual`` (tiles, 3); ``fall``: how far r fell.
 
-    ``segment``: see ``Radiometry``
+    ``strength`` (photographs,): the lamp's in each photograph of tiles, 1 at white; ``segment``: see ``Radiometry``
     """
 
     response: Float64
     mixing: Float64
     stray: Float64
+    strength: Float64
     residual: Float64
     fall: float = 0.0
     additivity: float = 0.0
@@ -148,25 +157,50 @@ def _fit(tiles: TileMeasurements, *, with_segment: bool = False) -> _RadiometryF
     """Mixing with the responses held, responses with the mixing held, new weights, until nothing changes."""
     x = np.arange(256) / 255
     gamma = np.full(3, FIRST_GAMMA)
-    fit = _RadiometryFit(np.stack([x**FIRST_GAMMA] * 3), np.eye(3), np.zeros(3), np.zeros_like(tiles.ratio))
-    weight = tiles.weight.copy()
+    even = np.ones(int(tiles.photograph.max()) + 1)
+    first = np.stack([x**FIRST_GAMMA] * 3)
+    fit = _RadiometryFit(first, np.eye(3), np.zeros(3), even, np.zeros_like(tiles.ratio))
+    weight, steady = tiles.weight.copy(), tiles
     for number in range(ROUNDS):
         before = fit.response.copy()
         rough = number < ROUGH_ROUNDS
         if with_segment:
-            _fit_segment(tiles, weight, fit)
-        _fit_mixing(tiles, weight, fit, with_stray=not rough)
-        _fit_responses(tiles, weight, gamma, fit)
+            _fit_segment(steady, weight, fit)
+        _fit_mixing(steady, weight, fit, with_stray=not rough)
+        _fit_responses(steady, weight, gamma, fit)
         if rough:
             gamma = _gamma_of(fit.response)
             continue
-        weight = tiles.weight * _kept(fit.residual)
+        _fit_strength(steady, fit)
+        steady = tiles.at(fit.strength)
+        weight = tiles.weight * _kept(_residual(steady, fit))
         if np.max(np.abs(fit.response - before)) < CONVERGED:
             break
+    fit.residual = _residual(steady, fit)
     # white itself takes no part in this: what the tiles say that white should be
-    white = _solve(tiles, weight, gamma, fit, white_known=False)[:, -1]
-    fit.additivity = float(np.max(np.abs(fit.mixing @ white - 1)))
+    white = fit.mixing @ _solve(steady, weight, gamma, fit, white_known=False)[:, -1]
+    fit.additivity = float(np.max(np.abs(fit.strength.mean() * white - 1)))
     return fit
+
+
+def _fit_strength(tiles: TileMeasurements, fit: _RadiometryFit) -> None:
+    """The lamp's strength in each photograph: against the others by all tiles, against white by full channels.
+
+    Where a channel is full its light is known, whatever the response is; below, a stronger lamp looks like another
+    response.
+    """
+    fitted = tiles.ratio - _residual(tiles, fit)
+    against = np.sum(tiles.weight * fitted * tiles.ratio, axis=1), np.sum(tiles.weight * fitted**2, axis=1)
+    light, known = (np.bincount(tiles.photograph, one, len(fit.strength)) for one in against)
+    each = np.divide(light, known, out=np.ones_like(light), where=known > 0)
+    full = (tiles.levels == 255) @ fit.mixing.T * (1 - fit.stray)
+    some = np.flatnonzero((tiles.levels == 255).any(axis=1))
+    if some.size < FEWEST_FULL:
+        return
+    weight = tiles.weight[some] * full[some]
+    found = 1 + np.sum(weight * (tiles.ratio - fitted)[some], axis=1) / np.sum(weight * full[some], axis=1)
+    strength = fit.strength * (each / each.mean()) * np.median(found)
+    fit.strength = np.clip(strength, 1 - MOST_FLICKER, 1 + MOST_FLICKER)
 
 
 def _channels(tiles: TileMeasurements, response: Float64) -> Float64:
@@ -215,12 +249,15 @@ def _fit_mixing(tiles: TileMeasurements, weight: Float64, fit: _RadiometryFit, *
 
 
 def _fit_responses(tiles: TileMeasurements, weight: Float64, gamma: Float64, fit: _RadiometryFit) -> None:
-    around = fit.mixing @ _shown(tiles, fit).mean(axis=0)
     curves = _solve(tiles, weight, gamma, fit, white_known=True)
     fit.fall = float(np.max(np.maximum.accumulate(curves, axis=1) - curves))
     fit.response = np.stack([_rising(curve) for curve in curves])
-    own = _shown(tiles, fit) @ fit.mixing.T
-    fit.residual = tiles.ratio - (own + fit.stray * (around - own))
+
+
+def _residual(tiles: TileMeasurements, fit: _RadiometryFit) -> Float64:
+    shown = _shown(tiles, fit)
+    own = shown @ fit.mixing.T
+    return np.asarray(tiles.ratio - (own + fit.stray * (fit.mixing @ shown.mean(axis=0) - own)), np.float64)
 
 
 def _solve(

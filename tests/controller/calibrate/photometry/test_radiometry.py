@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -100,6 +100,18 @@ def test_light_that_comes_back_from_the_surroundings_is_told_apart() -> None:
     radiometry, report = measure_radiometry(captures, PLAN)
     assert max(off(radiometry, scene())) < 0.006
     assert report.stray == pytest.approx(0.05, abs=0.01)
+
+
+@given(st.lists(st.floats(-0.02, 0.02), min_size=3, max_size=3))
+@settings(max_examples=8, deadline=None)
+def test_a_lamp_that_flickers_between_the_photographs_bends_no_response(flicker: list[float]) -> None:
+    captures = dict(before_response(scene()))
+    for pattern, change in zip(PLAN.of_kind(PatternKind.COLOUR_TILES), flicker, strict=True):
+        own = captures[pattern.name] - captures["black"]
+        captures[pattern.name] = (captures["black"] + np.float32(1 + change) * own).astype(np.float32)
+    radiometry, report = measure_radiometry(captures, PLAN)
+    assert max(off(radiometry, scene())) < 0.006
+    assert report.flicker == pytest.approx(max(abs(change) for change in flicker), abs=0.004)
 
 
 @dataclass(frozen=True)
