@@ -7,15 +7,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from controller.capture.latency import Thumbprint
 from controller.core.arrays import ByteImage
 from controller.core.errors import WorkError
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.interfaces import Camera, Display
-from hal.values import CapturedFile, ExposureSettings, FileKind
+from hal.values import CapturedFile, ExposureSettings, FileKind, Presented
 
 STORE_MARGIN_S = 5.0
 """Longest time that a camera may need beyond the exposure itself: mirror, write-out and transfer."""
+
+UNMEASURED_S = 0.15
+"""Seconds that are waited for a picture as long as its delay is not known and stage.toml says nothing."""
 
 DISK_CODES = ("no-space", "cannot-write")
 """Error codes of a camera driver when this computer's disk fails."""
@@ -30,6 +34,15 @@ class Shot:
     exposure_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class LastShown:
+    """The last photograph of a row of pictures: its frames, what it shows, and the frames' number at the display."""
+
+    frames: Mapping[str, ByteImage]
+    shows: Thumbprint
+    sequence: int
+
+
 class Acquirer:
     """Takes shots; sets the camera only when the exposure changes, and shows frames only when they change.
 
@@ -37,11 +50,11 @@ class Acquirer:
     ----------
     settle_s : least seconds between the display's report that frames are presented and the release of the shutter.
         Where the delay of the stage has been measured (``set_delay``), the longer of the two is waited, so that no
-        photograph shows the pattern before
+        photograph shows the pattern before. None: the measured delay alone
     """
 
     def __init__(
-        self, display: Display, camera: Camera, *, iso: int, aperture_f: float | None, settle_s: float
+        self, display: Display, camera: Camera, *, iso: int, aperture_f: float | None, settle_s: float | None
     ) -> None:
         self._display = display
         self._camera = camera
@@ -50,10 +63,14 @@ class Acquirer:
         self._settle_s = settle_s
         self._delay_s: float | None = None
         self._confirmed: tuple[float, ExposureSettings] | None = None
+        self.last: LastShown | None = None
+        """Set by whoever photographs picture after picture, to find out whether one shows the picture before."""
 
     @property
     def wait_s(self) -> float:
         """Seconds that are waited between presentation and shutter."""
+        if self._settle_s is None:
+            return UNMEASURED_S if self._delay_s is None else self._delay_s
         return max(self._settle_s, self._delay_s or 0.0)
 
     @property
@@ -67,8 +84,11 @@ class Acquirer:
 
     def show(self, frames: Mapping[str, ByteImage], *, deadline: Deadline) -> float:
         """Show frames; return when they were presented, on the monotonic clock."""
-        presented = self._display.show(frames, deadline=deadline.within(10.0))
-        return presented.at_s
+        return self.present(frames, deadline=deadline).at_s
+
+    def present(self, frames: Mapping[str, ByteImage], *, deadline: Deadline) -> Presented:
+        """Show frames; return when they were presented, and their number among all that the display has shown."""
+        return self._display.show(frames, deadline=deadline.within(10.0))
 
     def exposures_s(self) -> tuple[float, ...]:
         """The exposures that the camera offers, ascending, in seconds."""
@@ -78,12 +98,15 @@ class Acquirer:
         self, shot: Shot, folder: Path, *, deadline: Deadline, wait_s: float | None = None
     ) -> tuple[CapturedFile, float]:
         """Show and photograph one shot into ``folder``; return as ``photograph``."""
-        # The camera is set first: that takes a while, in which the frames would only wait.
-        self._set(shot.exposure_s, deadline)
-        shown_at_s = self.show(shot.frames, deadline=deadline)
+        presented = self.present_for(shot, deadline=deadline)
         return self.photograph(
-            shot.name, shot.exposure_s, folder, shown_at_s=shown_at_s, deadline=deadline, wait_s=wait_s
+            shot.name, shot.exposure_s, folder, shown_at_s=presented.at_s, deadline=deadline, wait_s=wait_s
         )
+
+    def present_for(self, shot: Shot, *, deadline: Deadline) -> Presented:
+        """Show a shot's frames, with the camera set for it before: that takes a while, in which they would wait."""
+        self._set(shot.exposure_s, deadline)
+        return self.present(shot.frames, deadline=deadline)
 
     def photograph(
         self,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -27,6 +28,8 @@ FIRST_DELAY_S = 0.04
 RESOLUTION_S = 0.025
 MARGIN_S = 0.035
 """Two frames: a picture may just have missed one at the display and one at the projector."""
+MARGIN_SHARE = 0.5
+"""Of the delay: a slow panel that shows 96 per cent of a change by then shows more than 99 after so much longer."""
 WHOLE_SHARE = 0.96
 """A picture is complete when all but a few blocks show this much of the change; lamps flicker by less."""
 NEARLY_SHARE = 0.9
@@ -39,6 +42,8 @@ LEAST_CONTRAST = 0.01
 CONFIRMATIONS = 4
 BEFORE_TIMES = 4.0
 """While the delay is searched, the picture before is shown for so many times the delay that was enough."""
+CONFIRMED_TIMES, CONFIRMED_S = 8.0, 0.5
+"""As ``BEFORE_TIMES``, and at least so long, while what was found is confirmed."""
 SPARSE = 8
 NOTICEABLE = 24
 """Of 255."""
@@ -59,7 +64,7 @@ class Latency:
     @property
     def wait_s(self) -> float:
         """How long to wait between a picture's presentation and the shutter."""
-        return self.delay_s + MARGIN_S
+        return self.delay_s + max(MARGIN_S, MARGIN_SHARE * self.delay_s)
 
 
 class CaptureFlat(Protocol):
@@ -109,13 +114,13 @@ def measure_latency(look: CaptureFlat) -> Latency:
     late_s, delay_s = 0.0, 0.0
     while not whole(delay_s) and delay_s < LONGEST_S:
         late_s, delay_s = delay_s, min(max(FIRST_DELAY_S, 2 * delay_s), LONGEST_S)
-    # Here several times the delay that was enough is enough for the picture before, too. What is found is confirmed
-    # after the longest wait.
+    # Here several times the delay that was enough is enough for the picture before, too.
     before_s = min(LONGEST_S, BEFORE_TIMES * delay_s)
+    confirming_s = min(LONGEST_S, max(CONFIRMED_S, CONFIRMED_TIMES * delay_s))
     while delay_s - late_s > RESOLUTION_S:
         middle_s = 0.5 * (late_s + delay_s)
         late_s, delay_s = (late_s, middle_s) if whole(middle_s, before_s) else (middle_s, delay_s)
-    return Latency(_confirmed(whole, delay_s), tuple(tries))
+    return Latency(_confirmed(partial(whole, before_s=confirming_s), delay_s), tuple(tries))
 
 
 def _confirmed(whole: Callable[[float], bool], delay_s: float) -> float:

@@ -98,8 +98,12 @@ class ObjectTable(ConfigTable):
 
 
 class CaptureTable(ConfigTable):
-    settle_s: float = Field(
-        default=0.15, ge=0, le=10, description="seconds from a frame's presentation to the shutter, 0 to 10"
+    settle_s: float | None = Field(
+        default=None,
+        ge=0,
+        le=10,
+        description="least seconds from a frame's presentation to the shutter, 0 to 10; without it, as long as a "
+        "calibration measured",
     )
     longest_exposure_s: float = Field(
         default=4.0, gt=0, le=3600, description="the longest exposure in seconds, above 0, at most 3600"

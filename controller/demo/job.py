@@ -41,7 +41,7 @@ from controller.steps.appearance.requests import requests_of
 from controller.steps.appearance.solving import device_frames, options_of, solve_steps
 from controller.steps.calibrate.grade import gate_step
 
-PLAYBACK_S = 4.0
+PLAYBACK_S = 2.0
 
 
 def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:

@@ -21,11 +21,10 @@ from controller.artefacts.photographs import (
     read_exposure,
     write_exposure,
 )
-from controller.capture.acquire import Shot
+from controller.capture.acquire import LastShown, Shot
 from controller.capture.latency import (
     CHANGED_FRAMES,
     LONGEST_S,
-    Thumbprint,
     changed_share,
     same_picture,
     thumbprint,
@@ -64,13 +63,11 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, into: Photo
     A photograph in the journal with the same frames and the same exposure is not taken again.
     """
     use_delay(rig, context.folder)
-    before: _Before | None = None
     watch = CameraWatch(rig.camera)
     with kept_if_lit(rig, context) as row:
         for number, planned in enumerate(plan):
             context.advance(number / len(plan), planned.name)
-            one, before = _take(rig, context, planned, into.shot(planned.name, planned.projector), before)
-            row.add(one)
+            row.add(_take(rig, context, planned, into.shot(planned.name, planned.projector)))
             watch.look(context)
     return [into.write(context.folder, row.taken), *(photograph.path for photograph in row.taken)]
 
@@ -133,56 +130,54 @@ def use_delay(rig: Rig, folder: Path) -> None:
         rig.acquirer.set_delay(wait_s)
 
 
-@dataclass(frozen=True, slots=True)
-class _Before:
-    """The previous photograph: what it should show, and what it shows."""
-
-    frames: Mapping[str, ByteImage]
-    shows: Thumbprint
-
-
-def _take(
-    rig: Rig, context: Context, planned: Planned, identity: ShotId, before: _Before | None
-) -> tuple[Taken, _Before | None]:
+def _take(rig: Rig, context: Context, planned: Planned, identity: ShotId) -> Taken:
+    acquirer = rig.acquirer
     frames = rig.on_outputs(planned.frames())
     settings = {"exposure_s": repr(planned.exposure_s), "frames": frames_digest(frames)}
     known = context.journal.shot(identity, settings)
     if known is not None:
-        return _taken(identity, known.path, read_exposure(known.path)), None
+        return _taken(identity, known.path, read_exposure(known.path))
     shot = Shot(capture_name(identity), frames, planned.exposure_s)
-    # Each photograph is compared with the previous one, so the first of a row must be right for certain.
-    wait_s = max(LONGEST_S, rig.acquirer.wait_s) if rig.acquirer.protected and before is None else None
-    file, exposure_s = rig.acquirer.take(
-        shot, captures_folder(context.folder, identity), deadline=context.deadline, wait_s=wait_s
+    folder = captures_folder(context.folder, identity)
+    presented = acquirer.present_for(shot, deadline=context.deadline)
+    # What the display showed before is known where nothing was shown in between.
+    before = acquirer.last if acquirer.last and acquirer.last.sequence == presented.sequence - 1 else None
+    acquirer.last = None
+    # Each photograph is compared with the previous one; where that is not known, this one must be right for certain.
+    wait_s = max(LONGEST_S, acquirer.wait_s) if acquirer.protected and before is None else None
+    file, exposure_s = acquirer.photograph(
+        shot.name, shot.exposure_s, folder, shown_at_s=presented.at_s, deadline=context.deadline, wait_s=wait_s
     )
-    path, shows = file.path, None
-    if rig.acquirer.protected:
-        shows = thumbprint(path, exposure_s)
+    path = file.path
+    if acquirer.protected:
+        last = LastShown(frames, thumbprint(path, exposure_s), presented.sequence)
         if before is not None and changed_share(before.frames, frames) > CHANGED_FRAMES:
-            first = (path, exposure_s, shows)
-            path, exposure_s, shows = _not_the_one_before(rig, context, identity, shot, first, before.shows)
-    taken = _journalled(context, identity, settings, path, exposure_s)
-    return taken, _Before(frames, shows) if shows is not None else None
+            path, exposure_s, last = _not_the_one_before(rig, context, identity, shot, (path, exposure_s, last), before)
+        acquirer.last = last
+    return _journalled(context, identity, settings, path, exposure_s)
 
 
 def _not_the_one_before(
-    rig: Rig, context: Context, identity: ShotId, shot: Shot, first: tuple[Path, float, Thumbprint], before: Thumbprint
-) -> tuple[Path, float, Thumbprint]:
+    rig: Rig, context: Context, identity: ShotId, shot: Shot, first: tuple[Path, float, LastShown], before: LastShown
+) -> tuple[Path, float, LastShown]:
     """The photograph if it differs from the previous one; otherwise one taken much later.
 
     If the later one differs, the display's delay has grown, and the waiting time becomes longer from now on.
     If not, the two pictures look the same to the camera.
     """
-    if not same_picture(first[2], before):
+    if not same_picture(first[2].shows, before.shows):
         return first
     first[0].unlink()
-    file, exposure_s = rig.acquirer.take(
-        shot, first[0].parent, deadline=context.deadline, wait_s=max(LONGEST_S, 2 * rig.acquirer.wait_s)
-    )
-    again = thumbprint(file.path, exposure_s)
-    if not same_picture(again, before):
-        longer_s = min(rig.acquirer.wait_s + MORE_DELAY_S, LONGEST_S)
-        rig.acquirer.set_delay(longer_s)
+    acquirer = rig.acquirer
+    presented = acquirer.present_for(shot, deadline=context.deadline)
+    file, exposure_s = acquirer.photograph(
+        shot.name, shot.exposure_s, first[0].parent, shown_at_s=presented.at_s, deadline=context.deadline,
+        wait_s=max(LONGEST_S, 2 * acquirer.wait_s),
+    )  # fmt: skip
+    again = LastShown(shot.frames, thumbprint(file.path, exposure_s), presented.sequence)
+    if not same_picture(again.shows, before.shows):
+        longer_s = min(acquirer.wait_s + MORE_DELAY_S, LONGEST_S)
+        acquirer.set_delay(longer_s)
         raise_delay(context.folder, longer_s)
         context.reporter.say(
             f"Photograph {identity} showed the picture before it and was taken again; from now on "

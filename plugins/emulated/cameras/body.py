@@ -222,16 +222,16 @@ class EmulatedBody:
     def _shutter(self, exposed: ExposedPicture, lasts_s: float | None = None) -> None:
         """The shutter's own thread: it stays open for its time, whatever happens to the connection."""
         until = time.monotonic() + (exposed.settings.exposure_s * self.time_scale if lasts_s is None else lasts_s)
+        self.last_exposure_s = exposed.settings.exposure_s
+        try:
+            files = self._expose(exposed.settings)  # of a stage it lasts as long as the exposure, of a test no time
+        except BaseException:
+            self.exposing = False  # the picture is lost, but the camera goes on
+            raise
         while (left_s := until - time.monotonic()) > 0 and not self.stopped.is_set():
             self.stopped.wait(min(left_s, 1.0))
         if self.stopped.is_set():
             return
-        self.last_exposure_s = exposed.settings.exposure_s
-        try:
-            files = self._expose(exposed.settings)
-        except BaseException:
-            self.exposing = False  # the picture is lost, but the camera goes on
-            raise
         with self.lock:
             self._picture = self._picture % 9999 + 1
             taken = time.strftime("%Y%m%dT%H%M%S")

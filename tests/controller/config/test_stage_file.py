@@ -71,7 +71,7 @@ def test_a_right_stage_is_read_with_defaults(tmp_path: Path) -> None:
     assert [projector.output for projector in stage.tables.projectors] == ["P1", "P2"]
     assert stage.tables.camera.focal_length_px == 5200.0
     assert stage.tables.bundle.allow_unsigned is False
-    assert stage.tables.capture.settle_s > 0
+    assert stage.tables.capture.longest_exposure_s > 0
     assert stage.path("run/tty-left") == tmp_path / "run" / "tty-left"
     assert load_stage(tmp_path / "stage.toml").tables.model_dump() == stage.tables.model_dump()
 
