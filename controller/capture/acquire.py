@@ -6,14 +6,17 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from controller.capture.latency import Thumbprint
 from controller.core.arrays import ByteImage
 from controller.core.errors import WorkError
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.interfaces import Camera, Display
 from hal.values import CapturedFile, ExposureSettings, FileKind, Presented
+
+if TYPE_CHECKING:  # it needs OpenCV, and a kiosk gets here before its first picture
+    from controller.capture.latency import Thumbprint
 
 STORE_MARGIN_S = 5.0
 """Longest time that a camera may need beyond the exposure itself: mirror, write-out and transfer."""
