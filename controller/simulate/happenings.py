@@ -30,6 +30,7 @@ class Living(Protocol):
     service: Service | None
     damaged: set[str]
     unreadable: set[str]
+    sound: dict[str, bytes]
     repaired_s: float
     news: Event
 
@@ -264,7 +265,9 @@ def _file_damaged(life: Living, item: Item) -> None:
             life.witness.ledger_lost()
         if item.who in ("stage.toml", "schedule.toml"):
             _unsure(life, MEND_FILE_S + REPAIR_S)
-            life.later(MEND_FILE_S, partial(_put_right, life, path, before))
+            if item.who not in life.sound:  # of a file that is damaged twice, what it was before the first time
+                life.sound[item.who] = before
+                life.later(MEND_FILE_S, partial(_put_right, life, path))
     life.world.scheduler.sleep(2.0)
     life.boot()
 
@@ -278,8 +281,8 @@ def _damaged(content: bytes, item: Item) -> bytes:
     return content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + 64]) + content[at + 64 :]
 
 
-def _put_right(life: Living, path: Path, content: bytes) -> None:
-    path.write_bytes(content)
+def _put_right(life: Living, path: Path) -> None:
+    path.write_bytes(life.sound.pop(path.name))
     life.unreadable.discard(path.name)
     life.repaired_s = life.world.scheduler.now_s
     if life.service is not None:

@@ -87,6 +87,8 @@ class Life:
         self.restart_in_s: float | None = None
         self.damaged: set[str] = set()
         self.unreadable: set[str] = set()
+        self.sound: dict[str, bytes] = {}
+        """What people will write again into files that are damaged."""
         self.repaired_s = 0.0
         self._repairs: list[tuple[float, int, Callable[[], None]]] = []
         self._last: tuple[Any, ...] = ()
