@@ -324,7 +324,8 @@ class Reconciler:
 
     def _recover(self, views: Sequence[ProjectorView], light: bool) -> None:
         if not light:
-            if not any(view.condition is Condition.LIT or view.maybe_lit for view in views) or self._waited(60.0):
+            # The lamps are wanted dark in this state, too: it ends when they are.
+            if not any(view.condition is Condition.LIT or view.maybe_lit for view in views):
                 self._go(Event.STOP, "closed")
         elif any(view.condition is Condition.LIT for view in views) or self._waited(
             RETRY_S[min(self._attempts, len(RETRY_S) - 1)]

@@ -167,8 +167,11 @@ class Devices:
 
         silenced = None if self.mains is None else partial(self.mains.silences, table.name)
         unfed = partial(self._unfed, table.name)
+        # Lit when the service before this one ended: it may burn behind a line that does not answer.
+        record = self._ledger.read(table.name)
+        maybe_lit = record is not None and record.lit and record.boot == self._world.boot()
         return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, asleep=silenced, unfed=unfed,
-                                   deadline=self._world.deadline)  # fmt: skip
+                                   deadline=self._world.deadline, maybe_lit=maybe_lit)  # fmt: skip
 
     def _unfed(self, projector: str) -> Decision | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]

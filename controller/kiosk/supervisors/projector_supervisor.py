@@ -44,6 +44,7 @@ class ProjectorSupervisor:
     asleep : whether it has no mains now, or is booting, so that its silence means nothing
     unfed : the problem of the relays that supply it, which may be the reason for its silence
     deadline : one that ends in so many seconds
+    maybe_lit : whether its lamp may be lit before it was looked at
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class ProjectorSupervisor:
         asleep: Callable[[], bool] | None = None,
         unfed: Callable[[], Decision | None] | None = None,
         deadline: Callable[[float], Deadline] = in_seconds,
+        maybe_lit: bool = False,
     ) -> None:
         self.name = name
         self._open_guard, self._tell = open_guard, tell
@@ -64,7 +66,7 @@ class ProjectorSupervisor:
         self._deadline = deadline
         self._guard: LampGuard | None = None
         self._want_lit: bool | None = None
-        self._view = ProjectorView(name)
+        self._view = ProjectorView(name, maybe_lit=maybe_lit)
         self._stepping = self._closed = False
         self._silent_since_s: float | None = None
         self._reopen_at_s, self._reopened = 0.0, 0

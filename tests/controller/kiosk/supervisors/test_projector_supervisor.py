@@ -60,9 +60,11 @@ class Kept:
         self.shelf = Shelf()
         self.begin_anew()
 
-    def begin_anew(self) -> None:
+    def begin_anew(self, *, maybe_lit: bool = False) -> None:
         """As a service that was killed and starts."""
-        self.supervisor = ProjectorSupervisor("left", self._opened, self.told.append, clock=self.world)
+        self.supervisor = ProjectorSupervisor(
+            "left", self._opened, self.told.append, clock=self.world, maybe_lit=maybe_lit
+        )
 
     def _opened(self, deadline: Deadline) -> LampGuard:
         if not self.there:
@@ -90,6 +92,19 @@ def kept() -> Kept:
 def test_nothing_is_done_until_somebody_says_what_is_wanted(kept: Kept) -> None:
     assert kept.run(30) is Condition.DARK
     assert kept.lamp.strikes == 0
+
+
+def test_a_lamp_that_was_lit_at_the_start_may_be_lit_until_its_projector_answers(kept: Kept) -> None:
+    kept.supervisor.want_lit = True
+    kept.run(5)
+    kept.there = False
+    kept.begin_anew(maybe_lit=True)
+    kept.supervisor.want_lit = False
+    assert kept.run(60) is Condition.LOST
+    assert kept.supervisor.view.maybe_lit
+    kept.there = True
+    assert kept.run(60) is Condition.DARK
+    assert not kept.supervisor.view.maybe_lit
 
 
 def test_lights_and_darkens_as_it_is_wanted(kept: Kept) -> None:
