@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -70,18 +70,22 @@ class LampLedger(Protocol):
 
 
 _UNKNOWN: Final = ""
+_UNREADABLE: Final = (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError)
 
 
 class LampFile:
-    """A ledger in one JSON file of the stage folder. A damaged file makes every lamp of the stage count as hot.
+    """A ledger in one JSON file of the stage folder, with a copy beside it.
 
-    Lamps that were not written since then count as hot after a restart, too: an entry without a name marks this.
+    Where the file is damaged, or gone and the copy is there, every lamp of the stage counts as hot; strikes and hours
+    are the copy's. Lamps that were not written since then count as hot after a restart, too: an entry without a
+    name marks this.
     """
 
     NAME: Final = "lamps.json"
+    COPY: Final = "lamps-copy.json"
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._copy = path, path.with_name(self.COPY)
         self._lock = threading.Lock()
         self.damaged = False
         self._records = self._load()
@@ -95,20 +99,34 @@ class LampFile:
             unknown = {_UNKNOWN: LampRecord(lit=True)} if self.damaged else {}
             records = {**unknown, **self._records, name: record}
             text = json.dumps({key: asdict(value) for key, value in sorted(records.items())}, indent=2)
-            write_atomically(self._path, text.encode() + b"\n")
+            # The copy first: if the second one fails, the file is as it was.
+            for path in (self._copy, self._path):
+                write_atomically(path, text.encode() + b"\n")
             self._records = records
 
     def _load(self) -> Mapping[str, LampRecord]:
+        gone = False
         try:
-            content = json.loads(read_bytes(self._path))
-            records = {str(name): _record(fields) for name, fields in content.items()}
+            records = _records(self._path)
         except FileNotFoundError:
+            gone = True
+        except _UNREADABLE:
+            pass
+        else:
+            self.damaged = _UNKNOWN in records
+            return records
+        try:
+            kept = _records(self._copy)
+        except _UNREADABLE:
+            self.damaged = not gone
             return {}
-        except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError):
-            self.damaged = True
-            return {}
-        self.damaged = _UNKNOWN in records
-        return records
+        self.damaged = True
+        return {name: replace(record, lit=True, boot="") for name, record in kept.items()}
+
+
+def _records(path: Path) -> dict[str, LampRecord]:
+    content = json.loads(read_bytes(path))
+    return {str(name): _record(fields) for name, fields in content.items()}
 
 
 def _record(fields: Mapping[str, object]) -> LampRecord:

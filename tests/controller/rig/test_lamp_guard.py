@@ -117,6 +117,25 @@ def test_a_damaged_ledger_makes_the_lamps_hot(tmp_path: Path, content: bytes) ->
     assert lamp.strikes == 0
 
 
+@pytest.mark.parametrize("content", [None, b"", b"{"], ids=["gone", "empty", "cut"])
+def test_a_lost_ledger_makes_the_lamps_hot_and_keeps_their_counts(tmp_path: Path, content: bytes | None) -> None:
+    file, world = tmp_path / LampFile.NAME, World()
+    guard, lamp = a_guard(world, ledger=LampFile(file))
+    guard.switch_on(deadline=soon())
+    lamp.go_dark()
+    world.time_s += 1.0
+    if content is None:
+        file.unlink()
+    else:
+        file.write_bytes(content)
+    guard = LampGuard("left", lamp, LampFile(file), clock=world)
+    assert refusal(lambda: guard.switch_on(deadline=soon())) in {"lamp-resting", "lamp-cooling"}
+    world.time_s += RULES.minimum_off_s
+    guard.switch_on(deadline=soon())
+    assert guard.use().strikes == 2
+    assert not lamp.sins
+
+
 def test_a_damaged_ledger_keeps_a_lamp_hot_of_which_nothing_was_written_before_a_kill(tmp_path: Path) -> None:
     (tmp_path / LampFile.NAME).write_bytes(b"{")
     ledger, world = LampFile(tmp_path / LampFile.NAME), World()
