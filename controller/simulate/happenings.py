@@ -263,6 +263,9 @@ def _file_damaged(life: Living, item: Item) -> None:
             _unsure_until_hours(life)
         if item.who.endswith("lamps.json"):
             life.witness.ledger_lost()
+        if item.who == "schedule.toml":
+            # With other hours for a while, what people said may have ended.
+            _unsure_until_hours(life)
         if item.who in ("stage.toml", "schedule.toml"):
             _unsure(life, MEND_FILE_S + REPAIR_S)
             if item.who not in life.sound:  # of a file that is damaged twice, what it was before the first time
