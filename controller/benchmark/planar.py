@@ -71,20 +71,22 @@ def planar(seen: Metapixels, camera: Pinhole, projector: Pinhole) -> Metapixels:
             what="The object has no flat part that most pixels of a projector light.",
             remedy="Use this method on the scene flat.",
         )
+    back = np.linalg.inv(_slopes(projector, matrix, camera, here[on_plane]))
+    measured = _matrices(seen.covariance_px2[rows[on_plane], columns[on_plane]])
+    own = np.median(back @ measured @ back.transpose(0, 2, 1), axis=0)
+
+    found = np.zeros(usable.shape, np.uint8)
+    found[rows[on_plane], columns[on_plane]] = 1
+    # The homography knows better than the measurement of one pixel: those between pixels of the plane lie on it, too.
+    valid = np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((EDGE_PX, EDGE_PX), np.uint8)), bool)
+    rows, columns = np.nonzero(valid)
+    here = np.stack([columns, rows], axis=-1).astype(np.float64)
     centre = np.full(seen.centre_px.shape, np.nan, np.float32)
     shape = np.full(seen.covariance_px2.shape, np.nan, np.float32)
-    valid = np.zeros_like(usable)
-    rows, columns, here = rows[on_plane], columns[on_plane], here[on_plane]
-    valid[rows, columns] = True
-    centre[rows, columns] = _through(projector, matrix, camera, here)
-    slope = np.stack(
-        [_through(projector, matrix, camera, here + step) - _through(projector, matrix, camera, here - step)
-         for step in ((0.5, 0.0), (0.0, 0.5))], axis=-1,
-    )  # fmt: skip
-    back = np.linalg.inv(slope)
-    own = np.median(back @ _matrices(seen.covariance_px2[rows, columns]) @ back.transpose(0, 2, 1), axis=0)
+    centre[valid] = _through(projector, matrix, camera, here)
+    slope = _slopes(projector, matrix, camera, here)
     spread = slope @ own @ slope.transpose(0, 2, 1)
-    shape[rows, columns] = np.stack([spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]], axis=-1)
+    shape[valid] = np.stack([spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]], axis=-1)
     return Metapixels(centre, shape, valid)
 
 
@@ -150,6 +152,15 @@ def _through(projector: Pinhole, matrix: Float64, camera: Pinhole, places_px: Fl
     rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
     found, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.matrix, np.array([*camera.distortion, 0, 0]))
     return np.asarray(found, np.float64).reshape(-1, 2)
+
+
+def _slopes(projector: Pinhole, matrix: Float64, camera: Pinhole, places_px: Float64) -> Float64:
+    """(n, 2, 2): how the camera's place moves with x and y of the projector's picture."""
+    moves = [np.array(move) for move in ((0.5, 0.0), (0.0, 0.5))]
+    return np.stack(
+        [_through(projector, matrix, camera, places_px + move) - _through(projector, matrix, camera, places_px - move)
+         for move in moves], axis=-1,
+    )  # fmt: skip
 
 
 def _matrices(covariance: FloatImage) -> Float64:

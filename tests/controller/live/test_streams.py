@@ -30,6 +30,8 @@ HERE = Path(__file__).parent
 COLOUR = (64, 128, 192)
 SIZE = (160, 120)
 SYSTEM_PYTHON = "/usr/bin/python3"
+NDI_LOSES = 6
+"""Of 255, by its own compression: 64, 128, 192 arrive as 62, 127, 186 at every size."""
 
 
 def has_rtsp_server() -> bool:
@@ -63,9 +65,9 @@ def sent(port: int) -> Iterator[subprocess.Popen[bytes]]:
         yield process
 
 
-def is_sent(picture: ByteImage) -> bool:
+def is_sent(picture: ByteImage, within: int = 4) -> bool:
     """Whether it is the picture that is sent, within what video's colours lose."""
-    return picture.shape == (SIZE[1], SIZE[0], 3) and int(np.abs(picture.astype(int) - COLOUR).max()) <= 4
+    return picture.shape == (SIZE[1], SIZE[0], 3) and int(np.abs(picture.astype(int) - COLOUR).max()) <= within
 
 
 def newest(source: StreamSource) -> LivePicture | None:
@@ -209,7 +211,7 @@ def test_ndi_from_its_own_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             (address,) = (one for one in found.get_source_names() if name in one)
         with contextlib.closing(open_stream(f"ndi://{address}", silent_s=2.0, retry_s=0.2)) as source:
             source.wait_for_picture(20)
-            wait_for(lambda: bool((one := newest(source)) and is_sent(one.pixels)))
+            wait_for(lambda: bool((one := newest(source)) and is_sent(one.pixels, NDI_LOSES)))
             sender.send_signal(signal.SIGSTOP)
 
             def lost() -> bool:
@@ -221,4 +223,4 @@ def test_ndi_from_its_own_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
             wait_for(lost)
             sender.send_signal(signal.SIGCONT)
-            wait_for(lambda: bool((one := newest(source)) and is_sent(one.pixels)))
+            wait_for(lambda: bool((one := newest(source)) and is_sent(one.pixels, NDI_LOSES)))
