@@ -52,6 +52,7 @@ test-setup:
 	@.ci/setup-peer homeassistant
 	@.ci/setup-peer openapi
 	@.ci/system-packages
+	@.ci/setup-npm
 	@.venv/bin/python -m hal.runtime.kernels compile
 	@.venv/bin/python -m tests.booted.trees
 

@@ -13,7 +13,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Final
 
-from controller.benchmark import methods
+from controller.benchmark import methods, planar
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
 
@@ -54,6 +54,7 @@ BUILT_IN: Final = (
     Entry("inversion", methods.inversion, dots=True, cost_s=90.0),
     Entry("feathering", methods.feathering, cost_s=30.0),
     Entry("single", methods.single, cost_s=30.0),
+    Entry("superresolution", planar.superresolution, cost_s=30.0),
 )
 
 

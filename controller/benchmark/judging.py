@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from controller.api.benchmark import BenchmarkTarget
 from controller.benchmark.counted import CountedStage, Shower, checked_frames
 from controller.benchmark.entering import Entry
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import VelaturaError, WorkError
 from controller.report.pictures import crop_around
 from controller.solve.judged import PixelSet
@@ -24,7 +25,7 @@ from controller.study.lab.measuring import pixel_sets
 from controller.study.lab.subject import ReachableTarget, Subject
 from controller.study.lab.trial import photograph_target
 from controller.study.output.drawing import screen
-from controller.transport import build_transport
+from controller.transport import LightTransport, build_transport
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
 
@@ -72,17 +73,25 @@ class Judged:
     failed: Failure | None = None
 
 
-def fixed_targets(subject: Subject) -> dict[str, ReachableTarget]:
-    """``TARGETS`` on this stage, each as bright as 95 % of the object can reach, by the reference calibration."""
+def fixed_targets(subject: Subject, only: Mask | None = None) -> dict[str, ReachableTarget]:
+    """``TARGETS`` on this stage, each as bright as 95 % of the object can reach, by the reference calibration.
+
+    ``only`` (camera rows, columns): the part on which they are judged; None: all
+    """
+
+    def wanted(target: Target, transport: LightTransport | None = None) -> ReachableTarget:
+        mask = target.mask if only is None else target.mask & only
+        return subject.wanted(dataclasses.replace(target, mask=mask), transport=transport)
+
     picture = photograph_target(subject)
     grey = Target(np.where(subject.mask[..., None], np.float32(GREY), np.float32(0)) * np.ones(3, np.float32),
                   subject.mask)  # fmt: skip
     alone = build_transport(subject.with_projectors(brightest_first(subject)[:1]))
     return {
-        "grey": subject.wanted(grey),
-        "checkerboard": subject.wanted(through_camera(checkerboard(subject.geometry, subject.mask))),
-        "photograph": subject.wanted(picture),
-        "photograph-dim": subject.wanted(picture, transport=alone),
+        "grey": wanted(grey),
+        "checkerboard": wanted(through_camera(checkerboard(subject.geometry, subject.mask))),
+        "photograph": wanted(picture),
+        "photograph-dim": wanted(picture, alone),
     }
 
 

@@ -44,6 +44,8 @@ FORMATS: Final = (
     Format("colmap-binary", "a folder with COLMAP's binary files", "colmap-binary", f"{_HERE}.colmap:write_binary"),
     Format("opencv", "views and points for OpenCV (YAML)", "stage.yml", f"{_HERE}.opencv:write_storage"),
     Format("st-maps", "a folder with warps as EXR pictures", "st-maps", f"{_HERE}.st_maps:write_maps"),
+    Format("mpcdi", "a folder with warps and poses for media servers (MPCDI 2.0)", "mpcdi",
+           f"{_HERE}.mpcdi:write_mpcdi"),
     Format("transport", "a folder with the light transport as scipy.sparse files", "transport",
            f"{_HERE}.sparse:write_transport"),
     Format("dataset", "a folder with photographs, calibration, targets and results, for research", "dataset",

@@ -1,1 +1,1 @@
-"""A stream of target pictures, as files or frames (docs/how-to/live-targets.md). Entry: `sources`."""
+"""A stream of target pictures: files, frames, a network (docs/how-to/live-targets.md). Entry: `sources`, `streams`."""

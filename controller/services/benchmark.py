@@ -16,6 +16,7 @@ from controller.benchmark import board, counted, judging, scenes
 from controller.benchmark.counted import CameraFacts, CountedStage, calibration_effort
 from controller.benchmark.entering import Entry, entries
 from controller.benchmark.judging import fixed_targets, judge
+from controller.benchmark.planar import flat_part
 from controller.benchmark.scenes import SCENES, chosen_scenes
 from controller.capture.profile import load_profile
 from controller.core.arrays import ByteImage, FloatImage
@@ -164,7 +165,8 @@ class _Arena:
 
     def _made(self, subject: Subject) -> Mapping[str, ReachableTarget]:
         if not self._targets:
-            self._targets = fixed_targets(subject)
+            flat = self.conditions["scene"] in scenes.PLANES
+            self._targets = fixed_targets(subject, flat_part(subject.geometry, subject.mask) if flat else None)
         return self._targets
 
 

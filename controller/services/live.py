@@ -19,7 +19,9 @@ from controller.bundle.reader import Bundle
 from controller.core.arrays import FloatImage
 from controller.core.errors import BundleError
 from controller.core.storage import runtime_folder
+from controller.live.readers import open_stream
 from controller.live.sources import LiveSource, open_source
+from controller.live.streams import StreamSource, is_stream, without_password
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 from controller.play.live.stream import TARGET
 from controller.rig.rig import Rig
@@ -60,7 +62,7 @@ class Ready:
 def live(
     *,
     session: StageSession,
-    source: Path,
+    source: str,
     rate_hz: float,
     loop: bool,
     seconds: float | None,
@@ -69,13 +71,16 @@ def live(
 ) -> Mapping[str, Any]:
     """Switch the projectors on and show ``source`` until it ends, ``seconds`` have passed or it is stopped.
 
+    ``source``: a file, a folder, or the address of a stream.
+
     Raises UsageError "live-source-unreadable" or "live-file-unfit", WorkError "base-not-solved", what
     ``usable_calibration`` raises, and what devices raise.
     """
     checked = check_stage(session.stage)
     calibrated = _calibrated(checked, reporter)
     open_it = partial(_opened, source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
-    open_it().close()
+    with contextlib.closing(open_it()) as tried:
+        _wait_for_picture(tried)
     ready = _ready(checked, calibrated, reporter)
     figures: dict[str, Any] = {}
 
@@ -85,17 +90,30 @@ def live(
             return ()
 
         return [
-            Step(StepId("live"), show, title=f"Live: {source.name}", enter=Event.PLAY, leave=Event.PAUSE, always=True)
+            Step(StepId("live"), show, title=f"Live: {_name(source)}", enter=Event.PLAY, leave=Event.PAUSE, always=True)
         ]
 
     session.run(checked, steps, name="live", reporter=reporter, cancel=cancel)
     return figures
 
 
-def _opened(source: Path, target_px: tuple[int, int], *, loop: bool, rate_hz: float) -> LiveSource:
-    if holds_frames(source):
-        return FileSource(source, OutputSize(TARGET, *target_px))
-    return open_source(source, loop=loop, rate_hz=rate_hz)
+def _opened(source: str, target_px: tuple[int, int], *, loop: bool, rate_hz: float) -> LiveSource:
+    if is_stream(source):
+        return open_stream(source)
+    path = Path(source)
+    if holds_frames(path):
+        return FileSource(path, OutputSize(TARGET, *target_px))
+    return open_source(path, loop=loop, rate_hz=rate_hz)
+
+
+def _wait_for_picture(source: LiveSource) -> None:
+    """A stream that sends nothing is refused before a lamp is lit. Raises UsageError("live-source-unreadable")."""
+    if isinstance(source, StreamSource):
+        source.wait_for_picture()
+
+
+def _name(source: str) -> str:
+    return without_password(source) if is_stream(source) else Path(source).name
 
 
 def _calibrated(checked: Checked, reporter: Reporter) -> Calibrated:
@@ -240,7 +258,7 @@ def _writer(file: FrameFile, outputs: Sequence[OutputSize], maps: LiveMaps) -> C
 def feed(
     *,
     stage: Path,
-    source: Path,
+    source: str,
     into: Path,
     targets: bool,
     rate_hz: float,
@@ -257,6 +275,7 @@ def feed(
     checked = check_stage(stage)
     calibrated = _calibrated(checked, reporter)
     pictures = _opened(source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
+    _wait_for_picture(pictures)
     ready = _ready(checked, calibrated, reporter)
     outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in checked.stage.tables.display.outputs]
     if targets:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import json
 import os
@@ -37,7 +38,7 @@ from plugins.emulated.optics.staging import (
     random_truth,
     size_named,
 )
-from plugins.emulated.optics.stands import SETTINGS, Stands, read_room, read_stands
+from plugins.emulated.optics.stands import SETTINGS, Stands, read_engine, read_room, read_stands
 from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
 from plugins.emulated.projectors.boards import USUAL, board_named
 from plugins.emulated.projectors.dousers import dmx_nodes
@@ -59,11 +60,15 @@ PORTS: Final = range(20000, 32768)
 
 
 class EmulatedBench:
-    """``hal.interfaces.Bench``. ``stands``: where the projectors of a stage that it prepares shall stand; ``room``."""
+    """``hal.interfaces.Bench``.
 
-    def __init__(self, stands: Stands | None = None, room: str = DARK) -> None:
+    ``stands``: where the projectors of a stage that it prepares shall stand; ``engine`` None: as the ``room`` says
+    """
+
+    def __init__(self, stands: Stands | None = None, room: str = DARK, engine: str | None = None) -> None:
         self._stands = stands or Stands()
         self._room = room
+        self._engine = engine
 
     def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
         """Write ``bench.toml`` and ``bench/``; return the device tables of stage.toml (see ``hal.interfaces.Bench``).
@@ -75,6 +80,7 @@ class EmulatedBench:
         shape = default_object() if object_file is None else load_object(object_file)
         kept = ObjectTruth("vase-and-bust" if object_file is None else "mesh", OBJECT_FILE, seed)
         truth = arranged(random_truth(size, seed, shape, kept, _free_ports(), self._stands), self._room, shape)
+        truth = truth if self._engine is None else dataclasses.replace(truth, engine=self._engine)
         with _explained(stage):
             for folder in (FOLDER, "run"):
                 (stage / folder).mkdir(parents=True, exist_ok=True)
@@ -333,7 +339,7 @@ def _stop_on_signals(stopped: threading.Event) -> Iterator[None]:
 
 
 def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> EmulatedBench:
-    return EmulatedBench(read_stands(settings, context.stage), read_room(settings))
+    return EmulatedBench(read_stands(settings, context.stage), read_room(settings), read_engine(settings))
 
 
 DRIVER: Final = Driver(

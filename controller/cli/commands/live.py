@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 def live(
     stage: StageFolder,
     source: Annotated[
-        Path, typer.Argument(help="A video file, a folder that receives pictures, or a shared frame file.")
+        str,
+        typer.Argument(
+            help="A video file, a folder that receives pictures, a shared frame file, or a stream: rtsp://, udp://,"
+            " ndi:// or /dev/video0."
+        ),
     ],
     fps: Annotated[float, typer.Option(help="Maximum pictures per second.", min=0.1, max=240)] = 25.0,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the video, or the pictures of the folder.")] = False,

@@ -12,7 +12,7 @@ from hal.errors import PluginError
 from hal.escapes import toml_value
 from hal.runtime.files import read_text
 from plugins.emulated.optics.rooms import DARK, ROOMS
-from plugins.emulated.optics.truth import Lens, Pose, ProjectorTruth, Three, Two
+from plugins.emulated.optics.truth import ENGINES, Lens, Pose, ProjectorTruth, Three, Two
 from plugins.emulated.tables import Between, load
 
 PLACES: Final = (
@@ -106,6 +106,7 @@ SETTINGS: Final = {
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
     " throw_ratio, centre_share, focus_m, lumens and pupil_m",
     "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
+    "engine": f"what works out the light between surfaces, one of {', '.join(ENGINES)}; if omitted: as the room says",
 }
 
 
@@ -145,6 +146,14 @@ def read_room(settings: Mapping[str, Any]) -> str:
     if room not in ROOMS:
         raise _wrong("room", room)
     return str(room)
+
+
+def read_engine(settings: Mapping[str, Any]) -> str | None:
+    """From the settings of the bench; None: as the room says. Raises PluginError("setting-wrong")."""
+    engine = settings.get("engine")
+    if engine is not None and engine not in ENGINES:
+        raise _wrong("engine", engine)
+    return engine
 
 
 def _wrong(key: str, value: object) -> PluginError:

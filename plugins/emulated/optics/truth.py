@@ -23,6 +23,8 @@ Three: TypeAlias = tuple[float, float, float]
 Matrix: TypeAlias = tuple[Three, Three, Three]
 FILE_NAME: Final = "bench.toml"
 FOLDER: Final = "bench"
+ENGINES: Final = ("direct", "radiosity", "mitsuba")
+"""Of light between surfaces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +267,7 @@ class BenchTruth:
     dousers: tuple[DouserTruth, ...] = ()
     indirect: Annotated[float, Between(0.0, 1.0)] = 0.0
     surfaces: tuple[SurfaceTruth, ...] = ()
-    engine: Annotated[str, OneOf("direct", "radiosity", "mitsuba")] = "direct"
+    engine: Annotated[str, OneOf(*ENGINES)] = "direct"
     patches: Annotated[int, Between(10, 20000)] = 2000
     paths: Annotated[int, Between(1, 100000)] = 256
 

@@ -1,8 +1,9 @@
-"""The stage as one PJLink class 2 projector, judged by two clients that nobody here wrote."""
+"""The stage as one PJLink class 2 projector, judged by three clients that nobody here wrote."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ from controller.kiosk.interface import KioskState
 from hal.codecs.projectors.pjlink import second_level_digest
 from tests.aiopjlink_client import talk
 from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.npm import needs_npm, run_node
 from tests.ports import kept_port
 from tests.waiting import wait_for
 
@@ -98,6 +100,40 @@ def test_pypjlink2_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp_path
             assert link.get_power() == "cooling"
         with contextlib.closing(PyPjLink.from_address("127.0.0.1", port, timeout=20)) as link:
             assert link.authenticate("wrong") is False
+
+
+@needs_npm
+def test_the_npm_client_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp_path: Path) -> None:
+    def told(password: str) -> list[list[Any]]:
+        done = run_node(Path(__file__).with_name("pjlink_client.js"), str(port), password)
+        return [json.loads(line) for line in done.splitlines()]
+
+    with stage(kiosk, tmp_path, PASSWORD) as port:
+        assert told("wrong")[0] == ["getPowerState", "Authorization failed"]
+        assert kiosk.snapshot().state == "playing"
+        found = told(PASSWORD)
+    inputs = [{"source": 3, "channel": n, "code": f"3{n}", "name": f"DIGITAL - {n}"} for n in (1, 2)]
+    silent = {"audio": True, "video": True}
+    assert found == [
+        ["getPowerState", None, 1],
+        ["getClass", None, "2"],
+        ["getName", None, "Head", "of", "a", "boy"],  # the client splits every answer at its spaces
+        ["getManufacturer", None, "Velatura"],
+        ["getInputs", None, inputs],
+        ["getLamps", None, [{"hours": 1204, "on": True}, {"hours": 3120, "on": False}]],
+        ["getErrors", None, dict.fromkeys(("fan", "temperature", "cover", "filter", "other"), False)
+         | {"lamp": "warning"}],
+        ["setInput", None],
+        ["getInput", None, inputs[1]],
+        ["setInput", "Out of parameter"],
+        ["setMute", None],
+        ["getMute", None, silent],
+        ["setMute", None],
+        ["getMute", None, dict.fromkeys(silent, False)],
+        ["powerOff", None],
+        ["getPowerState", None, 2],
+    ]  # fmt: skip
+    assert ("done-by", "PJLink (127.0.0.1): Show this appearance now (warm wood).") in kiosk.recorded
 
 
 def test_a_wrong_password_is_refused_and_changes_nothing(kiosk: MemoryKiosk, tmp_path: Path) -> None:
