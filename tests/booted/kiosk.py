@@ -18,13 +18,14 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.install.steps import PYTHON
 from tests.booted.machine import STAGE, Machine
 from tests.booted.trees import ROOT, built_package, tree
-from tests.controller.play.wire import noise
+from tests.controller.play.wire import Frames, noise, same
 from tests.end_to_end.kernel_copy import kernels_of_the_tables
 
 OUTPUTS: Final = [(name, 280, 210) for name in ("P1", "P2", "P3")]
@@ -68,6 +69,35 @@ class Kiosk:
         beside = np.concatenate(list(noise(OUTPUTS, _SEED).values()), axis=1)
         wanted[: beside.shape[0], : beside.shape[1]] = beside
         return bool(np.array_equal(screen, wanted))
+
+    def shows_installed(self) -> bool:
+        """Whether the projectors of a kiosk whose camera sees them (``calibrate``) show an appearance of the installed
+        bundle, to the byte.
+        """
+        file = self.machine.at(STAGE / "run" / "outputs.frame")
+        if not file.exists() or not self.answers():
+            return False
+        try:
+            shown = Frames(file).read()
+        except (AssertionError, ValueError):  # the player is just making it
+            return False
+        with Bundle.open(self.machine.at(STAGE / "bundles" / "current").resolve(), allow_unsigned=True) as bundle:
+            names = [one.name for one in bundle.index.appearances]
+            return any(same(shown, {output: bundle.decode(name, output) for output in shown}) for name in names)
+
+    def calibrate(self) -> None:
+        """Let the emulated camera see the projectors, calibrate, and play what was made, the appearance ``board``."""
+        machine = self.machine
+        described = machine.at(STAGE / "stage.toml")
+        text = re.sub(r'(driver = "player"\n)', r'\1frames = "run/outputs.frame"\n', described.read_text())
+        first, _, _ = text.partition("\n[[appearances]]")
+        (machine.at(STAGE) / "new.toml").write_text(f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n')
+        machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
+        machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
+        machine.wait_for(self.answers)
+        machine.call("velatura", "recalibrate", STAGE, user="velatura")
+        machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
+        machine.wait_for(lambda: machine.velatura("status")["playing"] == "board")
 
     def problems(self) -> dict[str, str]:
         """What the panel says of the devices that have one, by name."""
