@@ -22,7 +22,7 @@ from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Requ
 from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
-from controller.kiosk.jobs.job_runner import JobHandler, JobRunner
+from controller.kiosk.jobs.job_runner import JobHandler, JobRunner, title_of
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -134,6 +134,7 @@ class Service:
             self.log.add(Decision(problem.code, problem.what, problem.remedy, "error"))
         if self.problem is not None:
             self.log.add(self.problem)
+        self._go_on()
         self.reconciler.step()
         self._thread("player", self.player.step, STEP_S)
         self._thread("bundles", self.bundle_watch.step, LOOK_S)
@@ -211,6 +212,15 @@ class Service:
         self.reconciler.submit(*requests)
 
     # -- inside
+
+    def _go_on(self) -> None:
+        for request, again in self.reconciler.go_on():
+            what = f"{title_of(request)} was cut off when the kiosk ended."
+            if again:
+                self.log.add(Decision("work-cut-off", what, "It is done again.", "warning"))
+            else:
+                remedy = "Start it again: it continues where it stopped."
+                self.log.add_failure(Decision("work-cut-off", what, remedy, "error"))
 
     def _tell(self, decision: Decision) -> None:
         """A device's event. That nothing can be written is one event, not one of each device."""

@@ -85,19 +85,30 @@ class Kiosk:
             names = [one.name for one in bundle.index.appearances]
             return any(same(shown, {output: bundle.decode(name, output) for output in shown}) for name in names)
 
-    def calibrate(self) -> None:
-        """Let the emulated camera see the projectors, calibrate, and play what was made, the appearance ``board``."""
+    def let_the_camera_see(self) -> None:
+        """Show the pictures where the emulated camera sees them, and be asked for the appearance ``board``."""
         machine = self.machine
         described = machine.at(STAGE / "stage.toml")
         text = re.sub(r'(driver = "player"\n)', r'\1frames = "run/outputs.frame"\n', described.read_text())
         first, _, _ = text.partition("\n[[appearances]]")
-        (machine.at(STAGE) / "new.toml").write_text(f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n')
+        new = f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n'
+        (machine.at(STAGE) / "new.toml").write_text(new)
         machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
         machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
         machine.wait_for(self.answers)
+
+    def calibrate(self) -> None:
+        """Calibrate, and play what was made; after ``let_the_camera_see``."""
+        machine = self.machine
         machine.call("velatura", "recalibrate", STAGE, user="velatura")
         machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
         machine.wait_for(lambda: machine.velatura("status")["playing"] == "board")
+
+    def begin_appearance(self, name: str, seed: int) -> None:
+        """Begin to compute an appearance from a picture that nobody has computed yet."""
+        picture = Path(f"/opt/{name}-{seed}.png")
+        cv2.imwrite(str(self.machine.at(picture)), np.random.default_rng(seed).integers(0, 256, (48, 48, 3), np.uint8))
+        self.machine.call("velatura", "compute", STAGE, name, picture, "--no-wait", user="velatura")
 
     def problems(self) -> dict[str, str]:
         """What the panel says of the devices that have one, by name."""

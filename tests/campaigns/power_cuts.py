@@ -3,10 +3,10 @@
     python -m tests.campaigns.power_cuts [CUTS] [SEED] [SUITE] [SECONDS]
 
 A kiosk on a bare Debian (bookworm) that plays. It is switched on, and all its processes are ended at once up to 20 s
-later: while it boots, starts its services, opens its devices, or plays. So go three of four cuts. Then it is calibrated,
-and cut off while it calibrates, and while it computes and publishes an appearance, in turn. After so many SECONDS each
-half ends at its next cut. Ends with 0 where the picture came back every time, settings, key, bundle and every event were
-there after each cut, and a calibration at the end ran through and its bundle plays.
+later: while it boots, starts its services, opens its devices, or plays. So go three of four cuts. Then it calibrates,
+and is cut off while it calibrates, and while it computes and publishes an appearance, in turn. After so many SECONDS
+each part ends at its next cut. Ends with 0 where the picture came back every time, settings, key, bundle and every
+event were there after each cut, and a calibration at the end ran through and its bundle plays.
 
 The devices are emulated on the same machine, and begin anew, too. So some boots beside devices that are on follow, for
 the kiosk's own time.
@@ -24,9 +24,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
-
-import cv2
-import numpy as np
 
 from controller.kiosk.install.steps import DEBIAN
 from tests.booted.kiosk import Kiosk, installed, prepared_stage
@@ -103,9 +100,11 @@ class Cuts:
             machine.wait_for(lambda: self.kiosk.state == "playing" and not self.kiosk.problems())
             # A calibration takes longer, so each of two is cut off somewhere else.
             longest_s = PUBLISHING_S if number % 2 else CALIBRATING_S
-            work = self._publishing(number) if number % 2 else ("recalibrate",)
             key, rows = machine.at(STAGE / KEPT[1]).read_bytes(), self.kiosk.events()
-            machine.call("velatura", work[0], STAGE, *work[1:], "--no-wait", user="velatura")
+            if number % 2:
+                self.kiosk.begin_appearance("new", number)
+            else:
+                machine.call("velatura", "recalibrate", STAGE, "--no-wait", user="velatura")
             time.sleep(self._chance.uniform(0.0, longest_s))
             job = machine.velatura("status")["job"] or {}
             took_s = cut_now(self.kiosk, self.kiosk.shows_installed)
@@ -114,13 +113,6 @@ class Cuts:
             lost_of_it += [f"event {row['number']}" for row in rows if after.get(row["number"]) != row]
             lost_of_it += [one for one in machine.velatura("status")["warnings"] if "settings" in one]
             self._note(f"while {_step(job)}", took_s, lost_of_it)
-
-    def _publishing(self, number: int) -> tuple[str | Path, ...]:
-        """A picture that nobody has computed yet."""
-        picture = Path(f"/opt/picture-{number}.png")
-        pixels = np.random.default_rng(number).integers(0, 256, (48, 48, 3), np.uint8)
-        cv2.imwrite(str(self.kiosk.machine.at(picture)), pixels)
-        return ("compute", "new", picture)
 
     def _note(self, when: str, back_s: float, gone: list[str]) -> None:
         self.back_s.append(back_s)
@@ -148,6 +140,7 @@ def main(cuts: int, seed: int, suite: str, seconds: float) -> int:
             shown_s = [kiosk.boot_beside_devices() for _ in range(BOOTS)]
             print(f"{BOOTS} boots beside devices that are on: from X to the appearance {_spread(shown_s)}; {_load()}")
             kiosk.machine.wait_for(lambda: kiosk.state == "playing")
+            kiosk.let_the_camera_see()
             kiosk.calibrate()
             made.at_work(at_work)
             kiosk.machine.wait_for(lambda: kiosk.state == "playing" and not kiosk.problems())

@@ -193,6 +193,11 @@ class Reconciler:
         with self._lock:
             self._queue.submit(*requests)
 
+    def go_on(self) -> Sequence[tuple[Request, bool]]:
+        """As ``JobQueue.go_on``."""
+        with self._lock:
+            return self._queue.go_on()
+
     @contextlib.contextmanager
     def idle(self) -> Iterator[None]:
         """No job starts inside this context, so files that jobs read may be changed. Only its thread may queue jobs.
