@@ -29,7 +29,10 @@ class JobQueue:
 
     def go_on(self) -> Sequence[tuple[Request, bool]]:
         """What the previous service left undone, and whether it is done again: once, and not what needs the lamps."""
-        left = [(request, not (request.light or second)) for request, second in kept_work.unfinished(self._log)]
+        left = [
+            (request, not (request.light or second) and self._possible(request))
+            for request, second in kept_work.unfinished(self._log)
+        ]
         requests = [request for request, again in left if again]
         self._again = frozenset(requests)
         self._queue.extend(requests)
@@ -163,6 +166,12 @@ class JobQueue:
             self._settle(why.code)
             self._tell(why)
             self._keep()
+
+    def _possible(self, request: Request) -> bool:
+        try:
+            return self._jobs.refusal(request) is None
+        except KeyError:  # a kind that another version of the program knew
+            return False
 
     def _keep(self) -> None:
         running = () if self._jobs.running is None or self._cancelled else (self._jobs.running,)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterable
 from typing import Final
@@ -24,9 +25,17 @@ def keep(log: EventLog, requests: Iterable[Request], again: frozenset[Request]) 
 
 
 def unfinished(log: EventLog) -> list[tuple[Request, bool]]:
-    """What the previous service left undone, in its order, and whether that was the second attempt."""
-    rows = json.loads(log.value(_NAME) or "[]")
-    return [(Request(kind, light, arguments=tuple(arguments)), again) for kind, light, arguments, again in rows]
+    """What the previous service left undone, in its order, and whether that was the second attempt.
+
+    Nothing where what is kept can't be read: it must not keep a kiosk from starting.
+    """
+    with contextlib.suppress(ValueError, TypeError):
+        rows = json.loads(log.value(_NAME) or "[]")
+        return [
+            (Request(str(kind), bool(light), arguments=tuple(map(str, arguments))), bool(again))
+            for kind, light, arguments, again in rows
+        ]
+    return []
 
 
 def _is_kept(request: Request) -> bool:

@@ -130,6 +130,23 @@ def test_work_that_was_cancelled_or_belongs_to_the_schedule_is_not_done_again(de
     assert desk.queue.go_on() == []
 
 
+@pytest.mark.parametrize("text", ["", "{", "[1]", '[["publish"]]', "7", '[["publish", false, 3, false]]', "null"])
+def test_kept_work_that_can_not_be_read_keeps_no_kiosk_from_starting(desk: Desk, text: str) -> None:
+    desk.log.keep("work", text)
+    assert desk.queue.go_on() == []
+    desk.queue.submit(PUBLISH)
+    assert desk.begin() == PUBLISH
+
+
+def test_kept_work_that_is_refused_now_is_told_and_not_begun(desk: Desk) -> None:
+    desk.queue.submit(PUBLISH)
+    desk.begin()
+    desk.begin_anew()
+    desk.jobs.refused = Decision("no-calibration", "There is no calibration.")
+    assert desk.queue.go_on() == [(PUBLISH, False)]
+    assert desk.begin() is None
+
+
 def test_what_follows_comes_before_what_waits_and_in_its_order(desk: Desk) -> None:
     desk.queue.submit(FULL, REPORT)
     assert desk.begin(LIT) == FULL
