@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.install.steps import PYTHON
 from tests.booted.machine import STAGE, Machine
-from tests.booted.trees import ROOT, built_package, tree
+from tests.booted.trees import ROOT, built_packages, tree
 from tests.controller.play.wire import Frames, noise, same
 from tests.end_to_end.kernel_copy import kernels_of_the_tables
 
@@ -44,11 +44,15 @@ ExecStartPost=/bin/sh -c 'until test -e {STAGE}/run/tty-above; do sleep 0.1; don
 
 @dataclass(frozen=True)
 class Kiosk:
-    """``dry``, ``told``: what its installation printed that only would have been done, and that was."""
+    """``dry``, ``told``: what its installation printed that only would have been done, and that was.
+
+    ``packages``: one of each version, of which the first is installed.
+    """
 
     machine: Machine
     dry: str
     told: str
+    packages: list[Path]
 
     @property
     def password(self) -> str:
@@ -176,18 +180,18 @@ class Kiosk:
 
 
 @contextmanager
-def installed(suite: str, folder: Path) -> Iterator[Kiosk]:
-    """A kiosk without a stage, right after its installation on a bare Debian."""
+def installed(suite: str, folder: Path, *, versions: Sequence[str] = ("1",)) -> Iterator[Kiosk]:
+    """A kiosk without a stage, right after the installation of the first of these ``versions`` on a bare Debian."""
     debian = tree(suite)
-    package = built_package(suite, folder / "package", version="1")
+    packages = built_packages(suite, folder / "package", *versions)
     with Machine(debian, folder) as machine:
         machine.switch_on()
-        machine.install(package)
+        machine.install(packages[0])
         dry = machine.call("/opt/velatura/bin/velatura", "kiosk", "install", "--dry-run")
         assert not machine.at(STAGE).exists()
         told = machine.call("/opt/velatura/bin/velatura", "kiosk", "install")
         _compile_kernels(machine, suite)
-        yield Kiosk(machine, dry, told)
+        yield Kiosk(machine, dry, told, packages)
 
 
 def _compile_kernels(machine: Machine, suite: str) -> None:
