@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -77,17 +78,28 @@ def main() -> None:
     parser.add_argument("suite", choices=PYTHON)
     parser.add_argument("--out", type=Path, help="the folder for the package; without it, only the cache is filled")
     parser.add_argument("--debian", type=Path, help="the root folder of a Debian of this release, for its Python")
-    parser.add_argument("--version", help="instead of the version in pyproject.toml")
+    parser.add_argument(
+        "--version",
+        action="append",
+        default=[],
+        help="instead of that in pyproject.toml; can be repeated: for tests",
+    )
     parser.add_argument("--fast", action="store_true", help="do not compress: for tests")
     asked = parser.parse_args()
     compiling = _compiler(asked.suite, asked.debian)
     pinned = _pinned(asked.suite, compiling)
     if asked.out is not None:
-        print(build(asked.suite, asked.out, compiling, pinned, version=asked.version, fast=asked.fast))
+        for made in build(asked.suite, asked.out, compiling, pinned, versions=asked.version, fast=asked.fast):
+            print(made)
 
 
-def build(suite: str, out: Path, compiling: list[str], pinned: Path, *, version: str | None, fast: bool) -> Path:
-    """The package's file, of the ``pinned`` packages and Velatura. Raises CalledProcessError."""
+def build(
+    suite: str, out: Path, compiling: list[str], pinned: Path, *, versions: Sequence[str], fast: bool
+) -> list[Path]:
+    """The package's files, of the ``pinned`` packages and Velatura; of its own version where none is named.
+
+    Raises CalledProcessError.
+    """
     with tempfile.TemporaryDirectory(dir=pinned.parent) as scratch:
         tree = Path(scratch) / "tree"
         site = tree / PREFIX / "lib" / f"python{PYTHON[suite]}" / "site-packages"
@@ -99,12 +111,15 @@ def build(suite: str, out: Path, compiling: list[str], pinned: Path, *, version:
         for name in ("controller", "hal", "plugins", "firmware_configs"):
             subprocess.run([*compiling, "-s", str(tree), "-p", "/", str(site / name)], check=True)
         _programs(tree / PREFIX, PYTHON[suite])
-        _control(tree, suite, version or wheel.name.split("-")[1])
         out.mkdir(parents=True, exist_ok=True)
         compressed = ["-Znone"] if fast else ["-Zzstd", "-z9"]
-        named = ["dpkg-deb", "--root-owner-group", *compressed, "--build", str(tree), str(out)]
-        told = subprocess.run(named, check=True, capture_output=True, text=True).stdout
-        return Path(told.rsplit(" in '", 1)[1].split("'", 1)[0])
+        made = []
+        for version in versions or (wheel.name.split("-")[1],):
+            _control(tree, suite, version)
+            named = ["dpkg-deb", "--root-owner-group", *compressed, "--build", str(tree), str(out)]
+            told = subprocess.run(named, check=True, capture_output=True, text=True).stdout
+            made.append(Path(told.rsplit(" in '", 1)[1].split("'", 1)[0]))
+        return made
 
 
 def _compiler(suite: str, debian: Path | None) -> list[str]:
@@ -215,6 +230,7 @@ def _programs(prefix: Path, python: str) -> None:
 
 def _control(tree: Path, suite: str, version: str) -> None:
     folder = tree / "DEBIAN"
+    shutil.rmtree(folder, ignore_errors=True)
     size = sum(file.lstat().st_size for file in tree.rglob("*") if not file.is_dir())
     folder.mkdir()
     fields = _CONTROL.format(

@@ -83,11 +83,12 @@ def serve(
     notifier = Notifier()
     with contextlib.ExitStack() as stack:
         stack.callback(notifier.stopping)
-        first, socket_served, entrance = True, False, None
+        first, socket_served, entrance, told = True, False, None, ""
         while not cancel.is_set():
             kiosk.reload.clear()
             try:
                 with serving(stage, cancel, leave_lit=leave_lit, alive=notifier.alive) as service:
+                    told = ""
                     kiosk.attach(service)
                     if not socket_served:
                         socket_served = True
@@ -105,8 +106,10 @@ def serve(
                 if first and not setup:
                     raise
                 missing = not (stage / FILE).exists()
-                kiosk.attach(None, "" if missing else f"{error.what} {error.remedy}")
-                reporter.say(f"{error.what} {error.remedy}", Level.ERROR)
+                before, told = told, f"{error.what} {error.remedy}"
+                kiosk.attach(None, "" if missing else told)
+                if told != before:  # it is tried again every few seconds
+                    reporter.say(told, Level.ERROR)
                 if first:
                     entrance = _open_panel(stack, kiosk, panel, reporter)
                     stack.enter_context(building.serving(kiosk, protocols))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -21,7 +22,7 @@ from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Requ
 from controller.kiosk.decide.reconciler import Limits, Reconciler
 from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
-from controller.kiosk.jobs.job_runner import JobHandler, JobRunner
+from controller.kiosk.jobs.job_runner import JobHandler, JobRunner, title_of
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -33,7 +34,7 @@ from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.disk_supervisor import DiskSupervisor
 from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.kiosk.supervisors.lamp_history import LampHistory
-from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
+from controller.kiosk.supervisors.player_supervisor import OUTPUT_GONE, PlayerSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import Thread, World
 from controller.play.control.attached import AttachedPlayer
@@ -90,7 +91,7 @@ class Service:
         self.devices.scene = self._scene
         self.lamp_history = LampHistory(stage.folder, monotonic=world.monotonic)
         handlers = JobHandlers(
-            stage.folder, self.devices.lent, missing_device=self.devices.missing_for_work, calibrated=self._calibrated,
+            stage.folder, self.devices.lent, missing_device=self._missing_for_work, calibrated=self._calibrated,
             open_now=lambda: bool(self.schedule.now.rows) and self.reconciler.plan.open is True,
         )  # fmt: skip
         self.jobs = JobRunner(jobs(handlers), log, number=int(log.value("job") or 0), world=world)
@@ -133,6 +134,7 @@ class Service:
             self.log.add(Decision(problem.code, problem.what, problem.remedy, "error"))
         if self.problem is not None:
             self.log.add(self.problem)
+        self._go_on()
         self.reconciler.step()
         self._thread("player", self.player.step, STEP_S)
         self._thread("bundles", self.bundle_watch.step, LOOK_S)
@@ -211,6 +213,15 @@ class Service:
 
     # -- inside
 
+    def _go_on(self) -> None:
+        for request, again in self.reconciler.go_on():
+            what = f"{title_of(request)} was cut off when the kiosk ended."
+            if again:
+                self.log.add(Decision("work-cut-off", what, "It is done again.", "warning"))
+            else:
+                remedy = "Start it again: it continues where it stopped."
+                self.log.add_failure(Decision("work-cut-off", what, remedy, "error"))
+
     def _tell(self, decision: Decision) -> None:
         """A device's event. That nothing can be written is one event, not one of each device."""
         if decision.code == DISK_FULL:
@@ -239,6 +250,13 @@ class Service:
             return None
         lit = " ".join(view.name for view in views if view.shines)
         return f"{shown.bundle} {shown.appearance} {lit}"
+
+    def _missing_for_work(self) -> Decision | None:
+        """The device that photographs need and that is missing, or None."""
+        problem = self.player.view.problem
+        if problem is not None and problem.code == OUTPUT_GONE:
+            return replace(problem, reason=f"No photographs are possible without it. {problem.reason}")
+        return self.devices.missing_for_work()
 
     def _calibrated(self) -> bool:
         # Called four times a second while a task is due, so the journals are not opened each time.

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +18,14 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.install.steps import PYTHON
 from tests.booted.machine import STAGE, Machine
-from tests.booted.trees import ROOT, built_package, tree
-from tests.controller.play.wire import noise
+from tests.booted.trees import ROOT, built_packages, tree
+from tests.controller.play.wire import Frames, noise, same
 from tests.end_to_end.kernel_copy import kernels_of_the_tables
 
 OUTPUTS: Final = [(name, 280, 210) for name in ("P1", "P2", "P3")]
@@ -43,11 +44,15 @@ ExecStartPost=/bin/sh -c 'until test -e {STAGE}/run/tty-above; do sleep 0.1; don
 
 @dataclass(frozen=True)
 class Kiosk:
-    """``dry``, ``told``: what its installation printed that only would have been done, and that was."""
+    """``dry``, ``told``: what its installation printed that only would have been done, and that was.
+
+    ``packages``: one of each version, of which the first is installed.
+    """
 
     machine: Machine
     dry: str
     told: str
+    packages: list[Path]
 
     @property
     def password(self) -> str:
@@ -68,6 +73,46 @@ class Kiosk:
         beside = np.concatenate(list(noise(OUTPUTS, _SEED).values()), axis=1)
         wanted[: beside.shape[0], : beside.shape[1]] = beside
         return bool(np.array_equal(screen, wanted))
+
+    def shows_installed(self) -> bool:
+        """Whether the projectors of a kiosk whose camera sees them (``calibrate``) show an appearance of the installed
+        bundle, to the byte.
+        """
+        file = self.machine.at(STAGE / "run" / "outputs.frame")
+        if not file.exists() or not self.answers():
+            return False
+        try:
+            shown = Frames(file).read()
+        except (AssertionError, ValueError):  # the player is just making it
+            return False
+        with Bundle.open(self.machine.at(STAGE / "bundles" / "current").resolve(), allow_unsigned=True) as bundle:
+            names = [one.name for one in bundle.index.appearances]
+            return any(same(shown, {output: bundle.decode(name, output) for output in shown}) for name in names)
+
+    def let_the_camera_see(self) -> None:
+        """Show the pictures where the emulated camera sees them, and be asked for the appearance ``board``."""
+        machine = self.machine
+        described = machine.at(STAGE / "stage.toml")
+        text = re.sub(r'(driver = "player"\n)', r'\1frames = "run/outputs.frame"\n', described.read_text())
+        first, _, _ = text.partition("\n[[appearances]]")
+        new = f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n'
+        (machine.at(STAGE) / "new.toml").write_text(new)
+        machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
+        machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
+        machine.wait_for(self.answers)
+
+    def calibrate(self) -> None:
+        """Calibrate, and play what was made; after ``let_the_camera_see``."""
+        machine = self.machine
+        machine.call("velatura", "recalibrate", STAGE, user="velatura")
+        machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
+        machine.wait_for(lambda: machine.velatura("status")["playing"] == "board")
+
+    def begin_appearance(self, name: str, seed: int) -> None:
+        """Begin to compute an appearance from a picture that nobody has computed yet."""
+        picture = Path(f"/opt/{name}-{seed}.png")
+        cv2.imwrite(str(self.machine.at(picture)), np.random.default_rng(seed).integers(0, 256, (48, 48, 3), np.uint8))
+        self.machine.call("velatura", "compute", STAGE, name, picture, "--no-wait", user="velatura")
 
     def problems(self) -> dict[str, str]:
         """What the panel says of the devices that have one, by name."""
@@ -135,18 +180,18 @@ class Kiosk:
 
 
 @contextmanager
-def installed(suite: str, folder: Path) -> Iterator[Kiosk]:
-    """A kiosk without a stage, right after its installation on a bare Debian."""
+def installed(suite: str, folder: Path, *, versions: Sequence[str] = ("1",)) -> Iterator[Kiosk]:
+    """A kiosk without a stage, right after the installation of the first of these ``versions`` on a bare Debian."""
     debian = tree(suite)
-    package = built_package(suite, folder / "package", version="1")
+    packages = built_packages(suite, folder / "package", *versions)
     with Machine(debian, folder) as machine:
         machine.switch_on()
-        machine.install(package)
+        machine.install(packages[0])
         dry = machine.call("/opt/velatura/bin/velatura", "kiosk", "install", "--dry-run")
         assert not machine.at(STAGE).exists()
         told = machine.call("/opt/velatura/bin/velatura", "kiosk", "install")
         _compile_kernels(machine, suite)
-        yield Kiosk(machine, dry, told)
+        yield Kiosk(machine, dry, told, packages)
 
 
 def _compile_kernels(machine: Machine, suite: str) -> None:

@@ -20,9 +20,9 @@ from controller.kiosk.install.steps import DEBIAN
 from tests.booted.faults import Disk, clock_of_its_own, disk_of_its_own
 from tests.booted.kiosk import APPEARANCE, SERVICES, Kiosk, installed, prepared_stage
 from tests.booted.machine import ADDRESS, STAGE
-from tests.booted.trees import built_package, obstacle
+from tests.booted.trees import obstacle
 from tests.booted.visitor import visiting
-from tests.campaigns.power_cuts import cut, kept, lost
+from tests.campaigns.power_cuts import cut, cut_now, kept, lost
 from tests.controller.panel.browser import CHROMIUM
 
 PICTURE_S = 60.0
@@ -45,7 +45,8 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module", params=DEBIAN)
 def bare(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kiosk]:
     """Installed, without a stage; the projectors show the way to the panel."""
-    with installed(request.param, tmp_path_factory.mktemp(request.param)) as kiosk:
+    versions = ("1", "2") if request.param == "bookworm" else ("1",)
+    with installed(request.param, tmp_path_factory.mktemp(request.param), versions=versions) as kiosk:
         assert kiosk.machine.wait_for(lambda: kiosk.read_code() != "") < PICTURE_S
         yield kiosk
 
@@ -61,6 +62,17 @@ def test_without_a_stage_the_projectors_show_the_way_to_the_panel(bare: Kiosk) -
     address = bare.read_code()
     assert address == f"https://{ADDRESS}:8377/"
     assert 'name="password"' in bare.machine.fetched(f"{address}login")
+
+
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+def test_an_address_that_changes_is_shown_and_reaches_the_panel(bare: Kiosk) -> None:
+    machine, other = bare.machine, "198.51.100.7"
+    change = "ip address add {}/24 dev net0; ip address del {}/24 dev net0"
+    machine.call("sh", "-c", change.format(other, ADDRESS))
+    machine.wait_for(lambda: bare.read_code() == f"https://{other}:8377/")
+    assert 'name="password"' in machine.fetched(f"https://{other}:8377/login")
+    machine.call("sh", "-c", change.format(ADDRESS, other))
+    machine.wait_for(lambda: bare.read_code() == f"https://{ADDRESS}:8377/")
 
 
 def test_the_set_up_page_can_ask_which_projectors_there_are(bare: Kiosk) -> None:
@@ -160,6 +172,7 @@ def test_a_backup_is_restored_on_this_debians_python(playing: Kiosk) -> None:
     assert machine.restarts("velatura-controller") == restarts, "it begins anew without an end"
 
 
+@pytest.mark.parametrize("bare", ["trixie"], indirect=True)
 def test_after_a_power_cut_the_picture_is_back_by_itself_and_nothing_is_lost(playing: Kiosk) -> None:
     before = kept(playing)
     assert cut(playing, after_s=2.5) < PICTURE_S
@@ -169,10 +182,14 @@ def test_after_a_power_cut_the_picture_is_back_by_itself_and_nothing_is_lost(pla
 
 
 @pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
-def test_the_appearance_is_there_soon_after_the_x_server(playing: Kiosk) -> None:
+def test_after_a_power_cut_the_appearance_is_there_soon_after_the_x_server_and_nothing_is_lost(playing: Kiosk) -> None:
+    before = kept(playing)
     took_s = playing.boot_beside_devices()
     print(f"{took_s:.1f} s from X to the appearance")
     assert took_s <= APPEARANCE_S
+    playing.machine.wait_for(lambda: playing.state == "playing")
+    assert lost(playing, before) == []
+    assert {playing.machine.restarts(name) for name in SERVICES} == {0}
 
 
 def told_full(playing: Kiosk, disk: Disk) -> bool:
@@ -238,11 +255,10 @@ def test_hours_are_not_followed_by_a_clock_that_was_lost(playing: Kiosk) -> None
 
 
 @pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
-def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kiosk, tmp_path: Path) -> None:
+def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kiosk) -> None:
     machine = playing.machine
     version = ("dpkg-query", "--show", "--showformat=${Version}", "velatura")
-    (first,) = machine.at(Path("/opt")).glob("velatura_1-*.deb")
-    second = built_package("bookworm", tmp_path, version="2")
+    first, second = playing.packages
     before = kept(playing)
     for package, wanted in ((second, "2-1~deb12"), (first, "1-1~deb12")):
         with machine.watched() as seen:
@@ -260,19 +276,40 @@ def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kio
 @pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 def test_a_calibration_uses_the_same_player_and_what_it_made_plays(playing: Kiosk) -> None:
     machine = playing.machine
-    described = machine.at(STAGE / "stage.toml")
-    text = re.sub(r'(driver = "player"\n)', r'\1frames = "run/outputs.frame"\n', described.read_text())
-    first, _, _ = text.partition("\n[[appearances]]")
-    (machine.at(STAGE) / "new.toml").write_text(f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n')
-    machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
-    machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
-    machine.wait_for(playing.answers)
+    playing.let_the_camera_see()
     player = machine.call("systemctl", "show", "--property=MainPID", "velatura-player")
-    machine.call("velatura", "recalibrate", STAGE, user="velatura")
-    machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
-    machine.wait_for(lambda: machine.velatura("status")["playing"] == "board")
+    playing.calibrate()
+    assert playing.shows_installed()
     assert machine.call("systemctl", "show", "--property=MainPID", "velatura-player") == player
     assert machine.restarts("velatura-controller") == 0
+
+
+def works(playing: Kiosk, name: str) -> bool:
+    job = playing.machine.velatura("status")["job"] or {}
+    return str(job.get("name", "")).startswith(name) and bool(job["steps"]) and not job["ended"]
+
+
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
+def test_power_cuts_while_it_calibrates_and_publishes_leave_the_picture_and_are_told(playing: Kiosk) -> None:
+    machine = playing.machine
+    calibrated = len(list(machine.at(STAGE / "runs").iterdir()))
+    machine.wait_for(lambda: playing.state == "playing" and not playing.problems())
+    machine.call("velatura", "recalibrate", STAGE, "--no-wait", user="velatura")
+    machine.wait_for(lambda: works(playing, "Full recalibration"))
+    before, number = kept(playing), playing.events()[-1]["number"]
+    assert cut_now(playing, playing.shows_installed) < PICTURE_S
+    assert lost(playing, before) == []
+    machine.wait_for(lambda: "work-cut-off" in playing.codes(number))
+    assert len(list(machine.at(STAGE / "runs").iterdir())) == calibrated + 1, "the calibration can continue"
+    machine.wait_for(playing.answers)
+    playing.begin_appearance("random", 1)
+    machine.wait_for(lambda: works(playing, "New appearance random"))
+    before, number = kept(playing), playing.events()[-1]["number"]
+    assert cut_now(playing, playing.shows_installed) < PICTURE_S
+    assert lost(playing, before) == []
+    machine.wait_for(lambda: {"work-cut-off", "published"} <= set(playing.codes(number)))
+    shown = machine.call("velatura", "appearances", STAGE, user="velatura")
+    assert "random" in shown, "what needs no lamps is done again by itself"
 
 
 def test_uninstalling_leaves_the_stage_and_nothing_that_starts(playing: Kiosk) -> None:

@@ -70,9 +70,10 @@ def _bootstrap(suite: str, folder: Path) -> None:
     )
 
 
-def built_package(suite: str, out: Path, *, version: str) -> Path:
-    """Velatura's Debian package, as it is released but not compressed. Raises CalledProcessError."""
-    return Path(_package_script(suite, "--out", str(out), "--version", version, "--fast").strip())
+def built_packages(suite: str, out: Path, *versions: str) -> list[Path]:
+    """Velatura's Debian package, as it is released but not compressed, in each version. Raises CalledProcessError."""
+    told = _package_script(suite, "--out", str(out), *(f"--version={one}" for one in versions), "--fast")
+    return [Path(line) for line in told.splitlines()]
 
 
 def _package_script(suite: str, *words: str) -> str:

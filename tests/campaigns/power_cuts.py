@@ -1,13 +1,15 @@
 """Power cuts at random moments of a booted kiosk: its picture is back every time, and nothing is lost.
 
-    python -m tests.campaigns.power_cuts [CUTS] [SEED] [SUITE]
+    python -m tests.campaigns.power_cuts [CUTS] [SEED] [SUITE] [SECONDS]
 
 A kiosk on a bare Debian (bookworm) that plays. It is switched on, and all its processes are ended at once up to 20 s
-later: while it boots, starts its services, opens its devices, or plays. Ends with 0 where the picture came back every
-time, and settings, key, bundle and events were there at the end.
+later: while it boots, starts its services, opens its devices, or plays. So go three of four cuts. Then it calibrates,
+and is cut off while it calibrates, and while it computes and publishes an appearance, in turn. After so many SECONDS
+each part ends at its next cut. Ends with 0 where the picture came back every time, settings, key, bundle and every
+event were there after each cut, and a calibration at the end ran through and its bundle plays.
 
-The devices are emulated on the same machine, and begin anew, too, which takes longer than all else. So some boots
-beside devices that are on follow, for the kiosk's own time.
+The devices are emulated on the same machine, and begin anew, too. So some boots beside devices that are on follow, for
+the kiosk's own time.
 """
 
 from __future__ import annotations
@@ -19,8 +21,9 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from controller.kiosk.install.steps import DEBIAN
 from tests.booted.kiosk import Kiosk, installed, prepared_stage
@@ -28,6 +31,11 @@ from tests.booted.machine import STAGE
 
 LATEST_S: Final = 20.0
 BOOTS: Final = 5
+AT_WORK: Final = 0.25
+"""Of all cuts."""
+CALIBRATING_S: Final = 120.0
+PUBLISHING_S: Final = 30.0
+"""From the command to a moment after its end, on a computer that does much else."""
 KEPT: Final = ("stage.toml", "keys/stage.key")
 
 
@@ -37,10 +45,15 @@ def cut(kiosk: Kiosk, after_s: float) -> float:
     machine.cut_off()
     machine.switch_on()
     time.sleep(after_s)
+    return cut_now(kiosk, kiosk.shows)
+
+
+def cut_now(kiosk: Kiosk, shows: Callable[[], bool]) -> float:
+    machine = kiosk.machine
     machine.cut_off()
     began_s = time.monotonic()
     machine.switch_on()
-    machine.wait_for(kiosk.shows)
+    machine.wait_for(shows)
     return time.monotonic() - began_s
 
 
@@ -59,24 +72,82 @@ def lost(kiosk: Kiosk, before: dict[str, bytes]) -> list[str]:
     return gone + ([] if "playing" in events else ["events"])
 
 
-def main(cuts: int, seed: int, suite: str) -> int:
-    chance = random.Random(seed)
+class Cuts:
+    """Of one kiosk; ``ends_s``: when, on the monotonic clock, no other is begun."""
+
+    def __init__(self, kiosk: Kiosk, seed: int, seconds: float) -> None:
+        self.kiosk, self.seconds = kiosk, seconds
+        self.back_s: list[float] = []
+        self.gone: list[str] = []
+        self._chance = random.Random(seed)
+
+    def starting(self, cuts: int) -> None:
+        """While it boots, starts and plays."""
+        ends_s, before = time.monotonic() + self.seconds, kept(self.kiosk)
+        for _ in range(cuts):
+            if time.monotonic() > ends_s:
+                break
+            after_s = self._chance.uniform(0.0, LATEST_S)
+            self._note(f"{after_s:.1f} s after it was switched on", cut(self.kiosk, after_s), lost(self.kiosk, before))
+
+    def at_work(self, cuts: int) -> None:
+        """While it calibrates and publishes, in turn."""
+        machine = self.kiosk.machine
+        ends_s = time.monotonic() + self.seconds
+        for number in range(cuts):
+            if time.monotonic() > ends_s:
+                break
+            machine.wait_for(lambda: self.kiosk.state == "playing" and not self.kiosk.problems())
+            # A calibration takes longer, so each of two is cut off somewhere else.
+            longest_s = PUBLISHING_S if number % 2 else CALIBRATING_S
+            key, rows = machine.at(STAGE / KEPT[1]).read_bytes(), self.kiosk.events()
+            if number % 2:
+                self.kiosk.begin_appearance("new", number)
+            else:
+                machine.call("velatura", "recalibrate", STAGE, "--no-wait", user="velatura")
+            time.sleep(self._chance.uniform(0.0, longest_s))
+            job = machine.velatura("status")["job"] or {}
+            took_s = cut_now(self.kiosk, self.kiosk.shows_installed)
+            lost_of_it = lost(self.kiosk, {**kept(self.kiosk), KEPT[1]: key})
+            after = {row["number"]: row for row in self.kiosk.events()}
+            lost_of_it += [f"event {row['number']}" for row in rows if after.get(row["number"]) != row]
+            lost_of_it += [one for one in machine.velatura("status")["warnings"] if "settings" in one]
+            self._note(f"while {_step(job)}", took_s, lost_of_it)
+
+    def _note(self, when: str, back_s: float, gone: list[str]) -> None:
+        self.back_s.append(back_s)
+        self.gone += gone
+        found = f"lost: {', '.join(gone)}" if gone else "nothing lost"
+        print(f"{len(self.back_s)}: cut {when}, back after {back_s:.1f} s, {found}; {_load()}", flush=True)
+
+
+def _step(job: dict[str, Any]) -> str:
+    if not job or job["ended"]:
+        return "it plays, its work done"
+    return f"{job['name']}: {job['steps'][-1]['title'] if job['steps'] else 'begins'}"
+
+
+def main(cuts: int, seed: int, suite: str, seconds: float) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         stage = prepared_stage(folder)
         (folder / "machine").mkdir()
         with installed(suite, folder / "machine") as kiosk:
             kiosk.put_stage(stage)
-            before, back_s = kept(kiosk), list[float]()
-            for number in range(cuts):
-                after_s = chance.uniform(0.0, LATEST_S)
-                back_s.append(cut(kiosk, after_s))
-                print(f"{number + 1}: cut after {after_s:.1f} s, back after {back_s[-1]:.1f} s; {_load()}", flush=True)
-            gone = lost(kiosk, before)
+            made = Cuts(kiosk, seed, seconds)
+            at_work = round(AT_WORK * cuts)
+            made.starting(cuts - at_work)
             shown_s = [kiosk.boot_beside_devices() for _ in range(BOOTS)]
-    print(f"{cuts} cuts; lost: {gone or 'nothing'}; the picture was back after {_spread(back_s)}")
-    print(f"{BOOTS} boots beside devices that are on: from X to the appearance {_spread(shown_s)}; {_load()}")
-    return 1 if gone else 0
+            print(f"{BOOTS} boots beside devices that are on: from X to the appearance {_spread(shown_s)}; {_load()}")
+            kiosk.machine.wait_for(lambda: kiosk.state == "playing")
+            kiosk.let_the_camera_see()
+            kiosk.calibrate()
+            made.at_work(at_work)
+            kiosk.machine.wait_for(lambda: kiosk.state == "playing" and not kiosk.problems())
+            kiosk.machine.call("velatura", "recalibrate", STAGE, user="velatura")
+            kiosk.machine.wait_for(kiosk.shows_installed)
+    print(f"{len(made.back_s)} cuts; lost: {made.gone or 'nothing'}; the picture was back after {_spread(made.back_s)}")
+    return 1 if made.gone else 0
 
 
 def _spread(took_s: list[float]) -> str:
@@ -92,5 +163,6 @@ if __name__ == "__main__":
     parser.add_argument("cuts", type=int, nargs="?", default=100)
     parser.add_argument("seed", type=int, nargs="?", default=1)
     parser.add_argument("suite", choices=DEBIAN, nargs="?", default="bookworm")
+    parser.add_argument("seconds", type=float, nargs="?", default=float("inf"))
     options = parser.parse_args()
-    sys.exit(main(options.cuts, options.seed, options.suite))
+    sys.exit(main(options.cuts, options.seed, options.suite, options.seconds))

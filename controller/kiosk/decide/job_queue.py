@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Final
 
 from controller.core.errors import WorkError
+from controller.kiosk.decide import kept_work
 from controller.kiosk.decide.interfaces import Condition, Finished, Jobs, ProjectorView, Request
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -24,6 +25,19 @@ class JobQueue:
         self._queue: deque[Request] = deque()
         self._cancelled = False
         self._holder: int | None = None
+        self._again: frozenset[Request] = frozenset()
+
+    def go_on(self) -> Sequence[tuple[Request, bool]]:
+        """What the previous service left undone, and whether it is done again: once, and not what needs the lamps."""
+        left = [
+            (request, not (request.light or second) and self._possible(request))
+            for request, second in kept_work.unfinished(self._log)
+        ]
+        requests = [request for request, again in left if again]
+        self._again = frozenset(requests)
+        self._queue.extend(requests)
+        self._keep()
+        return left
 
     @property
     def head(self) -> Request | None:
@@ -50,6 +64,7 @@ class JobQueue:
             self._log.add(why)
             raise WorkError(why.code, what=why.reason, remedy=why.remedy)
         self._queue.extend(requests)
+        self._keep()
 
     def check_idle(self) -> None:
         """Raises WorkError("busy")."""
@@ -81,6 +96,7 @@ class JobQueue:
         if self._jobs.running is not None:
             self._cancelled = True
             self._jobs.cancel()
+        self._keep()
 
     def take_finished(self) -> Finished | None:
         """The job that ended since the last call; its follow-up jobs are now first in the queue."""
@@ -96,6 +112,7 @@ class JobQueue:
         if key and not any(request.key == key for request in finished.then):
             self._log.mark_done(key, finished.outcome.code)
         self._queue.extendleft(reversed(finished.then))
+        self._keep()
         return finished
 
     def take_due(self, plan: Plan, *, playing: bool) -> None:
@@ -148,6 +165,17 @@ class JobQueue:
         if self._queue:
             self._settle(why.code)
             self._tell(why)
+            self._keep()
+
+    def _possible(self, request: Request) -> bool:
+        try:
+            return self._jobs.refusal(request) is None
+        except KeyError:  # a kind that another version of the program knew
+            return False
+
+    def _keep(self) -> None:
+        running = () if self._jobs.running is None or self._cancelled else (self._jobs.running,)
+        kept_work.keep(self._log, (*running, *self._queue), self._again)
 
     def _tell(self, outcome: Decision) -> None:
         """Log it; a failure stays on the panel until an operator confirms it."""

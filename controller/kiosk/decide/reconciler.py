@@ -39,7 +39,8 @@ BRIGHTNESS_FADE_S: Final = 0.25
 """As long as the player's supervisor waits between two looks, so that a slow change has no steps to see."""
 RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
 """Between attempts to leave FAULT."""
-_ON: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED)
+_SHOWING: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED, State.FAULT)
+"""In a fault, too: a lamp whose control line is dead may be lit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ class Reconciler:
         self._lock = threading.RLock()
         self._plan = Plan(None)
         self._since_s = monotonic()
-        self._attempts, self._missing = 0, frozenset[str]()
+        self._attempts, self._missing, self._silent = 0, frozenset[str](), frozenset[str]()
         self._lit_until_s, self._lit_closed = float("-inf"), False
 
     # -- commands and questions
@@ -191,6 +192,11 @@ class Reconciler:
         """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
         with self._lock:
             self._queue.submit(*requests)
+
+    def go_on(self) -> Sequence[tuple[Request, bool]]:
+        """As ``JobQueue.go_on``."""
+        with self._lock:
+            return self._queue.go_on()
 
     @contextlib.contextmanager
     def idle(self) -> Iterator[None]:
@@ -327,17 +333,25 @@ class Reconciler:
             # The lamps are wanted dark in this state, too: it ends when they are.
             if not any(view.condition is Condition.LIT or view.maybe_lit for view in views):
                 self._go(Event.STOP, "closed")
+        elif self._answers_again(views):
+            self._go(Event.START, "a projector answers again")
         elif any(view.condition is Condition.LIT for view in views) or self._waited(
             RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
         ):
             self._attempts += 1
             self._go(Event.START, "trying again")
 
+    def _answers_again(self, views: Sequence[ProjectorView]) -> bool:
+        """Whether one does that was silent in this fault: after a power cut, projectors boot longer than computers."""
+        silent = frozenset(view.name for view in views if view.condition is Condition.LOST)
+        back, self._silent = self._silent - silent, silent
+        return bool(back)
+
     def _waited(self, seconds: float) -> bool:
         return self._monotonic() - self._since_s >= seconds
 
     def _go(self, event: Event, reason: str) -> None:
-        self._since_s = self._monotonic()
+        self._since_s, self._silent = self._monotonic(), frozenset()
         self.machine.handle(event, reason)
         if event in (Event.PLAY, Event.COOLED):
             self._attempts = 0
@@ -358,7 +372,7 @@ class Reconciler:
             return
         # If every lamp is dark, no projector can replace another.
         missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
-        want = self._content.of(self._plan, missing) if open_now and state in _ON else BLACK
+        want = self._content.of(self._plan, missing) if open_now and state in _SHOWING else BLACK
         self._player.want = want
         shown = self._player.view.shown
         if self._live.now.fade_s is not None and shown is not None and _same_picture(shown, want):

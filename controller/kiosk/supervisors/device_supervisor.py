@@ -10,6 +10,7 @@ from typing import Final
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
+from controller.kiosk.supervisors.reopening import pause_s
 from controller.kiosk.world import Lock
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
@@ -17,8 +18,6 @@ from hal.interfaces import Device
 
 OPEN_S: Final = 20.0
 LOOK_S: Final = 10.0
-_REOPEN_S: Final = (2.0, 5.0, 15.0)
-"""Not longer, because a person who plugs a cable in again waits for the result."""
 
 Look = Callable[[Device, Deadline], tuple[LiveValue, ...]]
 
@@ -40,7 +39,8 @@ class DeviceSupervisor:
         self._device: Device | None = None
         self._values: tuple[LiveValue, ...] = ()
         self._problem: Decision | None = None
-        self._next_s, self._failures = 0.0, 0
+        self._next_s = 0.0
+        self._lost_since_s: float | None = None
         self._closed = False
         self._deadline = deadline
         self.lent: Lock = lock or threading.Lock()
@@ -92,14 +92,16 @@ class DeviceSupervisor:
     def _recovered(self) -> None:
         if self._problem is not None:
             self._tell(Decision("device-back", f"{self.name} is connected again."))
-        self._problem, self._failures = None, 0
+        self._problem = self._lost_since_s = None
         self._next_s = self._monotonic() + self._every_s
 
     def _lost(self, problem: Decision) -> None:
         self._release()
         self._values = ()
-        self._next_s = self._monotonic() + _REOPEN_S[min(self._failures, len(_REOPEN_S) - 1)]
-        self._failures += 1
+        now_s = self._monotonic()
+        if self._lost_since_s is None:
+            self._lost_since_s = now_s
+        self._next_s = now_s + pause_s(now_s - self._lost_since_s)
         if self._problem is None or self._problem.code != problem.code:
             self._tell(problem)
         self._problem = problem

@@ -30,6 +30,8 @@ NOTICE_TURN_S: Final = 10.0
 """On an object that all projectors light, the text of several at once could not be read."""
 AGAIN_S: Final = 60.0
 """After this time without a picture, a player without the installed bundle is started with it again."""
+OUTPUT_GONE: Final = "output-gone"
+"""The code of a player's problem that is one of its outputs, and not its own."""
 STARTS_WITH_BUNDLE: Final = 6
 """Starts in a row without a picture after which the player is started without the installed bundle: it shows black.
 
@@ -232,9 +234,12 @@ class PlayerSupervisor:
             shown = want
         if self._monotonic() - self._started_at_s >= HEALTHY_S:
             self._failed = 0
-        if self._view.problem is not None:
+        problem = _outputs_problem(status)
+        if problem is not None and problem != self._view.problem:
+            self._tell(problem)
+        elif problem is None and self._view.problem is not None:
             self._tell(Decision("player-well", "The player shows what it should again."))
-        self._view = replace(self._view, shown=shown, problem=None, warning=self._warning(status))
+        self._view = replace(self._view, shown=shown, problem=problem, warning=self._warning(status))
 
     def _is_shown(self, want: Showing, shown: Showing | None, status: dict[str, Any]) -> bool:
         running = bool(status["sequence_running"])
@@ -295,6 +300,18 @@ class PlayerSupervisor:
         """Raises as ``PlayerChannel.request``."""
         assert self._process is not None
         return self._channel.request(self._process.socket, request, timeout_s)
+
+
+def _outputs_problem(status: dict[str, Any]) -> Decision | None:
+    """That outputs get no picture, although the player shows one."""
+    if not (names := status.get("missing_outputs")):
+        return None
+    if len(names) == 1:
+        what = f"The output {names[0]} of this computer is off, or has another size: its projector gets no picture."
+    else:
+        what = f"The outputs {', '.join(names)} of this computer are off, or have another size."
+    remedy = "Check the video cable, and that the projector is on. The picture comes back by itself."
+    return Decision(OUTPUT_GONE, what, remedy, "error")
 
 
 _SKIPPED: Final = Decision(

@@ -11,6 +11,7 @@ from controller.capture.acquire import DISK_CODES
 from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
 from controller.kiosk.store.event_log import Decision
+from controller.kiosk.supervisors.reopening import pause_s
 from controller.rig.lamp_faults import fatal_faults, faulty
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import Clock, SystemClock
@@ -30,8 +31,6 @@ _LOOKS: Final = {
     Power.ON: Condition.LIT, Power.WARMING: Condition.LIGHTING, Power.COOLING: Condition.COOLING,
     Power.OFF: Condition.DARK,
 }  # fmt: skip
-_REOPEN_S: Final = (2.0, 5.0, 15.0)
-"""Not longer, because a person who plugs a cable in again waits for the result."""
 
 
 class ProjectorSupervisor:
@@ -69,7 +68,7 @@ class ProjectorSupervisor:
         self._view = ProjectorView(name, maybe_lit=maybe_lit)
         self._stepping = self._closed = False
         self._silent_since_s: float | None = None
-        self._reopen_at_s, self._reopened = 0.0, 0
+        self._reopen_at_s = 0.0
         self._struck_at_s: float | None = None
         self._failed_strikes, self._remembered = 0, False
         self._burning = False
@@ -120,7 +119,7 @@ class ProjectorSupervisor:
     def _step(self) -> None:
         if self._asleep():
             self._silent_since_s = None
-            self._reopen_at_s, self._reopened = 0.0, 0
+            self._reopen_at_s = 0.0
             self._show(ProjectorView(self.name, Condition.DARK, Power.OFF, looked=True, hours=self._view.hours,
                                      strikes=self._view.strikes, counter_hours=self._view.counter_hours))  # fmt: skip
             return
@@ -134,7 +133,7 @@ class ProjectorSupervisor:
         except (DeviceError, VelaturaError) as error:
             self._silent(error)
             return
-        self._silent_since_s, self._reopened = None, 0
+        self._silent_since_s = None
         # Read late: opening the line takes seconds, and the lamp may not be wanted any more.
         wanted = self._want_lit
         try:
@@ -196,8 +195,9 @@ class ProjectorSupervisor:
         if self._guard is not None:
             self._release(self._guard)
             self._guard = None
-        self._reopen_at_s = self._clock.now_s() + _REOPEN_S[min(self._reopened, len(_REOPEN_S) - 1)]
-        self._reopened += 1
+        assert self._silent_since_s is not None
+        now_s = self._clock.now_s()
+        self._reopen_at_s = now_s + pause_s(now_s - self._silent_since_s)
         self._struck_at_s = None
         problem, unfed = _decision(error), self._unfed()
         if unfed is not None:

@@ -40,29 +40,35 @@ def fits(size: OutputSize, connector: Connector | None) -> bool:
     return connector is not None and (connector.width_px, connector.height_px) == (size.width_px, size.height_px)
 
 
-def check_connectors(
+def unfit(
     sizes: Sequence[OutputSize],
     where: Mapping[str, str],
     found: Mapping[str, Connector],
     connectors: Sequence[Connector],
-) -> None:
-    """Raise UsageError("output-missing", "output-size-differs", "output-rates-differ") unless all fit."""
+) -> dict[str, UsageError]:
+    """By our name, why an output can't show its pictures: UsageError("output-missing" or "output-size-differs")."""
+    wrong = {}
     for size in sizes:
         wanted, connector = where.get(size.name, size.name), found.get(size.name)
         if connector is None:
             has = ", ".join(" ".join((c.name, *(f"(serial number {s})" for s in c.serials[:1]))) for c in connectors)
-            raise UsageError(
+            wrong[size.name] = UsageError(
                 "output-missing",
                 what=f"The X server has no output {wanted}; it has {has or 'none'}.",
                 remedy="Check the cable and stage.toml, and force the output on if the projector is off.",
             )
-        if not fits(size, connector):
-            raise UsageError(
+        elif not fits(size, connector):
+            wrong[size.name] = UsageError(
                 "output-size-differs",
                 what=f"Output {size.name} is {connector.width_px}x{connector.height_px}, but stage.toml says "
                 f"{size.width_px}x{size.height_px}.",
                 remedy="Set the output's mode with xrandr, or correct stage.toml and calibrate again.",
             )
+    return wrong
+
+
+def check_rates(found: Mapping[str, Connector]) -> None:
+    """Raise UsageError("output-rates-differ") unless these change together."""
     rates = sorted((connector.rate_hz, name) for name, connector in found.items())
     (slowest, one), (quickest, other) = rates[0], rates[-1]
     if quickest - slowest > _MOST_RATES_APART_HZ:

@@ -18,8 +18,9 @@ from pyglet import gl  # noqa: E402
 
 from controller.bundle.live_maps import LiveMaps  # noqa: E402
 from controller.core.errors import WorkError  # noqa: E402
+from controller.play.control.notify import tell  # noqa: E402
 from controller.play.display.drawing import Canvas  # noqa: E402
-from controller.play.display.output_mapping import check_connectors, find_connectors, fits  # noqa: E402
+from controller.play.display.output_mapping import check_rates, find_connectors, fits, unfit  # noqa: E402
 from controller.play.display.x11 import Connector, XServer  # noqa: E402
 from controller.play.frames import FrameSet, OutputSize  # noqa: E402
 from controller.play.live.gl import LiveRenderer  # noqa: E402
@@ -30,25 +31,24 @@ class WindowOutput:
 
     Outputs are found by their connector's name (``xrandr``: DP-1, HDMI-2) or their display's serial number. If none of
     them is there, and none was asked for by ``where``, they lie side by side from the upper left corner, in stage
-    order. An output that goes away later, or changes its size, stays black; when it is back it shows what the others
-    show.
+    order. An output that is away, or has another size, stays black; when it is back it shows what the others show.
     """
 
     def __init__(self, sizes: Sequence[OutputSize], where: Mapping[str, str] | None = None) -> None:
         """Open the window. ``where``: connector or serial number by the output's name, where that is another.
 
         Raises WorkError("display-gone", "display-unfit", "output-gamma" or "output-range"), UsageError as
-        ``find_connectors`` and ``check_connectors``.
+        ``find_connectors`` and ``check_rates``, and as ``unfit`` if no output is as it should be.
         """
         self._sizes, self._where = tuple(sizes), dict(where or {})
         self._server = XServer()
         found, connectors = self._find()
         self._beside = not found and not self._where
+        self._missing: tuple[str, ...] = ()
         if not self._beside:
-            check_connectors(sizes, self._where, found, connectors)
+            self._missing = self._checked(found, connectors)
             for connector in found.values():
                 self._server.make_plain(connector)
-        self._missing: tuple[str, ...] = ()
         self._places = self._placed(found)
         try:
             self._window = _open_window(self._extent())
@@ -71,6 +71,16 @@ class WindowOutput:
     def _find(self) -> tuple[dict[str, Connector], tuple[Connector, ...]]:
         connectors = self._server.connectors()
         return find_connectors(self._sizes, self._where, connectors), connectors
+
+    def _checked(self, found: Mapping[str, Connector], connectors: Sequence[Connector]) -> tuple[str, ...]:
+        """The outputs that are not there as they should be; the others play."""
+        wrong = unfit(self._sizes, self._where, found, connectors)
+        if len(wrong) == len(self._sizes):
+            raise next(iter(wrong.values()))
+        for problem in wrong.values():
+            tell(f"{problem.what} {problem.remedy}")
+        check_rates({name: connector for name, connector in found.items() if name not in wrong})
+        return tuple(wrong)
 
     def _placed(self, found: Mapping[str, Connector]) -> tuple[tuple[int, int] | None, ...]:
         """Upper left corner of each output on the X screen, None for one that is not there as it should be."""

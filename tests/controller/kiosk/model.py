@@ -230,4 +230,4 @@ class Kiosk:
         return [sin for lamp in self.lamps.values() for sin in lamp.sins]
 
 
-__all__ = ["BUNDLE", "NAMES", "RULES", "FragileLamp", "Kiosk", "ModelJobs", "ModelPlayer", "Power"]
+__all__ = ["BUNDLE", "NAMES", "RULES", "STEP_S", "FragileLamp", "Kiosk", "ModelJobs", "ModelPlayer", "Power"]

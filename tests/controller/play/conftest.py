@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,16 @@ def outputs() -> list[tuple[str, int, int]]:
     return OUTPUTS
 
 
-def write_noise(path: Path, **more: Any) -> Path:
+def write_noise(path: Path, *, outputs: Sequence[tuple[str, int, int]] = OUTPUTS, **more: Any) -> Path:
     """An unsigned bundle with the appearances "0" to "5": noise of that seed; ``more`` for ``write_bundle``."""
+    sizes = list(outputs)
     write_bundle(
         path,
         stage="s",
         calibration="c",
         created_unix_s=0,
-        outputs=OUTPUTS,
-        appearances=[NewAppearance(str(seed), noise(OUTPUTS, seed)) for seed in range(6)],
+        outputs=sizes,
+        appearances=[NewAppearance(str(seed), noise(sizes, seed)) for seed in range(6)],
         **more,
     )
     return path

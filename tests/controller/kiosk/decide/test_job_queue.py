@@ -62,8 +62,12 @@ class Jobs:
 class Desk:
     def __init__(self) -> None:
         self.now_s = 0.0
-        self.jobs = Jobs()
         self.log = EventLog(Path(":memory:"), durable=False)
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """As a service that was killed and starts."""
+        self.jobs = Jobs()
         self.queue = JobQueue(self.jobs, self.log, monotonic=lambda: self.now_s, patience_s=PATIENCE_S)
 
     def begin(self, *views: ProjectorView) -> Request | None:
@@ -83,6 +87,64 @@ def desk() -> Iterator[Desk]:
     found = Desk()
     yield found
     found.log.close()
+
+
+def test_work_that_a_power_cut_ended_is_told_and_done_again_once_unless_it_needs_the_lamps(desk: Desk) -> None:
+    desk.queue.submit(FULL, REPORT)
+    desk.begin(LIT)
+    desk.begin_anew()
+    assert desk.queue.go_on() == [(FULL, False), (REPORT, True)]
+    assert desk.begin(DARK) == REPORT
+    desk.begin_anew()
+    assert desk.queue.go_on() == [(REPORT, False)], "what ends the kiosk is not begun again and again"
+    assert desk.begin(LIT) is None
+    desk.begin_anew()
+    assert desk.queue.go_on() == []
+    desk.queue.submit(FULL)
+    desk.begin(LIT)
+    desk.jobs.end(PUBLISH)
+    desk.queue.take_finished()
+    desk.begin_anew()
+    assert desk.queue.go_on() == [(PUBLISH, True)], "what follows a calibration is not lost with the power"
+    desk.begin()
+    desk.jobs.end()
+    desk.queue.take_finished()
+    desk.begin_anew()
+    assert desk.queue.go_on() == []
+
+
+@pytest.mark.parametrize("cancelled_while", ["it waits", "it runs"])
+def test_work_that_was_cancelled_or_belongs_to_the_schedule_is_not_done_again(desk: Desk, cancelled_while: str) -> None:
+    desk.queue.submit(PUBLISH, REPORT)
+    if cancelled_while == "it runs":
+        desk.begin()
+    desk.queue.cancel()
+    desk.begin_anew()
+    assert desk.queue.go_on() == []
+    desk.queue.take_due(Plan(None, due=(DRIFT,)), playing=False)
+    desk.begin(LIT)
+    desk.jobs.end(replace(PUBLISH, key=DRIFT.key))
+    desk.queue.take_finished()
+    desk.begin()
+    desk.begin_anew()
+    assert desk.queue.go_on() == []
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '[["publish"]]', "7", '[["publish", false, 3, false]]', "null"])
+def test_kept_work_that_can_not_be_read_keeps_no_kiosk_from_starting(desk: Desk, text: str) -> None:
+    desk.log.keep("work", text)
+    assert desk.queue.go_on() == []
+    desk.queue.submit(PUBLISH)
+    assert desk.begin() == PUBLISH
+
+
+def test_kept_work_that_is_refused_now_is_told_and_not_begun(desk: Desk) -> None:
+    desk.queue.submit(PUBLISH)
+    desk.begin()
+    desk.begin_anew()
+    desk.jobs.refused = Decision("no-calibration", "There is no calibration.")
+    assert desk.queue.go_on() == [(PUBLISH, False)]
+    assert desk.begin() is None
 
 
 def test_what_follows_comes_before_what_waits_and_in_its_order(desk: Desk) -> None:

@@ -8,7 +8,7 @@ from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import BLACK, Request, Showing
 from controller.run.state_machine import State
 from hal.values import Power, ProjectorStatus
-from tests.controller.kiosk.model import BUNDLE, NAMES, Kiosk
+from tests.controller.kiosk.model import BUNDLE, NAMES, RULES, STEP_S, Kiosk
 
 
 @pytest.fixture
@@ -109,6 +109,41 @@ def test_when_every_lamp_fails_it_is_a_fault_with_reason_and_it_comes_back_when_
     for lamp in kiosk.lamps.values():
         lamp.reports = None
     kiosk.run_until(State.PLAYING, within_s=1200)
+
+
+@pytest.mark.parametrize("boots_s", [5, 12, 30, 60])
+def test_projectors_that_boot_longer_than_the_computer_shine_soon_after_they_answer(kiosk: Kiosk, boots_s: int) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.gone.update(NAMES)
+    kiosk.power_cut(1.0)
+    kiosk.run(boots_s)
+    assert kiosk.state is State.FAULT
+    assert "left is away" in kiosk.reconciler.machine.reason
+    assert kiosk.player.view.shown == Showing(BUNDLE, "shine"), "a lamp behind a dead control line may be lit"
+    kiosk.gone.clear()
+    rest_s = max(0.0, RULES.minimum_off_s - boots_s)
+    longest_s = rest_s + max(2.0, boots_s / 3) + RULES.warm_up_s + RULES.stable_s + 5 * STEP_S
+    assert kiosk.run_until(State.PLAYING) <= longest_s
+    assert not kiosk.sins
+
+
+def test_a_service_that_begins_while_all_control_lines_are_dead_leaves_the_picture_on_the_lit_lamps(
+    kiosk: Kiosk,
+) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.gone.update(NAMES)
+    kiosk.log.close()
+    kiosk.boot()
+    kiosk.run(60)
+    assert kiosk.lit == list(NAMES)
+    assert kiosk.player.view.shown == Showing(BUNDLE, "shine")
+    kiosk.gone.clear()
+    kiosk.run_until(State.PLAYING, within_s=20)
+    assert [lamp.strikes for lamp in kiosk.lamps.values()] == [1, 1, 1]
+    kiosk.gone.update(NAMES)
+    kiosk.reconciler.shut()
+    kiosk.run(5)
+    assert kiosk.player.view.shown == BLACK
 
 
 def test_a_lamp_that_can_not_be_switched_off_is_a_fault(kiosk: Kiosk) -> None:

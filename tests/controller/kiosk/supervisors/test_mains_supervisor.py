@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from dataclasses import dataclass, field
 
 import pytest
@@ -289,9 +290,15 @@ def test_a_device_is_opened_again_less_and_less_often_and_told_of_once_a_trouble
     run(60)
     assert [one.code for one in told] == ["missing", "device-back"]
     assert [value.text for value in supervisor.row.values] == ["Sensor"]
-    sensor.trouble, sensor.looks = "silent", 0
-    run(100)
-    assert sensor.looks == 9, "and after 2, 5 and every 15 s"
+    sensor.trouble, looked_s = "silent", list[int]()
+    for second in range(200):
+        before = sensor.looks
+        run(1)
+        looked_s += [second] * (sensor.looks - before)
+    lost_s = looked_s[0]
+    pauses = [(at_s - lost_s, after_s - at_s) for at_s, after_s in itertools.pairwise(looked_s)]
+    assert all(2 <= pause_s <= 15 and pause_s <= max(2, missing_s / 3) for missing_s, pause_s in pauses), pauses
+    assert pauses[-1][1] >= 14, "it is asked rarely in the end"
     assert sensor.open == 0, "what does not answer is let go of"
     assert (supervisor.row.problem, supervisor.row.remedy, supervisor.row.values) == ("It is silent.", "Mend it.", ())
     sensor.trouble = "burning"

@@ -104,11 +104,15 @@ def refusal(play: Start, **changes: Any) -> str:
 
 
 def test_what_can_not_be_right_is_refused_with_its_reason(outputs: Outputs, play: Start) -> None:
-    assert "no output DP-9; it has DUMMY0, DUMMY1, DUMMY2" in refusal(play, where={**WHERE, "P2": "DP-9"})
-    outputs.place("DUMMY1", WIDTH, "other")
+    nowhere = dict.fromkeys(WHERE, "DP-9")
+    assert "no output DP-9; it has DUMMY0, DUMMY1, DUMMY2" in refusal(play, where=nowhere)
+    for number, connector in enumerate(CONNECTORS):
+        outputs.place(connector, number * WIDTH, "other")
     told = refusal(play)
-    assert "P2 is 120x100" in told
+    assert "P1 is 120x100" in told
     assert "160x120" in told
+    for number, connector in enumerate(CONNECTORS):
+        outputs.place(connector, number * WIDTH)
     outputs.place("DUMMY1", WIDTH, "quick")
     assert "P1 runs at 60.150 Hz and P2 at 120.301 Hz" in refusal(play)
     for connector in ("DUMMY0", "DUMMY1"):
@@ -128,6 +132,24 @@ def test_an_output_that_goes_is_named_and_shows_the_picture_when_it_is_back(outp
         outputs.place("DUMMY1", WIDTH, "other")
         time.sleep(0.3)
         assert wire.ask("status")["missing_outputs"] == ["P2"], "another size is not what was calibrated"
+        outputs.place("DUMMY1", WIDTH)
+        assert comes_true(lambda: same(shown(outputs), expected))
+        assert wire.ask("status")["missing_outputs"] == []
+
+
+@pytest.mark.parametrize("wrong", ["off", "another size"])
+def test_an_output_that_is_missing_at_the_start_keeps_no_other_dark_and_shows_the_picture_when_it_comes(
+    outputs: Outputs, play: Start, wrong: str
+) -> None:
+    outputs.xrandr("--output", "DUMMY1", "--off")
+    if wrong == "another size":
+        outputs.place("DUMMY1", WIDTH, "other")
+    with Wire(play().socket) as wire:
+        assert wire.ask("status")["missing_outputs"] == ["P2"]
+        assert wire.ask("play", appearance="3")["ok"]
+        expected = noise(SIZES, 3)
+        assert np.array_equal(outputs.picture(0), expected["P1"])
+        assert np.array_equal(outputs.picture(2 * WIDTH), expected["Prój3"])
         outputs.place("DUMMY1", WIDTH)
         assert comes_true(lambda: same(shown(outputs), expected))
         assert wire.ask("status")["missing_outputs"] == []
