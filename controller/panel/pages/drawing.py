@@ -7,7 +7,7 @@ import math
 import time
 import zoneinfo
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, date, datetime, tzinfo
 from importlib import resources
 from typing import Any, Final
 
@@ -122,6 +122,8 @@ class Drawing:
             "number": figures.number,
             "date": self._date,
             "day": figures.day,
+            "named_day": _named_day,
+            "sentence": lambda text: text[:1].upper() + text[1:],
             "said": gettext,
             "job_title": spoken.job_title,
         }
@@ -178,6 +180,14 @@ class Drawing:
         except (ValueError, OverflowError, OSError):
             # A wrong time in a file must not break a page.
             return gettext(UNKNOWN_TIME)
+
+
+def _named_day(text: str) -> str:
+    """A date of a file, "2026-12-24", as the language writes it; anything else as it is."""
+    try:
+        return figures.day(date.fromisoformat(text))
+    except ValueError:
+        return text
 
 
 def str_of_date(at: datetime) -> str:

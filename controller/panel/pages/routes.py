@@ -42,7 +42,7 @@ BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/r
 """Pages that are not in the navigation, and those that they belong to."""
 NO_TARGET: Final[dict[str, Any]] = {"target": None, "reach": None, "outline": "[]", "stamp": 0}
 FRAMED: Final = {
-    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
+    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:; "
     "frame-ancestors 'self'",
     "x-frame-options": "SAMEORIGIN",
 }
