@@ -98,6 +98,9 @@ class Kiosk(Protocol):
     def start(self) -> None:
         """Open: lamps on, warm up, and play."""
 
+    def view_px(self) -> tuple[int, int] | None:
+        """(width, height) of the camera's view; None while it is unknown."""
+
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         """The picture ``target`` (PNG) fitted to the camera's view; unchanged while the view is unknown.
 

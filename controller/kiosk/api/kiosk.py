@@ -34,6 +34,7 @@ from controller.kiosk.interface import (
     Job,
     KioskState,
     LampDay,
+    Reach,
     RecalibrationKind,
     Results,
     Schedule,
@@ -256,8 +257,16 @@ class StageKiosk(FolderKiosk):
             supervisor.forgive()
         self.service.reconciler.open()
 
+    def view_px(self) -> tuple[int, int] | None:
+        return None if self._service is None else targets.camera_view_px(self.stage, self._service.checked.names)
+
+    def reach(self, target: Path) -> Reach:
+        from controller.kiosk.api.reach import reach
+
+        return reach(self.service.checked, target)
+
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
-        picture, size_px = target.read_bytes(), targets.camera_view_px(self.stage)
+        picture, size_px = target.read_bytes(), self.view_px()
         return picture if size_px is None else targets.fitted(picture, size_px, fit)
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:

@@ -13,19 +13,20 @@ import numpy.typing as npt
 from controller.core.errors import UsageError, VelaturaError
 from controller.kiosk.values import Fit
 from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import check_stage
 
 Region = tuple[tuple[float, float], ...]
 """Corners of one part of a target, as shares of its width and height."""
 MOST_REGIONS, MOST_CORNERS = 32, 400
 
 
-def camera_view_px(stage: Path) -> tuple[int, int] | None:
-    """(width, height) of the camera's picture in the newest finished calibration; None without one."""
+def camera_view_px(stage: Path, names: tuple[str, ...]) -> tuple[int, int] | None:
+    """(width, height) of the camera's picture in the newest finished calibration; None without one.
+
+    ``names`` of the projectors.
+    """
     from controller.artefacts.calibrated import Calibrated
 
     try:
-        names = check_stage(stage).names
         run = next(iter(finished_calibrations(stage)), None)
         return None if run is None else Calibrated(run, names).camera_px
     except (VelaturaError, OSError, ValueError, KeyError, TypeError):

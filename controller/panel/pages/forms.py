@@ -82,6 +82,9 @@ class Forms:
                 result = await answers.run(self._panel, operation, values, visitor.name)
             except answers.FAILURES as error:
                 return await self._again(operation, visitor, sent, error)
+            if operation.name in ("upload-target", "outline-target"):
+                # It is calculated while the browser loads the page on which it is shown.
+                self._pages.prepare_reach(result.target if isinstance(result, NewTarget) else values["target"])
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
             visitor.session.notes.append(("good", gettext(operation.said).format_map(values)))

@@ -282,6 +282,15 @@ class Pages:
         threading.Thread(target=prepare, name="prepare-preview", daemon=True).start()
         return NO_TARGET
 
+    def prepare_reach(self, target: str) -> None:
+        """Begin to calculate what of a target is in reach; the page that shows it waits for the rest only."""
+
+        def prepare() -> None:
+            with contextlib.suppress(*answers.FAILURES):
+                self._panel.kiosk.reach(self._panel.targets.path(target))
+
+        threading.Thread(target=prepare, name="prepare-reach", daemon=True).start()
+
     def _target(self, request: Request) -> dict[str, Any]:
         target = request.path_params["target"]
         return self._reached(request) if "wait" in request.query_params else self._reach(target)
