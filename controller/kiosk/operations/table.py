@@ -23,7 +23,7 @@ NEW_NAME: Final = Field("name", "a name of 1 to 64 letters, digits, - and _; the
                         pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", names="appearance")  # fmt: skip
 """The same rule as in stage.toml."""
 TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9])?$"
-DAY: Final = r"^[A-Za-z0-9][A-Za-z0-9 ,.\u2013-]*$"
+DAY: Final = r"^[^\u0000-\u001f\u007f]+$"
 """Which days it names, ``decide.days`` finds out."""
 ROW: Final = (
     Field("day", ALLOWED_DAYS, pattern=DAY, longest=64),

@@ -16,7 +16,7 @@ import jinja2
 from controller.core.text import duration
 from controller.kiosk.interface import EventRow, KioskState
 from controller.panel.pages import curves
-from controller.panel.words import figures, spoken
+from controller.panel.words import days, figures, spoken
 from controller.panel.words.language import LANGUAGES, gettext, language, mark, ngettext
 
 STATES: Final = {
@@ -123,6 +123,7 @@ class Drawing:
             "date": self._date,
             "day": figures.day,
             "named_day": _named_day,
+            "days": days.written,
             "sentence": lambda text: text[:1].upper() + text[1:],
             "said": gettext,
             "job_title": spoken.job_title,

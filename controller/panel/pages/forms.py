@@ -23,6 +23,7 @@ from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor, same_origin
 from controller.panel.context import Panel
 from controller.panel.pages.routes import Pages
+from controller.panel.words.days import canonical
 from controller.panel.words.language import gettext
 
 MOST_FIELDS = 2000
@@ -219,7 +220,10 @@ def _schedule_values(operation: Operation, sent: Sent) -> Values:
     if len({len(column) for column in columns}) > 1:
         raise UsageError("form-cut", what="The table of hours is incomplete.", remedy="Load the page again.")
     rows = [
-        {column.name: text.strip() for column, text in zip(ROW, row, strict=True)}
+        {
+            column.name: canonical(text) if column.name == "day" else text.strip()
+            for column, text in zip(ROW, row, strict=True)
+        }
         for row in zip(*columns, strict=True)
         if row[0].strip()
     ]
