@@ -104,7 +104,8 @@ class Kiosk(Protocol):
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         """The picture ``target`` (PNG) fitted to the camera's view; unchanged while the view is unknown.
 
-        ``fit``: see ``store.targets.fitted``. Raises UsageError("target-unreadable").
+        ``fit``: see ``store.targets.fitted``; "wrap" wraps it around the object. Raises UsageError("target-unreadable",
+        "not-calibrated").
         """
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:

@@ -49,6 +49,7 @@ from controller.kiosk.store.accounts import Accounts, stage_accounts
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.store.schedule_file import check
 from controller.kiosk.world import World
+from controller.stage.calibrations import finished_calibration
 from controller.stage.check import check_stage
 
 NOTICE_S: Final = 900.0
@@ -266,6 +267,10 @@ class StageKiosk(FolderKiosk):
         return reach(self.service.checked, target)
 
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
+        if fit == "wrap":
+            from controller.kiosk.api.wrapped import wrapped
+
+            return wrapped(finished_calibration(self.stage), self.service.checked.names, target)
         picture, size_px = target.read_bytes(), self.view_px()
         return picture if size_px is None else targets.fitted(picture, size_px, fit)
 

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.errors import UsageError, VelaturaError
-from controller.kiosk.values import Fit
 from controller.stage.calibrations import finished_calibrations
 
 Region = tuple[tuple[float, float], ...]
@@ -33,7 +32,7 @@ def camera_view_px(stage: Path, names: tuple[str, ...]) -> tuple[int, int] | Non
         return None
 
 
-def fitted(picture: bytes, size_px: tuple[int, int], how: Fit | Literal["stretch"] = "fit") -> bytes:
+def fitted(picture: bytes, size_px: tuple[int, int], how: Literal["fit", "fill", "crop", "stretch"] = "fit") -> bytes:
     """``picture`` (PNG) as a PNG of the size of the camera's view; unchanged if it has that size already.
 
     "fit" shows the whole picture; "fill" fills the view and cuts the edges; "crop" keeps the original pixels in the
