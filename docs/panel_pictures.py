@@ -30,11 +30,11 @@ PATIENCE_MS: Final = 600_000
 def save(page: Page, name: str, tallest_px: int = TALLEST_PX) -> None:
     """The page from its top, without what is farther down than ``tallest_px``."""
     page.evaluate("document.querySelectorAll('img[loading=lazy]').forEach((one) => { one.loading = 'eager'; })")
-    page.wait_for_function("[...document.images].every((one) => one.complete)")
+    page.evaluate("Promise.all([...document.images].map((one) => one.decode().catch(() => null)))")
     page.wait_for_timeout(500)
     with Image.open(io.BytesIO(page.screenshot(full_page=True))) as whole:
         top = whole.convert("RGB").crop((0, 0, whole.width, min(whole.height, tallest_px)))
-        top.save(PICTURES / f"{name}.webp", quality=82, method=6)
+        top.save(PICTURES / f"{name}.webp", quality=72, method=6)
 
 
 @contextlib.contextmanager
@@ -56,11 +56,13 @@ def photograph(browser: Browser, address: str, name: str, target: Path) -> None:
         save(page, "panel-now")
         page.goto("/results")
         save(page, "panel-results")
-        page.goto("/aiming")
-        page.get_by_role("button", name="Take test shots").click()
+        page.get_by_role("button", name="Photograph and compare").click()
         page.goto("/")
         expect(page.locator("#photograph")).to_be_visible()
         save(page, "panel-job", 1000)
+        expect(page.locator("[data-running]")).to_have_count(0)
+        page.goto("/aiming")
+        page.get_by_role("button", name="Take test shots").click()
         expect(page.locator("[data-running]")).to_have_count(0)
         page.goto("/aiming")
         save(page, "panel-aiming")
