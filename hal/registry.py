@@ -168,8 +168,12 @@ def load_drivers(found: Iterable[EntryPoint] | None = None, *, benches: bool = T
 def _distinct(found: Iterable[EntryPoint]) -> Iterable[EntryPoint]:
     """Without duplicates: an installed and a source copy of one distribution list the same entry points."""
     seen: dict[tuple[str, str, str], EntryPoint] = {}
-    for entry in found:
-        owner = entry.dist.name.replace("_", "-").lower() if entry.dist is not None else ""
+    # A distribution's name is parsed out of its description each time, and one of them has most entry points.
+    owners: dict[int, str] = {id(None): ""}
+    for entry in (found := list(found)):
+        if id(entry.dist) not in owners and entry.dist is not None:
+            owners[id(entry.dist)] = entry.dist.name.replace("_", "-").lower()
+        owner = owners[id(entry.dist)]
         seen.setdefault((owner, entry.name, entry.value), entry)
     return sorted(seen.values(), key=lambda entry: (entry.name, entry.value))
 

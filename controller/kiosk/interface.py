@@ -98,10 +98,14 @@ class Kiosk(Protocol):
     def start(self) -> None:
         """Open: lamps on, warm up, and play."""
 
+    def view_px(self) -> tuple[int, int] | None:
+        """(width, height) of the camera's view; None while it is unknown."""
+
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         """The picture ``target`` (PNG) fitted to the camera's view; unchanged while the view is unknown.
 
-        ``fit``: see ``store.targets.fitted``. Raises UsageError("target-unreadable").
+        ``fit``: see ``store.targets.fitted``; "wrap" wraps it around the object. Raises UsageError("target-unreadable",
+        "not-calibrated").
         """
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 RecalibrationKind = Literal["full", "quick"]
-Fit = Literal["fit", "fill", "crop"]
+Fit = Literal["fit", "fill", "crop", "wrap"]
 EventLevel = Literal["info", "warning", "error"]
 Unsubscribe = Callable[[], None]
 

@@ -68,7 +68,7 @@ def make_panel(
         accounts=accounts,
         options=options,
         sessions=Sessions(options.folder / "sessions.json"),
-        targets=Targets(options.folder / "targets", options.uploads, fitted=kiosk.fitted),
+        targets=Targets(options.folder / "targets", options.uploads, fitted=kiosk.fitted, view_px=kiosk.view_px),
         hub=Hub(draw, frames_per_s=options.frames_per_s, most=options.most_open_panels),
         operations=operations,
     )

@@ -36,14 +36,15 @@ class UploadLimits:
     seconds: int = 20
 
 
-def decode_picture(file: Path, limits: UploadLimits) -> bytes:
-    """The picture in ``file``, encoded again as PNG (RGB, 8 bit, no metadata).
+def decode_picture(file: Path, limits: UploadLimits, least_px: tuple[int, int] | None = None) -> bytes:
+    """The picture in ``file``, encoded again as PNG (RGB, 8 bit, no metadata); ``least_px``: see ``decoder.decode``.
 
     Raises UsageError("picture-refused") unless it is a PNG, JPEG, TIFF or WebP that decodes within ``limits``, and
     UsageError("picture-too-large") for one with too many pixels.
     """
     command = [sys.executable, "-I", str(Path(decoder.__file__))]
-    command += [str(limits.most_pixels), str(limits.memory_bytes), str(limits.seconds)]
+    wide, high = least_px or (0, 0)
+    command += [str(number) for number in (limits.most_pixels, limits.memory_bytes, limits.seconds, wide, high)]
     try:
         with file.open("rb") as data:
             done = subprocess.run(  # noqa: S603 - our own file, with numbers as arguments
@@ -87,8 +88,10 @@ class Targets:
         *,
         most: int = 20,
         fitted: Fitted = lambda file, fit: file.read_bytes(),
+        view_px: Callable[[], tuple[int, int] | None] = lambda: None,
     ) -> None:
-        self._folder, self._limits, self._most, self._fitted = folder, limits, most, fitted
+        self._folder, self._limits, self._most = folder, limits, most
+        self._fitted, self._view_px = fitted, view_px
         # One upload at a time, so that the limits hold for all together.
         self._decoding = threading.Lock()
 
@@ -102,7 +105,8 @@ class Targets:
         Raises as ``decode_picture``.
         """
         with self._decoding:
-            png = decode_picture(uploaded, self._limits)
+            # Only a picture that keeps its own pixels needs all of them.
+            png = decode_picture(uploaded, self._limits, None if fit == "crop" else self._view_px())
             key = secrets.token_hex(12)
             file = self._folder / f"{key}.png"
             write_atomically(file, png, mode=0o600)

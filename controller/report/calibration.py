@@ -33,7 +33,9 @@ from controller.report import plots
 from controller.report.light import light_gallery, whites
 from controller.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.report.pictures import Crop, crop_around, fitted, to_screen
+from controller.report.words import moment, spent
 from controller.run.journal import Journal
+from controller.run.step_id import StepId
 
 COMPARED: Final = 3
 SHOWN_RUNS: Final = 12
@@ -67,7 +69,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
     fine = plots.field(_cut(resolution, crop), "camera pixels, smaller is finer", least=0)
     _keep(run / RESOLUTION, fine)
     page = Page(
-        title=f"{asked.stage}: calibration {run.name}",
+        title=f"{asked.stage}: calibration of {moment(run.name)}",
         summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work.",
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
@@ -79,7 +81,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
             *light_gallery(calibration, crop),
             ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures)),
         ),
-        steps=tuple(figures["steps"].items()),
+        steps=spent(_steps(run)),
     )  # fmt: skip
     html, _ = write_report(out or run, page, figures)
     return html
@@ -107,6 +109,11 @@ def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
         "verification": read_grade_figures(run),
         "steps": {str(step): seconds for step, seconds in steps.items()},
     }
+
+
+def _steps(run: Path) -> Mapping[StepId, float]:
+    with Journal(run) as journal:
+        return journal.steps()
 
 
 def resolution_px(calibration: Calibration) -> FloatImage:
@@ -177,7 +184,7 @@ def _compared(run: Path, now: Mapping[str, Any], runs: Sequence[Path], last: Seq
     rows.append(row("reprojection", lambda one: one["geometry"]["reprojection_rms_px"], "{:.3f} px"))
     rows.append(row("photographs", lambda one: one["photographs"], "{}"))
     rows.append(row("work", lambda one: one["seconds"], "{:.0f} s"))
-    header = ("", f"{run.name} (this one)", *(one.name for one in reversed(runs)))
+    header = ("", f"{moment(run.name)} (this one)", *(moment(one.name) for one in reversed(runs)))
     title = "Compared with the last calibrations" if runs else "This is the first calibration"
     return PageTable(title, header, tuple(rows))
 
@@ -241,7 +248,7 @@ def _plots(
     }
     return (
         ReportPicture(
-            "Error over the calibrations", plots.history(errors, [one.name for one in runs], limit), large=True
+            "Error over the calibrations", plots.history(errors, [moment(one.name) for one in runs], limit), large=True
         ),
         ReportPicture("Response", plots.responses({p.name: p.radiometry.response for p in calibration.projectors})),
         ReportPicture("Sizes of metapixels", plots.sizes(widths), large=True),

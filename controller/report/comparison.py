@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from controller.report.page import (
     write_report,
 )
 from controller.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
+from controller.report.words import moment, spent
 from controller.run.journal import Journal
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -108,34 +109,27 @@ def write_comparison_report(run: Path, stage_name: str, out: Path | None = None)
                          remedy="Give the folder of a run of `velatura photograph`.")  # fmt: skip
     earlier = [one for one in all_compared(run.parent.parent) if one.name < run.name][-SHOWN_RUNS + 1 :]
     before = [{one.name: one for one in compared_in(folder)} for folder in earlier]
-    figures = _figures(run, found)
+    with Journal(run) as journal:
+        steps, shots = journal.steps(), journal.shot_count()
+    figures = _figures(run, found, steps, shots)
     page = Page(
         title=f"{stage_name}: what {len(found)} appearance{'s' * (len(found) > 1)} achieve{'s' * (len(found) == 1)}",
-        summary=f"{figures['photographs']} photographs of {_day(run.name)}, compared with the targets that were solved"
-        f" on the calibration {found[0].calibration}.",
+        summary=f"{figures['photographs']} photographs of {moment(run.name)}, compared with the targets that were"
+        f" solved on the calibration of {moment(found[0].calibration)}.",
         goals=_goals(found, before),
         rows=tuple(_row(run, one) for one in found),
         tables=(_beside(run.name, found, earlier[-COMPARED:], before[-COMPARED:]),),
         galleries=_course(run.name, found, earlier, before),
-        steps=tuple(figures["steps"].items()),
+        steps=spent(steps),
     )
     html, _ = write_report(out or run, page, figures)
     return html
 
 
-def _figures(run: Path, found: Sequence[Compared]) -> dict[str, Any]:
-    with Journal(run) as journal:
-        steps, shots = journal.steps(), journal.shot_count()
+def _figures(run: Path, found: Sequence[Compared], steps: Mapping[StepId, float], shots: int) -> dict[str, Any]:
     return {"run": run.name, "photographs": shots, "seconds": sum(steps.values()),
             "appearances": [asdict(one) for one in found],
             "steps": {str(step): seconds for step, seconds in steps.items()}}  # fmt: skip
-
-
-def _day(name: str) -> str:
-    try:
-        return time.strftime(MOMENT, time.strptime(name[:15], "%Y%m%d-%H%M%S"))
-    except ValueError:
-        return name
 
 
 def _goals(found: Sequence[Compared], before: Sequence[dict[str, Compared]]) -> tuple[Goal, ...]:
@@ -191,7 +185,7 @@ def _beside(
         (one.title, *(_short(each[one.name]) if one.name in each else "" for each in ({one.name: one}, *runs)))
         for one in found
     ]
-    header = ("", f"{name} (this one)", *(folder.name for folder in reversed(earlier)))
+    header = ("", f"{moment(name)} (this one)", *(moment(folder.name) for folder in reversed(earlier)))
     comparison = "compared with earlier runs" if earlier else "first run"
     return PageTable(f"Colour difference, median and 95 %, and sharpness: {comparison}", header, tuple(rows))
 
@@ -208,7 +202,7 @@ def _course(
     held = [*before, {one.name: one for one in found}]
     medians = {one.title: [each[one.name].delta_e00_median if one.name in each else float("nan") for each in held]
                for one in found}  # fmt: skip
-    runs = [*(folder.name for folder in earlier), name]
+    runs = [*(moment(folder.name) for folder in earlier), moment(name)]
     label = "median colour difference, CIEDE2000"
     drawn = plots.history(medians, runs, GOAL_DELTA_E, label=label, unit="")
     return (("How it went", "", (ReportPicture("History", drawn, large=True),)),)

@@ -27,6 +27,7 @@ from controller.report.one_projector import OneProjector, as_figures, as_rows, o
 from controller.report.one_projector import goals as one_projector_goals
 from controller.report.page import Goal, Page, PictureRow, ReportPicture, judged_rows, refined_row, write_report
 from controller.report.pictures import Crop, crop_around, error_picture, fitted, to_screen
+from controller.report.words import spent
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.solve.metrics import Comparison, compare
@@ -178,7 +179,7 @@ def _page(
             *light_gallery(calibration, crop),
             _frames_gallery(judged, checked),
         ),
-        steps=tuple((str(step), seconds) for step, seconds in steps.items()),
+        steps=spent(steps),
         facts=_facts(checked, calibration, figures),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ import jinja2
 
 from controller.artefacts.names import REPORT_FIGURES, REPORT_PAGE
 from controller.core.arrays import ByteImage
+from controller.core.lettering import font_file
 from controller.core.storage import write_atomically
 from controller.report.pictures import ERROR_SCALE_DELTA_E, data_uri, scale_bar
 from controller.solve.judged import as_rows
@@ -100,9 +102,16 @@ def render(page: Page) -> str:
     return environment.from_string(source).render(
         page=page,
         scale=scale_bar(),
+        typeface=_typeface(),
         scale_top=ERROR_SCALE_DELTA_E,
         slowest=max((s for _, s in page.steps), default=1.0),
     )
+
+
+def _typeface() -> str:
+    """The letters of the plots for the page, too; inside it, because a report is one file."""
+    font = font_file().read_bytes()
+    return f"data:font/ttf;base64,{base64.b64encode(font).decode()}"
 
 
 def write_report(folder: Path, page: Page, figures: Mapping[str, Any]) -> tuple[Path, Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -14,12 +15,12 @@ from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.plotting import figure_of, picture_of
 
 WIDE_IN, HIGH_IN, DPI = 7.2, 4.2, 100
-BACK, INK, DIM = "#1f2125", "#e8e6e1", "#9b9890"
+BACK, INK, DIM = "#1a1815", "#ebe3d6", "#b1a696"
 COLOURS: Final = ("#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#d55e00", "#0072b2")
 """Also distinguishable for colour-blind readers (Okabe and Ito)."""
 STYLE: Final[Any] = {
     "figure.facecolor": BACK, "axes.facecolor": BACK, "savefig.facecolor": BACK, "axes.edgecolor": DIM,
-    "axes.labelcolor": INK, "text.color": INK, "xtick.color": DIM, "ytick.color": DIM, "grid.color": "#34363b",
+    "axes.labelcolor": INK, "text.color": INK, "xtick.color": DIM, "ytick.color": DIM, "grid.color": "#332e27",
     "axes.grid": True, "axes.prop_cycle": cycler(color=list(COLOURS)), "legend.frameon": False, "font.size": 11,
     "axes.spines.top": False, "axes.spines.right": False, "lines.linewidth": 2.0,
 }  # fmt: skip
@@ -39,7 +40,7 @@ def history(
         for name, values in errors.items():
             axes.plot(range(len(runs)), values, marker="o", label=name)
         axes.axhline(limit, color="#f0876b", linestyle="--", label=f"limit {limit:g}{unit}")
-        axes.set_xticks(range(len(runs)), [f"{run[4:6]}-{run[6:8]}\n{run[9:11]}:{run[11:13]}" for run in runs])
+        axes.set_xticks(range(len(runs)), [re.sub(r" [0-9]{4}, ", "\n", run) for run in runs])
         axes.set_ylim(bottom=0)
         axes.set_ylabel(label)
         axes.legend(ncols=2, fontsize=9)

@@ -95,11 +95,10 @@ def down_adjoint(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tu
 
 def up(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> FloatImage:
     """(rows, columns, 3): values of blocks, interpolated between their middles."""
-    down_, across = _between(shape[0], grid[0], side), _between(shape[1], grid[1], side)
-    # One channel after the other: the products of every third number are several times slower.
-    planes = np.ascontiguousarray(np.moveaxis(blocks.reshape(*grid, -1), 2, 0))
-    # OpenCV puts the channels beside each other twenty times faster than a copy of the moved axis.
-    return np.asarray(cv2.merge(list((down_ @ planes) @ across.T)), np.float32).reshape(*shape[:2], -1)
+    # OpenCV's linear enlargement is that of ``_between``, and takes a tenth of the time of its products.
+    size_px = (grid[1] * side, grid[0] * side)
+    whole = cv2.resize(np.ascontiguousarray(blocks.reshape(*grid, -1)), size_px, interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(whole[: shape[0], : shape[1]]).reshape(*shape[:2], -1)
 
 
 def up_adjoint(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:

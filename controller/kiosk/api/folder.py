@@ -66,7 +66,7 @@ class FolderKiosk:
     def reach(self, target: Path) -> Reach:
         from controller.kiosk.api.reach import reach
 
-        return reach(self.stage, target)
+        return reach(check_stage(self.stage), target)
 
     def schedule(self) -> Schedule:
         return self._schedule().now

@@ -34,6 +34,7 @@ from controller.kiosk.interface import (
     Job,
     KioskState,
     LampDay,
+    Reach,
     RecalibrationKind,
     Results,
     Schedule,
@@ -48,6 +49,7 @@ from controller.kiosk.store.accounts import Accounts, stage_accounts
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.store.schedule_file import check
 from controller.kiosk.world import World
+from controller.stage.calibrations import finished_calibration
 from controller.stage.check import check_stage
 
 NOTICE_S: Final = 900.0
@@ -256,8 +258,20 @@ class StageKiosk(FolderKiosk):
             supervisor.forgive()
         self.service.reconciler.open()
 
+    def view_px(self) -> tuple[int, int] | None:
+        return None if self._service is None else targets.camera_view_px(self.stage, self._service.checked.names)
+
+    def reach(self, target: Path) -> Reach:
+        from controller.kiosk.api.reach import reach
+
+        return reach(self.service.checked, target)
+
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
-        picture, size_px = target.read_bytes(), targets.camera_view_px(self.stage)
+        if fit == "wrap":
+            from controller.kiosk.api.wrapped import wrapped
+
+            return wrapped(finished_calibration(self.stage), self.service.checked.names, target)
+        picture, size_px = target.read_bytes(), self.view_px()
         return picture if size_px is None else targets.fitted(picture, size_px, fit)
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:

@@ -18,7 +18,7 @@ from controller.core.storage import write_atomically
 from controller.kiosk.store.targets import fitted
 from controller.kiosk.values import Reach
 from controller.stage.calibrations import finished_calibration
-from controller.stage.check import Checked, check_stage
+from controller.stage.check import Checked
 
 if TYPE_CHECKING:
     from controller.kiosk.api.preview_light import PreviewLight
@@ -36,12 +36,11 @@ BRIGHT, DARK, COLOURFUL, UNLIT = (240, 179, 90), (90, 140, 255), (216, 96, 190),
 _one_at_a_time = threading.Lock()
 
 
-def reach(stage: Path, target: Path) -> Reach:
+def reach(checked: Checked, target: Path) -> Reach:
     """Shares of the visible object, and three pictures of it; kept until target, calibration or settings change.
 
     Raises UsageError("not-calibrated", "target-unreadable"), WorkError("no-light", "no-space").
     """
-    checked = check_stage(stage)
     folder = checked.stage.folder / FOLDER / target.stem[:64]
     run = finished_calibration(checked.stage.folder)
     about = {"run": run.name, "changed_ns": target.stat().st_mtime_ns, "solve": repr(checked.stage.tables.solve)}

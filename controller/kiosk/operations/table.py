@@ -23,7 +23,7 @@ NEW_NAME: Final = Field("name", "a name of 1 to 64 letters, digits, - and _; the
                         pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", names="appearance")  # fmt: skip
 """The same rule as in stage.toml."""
 TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9])?$"
-DAY: Final = r"^[A-Za-z0-9][A-Za-z0-9 ,.\u2013-]*$"
+DAY: Final = r"^[^\u0000-\u001f\u007f]+$"
 """Which days it names, ``decide.days`` finds out."""
 ROW: Final = (
     Field("day", ALLOWED_DAYS, pattern=DAY, longest=64),
@@ -45,8 +45,9 @@ TARGET_KEY: Final = r"^[0-9a-f]{24}$"
 TARGET: Final = Field("target", "the key of an uploaded target", "target", pattern=TARGET_KEY, longest=24,
                       metavar="PNG")  # fmt: skip
 FIT: Final = Field(
-    "fit", "how a picture of another size is fitted to the camera's view: fit (whole picture), fill (edges are cut) or "
-    "crop (original pixels); default: fit", required=False, choices=("fit", "fill", "crop"),
+    "fit", "how a picture of another size is fitted to the camera's view: fit (whole picture), fill (edges are cut), "
+    "crop (original pixels) or wrap (around the object); default: fit", required=False,
+    choices=("fit", "fill", "crop", "wrap"),
 )  # fmt: skip
 SETTINGS: Final = Field("text", "the text of stage.toml", longest=1 << 20)
 RUN: Final = Field("run", "a run's name", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,95}$", longest=96)

@@ -11,28 +11,28 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.errors import UsageError, VelaturaError
-from controller.kiosk.values import Fit
 from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import check_stage
 
 Region = tuple[tuple[float, float], ...]
 """Corners of one part of a target, as shares of its width and height."""
 MOST_REGIONS, MOST_CORNERS = 32, 400
 
 
-def camera_view_px(stage: Path) -> tuple[int, int] | None:
-    """(width, height) of the camera's picture in the newest finished calibration; None without one."""
+def camera_view_px(stage: Path, names: tuple[str, ...]) -> tuple[int, int] | None:
+    """(width, height) of the camera's picture in the newest finished calibration; None without one.
+
+    ``names`` of the projectors.
+    """
     from controller.artefacts.calibrated import Calibrated
 
     try:
-        names = check_stage(stage).names
         run = next(iter(finished_calibrations(stage)), None)
         return None if run is None else Calibrated(run, names).camera_px
     except (VelaturaError, OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def fitted(picture: bytes, size_px: tuple[int, int], how: Fit | Literal["stretch"] = "fit") -> bytes:
+def fitted(picture: bytes, size_px: tuple[int, int], how: Literal["fit", "fill", "crop", "stretch"] = "fit") -> bytes:
     """``picture`` (PNG) as a PNG of the size of the camera's view; unchanged if it has that size already.
 
     "fit" shows the whole picture; "fill" fills the view and cuts the edges; "crop" keeps the original pixels in the

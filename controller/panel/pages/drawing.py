@@ -7,7 +7,7 @@ import math
 import time
 import zoneinfo
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, date, datetime, tzinfo
 from importlib import resources
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ import jinja2
 from controller.core.text import duration
 from controller.kiosk.interface import EventRow, KioskState
 from controller.panel.pages import curves
-from controller.panel.words import figures, spoken
+from controller.panel.words import days, figures, spoken
 from controller.panel.words.language import LANGUAGES, gettext, language, mark, ngettext
 
 STATES: Final = {
@@ -122,6 +122,9 @@ class Drawing:
             "number": figures.number,
             "date": self._date,
             "day": figures.day,
+            "named_day": _named_day,
+            "days": days.written,
+            "sentence": lambda text: text[:1].upper() + text[1:],
             "said": gettext,
             "job_title": spoken.job_title,
         }
@@ -178,6 +181,14 @@ class Drawing:
         except (ValueError, OverflowError, OSError):
             # A wrong time in a file must not break a page.
             return gettext(UNKNOWN_TIME)
+
+
+def _named_day(text: str) -> str:
+    """A date of a file, "2026-12-24", as the language writes it; anything else as it is."""
+    try:
+        return figures.day(date.fromisoformat(text))
+    except ValueError:
+        return text
 
 
 def str_of_date(at: datetime) -> str:

@@ -23,6 +23,7 @@ from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor, same_origin
 from controller.panel.context import Panel
 from controller.panel.pages.routes import Pages
+from controller.panel.words.days import canonical
 from controller.panel.words.language import gettext
 
 MOST_FIELDS = 2000
@@ -82,6 +83,9 @@ class Forms:
                 result = await answers.run(self._panel, operation, values, visitor.name)
             except answers.FAILURES as error:
                 return await self._again(operation, visitor, sent, error)
+            if operation.name in ("upload-target", "outline-target"):
+                # It is calculated while the browser loads the page on which it is shown.
+                self._pages.prepare_reach(result.target if isinstance(result, NewTarget) else values["target"])
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
             visitor.session.notes.append(("good", gettext(operation.said).format_map(values)))
@@ -216,7 +220,10 @@ def _schedule_values(operation: Operation, sent: Sent) -> Values:
     if len({len(column) for column in columns}) > 1:
         raise UsageError("form-cut", what="The table of hours is incomplete.", remedy="Load the page again.")
     rows = [
-        {column.name: text.strip() for column, text in zip(ROW, row, strict=True)}
+        {
+            column.name: canonical(text) if column.name == "day" else text.strip()
+            for column, text in zip(ROW, row, strict=True)
+        }
         for row in zip(*columns, strict=True)
         if row[0].strip()
     ]

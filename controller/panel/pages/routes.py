@@ -42,7 +42,7 @@ BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/r
 """Pages that are not in the navigation, and those that they belong to."""
 NO_TARGET: Final[dict[str, Any]] = {"target": None, "reach": None, "outline": "[]", "stamp": 0}
 FRAMED: Final = {
-    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
+    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:; "
     "frame-ancestors 'self'",
     "x-frame-options": "SAMEORIGIN",
 }
@@ -281,6 +281,15 @@ class Pages:
 
         threading.Thread(target=prepare, name="prepare-preview", daemon=True).start()
         return NO_TARGET
+
+    def prepare_reach(self, target: str) -> None:
+        """Begin to calculate what of a target is in reach; the page that shows it waits for the rest only."""
+
+        def prepare() -> None:
+            with contextlib.suppress(*answers.FAILURES):
+                self._panel.kiosk.reach(self._panel.targets.path(target))
+
+        threading.Thread(target=prepare, name="prepare-reach", daemon=True).start()
 
     def _target(self, request: Request) -> dict[str, Any]:
         target = request.path_params["target"]

@@ -20,7 +20,16 @@ JOBS: Final = (
     _("Frames without projector"), _("Frames for the loss of a projector"),
 )  # fmt: skip
 EVENTS: Final = (_("opens"), _("closes"), _("drift check"))
-KINDS: Final = (_("projector"), _("camera"), _("display"), _("relay"), _("sensor"), _("buttons"))
+KINDS: Final = (
+    _("projector"),
+    _("camera"),
+    _("display"),
+    _("relay"),
+    _("sensor"),
+    _("buttons"),
+    _("disk"),
+    _("player"),
+)
 LEVELS: Final = (_("info"), _("warning"), _("error"))
 ROLES: Final = (_("viewer"), _("operator"), _("technician"))
 RUNS: Final = (_("full"), _("quick"), _("projector"), _("calibrate"), _("demo"))

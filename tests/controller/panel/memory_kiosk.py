@@ -283,8 +283,11 @@ class MemoryKiosk:
     def start(self) -> None:
         self.change(state="powering", reason="The stage was opened by hand.")
 
+    def view_px(self) -> tuple[int, int] | None:
+        return 240, 160
+
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
-        return targets.fitted(target.read_bytes(), (240, 160), fit)
+        return targets.fitted(target.read_bytes(), (240, 160), "stretch" if fit == "wrap" else fit)
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:
         settings.check_name(name)

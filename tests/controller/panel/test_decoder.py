@@ -74,3 +74,28 @@ def test_too_many_pixels_are_told_before_they_are_decoded() -> None:
     with pytest.raises(SystemExit) as caught:
         decode(saved(Image.new("RGB", (101, 100)), "PNG"), 10_000)
     assert caught.value.code == decoder.TOO_MANY_PIXELS
+
+
+@pytest.mark.parametrize(("size", "least", "expected"), [
+    ((2000, 1500), (400, 300), (400, 300)),  # an exact fifth: a quarter by the JPEG's blocks, which still covers it
+    ((2000, 1500), (700, 300), (1000, 750)), ((2000, 1500), (2400, 1600), (2000, 1500)),
+])  # fmt: skip
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_large_picture_is_made_smaller_and_still_covers_what_is_asked(
+    size: tuple[int, int], least: tuple[int, int], expected: tuple[int, int], kind: str, turned: bool
+) -> None:
+    ramp = np.linspace(0, 255, size[0])[None, :, None] * np.linspace(0, 1, size[1])[:, None, None]
+    whole = Image.fromarray(np.repeat(ramp, 3, axis=2).astype(np.uint8))
+    held = Image.Exif()
+    if turned:
+        # What is to be seen upright lies on its side in the file.
+        held[decoder.ORIENTATION] = 6
+        whole = whole.transpose(Image.Transpose.ROTATE_90)
+    with Image.open(io.BytesIO(decode(saved(whole, kind, exif=held), 10_000_000, least))) as found:
+        assert found.width >= min(least[0], size[0])
+        assert found.height >= min(least[1], size[1])
+        assert found.size == expected or (kind == "JPEG" and expected == (400, 300) and found.size == (500, 375))
+        seen = np.asarray(found, float)[..., 0]
+    upright = np.asarray(Image.fromarray(ramp[..., 0].astype(np.uint8)).resize(found.size, Image.Resampling.BOX), float)
+    assert np.abs(seen - upright).mean() < 1.5

@@ -108,9 +108,10 @@ def test_it_is_compared_with_those_before_it_and_not_with_those_after(run: Path)
     seen = Seen()
     seen.feed((run / "report.html").read_text())
     text = re.sub(r"\s+", " ", seen.text)
-    assert "20260103-100000-calibrate (this one) 20260102-100000-quick 20260101-100000-calibrate" in text
+    assert "3 Jan 2026, 10:00 (this one) 2 Jan 2026, 10:00 1 Jan 2026, 10:00" in text
     assert "error of left 9.00 % 2.50 % 2.00 %" in text
-    assert "20260104" not in text
+    assert "4 Jan 2026" not in text
+    assert not re.search("[0-9]{8}-[0-9]{6}", text), "names of runs are for programs"
     assert "at most 8 %, not reached" in text
 
 

@@ -11,6 +11,7 @@ import pytest
 from controller.core.errors import UsageError
 from controller.kiosk.api.reach import BRIGHT, COLOURFUL, DARK, FOLDER, UNLIT, kinds_of, map_of, reach
 from controller.solve.feasibility import Feasibility
+from controller.stage.check import check_stage
 from tests.controller.kiosk.vase import graded_run, vase
 
 
@@ -31,7 +32,7 @@ def test_each_pixel_has_one_reason_and_one_colour() -> None:
 def test_without_a_calibration_it_says_so(tmp_path: Path) -> None:
     stage = vase(tmp_path)
     with pytest.raises(UsageError) as caught:
-        reach(stage, stage / "target.png")
+        reach(check_stage(stage), stage / "target.png")
     assert caught.value.code == "not-calibrated"
 
 
@@ -51,5 +52,5 @@ def test_pictures_of_what_can_be_reached_do_not_fill_the_disk_in_months(tmp_path
             one = one.with_suffix(".png")
         os.utime(one, (1e9 + number, 1e9 + number))
     with pytest.raises(UsageError):
-        reach(stage, stage / "target.png")
+        reach(check_stage(stage), stage / "target.png")
     assert sorted(int(one.stem, 16) for one in folder.iterdir()) == list(range(11, 30))
