@@ -17,6 +17,7 @@ EXTRAS: Final = {
     "mains": "mains by network: PDUs by SNMP, relays by Modbus",
     "building": "show control by OSC and sACN, dousers by sACN",
     "cluster": "solve on many machines (--scheduler)",
+    "gpu": "solve on a graphics processor",
     "study": "judge a study by FLIP, and light of Mitsuba on the emulated stage",
 }
 """Purpose of each extra of pyproject.toml that people install."""
@@ -30,6 +31,7 @@ _MODULES: Final = {
     "mains": "pymodbus pysnmp",
     "building": "pythonosc sacn",
     "cluster": "dask distributed",
+    "gpu": "wgpu",
     "study": "drjit flip_evaluator mitsuba",
 }
 EXTRA_OF: Final = {module: extra for extra, modules in _MODULES.items() for module in modules.split()}
