@@ -127,15 +127,15 @@ def make_appearances(
     keeps refined frames. ``device``: what solves, instead of stage.toml's.
 
     Without a refinement it uses no device: the projectors may be off, or playing.
-    Raises what ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
+    Raises what ``choose_engine``, ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
     """
     chosen = None if base is None else base_choice(base)
     checked = check_stage(session.stage)
     folder = checked.stage.folder
+    engine = choose_engine(checked.stage.tables.solve.device if device is None else device, reporter.say)
     with session.locked():
         run = usable_calibration(checked, reporter, accept_grade=accept_grade)
-        wanted = checked.stage.tables.solve.device if device is None else device
-        calibrated = Calibrated(run, checked.names, choose_engine(wanted, reporter.say))
+        calibrated = Calibrated(run, checked.names, engine)
         requests = requests_of(checked.stage, calibrated, names) if names or not scenes else []
         requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve

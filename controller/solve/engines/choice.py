@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
+from controller.solve.engines.graphics import MODULE
 from controller.solve.engines.processor import Engine, Processor
 
 Choice = Literal["auto", "cpu", "gpu"]
-MODULE: Final = "wgpu"
 
 
 def choose_engine(wanted: str, note: Callable[[str], None]) -> Engine:
@@ -59,16 +59,3 @@ def choose_engine(wanted: str, note: Callable[[str], None]) -> Engine:
             remedy='Install its Vulkan driver, or set device = "auto" under [solve] in stage.toml.',
         )
     return Processor()
-
-
-def graphics_processors() -> list[str] | None:
-    """A line on each graphics processor that could solve; None where the extra `gpu` is not installed."""
-    if importlib.util.find_spec(MODULE) is None:
-        return None
-    from controller.solve.gpu.device import DeviceRefused, adapters
-
-    try:
-        found = adapters()
-    except DeviceRefused:
-        return []
-    return [f"{one.name} ({one.backend}{', in software' if one.software else ''})" for one in found]

@@ -28,7 +28,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
       let i = x - left_of(w) - (at >> PHASE_BITS);
       if (i < 0 || i >= wide.y) { continue; }
       let share = table[wide.x + (at & (PHASES - 1)) * wide.y + i] * row_share(w, high, j);
-      sums[colour_of(w)] += share * gain_of(e, w) * values[w.x];
+      sums += coloured(w, share * gain_of(e, w) * values[w.x]);
     }
   }
   let at = u32(y * band.columns + x);

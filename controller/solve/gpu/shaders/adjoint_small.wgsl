@@ -13,7 +13,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let end = first[row + 1];
     for (var e = first[row - 3]; e < end; e++) {
       let w = records[e];
-      sums[colour_of(w)] += share(w, x - left_of(w), y - top) * gain_of(e, w) * values[w.x];
+      sums += coloured(w, share(w, x - left_of(w), y - top) * gain_of(e, w) * values[w.x]);
     }
   }
   let at = u32(y * band.columns + x);

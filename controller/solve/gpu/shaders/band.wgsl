@@ -25,3 +25,7 @@ const SHEAR_BITS: u32 = 6u;
 fn left_of(w: vec4<u32>) -> i32 { return i32(w.w & 0xffffu) - MARGIN; }
 fn skew_of(w: vec4<u32>) -> i32 { return i32((w.w >> 16u) & 0xffu) - 128; }
 fn colour_of(w: vec4<u32>) -> u32 { return w.w >> 24u; }
+// the value in its window's colour; not all compilers can write to a component by number
+fn coloured(w: vec4<u32>, value: f32) -> vec3<f32> {
+  return select(vec3<f32>(0.0), vec3<f32>(value), vec3<u32>(colour_of(w)) == vec3<u32>(0u, 1u, 2u));
+}

@@ -58,7 +58,7 @@ def test_objectives_agree_with_the_processor(engine: GpuEngine, mosaic: bool, ed
     target = transport.reach() * rng.uniform(0, 1.2, black.shape).astype(np.float32)
     weights = rng.uniform(0.1, 3, transport.camera_shape).astype(np.float32)
     there, here = (
-        solve_bounded(transport, target, black, weights=weights, tolerance=1e-6, most_iterations=3000, engine=which)
+        solve_bounded(transport, target, black, weights=weights, tolerance=1e-5, most_iterations=100, engine=which)
         for which in (engine, None)
     )
     assert there.objective == pytest.approx(here.objective, rel=1e-4)
@@ -71,7 +71,7 @@ def test_sweeps_are_those_of_the_processor(engine: GpuEngine, stage: tuple[Calib
     """The same steps from the same start, so the same frames after any number of sweeps, recomputed light included."""
     calibration, transport = stage
     target = unreachable_in_parts(transport, calibration.black)
-    for sweeps in (1, 7, 60):
+    for sweeps in (3, 53):
         there, here = (
             solve_bounded(transport, target, calibration.black, tolerance=0, most_iterations=sweeps, engine=which)
             for which in (engine, None)
