@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
+import numba
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -30,6 +31,15 @@ def device() -> Iterator[Device]:
     made = opened()
     yield made
     made.close()
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """The processor's loops on one core: stages are so small that threads mostly wait for each other."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    yield
+    numba.set_num_threads(before)
 
 
 def any_windows(seed: int, *, mosaic: bool, edges: bool = False, segment: float = 0.0) -> LightTransport:
