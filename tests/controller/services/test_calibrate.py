@@ -16,7 +16,6 @@ from controller.run.progress import Silent
 from controller.run.step_id import StepId
 from controller.services.calibrate import KEY_FILE, finished_calibration, make_appearances, output_sizes, signing_key
 from controller.services.play import play
-from controller.solve.engines import graphics
 from controller.stage.check import check_stage
 from controller.stage.run import LOCK
 from controller.stage.session import OwnSession
@@ -122,7 +121,7 @@ def test_what_solves_is_as_typed_or_as_the_stage_says(stage: Path, monkeypatch: 
     with (stage / "stage.toml").open("a") as file:
         file.write('\n[solve]\ndevice = "gpu"\n')
     # as if the extra were not installed
-    monkeypatch.setattr(graphics.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert refused(None) == "extra-missing"
     assert refused("auto") == "not-calibrated"
 

@@ -8,7 +8,6 @@ import sys
 import pytest
 
 from controller.core.errors import UsageError
-from controller.solve.engines import graphics
 from controller.solve.engines.choice import choose_engine
 from controller.solve.engines.graphics import graphics_sentence
 from controller.solve.engines.processor import Processor
@@ -58,7 +57,7 @@ def test_without_drivers_auto_is_the_processor_and_gpu_an_error(wanted: str) -> 
 
 
 def test_without_the_extra_gpu_nothing_of_it_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(graphics.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert isinstance(choose_engine("auto", silent), Processor)
     with pytest.raises(UsageError, match=r"velatura\[gpu\]") as refused:
         choose_engine("gpu", silent)

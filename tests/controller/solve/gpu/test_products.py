@@ -82,7 +82,7 @@ def test_light_and_its_transpose_are_those_of_the_processor(
     # by themselves, too: one is the transpose of the other, and sums go in, sums come out
     inner = np.vdot(light.astype(np.float64), r), np.vdot(p.astype(np.float64), back)
     scale = np.linalg.norm(light.astype(np.float64)) * np.linalg.norm(r.astype(np.float64))
-    assert inner[0] == pytest.approx(inner[1], abs=1e-6 * scale)
+    assert inner[0] == pytest.approx(inner[1], abs=1e-6 * float(scale))
     other = numbers(transport, seed + 1)[0]
     assert near(forward(there, 0.5 * p - 2 * other), 0.5 * light - 2 * forward(there, other))
     there.free()
