@@ -189,6 +189,9 @@ def appearance(
         int | None,
         typer.Option(help="Photographs that correct each result (default: from stage.toml).", min=0, max=9),
     ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="What solves: auto, cpu or gpu (default: from stage.toml).")
+    ] = None,
     accept_grade: AcceptGrade = False,
     as_json: Json = False,
 ) -> None:
@@ -202,7 +205,7 @@ def appearance(
         return make_appearances(
             session=OwnSession(stage), names=tuple(names or ()), scenes=tuple(blender or ()),
             accept_grade=accept_grade, base=base, scheduler=scheduler, quick=quick,
-            refinement=refinement_of(stage, refine, quick=quick), reporter=reporter, cancel=cancel,
+            refinement=refinement_of(stage, refine, quick=quick), device=device, reporter=reporter, cancel=cancel,
         )  # fmt: skip
 
     work(do, as_json=as_json, stage=stage)

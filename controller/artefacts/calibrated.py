@@ -14,17 +14,22 @@ from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.solve.appearance import Base, prepare_base
 from controller.solve.drive_levels import DriveLevels
+from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport, build_transport
 from controller.transport.indirect import IndirectLight
 from controller.transport.indirect_fit import beside, fit_indirect
 
 
 class Calibrated:
-    """The calibration of a run and its transport, read at the first use and kept."""
+    """The calibration of a run and its transport, read at the first use and kept.
 
-    def __init__(self, folder: Path, projectors: Sequence[str]) -> None:
+    ``engine``: what does the heavy loops of its solves
+    """
+
+    def __init__(self, folder: Path, projectors: Sequence[str], engine: Engine | None = None) -> None:
         self.folder = folder
         self.projectors = tuple(projectors)
+        self.engine: Engine = Processor() if engine is None else engine
         self._calibration: Calibration | None = None
         self._transport: LightTransport | None = None
         self._indirect: IndirectLight | None = None

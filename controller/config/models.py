@@ -155,6 +155,11 @@ class SolveTable(ConfigTable):
         description="how far a target is bent where light is lacking, so that the object's own pattern does not "
         "show, from 0 (what can't be shown is cut off) to 1",
     )
+    device: Literal["auto", "cpu", "gpu"] = Field(
+        default="auto",
+        description='what solves: "cpu" (the processor), "gpu" (a graphics processor, also one in software), or "auto" '
+        "(a real graphics processor where there is one, else the processor)",
+    )
     refine: int = Field(
         default=REFINE,
         ge=0,

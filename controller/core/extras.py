@@ -18,6 +18,7 @@ EXTRAS: Final = {
     "building": "show control by OSC and sACN, dousers by sACN",
     "cluster": "solve on many machines (--scheduler)",
     "ndi": "live targets by NDI",
+    "gpu": "solve on a graphics processor",
     "study": "judge a study by FLIP, and light of Mitsuba on the emulated stage",
 }
 """Purpose of each extra of pyproject.toml that people install."""
@@ -32,6 +33,7 @@ _MODULES: Final = {
     "building": "pythonosc sacn",
     "cluster": "dask distributed",
     "ndi": "cyndilib",
+    "gpu": "wgpu",
     "study": "drjit flip_evaluator mitsuba",
 }
 EXTRA_OF: Final = {module: extra for extra, modules in _MODULES.items() for module in modules.split()}

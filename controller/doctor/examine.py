@@ -18,6 +18,7 @@ from controller.doctor.trying import Trying, devices_of
 from controller.doctor.values import Examination, Finding
 from controller.doctor.writing import write
 from controller.run.progress import Reporter
+from controller.solve.engines.graphics import graphics_sentence
 from controller.stage.check import Checked, check_stage
 from controller.stage.run import LOCK
 from hal.deadline import Cancelled, Deadline, in_seconds
@@ -65,6 +66,7 @@ def examine(
         seen = _compared(checked, found, [*wrong, *problems], tools)
         if checked is not None:
             seen = _tried(checked, seen, deadline, reporter)
+        seen = replace(seen, graphics=graphics_sentence())
     if write_it:
         if wrong and checked is None:
             raise UsageError(wrong[0].problem.code, what=wrong[0].problem.what, remedy=wrong[0].problem.remedy)

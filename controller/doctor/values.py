@@ -37,13 +37,14 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """All results. ``new``: devices that are not in stage.toml yet."""
+    """All results. ``new``: devices that are not in stage.toml yet; ``graphics``: what this computer can solve on."""
 
     found: tuple[Found, ...]
     tried: tuple[Tried, ...]
     findings: tuple[Finding, ...]
     new: tuple[Found, ...]
     written: tuple[str, ...] = ()
+    graphics: str = ""
 
     @property
     def healthy(self) -> bool:
@@ -68,6 +69,7 @@ class Examination:
             "tried": [{"name": tried.name, "kind": tried.kind, "answer": tried.answer} for tried in self.tried],
             "problems": [finding.as_json() for finding in self.findings],
             "written": list(self.written),
+            "graphics": self.graphics,
         }
 
     def as_text(self) -> str:
@@ -80,6 +82,8 @@ class Examination:
         if self.tried:
             lines += ["", "The stage's devices:"]
             lines += [f"  {tried.name:<16} {tried.answer or 'failed, see below'}" for tried in self.tried]
+        if self.graphics:
+            lines += ["", self.graphics]
         for number, finding in enumerate(self.findings, 1):
             where = f"{finding.device}: " if finding.device else ""
             lines += ["", f"{number}. {where}{finding.problem.what} [{finding.problem.code}]",

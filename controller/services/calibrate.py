@@ -22,6 +22,7 @@ from controller.run.progress import Level, Reporter
 from controller.run.runner import Runner, Step
 from controller.run.state_machine import Event
 from controller.services.refine import Refinement, refine
+from controller.solve.engines.choice import choose_engine
 from controller.stage.calibrations import (
     KEY_FILE,
     finished_calibration,
@@ -115,6 +116,7 @@ def make_appearances(
     scheduler: str | None = None,
     quick: bool = False,
     refinement: Refinement | None = None,
+    device: str | None = None,
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml with the latest calibration, and install them as the stage's bundle.
 
@@ -122,17 +124,18 @@ def make_appearances(
     ``accept_grade``: publish with any calibration grade. ``base``: base image that replaces stage.toml's.
     ``scheduler``: a Dask cluster that solves the appearances. ``quick``: a preview by base times scale only;
     the next run without it solves them as stage.toml says. ``refinement``: how photographs then correct them; None
-    keeps refined frames.
+    keeps refined frames. ``device``: what solves, instead of stage.toml's.
 
     Without a refinement it uses no device: the projectors may be off, or playing.
-    Raises what ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
+    Raises what ``choose_engine``, ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
     """
     chosen = None if base is None else base_choice(base)
     checked = check_stage(session.stage)
     folder = checked.stage.folder
+    engine = choose_engine(checked.stage.tables.solve.device if device is None else device, reporter.say)
     with session.locked():
         run = usable_calibration(checked, reporter, accept_grade=accept_grade)
-        calibrated = Calibrated(run, checked.names)
+        calibrated = Calibrated(run, checked.names, engine)
         requests = requests_of(checked.stage, calibrated, names) if names or not scenes else []
         requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         table = checked.stage.tables.solve

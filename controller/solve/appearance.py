@@ -16,8 +16,8 @@ import numpy as np
 
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask
-from controller.solve.bounded.gradient import scale_base
 from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
+from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, plane_frames, plane_image, planes_above
 
@@ -126,11 +126,13 @@ def solve_base(
     tolerance: float = TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    engine: Engine | None = None,
 ) -> Base:
     """Solve the frames of a base ``image`` (``base_image``) and prepare to scale them; errors as ``solve_bounded``."""
     solution = solve_bounded(
-        transport, image, black, smoothness=smoothness, tolerance=tolerance, progress=progress, cancelled=cancelled
-    )
+        transport, image, black, smoothness=smoothness, tolerance=tolerance, progress=progress, cancelled=cancelled,
+        engine=engine,
+    )  # fmt: skip
     return prepare_base(transport, image, black, solution)
 
 
@@ -153,30 +155,18 @@ def prepare_base(transport: LightTransport, image: FloatImage, black: FloatImage
     return Base(image, solution, inverse, coverage, mixed)
 
 
-def scale_frames(transport: LightTransport, base: Base, target: FloatImage, black: FloatImage) -> list[FloatImage]:
+def scale_frames(
+    transport: LightTransport, base: Base, target: FloatImage, black: FloatImage, *, engine: Engine | None = None
+) -> list[FloatImage]:
     """P_t = P_b x P_s (paper eqs 4-6): frames (rows, columns, 3) in [0, 1] for a target radiance (rows, columns, 3).
 
     Exact where C_t / C_b has no detail finer than one projector's pixels (paper 3.3).
     Raises UsageError("image-wrong-size", "target-not-finite").
     """
     check_target(transport, target)
-    scale = planes_above(target, black)
-    scale *= base.inverse
-    means = transport.gaussian_mean_planes(scale)
-    out = means
-    for n, M in enumerate(transport.mixing):
-        start, end = transport.span(n).start, transport.span(n).stop
-        unmix = np.linalg.inv(M.astype(np.float64)).astype(np.float32)
-        scale_base(base.mixed, means, base.coverage, unmix, start, end, out)
-        if transport.segment(n):
-            out[:, start:end] = _saturated(out[:, start:end], transport.segment(n))
+    light = planes_above(target, black)
+    out = (engine or Processor()).scaled(transport, light, base.inverse, base.mixed, base.coverage)
     return plane_frames(out, transport.sizes)
-
-
-def _saturated(planes: FloatImage, segment: float) -> FloatImage:
-    """Frames (3, pixels) as a projector with a white segment shows them: saturated colours end earlier."""
-    top = 1 - segment * (1 - planes.min(axis=0))
-    return np.minimum(planes, np.asarray(top, np.float32))
 
 
 def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black: FloatImage) -> float:
@@ -251,6 +241,7 @@ def make_appearance(
     tolerance: float = TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    engine: Engine | None = None,
 ) -> Appearance:
     """Frames for a target radiance: by base and scale, by a full solve, or depending on target and result.
 
@@ -262,7 +253,7 @@ def make_appearance(
     check_target(transport, target)
     detail = fine_detail(transport, base, target, black)
     if mode == "scale" or (mode == "auto" and detail < FINE_DETAIL):
-        scaled = scale_frames(transport, base, target, black)
+        scaled = scale_frames(transport, base, target, black, engine=engine)
         if mode == "scale" or reachable is None or _as_good(transport, base, scaled, target, black, reachable):
             return Appearance(tuple(scaled), "scale", detail, None)
     solution = solve_bounded(
@@ -275,5 +266,6 @@ def make_appearance(
         tolerance=tolerance,
         progress=progress,
         cancelled=cancelled,
+        engine=engine,
     )
     return Appearance(solution.frames, "full", detail, solution)

@@ -18,6 +18,7 @@ from controller.core.arrays import Float64, FloatImage, Mask
 from controller.solve.bounded.solver import solve_bounded
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
+from controller.solve.engines.processor import Engine
 from controller.solve.feasibility import feasibility, target_radiance
 from controller.solve.metrics import colour_difference
 from controller.transport import LightTransport
@@ -227,6 +228,7 @@ def solve_again(
     smoothness: float,
     drive: DriveLevels | None = None,
     progress: Callable[[int, float], None] | None = None,
+    engine: Engine | None = None,
 ) -> tuple[FloatImage, ...]:
     """Frames for ``aimed`` from the present ones, ``start``, in full, with the weights of the appearance ``target``.
 
@@ -237,6 +239,7 @@ def solve_again(
     weights = appearance_weights(wanted, possible.reachable, exposure)
     radiance = target_radiance(aimed, black, 1.0)
     solution = solve_bounded(
-        transport, radiance, black, smoothness=smoothness, weights=weights, start=start, progress=progress
-    )
+        transport, radiance, black, smoothness=smoothness, weights=weights, start=start, progress=progress,
+        engine=engine,
+    )  # fmt: skip
     return solution.frames

@@ -28,6 +28,7 @@ from controller.solve.appearance import (
 )
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
+from controller.solve.engines.processor import Engine
 from controller.solve.exposed import direct_part, exposed
 from controller.solve.feasibility import Feasibility, feasibility, target_radiance
 from controller.solve.targets.values import Target
@@ -101,17 +102,20 @@ def solve_appearance(
     indirect: IndirectLight | None = None,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    engine: Engine | None = None,
 ) -> AppearanceResult:
     """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
 
     ``indirect``: light by way of other surfaces, of which the frames then leave room in the target.
+    ``engine``: what does the heavy loops (``engines``); None: the processor
 
     Raises what ``choose_exposure`` and ``solve_bounded`` raise.
     """
     drive = DriveLevels(transport) if drive is None else drive
     aim = aim_at(transport, black, requested.image, options, drive=drive, indirect=indirect)
     began_s = time.perf_counter()
-    solve = partial(_solved, transport, base, black, options, aim, progress=progress, cancelled=cancelled)
+    solve = partial(_solved, transport, base, black, options, aim, progress=progress, cancelled=cancelled,
+                    engine=engine)  # fmt: skip
     made = solve(aim.direct)
     if indirect is not None:
         # what can't be reached throws back other light than was wanted of it
@@ -188,13 +192,15 @@ def _solved(
     start: Sequence[FloatImage] | None = None,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    engine: Engine | None = None,
 ) -> Appearance:
     """Frames for a target radiance, in direct light."""
     if options.base == "high-pass":
         image = high_pass_base(transport, base.image, target, black)
         base = solve_base(
-            transport, image, black, smoothness=options.smoothness, progress=progress, cancelled=cancelled
-        )
+            transport, image, black, smoothness=options.smoothness, progress=progress, cancelled=cancelled,
+            engine=engine,
+        )  # fmt: skip
     return make_appearance(
         transport,
         base,
@@ -207,4 +213,5 @@ def _solved(
         start=start,
         progress=progress,
         cancelled=cancelled,
+        engine=engine,
     )

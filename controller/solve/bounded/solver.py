@@ -18,11 +18,12 @@ import numpy.typing as npt
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
-from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.solve.bounded.descent import IterationControl
 from controller.solve.bounded.gradient import add_smoothness, inner, weighted_residual
 from controller.solve.bounded.initial_estimate import initial_estimate
 from controller.solve.bounded.problem import Problem
 from controller.solve.bounded.smoothness import TIE_STEPS, squared_edge_weights
+from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, plane_frames, plane_image, planes_above
 
@@ -83,6 +84,7 @@ def solve_bounded(
     most_iterations: int = MOST_ITERATIONS,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    engine: Engine | None = None,
 ) -> Solution:
     """Find the projectors' images that make the camera see ``target``.
 
@@ -93,7 +95,8 @@ def solve_bounded(
     weights : (rows, columns) >= 0, how much each camera pixel counts; default 1 everywhere
     start : frames to start from, for example those of a similar target
     tolerance : stop when the rms scaled projected gradient step falls below it
-    progress : called with (iteration, kkt); ``cancelled`` : asked once an iteration
+    progress : called with (iteration, kkt); ``cancelled`` : asked once an iteration, or once in a few of them
+    engine : what does the sweeps (``engines``); None: the processor
 
     Raises
     ------
@@ -110,9 +113,8 @@ def solve_bounded(
         if x.shape != problem.majoriser.shape:
             raise _wrong("the start frames do not have the projectors' sizes")
     x[problem.majoriser == 0] = 0
-    x, kkt, iterations = block_coordinate_descent(
-        problem, x, IterationControl(tolerance, most_iterations, progress, cancelled)
-    )
+    control = IterationControl(tolerance, most_iterations, progress, cancelled)
+    x, kkt, iterations = (engine or Processor()).descend(problem, x, control)
     light = transport.forward_planes(x)
     objective = objective_of(problem, x, light)
     del problem

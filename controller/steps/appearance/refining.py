@@ -179,6 +179,7 @@ class _Round:
             exposure=self.solved.exposure,
             smoothness=self.options.smoothness,
             drive=self.calibrated.drive,
+            engine=self.calibrated.engine,
             progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
         )
         new = dict(zip(self.calibrated.projectors, frames, strict=True))

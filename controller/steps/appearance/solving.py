@@ -126,7 +126,8 @@ def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context)
     black = calibrated.calibration.black
     image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
     base = solve_base(
-        calibrated.transport, image, black, smoothness=options.smoothness, progress=_watched(context)
+        calibrated.transport, image, black, smoothness=options.smoothness, progress=_watched(context),
+        engine=calibrated.engine,
     )  # fmt: skip
     calibrated.keep_base(base)
     return SolvedBase(image, base.solution).write(context.folder, calibrated.projectors)
@@ -157,6 +158,7 @@ def _answer_here(
         drive=calibrated.drive,
         indirect=calibrated.indirect,
         progress=_watched(context),
+        engine=calibrated.engine,
     )
 
 

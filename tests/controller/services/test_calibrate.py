@@ -108,6 +108,24 @@ def test_solving_is_refused_while_the_stage_is_at_work(stage: Path) -> None:
     assert refused.value.code == "already-running"
 
 
+def test_what_solves_is_as_typed_or_as_the_stage_says(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(device: str | None) -> str:
+        with pytest.raises(UsageError) as error:
+            make_appearances(
+                session=OwnSession(stage), names=(), reporter=Silent(), cancel=threading.Event(), device=device
+            )
+        return error.value.code
+
+    assert refused("tpu") == "solve-device-unknown"
+    assert refused("cpu") == "not-calibrated", "that was accepted"
+    with (stage / "stage.toml").open("a") as file:
+        file.write('\n[solve]\ndevice = "gpu"\n')
+    # as if the extra were not installed
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert refused(None) == "extra-missing"
+    assert refused("auto") == "not-calibrated"
+
+
 def test_playing_without_a_bundle_is_refused_before_any_device_is_opened(stage: Path) -> None:
     with pytest.raises(UsageError) as refused:
         play(
