@@ -1,4 +1,7 @@
-"""The player as a kiosk runs it: a process of its own, three outputs in memory, a signed-for bundle, another reader."""
+"""The player as a kiosk runs it: a process of its own, outputs in memory, a signed-for bundle, another reader.
+
+Size uhd: four outputs of 3840x2160. ``BENCH_MINUTES`` says for how long 30 Hz is played (10 for the goal; else 10 s).
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import SIZES as USUAL
 from benchmarks import Row, at_least, at_most
-from benchmarks._frames import OUTPUTS, compensation_frames
+from benchmarks._frames import UHD, compensation_frames
 from benchmarks._watch import digest
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.arrays import ByteImage
@@ -27,6 +31,7 @@ from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from plugins.display.player import DRIVER, PlayerDisplay
 
+SIZES = (*USUAL, UHD)
 RESIDENT = 3
 """So few are decoded once and stay."""
 BEYOND_CACHE = 4
@@ -57,7 +62,7 @@ def measure(size: str) -> list[Row]:
             assert isinstance(display, PlayerDisplay)
             try:
                 rows += _sustained(display, len(swaps), paper=paper)
-                rows += [row for rate_hz in (30.0, 60.0) for row in _paced(display, rate_hz, len(swaps))]
+                rows += [row for rate_hz in (30.0, 60.0) for row in _paced(display, rate_hz, len(swaps), player.pid)]
                 rows.append(_fading(display))
                 rows.append(_watched(display, place, swaps))
                 rows += _memory(player, display, len(swaps))
@@ -83,8 +88,7 @@ def more_than_kept(set_bytes: int) -> int:
 
 
 def _settings(place: Path, swaps: Sequence[dict[str, ByteImage]]) -> PlayerSettings:
-    rows, columns, _ = swaps[0][OUTPUTS[0]].shape
-    outputs = [(name, columns, rows) for name in OUTPUTS]
+    outputs = [(name, frame.shape[1], frame.shape[0]) for name, frame in swaps[0].items()]
     bundle = place / "bundle.vel"
     write_bundle(bundle, stage="benchmark", calibration="benchmark", created_unix_s=0, outputs=outputs,
                  appearances=(NewAppearance(f"a{n}", frames) for n, frames in enumerate(swaps)))  # fmt: skip
@@ -160,16 +164,24 @@ def _sustained(display: PlayerDisplay, sets: int, *, paper: bool) -> list[Row]:
     return rows
 
 
-def _paced(display: PlayerDisplay, rate_hz: float, sets: int) -> list[Row]:
+def _paced(display: PlayerDisplay, rate_hz: float, sets: int, pid: int) -> list[Row]:
+    goal = rate_hz == 30.0
+    seconds = 60 * float(os.environ.get("BENCH_MINUTES", PACED_S / 60)) if goal else PACED_S
     _play(display, rate_hz, sets)
-    time.sleep(PACED_S)
+    used, before = processor_s(pid), display.playing(deadline=in_seconds(5)).swaps
+    time.sleep(seconds)
     found = display.playing(deadline=in_seconds(5))
     assert found.interval_p50_s is not None
     assert found.interval_p99_s is not None
-    tick_ms = 1000 / rate_hz
-    how = f"p50 {1000 * found.interval_p50_s:.2f} ms of {tick_ms:.2f}; {found.late} late in {PACED_S:g} s, each decoded"
-    goal = 34.5 if rate_hz == 30.0 else None
-    return [at_most(f"interval at {rate_hz:g} Hz", 1000 * found.interval_p99_s, goal, unit="ms p99", how=how)]
+    tick_ms, swaps = 1000 / rate_hz, max(1, found.swaps - before)
+    how = f"p50 {1000 * found.interval_p50_s:.2f} ms of {tick_ms:.2f}; {swaps} swaps in {seconds:g} s, each decoded"
+    spent_ms = 1000 * (processor_s(pid) - used) / swaps
+    return [
+        at_most(f"interval at {rate_hz:g} Hz", 1000 * found.interval_p99_s, 34.5 if goal else None, unit="ms p99",
+                how=how),
+        at_most(f"late at {rate_hz:g} Hz", float(found.late), 0.0 if goal else None, unit="",
+                how=f"by more than a tick; the goal is for 10 minutes; {spent_ms:.1f} ms of processor time a swap"),
+    ]  # fmt: skip
 
 
 def _fading(display: PlayerDisplay) -> Row:

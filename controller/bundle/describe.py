@@ -45,7 +45,7 @@ def _output(output: OutputLayout) -> dict[str, Any]:
 def _appearance(appearance: BundledAppearance) -> dict[str, Any]:
     return {
         "name": appearance.name,
-        "bytes": sum(blob.length for blobs in appearance.stripes.values() for blob in blobs),
+        "bytes": sum(blob.length for blobs in appearance.bands.values() for blob in blobs),
         "thumbnail": appearance.thumbnail is not None,
         "metadata": dict(appearance.metadata),
     }
@@ -115,7 +115,7 @@ def _appearance_differences(one: Index, other: Index) -> dict[str, list[Any]]:
 
 
 def _parts(before: BundledAppearance, after: BundledAppearance) -> dict[str, Any]:
-    outputs = [*before.stripes, *(name for name in after.stripes if name not in before.stripes)]
+    outputs = [*before.bands, *(name for name in after.bands if name not in before.bands)]
     thumbnails = [None if one.thumbnail is None else one.thumbnail.sha256 for one in (before, after)]
     return {
         "pictures": [name for name in outputs if _hashes(before, name) != _hashes(after, name)],
@@ -125,7 +125,7 @@ def _parts(before: BundledAppearance, after: BundledAppearance) -> dict[str, Any
 
 
 def _hashes(appearance: BundledAppearance, output: str) -> list[bytes]:
-    return [blob.sha256 for blob in appearance.stripes.get(output, ())]
+    return [blob.sha256 for blob in appearance.bands.get(output, ())]
 
 
 def differences_as_text(found: Mapping[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """Constants, limits, header and index values of a bundle (docs/reference/bundle-format.md). No I/O.
 
-A bundle is one file: header, stripes of compressed pixels, JSON index, signature block. Everything that is read from
+A bundle is one file: header, bands of compressed tiles, JSON index, signature block. Everything that is read from
 it is checked against the limits below before anything of that size is allocated.
 """
 
@@ -12,19 +12,26 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import numpy as np
+
 from controller.core.errors import BundleError
 
 MAGIC: Final = b"VELBUNDL"
-VERSION: Final = 2
-READABLE: Final = (1, 2)
+VERSION: Final = 3
+READABLE: Final = (1, 2, 3)
 HEADER: Final = struct.Struct("<8sIIQQQ32s56x")
 HEADER_BYTES: Final = HEADER.size
 FIRST_BLOB: Final = 4096
-ALIGNMENTS: Final = {1: 4096, 2: 64}
+ALIGNMENTS: Final = {1: 4096, 2: 64, 3: 64}
 """Alignment of blobs by format version. 4 KiB cost a bundle 1 to 15 % of its size, and nothing reads whole pages of
 it."""
 ALIGNMENT: Final = ALIGNMENTS[VERSION]
-STRIPES_PER_IMAGE: Final = 6
+TILED_FROM: Final = 3
+"""The first version whose images are tiles; before it they were stripes, which are read as tiles of full width."""
+BAND_BYTES: Final = 768 * 1024
+"""The most pixel bytes that the writer puts into a band: its rows are added up in a processor core's own cache."""
+NARROW_PX: Final = 320
+"""About so wide are narrow tiles: even narrower ones cost more calls than the pixels that they spare."""
 
 MAX_INDEX_BYTES: Final = 2 * 1024 * 1024
 MAX_INDEX_TABLES: Final = 60_000
@@ -32,15 +39,21 @@ MAX_OUTPUTS: Final = 16
 MAX_APPEARANCES: Final = 4096
 MAX_SIDE_PX: Final = 16384
 MAX_OUTPUT_PX: Final = 2**24
+MAX_TILE_BYTES: Final = 2**22
+MAX_TILES_ACROSS: Final = 256
 MAX_THUMBNAIL_BYTES: Final = 256 * 1024
 MAX_LIVE_ARRAYS: Final = 128
 MAX_LIVE_BYTES: Final = 2**28
 """Of one array of the live section, decompressed."""
 MAX_DURATION_MS: Final = 366 * 86_400_000
+CODECS: Final = ("zstd", "lz4")
+"""How tiles may be compressed: Zstandard frames, or LZ4 blocks, which take more room and a third of the time."""
 LIVE_TYPES: Final = ("u1", "u2", "f2", "f4")
 """Element types of the live section, little-endian, as numpy names them."""
 MAX_NAME_BYTES: Final = 80
 MAX_OUTPUT_NAME_BYTES: Final = 39
+TILE_ENTRY: Final = np.dtype([("length", "<u4"), ("zero", "<u4"), ("content", "<u8")])
+"""A row of the table at the beginning of a band: compressed bytes of the tile, 0, and the xxh3 of its pixels."""
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 
 
@@ -67,26 +80,43 @@ class Blob:
 
 @dataclass(frozen=True, slots=True)
 class OutputLayout:
-    """One projector output: its size, and how many rows each stripe of its image has (the last may have fewer)."""
+    """One projector output: its size, and that of the tiles of its image (the last of a row or column may be less)."""
 
     name: str
     width_px: int
     height_px: int
-    stripe_rows: int
+    tile_width_px: int
+    tile_height_px: int
 
     @property
-    def stripe_heights(self) -> tuple[int, ...]:
-        """Rows of each stripe, from the top."""
-        whole, rest = divmod(self.height_px, self.stripe_rows)
-        return (self.stripe_rows,) * whole + ((rest,) if rest else ())
+    def band_heights(self) -> tuple[int, ...]:
+        """Rows of each band of tiles, from the top."""
+        return _parts(self.height_px, self.tile_height_px)
+
+    @property
+    def tile_widths(self) -> tuple[int, ...]:
+        """Columns of each tile of a band, from the left."""
+        return _parts(self.width_px, self.tile_width_px)
+
+
+def _parts(whole: int, part: int) -> tuple[int, ...]:
+    count, rest = divmod(whole, part)
+    return (part,) * count + ((rest,) if rest else ())
+
+
+def tiled(name: str, width_px: int, height_px: int, *, narrow: bool) -> OutputLayout:
+    """The layout that the writer gives an output of this size; tiles are as wide as it unless ``narrow``."""
+    bands = -(-height_px * width_px * 3 // BAND_BYTES)
+    across = max(1, round(width_px / NARROW_PX)) if narrow else 1
+    return OutputLayout(name, width_px, height_px, -(-width_px // across), -(-height_px // bands))
 
 
 @dataclass(frozen=True, slots=True)
 class BundledAppearance:
-    """One appearance: the stripes of each output's image from top to bottom, a PNG thumbnail, free metadata (JSON)."""
+    """One appearance: the bands of each output's image from top to bottom, a PNG thumbnail, free metadata (JSON)."""
 
     name: str
-    stripes: Mapping[str, tuple[Blob, ...]]
+    bands: Mapping[str, tuple[Blob, ...]]
     thumbnail: Blob | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -128,7 +158,7 @@ class Index:
 
     ``stage`` and ``calibration`` say for which stage and from which calibration it was made; ``created_unix_s`` is
     given by whoever publishes; ``revision`` never goes down on a kiosk (see ``install``). Version 1 has neither
-    ``schedule`` nor ``live``.
+    ``schedule`` nor ``live``; versions 1 and 2 have one codec. ``codec`` is one of ``CODECS``.
     """
 
     stage: str
@@ -139,6 +169,7 @@ class Index:
     appearances: tuple[BundledAppearance, ...]
     schedule: tuple[PlaylistEntry, ...] = ()
     live: LiveSection | None = None
+    codec: str = "zstd"
 
     def output(self, name: str) -> OutputLayout:
         """The output of this name. Raises BundleError("bundle-no-output")."""
@@ -178,8 +209,13 @@ def damaged(detail: str) -> BundleError:
 
 
 def compressed_bound(raw_bytes: int) -> int:
-    """The most bytes that a compressed stripe of ``raw_bytes`` may take; more is refused unread."""
+    """The most bytes that a compressed tile of ``raw_bytes`` may take; more is refused unread."""
     return raw_bytes + raw_bytes // 128 + 1024
+
+
+def band_bound(raw_bytes: int, tiles: int) -> int:
+    """The most bytes that a band of so many tiles may take, its table included."""
+    return raw_bytes + raw_bytes // 128 + tiles * (1024 + TILE_ENTRY.itemsize)
 
 
 def pack_header(header: Header) -> bytes:

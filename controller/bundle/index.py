@@ -10,6 +10,7 @@ from typing import Any, Final, NoReturn
 
 from controller.bundle.format import (
     ALIGNMENTS,
+    CODECS,
     FIRST_BLOB,
     LIVE_TYPES,
     MAX_APPEARANCES,
@@ -24,6 +25,9 @@ from controller.bundle.format import (
     MAX_OUTPUTS,
     MAX_SIDE_PX,
     MAX_THUMBNAIL_BYTES,
+    MAX_TILE_BYTES,
+    MAX_TILES_ACROSS,
+    TILED_FROM,
     VERSION,
     Blob,
     BundledAppearance,
@@ -32,6 +36,7 @@ from controller.bundle.format import (
     LiveSection,
     OutputLayout,
     PlaylistEntry,
+    band_bound,
     compressed_bound,
     damaged,
     valid_name,
@@ -50,18 +55,25 @@ def encode_index(index: Index) -> bytes:
         "created_unix_s": index.created_unix_s,
         "revision": index.revision,
         "outputs": [
-            {"name": o.name, "width_px": o.width_px, "height_px": o.height_px, "stripe_rows": o.stripe_rows}
+            {
+                "name": o.name,
+                "width_px": o.width_px,
+                "height_px": o.height_px,
+                "tile_width_px": o.tile_width_px,
+                "tile_height_px": o.tile_height_px,
+            }
             for o in index.outputs
         ],
         "appearances": [
             {
                 "name": a.name,
-                "stripes": {name: [_packed(blob) for blob in blobs] for name, blobs in a.stripes.items()},
+                "bands": {name: [_packed(blob) for blob in blobs] for name, blobs in a.bands.items()},
                 "thumbnail": None if a.thumbnail is None else _packed(a.thumbnail),
                 "metadata": dict(a.metadata),
             }
             for a in index.appearances
         ],
+        "codec": index.codec,
         "schedule": [[hint.appearance, hint.duration_ms, hint.fade_ms] for hint in index.schedule],
         "live": None if index.live is None else _live_document(index.live),
     }
@@ -91,18 +103,26 @@ def _packed(blob: Blob) -> list[int | str]:
 
 @dataclass(frozen=True, slots=True)
 class _Area:
-    """Where blobs may lie: at multiples of ``alignment``, up to ``end`` (bytes from the file's start)."""
+    """Where blobs may lie: at multiples of ``alignment``, up to ``end`` (bytes from the file's start); the version."""
 
-    alignment: int
+    version: int
     end: int
+
+    @property
+    def alignment(self) -> int:
+        return ALIGNMENTS[self.version]
+
+    @property
+    def tiled(self) -> bool:
+        return self.version >= TILED_FROM
 
 
 _KEYS: Final = {"stage", "calibration", "created_unix_s", "revision", "outputs", "appearances"}
-_LATER_KEYS: Final = {"schedule", "live"}
+_LATER_KEYS: Final = {1: _KEYS, 2: _KEYS | {"schedule", "live"}, 3: _KEYS | {"schedule", "live", "codec"}}
 
 
 def parse_index(data: bytes, *, data_end: int, version: int = VERSION) -> Index:
-    """Read an index whose stripes must lie between the header and ``data_end`` (bytes from the file's start).
+    """Read an index whose blobs must lie between the header and ``data_end`` (bytes from the file's start).
 
     Raises BundleError("bundle-damaged") for anything that the format does not allow.
     """
@@ -113,9 +133,11 @@ def parse_index(data: bytes, *, data_end: int, version: int = VERSION) -> Index:
         document = json.loads(data.decode(), object_pairs_hook=_table, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise damaged("its index is not JSON") from error
-    top = _fields(document, _KEYS if version == 1 else _KEYS | _LATER_KEYS)
-    area = _Area(ALIGNMENTS[version], data_end)
-    outputs = tuple(_output(item) for item in _list(top["outputs"], "outputs", 1, MAX_OUTPUTS))
+    top = _fields(document, _LATER_KEYS[version])
+    if top.get("codec", CODECS[0]) not in CODECS:
+        raise damaged("its tiles are compressed in an unknown way")
+    area = _Area(version, data_end)
+    outputs = tuple(_output(item, tiled=area.tiled) for item in _list(top["outputs"], "outputs", 1, MAX_OUTPUTS))
     listed = _list(top["appearances"], "appearances", 0, MAX_APPEARANCES)
     appearances = tuple(_appearance(item, outputs, area) for item in listed)
     for what, names in (("outputs", [o.name for o in outputs]), ("appearances", [a.name for a in appearances])):
@@ -130,6 +152,7 @@ def parse_index(data: bytes, *, data_end: int, version: int = VERSION) -> Index:
         appearances=appearances,
         schedule=_schedule(top.get("schedule", []), {a.name for a in appearances}),
         live=None if top.get("live") is None else _live(top["live"], area),
+        codec=top.get("codec", CODECS[0]),
     )
 
 
@@ -168,25 +191,33 @@ def _name(value: Any, most_bytes: int = MAX_NAME_BYTES) -> str:
     return value
 
 
-def _output(value: Any) -> OutputLayout:
-    table = _fields(value, {"name", "width_px", "height_px", "stripe_rows"})
+def _output(value: Any, *, tiled: bool) -> OutputLayout:
+    sides = {"tile_width_px", "tile_height_px"} if tiled else {"stripe_rows"}
+    table = _fields(value, {"name", "width_px", "height_px"} | sides)
     width = _whole(table["width_px"], "width_px", 1, MAX_SIDE_PX)
     height = _whole(table["height_px"], "height_px", 1, MAX_SIDE_PX)
     if width * height > MAX_OUTPUT_PX:
         raise damaged(f"an output of {width}x{height} pixels is larger than {MAX_OUTPUT_PX} pixels")
-    rows = _whole(table["stripe_rows"], "stripe_rows", 1, height)
-    return OutputLayout(_name(table["name"], MAX_OUTPUT_NAME_BYTES), width, height, rows)
+    name = _name(table["name"], MAX_OUTPUT_NAME_BYTES)
+    if not tiled:
+        return OutputLayout(name, width, height, width, _whole(table["stripe_rows"], "stripe_rows", 1, height))
+    across = _whole(table["tile_width_px"], "tile_width_px", -(-width // MAX_TILES_ACROSS), width)
+    down = _whole(table["tile_height_px"], "tile_height_px", 1, height)
+    if across * down * 3 > MAX_TILE_BYTES:
+        raise damaged(f"a tile of {across}x{down} pixels is larger than {MAX_TILE_BYTES} bytes")
+    return OutputLayout(name, width, height, across, down)
 
 
 def _appearance(value: Any, outputs: tuple[OutputLayout, ...], area: _Area) -> BundledAppearance:
-    table = _fields(value, {"name", "stripes", "thumbnail", "metadata"})
-    stripes = _fields(table["stripes"], {output.name for output in outputs})
+    key = "bands" if area.tiled else "stripes"
+    table = _fields(value, {"name", key, "thumbnail", "metadata"})
+    bands = _fields(table[key], {output.name for output in outputs})
     if not isinstance(table["metadata"], dict):
         raise damaged("the metadata of an appearance is not a table")
     thumbnail = table["thumbnail"]
     return BundledAppearance(
         name=_name(table["name"]),
-        stripes={o.name: _stripes(stripes[o.name], o, area) for o in outputs},
+        bands={o.name: _bands(bands[o.name], o, area) for o in outputs},
         thumbnail=None if thumbnail is None else _blob(thumbnail, MAX_THUMBNAIL_BYTES, area),
         metadata=table["metadata"],
     )
@@ -224,21 +255,22 @@ def _live_array(value: Any, area: _Area) -> LiveArray:
     return LiveArray(table["dtype"], shape, _blob(table["blob"], compressed_bound(raw_bytes), area))
 
 
-def _stripes(value: Any, output: OutputLayout, area: _Area) -> tuple[Blob, ...]:
-    heights = output.stripe_heights
-    blobs = _list(value, f"stripes of {output.name}", len(heights), len(heights))
-    row_bytes = output.width_px * 3
-    return tuple(
-        _blob(blob, compressed_bound(rows * row_bytes), area) for blob, rows in zip(blobs, heights, strict=True)
-    )
+def _bands(value: Any, output: OutputLayout, area: _Area) -> tuple[Blob, ...]:
+    heights = output.band_heights
+    blobs = _list(value, f"bands of {output.name}", len(heights), len(heights))
+    row_bytes, tiles = output.width_px * 3, len(output.tile_widths)
+    most = [
+        band_bound(rows * row_bytes, tiles) if area.tiled else compressed_bound(rows * row_bytes) for rows in heights
+    ]
+    return tuple(_blob(blob, bound, area) for blob, bound in zip(blobs, most, strict=True))
 
 
 def _blob(value: Any, most_bytes: int, area: _Area) -> Blob:
-    offset, length, quick, digest = _list(value, "a stripe", 4, 4)
-    offset = _whole(offset, "a stripe's offset", FIRST_BLOB, area.end)
-    length = _whole(length, "a stripe's length", 1, most_bytes)
+    offset, length, quick, digest = _list(value, "a blob", 4, 4)
+    offset = _whole(offset, "a blob's offset", FIRST_BLOB, area.end)
+    length = _whole(length, "a blob's length", 1, most_bytes)
     if offset % area.alignment or offset + length > area.end:
-        raise damaged("a stripe lies outside the file or is not aligned")
+        raise damaged("a blob lies outside the file or is not aligned")
     return Blob(offset, length, int.from_bytes(_hex(quick, 8), "big"), _hex(digest, 32))
 
 

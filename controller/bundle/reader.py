@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import mmap
 import os
 import stat
-import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import numpy.typing as npt
 import xxhash
-import zstandard
 from nacl.signing import SigningKey
 
 from controller.bundle import format as fmt
 from controller.bundle.format import damaged
 from controller.bundle.index import parse_index
 from controller.bundle.signing import BLOCK_BYTES, Trust, check_signature, sign
+from controller.bundle.tiles import Content, Inflater, TiledImage
 from controller.core.errors import BundleError
-
-_MAX_WINDOW_BYTES: Final = 2**23
 
 
 class Bundle:
@@ -59,8 +56,7 @@ class Bundle:
         self.version = header.version
         self.identity = header.index_sha256.hex()
         self._data_end = header.index_offset
-        # One unpacker a thread: created for each stripe, their buffers leave gaps, and memory use grows slowly.
-        self._thread = threading.local()
+        self._inflater = Inflater()
 
     @property
     def size(self) -> int:
@@ -103,8 +99,9 @@ class Bundle:
             raise
 
     def close(self) -> None:
-        """Release the mapping. Harmless when called twice."""
-        self._data.close()
+        """Release the mapping, at the latest when the last error that it caused is gone. Harmless when called twice."""
+        with contextlib.suppress(BufferError):
+            self._data.close()
 
     def __enter__(self) -> Self:
         return self
@@ -113,7 +110,7 @@ class Bundle:
         self.close()
 
     def verify(self) -> None:
-        """Check the SHA-256 of every stripe and thumbnail, and that nothing but zeros lies between them.
+        """Check the SHA-256 of every band and thumbnail, and that nothing but zeros lies between them.
 
         Raises BundleError("bundle-damaged") at the first that is wrong.
         """
@@ -138,7 +135,7 @@ class Bundle:
     def _blobs(self) -> list[fmt.Blob]:
         found = []
         for appearance in self.index.appearances:
-            found += [blob for blobs in appearance.stripes.values() for blob in blobs]
+            found += [blob for blobs in appearance.bands.values() for blob in blobs]
             found += [appearance.thumbnail] if appearance.thumbnail else []
         if self.index.live is not None:
             found += [array.blob for array in self.index.live.arrays.values()]
@@ -170,7 +167,10 @@ class Bundle:
                 remedy="Build it again on the stage with 'velatura bundle build --live'.",
             )
         values = np.empty(found.shape, f"<{found.dtype}")
-        self._inflate(found.blob, values)
+        view = self._view(found.blob)
+        if xxhash.xxh3_64_intdigest(view) != found.blob.xxh3:
+            raise damaged(f"the bytes at {found.blob.offset} do not match their checksum")
+        self._inflater.into(view, values, found.blob.offset)
         if values.dtype.kind == "u":
             np.add.accumulate(values, axis=0, dtype=values.dtype, out=values)
         return values
@@ -186,91 +186,33 @@ class Bundle:
         return image
 
     def decode_into(
-        self, appearance: str, buffers: Mapping[str, npt.NDArray[np.uint8]], pool: Executor | None = None
-    ) -> None:
+        self,
+        appearance: str,
+        buffers: Mapping[str, npt.NDArray[np.uint8]],
+        pool: Executor | None = None,
+        known: Mapping[str, Content] | None = None,
+    ) -> dict[str, Content]:
         """Decode into ``buffers``, output name -> C-contiguous (rows, columns, 3) uint8, on the threads of ``pool``.
 
-        Checks the quick checksum of every stripe. Raises as ``decode``; the buffers' content is then undefined.
-        ValueError if a buffer does not have its output's shape.
+        Returns what each buffer holds then. ``known``: what this returned for the buffers' present pixels; tiles that
+        are there already stay. Checks the quick checksum of every band that it reads. Raises as ``decode``; the
+        buffers' content is then undefined. ValueError if a buffer does not have its output's shape.
         """
         found = self.index.appearance(appearance)
-        images = []
+        codec = self.index.codec if self.version >= fmt.TILED_FROM else None
+        images = {}
         for name, buffer in buffers.items():
             layout = self.index.output(name)
             if buffer.shape != (layout.height_px, layout.width_px, 3) or buffer.dtype != np.uint8:
                 raise ValueError(f"the buffer for {name} has shape {buffer.shape} and dtype {buffer.dtype}")
-            images.append(_Image(self._inflate, found.stripes[name], buffer, layout.stripe_rows))
+            bands = [(blob, self._view(blob)) for blob in found.bands[name]]
+            content = None if known is None else known[name]
+            images[name] = TiledImage(bands, layout, codec, buffer, content, self._inflater)
+        tasks = [task for image in images.values() for task in image.tasks()]
         if pool is None:
-            for image in images:
-                image.decode()
-            return
-        for future in [pool.submit(task) for image in images for task in image.tasks()]:
-            future.result()
-
-    def _unpacker(self) -> zstandard.ZstdDecompressor:
-        if not hasattr(self._thread, "unpacker"):
-            self._thread.unpacker = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
-        unpacker: zstandard.ZstdDecompressor = self._thread.unpacker
-        return unpacker
-
-    def _inflate(self, blob: fmt.Blob, rows: npt.NDArray[Any]) -> None:
-        """Decompress a blob into ``rows``; its frame must hold exactly that many bytes."""
-        view = self._view(blob)
-        if xxhash.xxh3_64_intdigest(view) != blob.xxh3:
-            raise damaged(f"the stripe at {blob.offset} does not match its checksum")
-        try:
-            if zstandard.frame_content_size(view) != rows.nbytes:
-                raise damaged(f"the stripe at {blob.offset} does not have the pixels of its rows")
-            with self._unpacker().stream_reader(view, read_size=len(view)) as stream:
-                filled = stream.readinto(rows.data.cast("B"))
-        except zstandard.ZstdError as error:
-            raise damaged(f"the stripe at {blob.offset} can't be decompressed") from error
-        if filled != rows.nbytes:
-            raise damaged(f"the stripe at {blob.offset} ends too early")
-
-
-class _Image:
-    """One image to be decoded: its stripes apart from each other, and the last to end adds the rows up.
-
-    Adding is a numpy call a row for all stripes together, so a task for some of the stripes makes as many calls as one
-    for all; these are too short for two threads to gain by making them at the same time (docs/decisions/0021).
-    """
-
-    def __init__(
-        self,
-        inflate: Callable[[fmt.Blob, npt.NDArray[Any]], None],
-        blobs: Sequence[fmt.Blob],
-        image: npt.NDArray[np.uint8],
-        stripe_rows: int,
-    ) -> None:
-        self._inflate, self._blobs, self._image, self._stripe_rows = inflate, blobs, image, stripe_rows
-        self._left, self._lock = len(blobs), threading.Lock()
-
-    def decode(self) -> None:
-        for task in self.tasks():
-            task()
-
-    def tasks(self) -> list[Callable[[], None]]:
-        """What is to be done, in any order, on any threads."""
-        return [partial(self._one, number) for number in range(len(self._blobs))]
-
-    def _one(self, number: int) -> None:
-        self._inflate(self._blobs[number], self._image[number * self._stripe_rows : (number + 1) * self._stripe_rows])
-        with self._lock:
-            self._left -= 1
-            last = self._left == 0
-        if last:
-            undo_row_differences(self._image, self._stripe_rows)
-
-
-def undo_row_differences(rows: npt.NDArray[np.uint8], stripe_rows: int) -> None:
-    """Add to each row the row above it, modulo 256, in place, stripe by stripe.
-
-    Stripes of equal height go together: one addition a row for all of them is the quickest that numpy offers.
-    """
-    whole, row_bytes = len(rows) // stripe_rows, rows.shape[1] * 3
-    together = rows[: whole * stripe_rows].reshape(whole, stripe_rows, row_bytes)
-    last = rows[whole * stripe_rows :].reshape(1, -1, row_bytes)
-    for block in (together, last):
-        for row in range(1, block.shape[1]):
-            np.add(block[:, row], block[:, row - 1], out=block[:, row])
+            for task in tasks:
+                task()
+        else:
+            for future in [pool.submit(task) for task in tasks]:
+                future.result()
+        return {name: image.content for name, image in images.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Sequence
@@ -11,12 +12,18 @@ from typing import Final
 from controller.bundle.reader import Bundle
 from controller.core.errors import BundleError, VelaturaError
 from controller.play.frames import FrameSet, OutputSize
+from controller.play.tiles import Tiles
 
 CACHE_BYTES: Final = 64 * 1024 * 1024
 _FEWEST_SETS: Final = 3
 _MOST_SETS: Final = 64
-_DECODE_THREADS: Final = 2
+_MOST_THREADS: Final = 4
 _SETS_AT_ONCE: Final = 2
+
+
+def decode_threads() -> int:
+    """How many threads decode: as many as there are processor cores for us, 2 to 4."""
+    return min(_MOST_THREADS, max(2, len(os.sched_getaffinity(0))))
 
 
 def check_fits(bundle: Bundle, outputs: Sequence[OutputSize]) -> None:
@@ -35,7 +42,7 @@ class DecodedAhead:
     """Decodes what is wanted, in order, in the background; holds as many sets as its memory allows.
 
     Called from the player's loop, except ``_work``. ``on_ready`` is called from a decoding thread. Two sets are decoded
-    at once, so that no thread waits for the last stripe of one; the stripes of the sooner one come first.
+    at once, so that no thread waits for the last band of one; the bands of the sooner one come first.
     """
 
     def __init__(self, bundle: Bundle, outputs: Sequence[OutputSize], on_ready: Callable[[], None]) -> None:
@@ -52,7 +59,7 @@ class DecodedAhead:
         self._held: tuple[FrameSet, ...] = ()
         self._decoding: set[str] = set()
         self._ended = False
-        self._pool = ThreadPoolExecutor(_DECODE_THREADS, thread_name_prefix="decode")
+        self._pool = ThreadPoolExecutor(decode_threads(), thread_name_prefix="decode")
         self._working = _SETS_AT_ONCE
         for _ in range(_SETS_AT_ONCE):
             threading.Thread(target=self._work, name="decode", daemon=True).start()
@@ -103,8 +110,7 @@ class DecodedAhead:
             name, frames = job
             failure = None
             try:
-                buffers = {o.name: image for o, image in zip(self._outputs, frames.pixels, strict=True)}
-                self.bundle.decode_into(name, buffers, self._pool)
+                frames = self._decode(name, frames)
             except VelaturaError as error:
                 failure = error
             with self._changed:
@@ -120,6 +126,16 @@ class DecodedAhead:
         if last:
             self._pool.shutdown()
             self.bundle.close()
+
+    def _decode(self, name: str, frames: FrameSet) -> FrameSet:
+        """The appearance, in the pixels of ``frames``; what they have of it already stays."""
+        names = [output.name for output in self._outputs]
+        buffers = dict(zip(names, frames.pixels, strict=True))
+        known = None if frames.tiles is None else {n: t.content for n, t in zip(names, frames.tiles, strict=True)}
+        content = self.bundle.decode_into(name, buffers, self._pool, known)
+        layouts = [self.bundle.index.output(name) for name in names]
+        tiles = tuple(Tiles(layout.tile_width_px, layout.tile_height_px, content[layout.name]) for layout in layouts)
+        return FrameSet(frames.pixels, tiles)
 
     def _next_job(self) -> tuple[str, FrameSet] | None:
         with self._changed:

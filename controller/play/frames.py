@@ -14,6 +14,7 @@ import re
 import struct
 import time
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
@@ -23,6 +24,7 @@ import numpy.typing as npt
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import stream_atomically
+from controller.play.tiles import Tiles, differing
 
 MAGIC: Final = b"VELFRAME"
 VERSION: Final = 1
@@ -33,6 +35,8 @@ SEQUENCE_AT: Final = 16
 PRESENTED_AT: Final = 24
 MAX_OUTPUTS: Final = 16
 MAX_SIDE_PX: Final = 16384
+_ALONE_BYTES: Final = 4 * 1024 * 1024
+"""So little is copied sooner by one thread than other threads are woken."""
 _OUTPUT: Final = re.compile(r"([^:,\s]{1,39}):([0-9]{1,5})x([0-9]{1,5})")
 
 
@@ -81,11 +85,15 @@ def _outputs_wrong(detail: str) -> UsageError:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """One picture for every output: ``pixels`` are (rows, columns, 3) uint8 device values, in the outputs' order."""
+    """One picture for every output: ``pixels`` are (rows, columns, 3) uint8 device values, in the outputs' order.
+
+    ``tiles``: what the tiles of each are, where that is known; it says what another set has as well.
+    """
 
     pixels: tuple[npt.NDArray[np.uint8], ...]
+    tiles: tuple[Tiles, ...] | None = None
 
     @classmethod
     def black(cls, outputs: Sequence[OutputSize]) -> Self:
@@ -134,6 +142,7 @@ class FrameFile:
         except BlockingIOError as error:
             self._file.close()
             raise _in_use(path) from error
+        self._written: tuple[Tiles, ...] | None = None
         # One aligned 64-bit store each: a byte-wise store could be read half done.
         self._sequence = np.frombuffer(self._map, "<u8", 1, SEQUENCE_AT)
         self._presented_at = np.frombuffer(self._map, "<f8", 1, PRESENTED_AT)
@@ -150,12 +159,24 @@ class FrameFile:
     def presented_at(self) -> float:
         return float(self._presented_at[0])
 
-    def write(self, frames: FrameSet) -> None:
-        """Replace the set in the file, and say the monotonic time at which it was whole."""
+    def write(self, frames: FrameSet, pool: Executor | None = None) -> None:
+        """Replace the set in the file, and say the monotonic time at which it was whole.
+
+        On the threads of ``pool`` if given. Tiles that the set of the last call had as well are left alone.
+        """
         sequence = self.sequence | 1
         self._sequence[0] = sequence
-        for target, image in zip(self._pixels, frames.pixels, strict=True):
-            np.copyto(target, image)
+        written, self._written = self._written, None
+        parts = []
+        for number, (target, image) in enumerate(zip(self._pixels, frames.pixels, strict=True)):
+            for part in differing(image.shape, _tiles_of(frames.tiles, number), _tiles_of(written, number)):
+                parts.append((target[part], image[part]))
+        if pool is None or sum(image.nbytes for _, image in parts) < _ALONE_BYTES:
+            for target, image in parts:
+                np.copyto(target, image)
+        else:
+            list(pool.map(lambda pair: np.copyto(*pair), parts))
+        self._written = frames.tiles
         self._presented_at[0] = time.monotonic()
         self._sequence[0] = sequence + 1
 
@@ -181,6 +202,10 @@ class FrameFile:
         with contextlib.suppress(BufferError):
             self._map.close()
         self._file.close()
+
+
+def _tiles_of(tiles: tuple[Tiles, ...] | None, number: int) -> Tiles | None:
+    return None if tiles is None else tiles[number]
 
 
 def _in_use(path: Path) -> UsageError:

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from nacl.signing import SigningKey
 
-from controller.bundle.format import PlaylistEntry
+from controller.bundle.format import OutputLayout, PlaylistEntry
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance, NewLive, write_bundle
+from controller.bundle.writer import NewAppearance, NewLive, Packing, write_bundle
 from controller.core.errors import BundleError
 
 KEY = SigningKey(bytes(range(32)))
@@ -43,7 +43,7 @@ class Outcome:
 
 
 def write(path: Path) -> None:
-    """A signed bundle with noise, a ramp, a thumbnail and a live section."""
+    """A signed bundle with noise, a ramp, a thumbnail and a live section; its tiles LZ4, which is the younger codec."""
     random = np.random.default_rng(1)
     noise = {name: random.integers(0, 256, (rows, columns, 3), dtype=np.uint8) for name, columns, rows in OUTPUTS}
     rising = np.arange(40, dtype=np.uint8)[:, None, None]
@@ -52,6 +52,7 @@ def write(path: Path) -> None:
         path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS, key=KEY,
         schedule=[PlaylistEntry("ramp", 900, 9)],
         appearances=[NewAppearance("noise", noise), NewAppearance("ramp", ramp, b"\x89PNG\r\n\x1a\n" + bytes(99))],
+        packing=Packing(tuple(OutputLayout(name, columns, rows, 16, 9) for name, columns, rows in OUTPUTS), "lz4"),
         live=NewLive((5, 4), {"gain": random.random((4, 5, 3)).astype(np.float16)}),
     )  # fmt: skip
 

@@ -224,11 +224,11 @@ def _hid(data: bytes) -> None:
 
 _INDEX = {
     "stage": "demo", "calibration": "c", "created_unix_s": 1, "revision": 1,
-    "outputs": [{"name": "P1", "width_px": 8, "height_px": 4, "stripe_rows": 4}],
+    "outputs": [{"name": "P1", "width_px": 8, "height_px": 4, "tile_width_px": 8, "tile_height_px": 4}],
     "appearances": [
-        {"name": "a", "stripes": {"P1": [[4096, 10, "00" * 8, "00" * 32]]}, "thumbnail": None, "metadata": {}}
+        {"name": "a", "bands": {"P1": [[4096, 10, "00" * 8, "00" * 32]]}, "thumbnail": None, "metadata": {}}
     ],
-    "schedule": [["a", 1000, 0]], "live": None,
+    "schedule": [["a", 1000, 0]], "live": None, "codec": "zstd",
 }  # fmt: skip
 
 

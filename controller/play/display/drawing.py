@@ -10,6 +10,7 @@ from pyglet import gl
 
 from controller.core.errors import WorkError
 from controller.play.frames import FrameSet, OutputSize
+from controller.play.tiles import Tiles, differing
 
 _VERTEX: Final = """#version 330 core
 out vec2 place;
@@ -54,10 +55,12 @@ class Canvas:
         _set_up()
         self._before = [_texture(size) for size in sizes]
         self._after: list[int] = []
+        self._held: dict[int, Tiles] = {}
 
     @property
     def pictures(self) -> Sequence[int]:
         """The textures that are drawn with share 0: whoever draws into them does what ``load`` does."""
+        self._held.clear()
         return self._before
 
     def load(self, frames: FrameSet) -> None:
@@ -72,12 +75,19 @@ class Canvas:
         self._upload(self._after, after)
 
     def _upload(self, textures: Sequence[int], frames: FrameSet) -> None:
+        """Take over what a texture does not hold already."""
         gl.glActiveTexture(gl.GL_TEXTURE0)
-        for texture, size, image in zip(textures, self._sizes, frames.pixels, strict=True):
+        for number, (texture, size, image) in enumerate(zip(textures, self._sizes, frames.pixels, strict=True)):
             gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
-            pointer = image.ctypes.data_as(ctypes.c_void_p)
-            shape = (size.width_px, size.height_px)
-            gl.glTexSubImage2D(gl.GL_TEXTURE_2D, 0, 0, 0, *shape, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, pointer)
+            gl.glPixelStorei(gl.GL_UNPACK_ROW_LENGTH, size.width_px)
+            tiles = None if frames.tiles is None else frames.tiles[number]
+            for rows, columns in differing(image.shape, tiles, self._held.pop(texture, None)):
+                pointer = image[rows, columns].ctypes.data_as(ctypes.c_void_p)
+                place = (columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
+                gl.glTexSubImage2D(gl.GL_TEXTURE_2D, 0, *place, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, pointer)
+            if tiles is not None:
+                self._held[texture] = tiles
+        gl.glPixelStorei(gl.GL_UNPACK_ROW_LENGTH, 0)
 
     def draw(self, places: Sequence[tuple[int, int] | None], shape: tuple[int, int], share: float) -> None:
         """Draw into a black window of this (width, height); ``places``: upper left corners, None: not drawn."""

@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, Protocol
 
-from controller.play.display.mixing import mix_sets
+from controller.play.display.mixing import mix_sets, mixture_of
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 
-_MIX_THREADS: Final = 2
+_THREADS: Final = 2
 
 
 class Output(Protocol):
@@ -50,14 +50,14 @@ class MemoryOutput:
         self._next: FrameSet | None = None
         self._fade: tuple[FrameSet, FrameSet] | None = None
         self._mixture: FrameSet | None = None
-        self._pool = ThreadPoolExecutor(_MIX_THREADS, thread_name_prefix="mix")
+        self._pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="mix")
 
     def prepare(self, frames: FrameSet) -> None:
         self._next, self._fade, self._mixture = frames, None, None
 
     def load_fade(self, before: FrameSet, after: FrameSet) -> None:
         self._fade = before, after
-        self._mixture = FrameSet.black(self._outputs)
+        self._mixture = mixture_of(before, after, self._outputs)
 
     def mix(self, share: float) -> None:
         assert self._fade is not None
@@ -71,7 +71,7 @@ class MemoryOutput:
 
     def flip(self) -> float:
         assert self._next is not None
-        self._file.write(self._next)
+        self._file.write(self._next, self._pool)
         self._next = None
         return self._file.presented_at
 

@@ -114,7 +114,7 @@ def _publish(
     installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
     raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
     stored = sum(
-        blob.length for appearance in index.appearances for blobs in appearance.stripes.values() for blob in blobs
+        blob.length for appearance in index.appearances for blobs in appearance.bands.values() for blob in blobs
     )
     figures = BundleFigures(built.stat().st_size, raw / stored, installed.name, names)
     return [figures.write(context.folder), built]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import struct
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import lz4.block
 import numpy as np
 import pytest
 import xxhash
@@ -19,8 +21,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nacl.signing import SigningKey
 
+from controller.bundle.format import Blob, OutputLayout
 from controller.bundle.index import parse_index
 from controller.bundle.reader import Bundle
+from controller.bundle.tiles import Inflater, TiledImage
 from controller.bundle.writer import NewAppearance
 from controller.core.errors import BundleError
 from tests.controller.bundle.conftest import write
@@ -40,7 +44,7 @@ def refused(path: Path, data: bytes, **how: Any) -> BundleError:
     return caught.value
 
 
-def sealed(path: Path, index: bytes, blobs: bytes = bytes(4096), version: int = 2) -> Path:
+def sealed(path: Path, index: bytes, blobs: bytes = bytes(4096), version: int = 3) -> Path:
     """An unsigned bundle with this index, hashes right: what someone with a text editor and time can make."""
     start = 4096 + len(blobs)
     head = struct.pack(
@@ -56,11 +60,27 @@ def blob_of(data: bytes, offset: int = 4096) -> list[Any]:
 
 
 def small_index(blob: list[Any], **changes: Any) -> Table:
-    output = {"name": "P1", "width_px": 4, "height_px": 3, "stripe_rows": 3}
-    appearance = {"name": "a", "stripes": {"P1": [blob]}, "thumbnail": None, "metadata": {}}
+    output = {"name": "P1", "width_px": 4, "height_px": 3, "tile_width_px": 4, "tile_height_px": 3}
+    appearance = {"name": "a", "bands": {"P1": [blob]}, "thumbnail": None, "metadata": {}}
     index = {"stage": "s", "calibration": "c", "created_unix_s": 0, "revision": 0}
-    index |= {"schedule": [["a", 1000, 0]], "live": None}
+    index |= {"codec": "zstd", "schedule": [["a", 1000, 0]], "live": None}
     return {**index, "outputs": [output], "appearances": [appearance], **changes}
+
+
+def older_index(blob: list[Any], version: int) -> Table:
+    """The same of a version without tiles."""
+    index = small_index(blob)
+    for key in ("codec",) if version == 2 else ("codec", "schedule", "live"):
+        del index[key]
+    index["outputs"] = [{"name": "P1", "width_px": 4, "height_px": 3, "stripe_rows": 3}]
+    index["appearances"] = [{"name": "a", "stripes": {"P1": [blob]}, "thumbnail": None, "metadata": {}}]
+    return index
+
+
+def band_of(*tiles: bytes, lengths: list[int] | None = None, zero: int = 0) -> bytes:
+    """A band of these compressed tiles, whose table says so or lies."""
+    sizes = [len(tile) for tile in tiles] if lengths is None else lengths
+    return b"".join(struct.pack("<IIQ", size, zero, 1) for size in sizes) + b"".join(tiles)
 
 
 def test_every_flipped_byte_of_header_index_and_signature_is_refused(
@@ -122,23 +142,27 @@ def other_block(signed: Path, public: bytes) -> bytes:
 
 def test_a_newer_format_is_told_from_a_damaged_one(tmp_path: Path, unsigned: Path) -> None:
     data = bytearray(unsigned.read_bytes())
-    data[8] = 3
+    data[8] = 4
     assert refused(tmp_path / "new.vel", bytes(data), allow_unsigned=True).code == "bundle-version"
     assert refused(tmp_path / "zip.vel", b"PK\3\4" + bytes(500), allow_unsigned=True).code == "bundle-foreign"
 
 
-PIXELS = zstandard.ZstdCompressor().compress(bytes(36))
+FRAME = zstandard.ZstdCompressor().compress(bytes(36))
+PIXELS = band_of(FRAME)
 BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(50_000_000))
 SIZELESS = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(36))
 GOOD = blob_of(PIXELS)
+GOOD_FRAME = blob_of(FRAME)
 
 
 def output(**changes: Any) -> Table:
-    return {"outputs": [{"name": "P1", "width_px": 4, "height_px": 3, "stripe_rows": 3, **changes}]}
+    return {
+        "outputs": [{"name": "P1", "width_px": 4, "height_px": 3, "tile_width_px": 4, "tile_height_px": 3, **changes}]
+    }
 
 
 def live(**changes: Any) -> Table:
-    return {"target_px": [4, 3], "arrays": {"gain": {"dtype": "u1", "shape": [36], "blob": GOOD, **changes}}}
+    return {"target_px": [4, 3], "arrays": {"gain": {"dtype": "u1", "shape": [36], "blob": GOOD_FRAME, **changes}}}
 
 
 def many_arrays() -> Table:
@@ -148,8 +172,16 @@ def many_arrays() -> Table:
 HOSTILE: dict[str, Callable[[], bytes]] = {
     "an output of 4 Gpx": lambda: as_json(small_index(GOOD, **output(width_px=65536, height_px=65536))),
     "an output of 256 Mpx": lambda: as_json(small_index(GOOD, **output(width_px=16384, height_px=16384))),
-    "2 million stripes": lambda: as_json(small_index(GOOD, **output(height_px=16384, stripe_rows=1))),
-    "no rows in a stripe": lambda: as_json(small_index(GOOD, **output(stripe_rows=0))),
+    "2 million bands": lambda: as_json(small_index(GOOD, **output(height_px=16384, tile_height_px=1))),
+    "no rows in a band": lambda: as_json(small_index(GOOD, **output(tile_height_px=0))),
+    "no columns in a tile": lambda: as_json(small_index(GOOD, **output(tile_width_px=0))),
+    "16384 tiles across": lambda: as_json(small_index(GOOD, **output(width_px=16384, tile_width_px=1))),
+    "a tile of 48 MB": lambda: as_json(
+        small_index(GOOD, **output(width_px=4096, height_px=4096, tile_width_px=4096, tile_height_px=4096))
+    ),
+    "a tile wider than its output": lambda: as_json(small_index(GOOD, **output(tile_width_px=5))),
+    "an unknown codec": lambda: as_json(small_index(GOOD, codec="brotli")),
+    "a codec that is a list": lambda: as_json(small_index(GOOD, codec=["zstd"])),
     "a negative size": lambda: as_json(small_index(GOOD, **output(width_px=-4))),
     "a size that is true": lambda: as_json(small_index(GOOD, **output(width_px=True))),
     "a fractional size": lambda: as_json(small_index(GOOD, **output(width_px=4.0))),
@@ -168,7 +200,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "a live array of objects": lambda: as_json(small_index(GOOD, live=live(dtype="O8"))),
     "a live array of 4 TB": lambda: as_json(small_index(GOOD, live=live(shape=[16384, 16384, 16384]))),
     "a live array without sides": lambda: as_json(small_index(GOOD, live=live(shape=[]))),
-    "a live array beyond the file": lambda: as_json(small_index(GOOD, live=live(blob=[2**40, 9, *GOOD[2:]]))),
+    "a live array beyond the file": lambda: as_json(small_index(GOOD, live=live(blob=[2**40, 9, *GOOD_FRAME[2:]]))),
     "many live arrays": lambda: as_json(small_index(GOOD, live={"target_px": [4, 3], "arrays": many_arrays()})),
     "a live target of no size": lambda: as_json(small_index(GOOD, live=live() | {"target_px": [0, 3]})),
     "an unknown key": lambda: as_json(small_index(GOOD, extra=1)),
@@ -194,43 +226,41 @@ def test_the_small_index_itself_is_sound(tmp_path: Path) -> None:
 
 
 def test_the_live_section_is_read_and_its_bombs_are_refused(tmp_path: Path) -> None:
-    path = sealed(tmp_path / "live.vel", as_json(small_index(GOOD, live=live())), PIXELS)
+    path = sealed(tmp_path / "live.vel", as_json(small_index(GOOD_FRAME, live=live())), FRAME)
     with Bundle.open(path, allow_unsigned=True) as bundle:
         bundle.verify()
         assert bundle.live_array("gain").shape == (36,)
         with pytest.raises(BundleError, match="live mode"):
             bundle.live_array("other")
-    path = sealed(tmp_path / "bomb.vel", as_json(small_index(GOOD, live=live(shape=[35]))), PIXELS)
+    path = sealed(tmp_path / "bomb.vel", as_json(small_index(GOOD_FRAME, live=live(shape=[35]))), FRAME)
     with Bundle.open(path, allow_unsigned=True) as bundle, pytest.raises(BundleError, match="damaged"):
         bundle.live_array("gain")
 
 
-def test_a_bundle_of_version_1_still_plays_and_keeps_its_own_rules(tmp_path: Path) -> None:
-    index = small_index(GOOD)
-    newer = as_json(index)
-    for key in ("schedule", "live"):
-        del index[key]
-    with Bundle.open(sealed(tmp_path / "old.vel", as_json(index), PIXELS, 1), allow_unsigned=True) as bundle:
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_older_bundle_still_plays_and_keeps_its_own_rules(tmp_path: Path, version: int) -> None:
+    index = as_json(older_index(GOOD_FRAME, version))
+    with Bundle.open(sealed(tmp_path / "old.vel", index, FRAME, version), allow_unsigned=True) as bundle:
         bundle.verify()
-        assert (bundle.version, bundle.index.schedule, bundle.index.live) == (1, (), None)
+        assert (bundle.version, bundle.index.schedule, bundle.index.live, bundle.index.codec)[2:] == (None, "zstd")
         assert not bundle.decode("a", "P1").any()
-    refused(tmp_path / "b.vel", sealed(tmp_path / "a.vel", as_json(index), PIXELS, 2).read_bytes(), allow_unsigned=True)
-    refused(tmp_path / "b.vel", sealed(tmp_path / "a.vel", newer, PIXELS, 1).read_bytes(), allow_unsigned=True)
-    shifted = small_index([4096 + 64, *GOOD[1:]])
-    blobs = bytes(64) + PIXELS
-    with Bundle.open(sealed(tmp_path / "new.vel", as_json(shifted), blobs), allow_unsigned=True) as bundle:
-        bundle.verify()
-    for key in ("schedule", "live"):
-        del shifted[key]
-    path = sealed(tmp_path / "a.vel", as_json(shifted), blobs, 1)
-    assert refused(tmp_path / "b.vel", path.read_bytes(), allow_unsigned=True).code == "bundle-damaged"
+    others = {1, 2, 3} - {version}
+    for other in others:
+        refused(tmp_path / "b.vel", sealed(tmp_path / "a.vel", index, FRAME, other).read_bytes(), allow_unsigned=True)
+    shifted = as_json(older_index([4096 + 64, *GOOD_FRAME[1:]], version))
+    path = sealed(tmp_path / "a.vel", shifted, bytes(64) + FRAME, version)
+    if version == 1:
+        assert refused(tmp_path / "b.vel", path.read_bytes(), allow_unsigned=True).code == "bundle-damaged"
+    else:
+        with Bundle.open(path, allow_unsigned=True) as bundle:
+            bundle.verify()
 
 
 def test_a_truncation_at_every_part_s_edge_is_refused_even_with_a_header_to_match(tmp_path: Path, signed: Path,
                                                                                  key: SigningKey) -> None:  # fmt: skip
     data, trusted = signed.read_bytes(), [bytes(key.verify_key)]
     with Bundle.open(signed, trusted=trusted) as bundle:
-        blobs = [blob for part in bundle.index.appearances for found in part.stripes.values() for blob in found]
+        blobs = [blob for part in bundle.index.appearances for found in part.bands.values() for blob in found]
     start, length = index_place(data)
     edges = {0, 128, 4096, start, start + length, *(b.offset for b in blobs), *(b.offset + b.length for b in blobs)}
     for edge in sorted(edges):
@@ -274,10 +304,35 @@ def seconds_to_refuse(path: Path) -> float:
     return time.process_time() - began
 
 
-@pytest.mark.parametrize("payload", [BOMB, SIZELESS, b"not a frame", PIXELS[:-3], zstandard.compress(bytes(35))])
-def test_stripes_that_do_not_hold_their_pixels_are_refused_in_little_memory(tmp_path: Path, payload: bytes) -> None:
-    size = {"width_px": 50, "height_px": 40, "stripe_rows": 40} if payload is BOMB else {}
-    path = sealed(tmp_path / "bomb.vel", as_json(small_index(blob_of(payload), **output(**size))), payload)
+PACKED = lz4.block.compress(bytes(36), store_size=False)
+SHORT = zstandard.compress(bytes(35))
+BAD_BANDS: dict[str, tuple[str, bytes]] = {
+    "a bomb": ("zstd", band_of(BOMB)),
+    "a frame without its size": ("zstd", band_of(SIZELESS)),
+    "no frame": ("zstd", band_of(b"not a frame")),
+    "a frame cut off": ("zstd", band_of(FRAME[:-3])),
+    "too few pixels": ("zstd", band_of(SHORT)),
+    "LZ4, a bomb": ("lz4", band_of(lz4.block.compress(bytes(50_000_000), store_size=False))),
+    "LZ4, cut off": ("lz4", band_of(PACKED[:-3])),
+    "LZ4, no block": ("lz4", band_of(b"\xff" * 40)),
+    "LZ4, nothing": ("lz4", band_of(b"")),
+    "LZ4, too few pixels": ("lz4", band_of(lz4.block.compress(bytes(35), store_size=False))),
+    "LZ4, a size that lies": ("lz4", band_of(struct.pack("<i", 2**31 - 1) + PACKED)),
+    "Zstandard said to be LZ4": ("lz4", band_of(FRAME)),
+    "a tile beyond its band": ("zstd", band_of(FRAME, lengths=[len(FRAME) + 1])),
+    "bytes after the tiles": ("zstd", band_of(FRAME) + b"\0"),
+    "lengths that wrap around": ("zstd", band_of(FRAME, lengths=[2**32 - 1])),
+    "bits that stand for nothing": ("zstd", band_of(FRAME, zero=1)),
+    "half a table": ("zstd", band_of(FRAME)[:9]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_BANDS)
+def test_bands_that_do_not_hold_their_pixels_are_refused_in_little_memory(tmp_path: Path, name: str) -> None:
+    codec, band = BAD_BANDS[name]
+    bomb = "bomb" in name
+    size = {"width_px": 500, "height_px": 400, "tile_width_px": 500, "tile_height_px": 400} if bomb else {}
+    path = sealed(tmp_path / "b.vel", as_json(small_index(blob_of(band), codec=codec, **output(**size))), band)
     tracemalloc.start()
     try:
         with Bundle.open(path, allow_unsigned=True) as bundle, pytest.raises(BundleError):
@@ -285,6 +340,18 @@ def test_stripes_that_do_not_hold_their_pixels_are_refused_in_little_memory(tmp_
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(["zstd", "lz4"]), st.binary(max_size=120) | st.builds(band_of, st.binary(max_size=80)))
+def test_no_bytes_of_a_band_make_the_decoder_fail_in_another_way(codec: str, band: bytes) -> None:
+    blob = Blob(4096, len(band), xxhash.xxh3_64_intdigest(band), b"")
+    around = np.full((5, 4, 3), 7, np.uint8)
+    image = TiledImage([(blob, memoryview(band))], OutputLayout("P1", 4, 3, 4, 3), codec, around[1:4], None, Inflater())
+    with contextlib.suppress(BundleError):
+        for task in image.tasks():
+            task()
+    assert (around[[0, 4]] == 7).all()
 
 
 @settings(max_examples=300, deadline=None)
@@ -306,16 +373,18 @@ PLACES = [
     ["outputs", 0],
     ["outputs", 0, "name"],
     ["outputs", 0, "width_px"],
-    ["outputs", 0, "stripe_rows"],
+    ["outputs", 0, "tile_width_px"],
+    ["outputs", 0, "tile_height_px"],
+    ["codec"],
     ["appearances"],
     ["appearances", 0],
     ["appearances", 0, "thumbnail"],
-    ["appearances", 0, "stripes"],
-    ["appearances", 0, "stripes", "P1"],
-    ["appearances", 0, "stripes", "P1", 0],
-    ["appearances", 0, "stripes", "P1", 0, 0],
-    ["appearances", 0, "stripes", "P1", 0, 1],
-    ["appearances", 0, "stripes", "P1", 0, 2],
+    ["appearances", 0, "bands"],
+    ["appearances", 0, "bands", "P1"],
+    ["appearances", 0, "bands", "P1", 0],
+    ["appearances", 0, "bands", "P1", 0, 0],
+    ["appearances", 0, "bands", "P1", 0, 1],
+    ["appearances", 0, "bands", "P1", 0, 2],
     ["schedule"],
     ["schedule", 0],
     ["schedule", 0, 1],
@@ -343,8 +412,9 @@ def test_any_value_at_any_place_is_either_in_bounds_or_refused(place: list[str |
     except BundleError:
         return
     for appearance in parsed.appearances:
-        for blobs in appearance.stripes.values():
+        for blobs in appearance.bands.values():
             assert all(blob.offset >= 4096 and blob.offset + blob.length <= 8192 for blob in blobs)
     if parsed.live is not None:
         assert all(array.raw_bytes <= 2**28 for array in parsed.live.arrays.values())
     assert all(o.width_px * o.height_px <= 2**24 for o in parsed.outputs)
+    assert all(3 * o.tile_width_px * o.tile_height_px <= 2**22 for o in parsed.outputs)

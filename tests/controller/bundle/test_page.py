@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import xxhash
 import zstandard
@@ -40,9 +41,9 @@ def blobs_of(index: Document) -> dict[int, tuple[list[Any], Any]]:
     found: dict[int, tuple[list[Any], Any]] = {}
     sizes = {output["name"]: output for output in index["outputs"]}
     for appearance in index["appearances"]:
-        for output, blobs in appearance["stripes"].items():
+        for output, blobs in appearance["bands"].items():
             for number, blob in enumerate(blobs):
-                found[blob[0]] = blob, ("stripe", appearance["name"], output, number * sizes[output]["stripe_rows"])
+                found[blob[0]] = blob, ("band", appearance["name"], output, number * sizes[output]["tile_height_px"])
         if appearance["thumbnail"] is not None:
             found[appearance["thumbnail"][0]] = appearance["thumbnail"], ("thumbnail",)
     for name, array in index["live"]["arrays"].items():
@@ -50,7 +51,7 @@ def blobs_of(index: Document) -> dict[int, tuple[list[Any], Any]]:
     return dict(sorted(found.items()))
 
 
-STRIPES = zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters(
+TILES = zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters(
     strategy=zstandard.STRATEGY_LAZY2, window_log=20, hash_log=18, chain_log=18, search_log=5, min_match=6,
     target_length=32, write_content_size=True, write_checksum=False,
 ))  # fmt: skip
@@ -64,6 +65,15 @@ def packed(values: Any, packer: zstandard.ZstdCompressor, *, differences: bool) 
     return bytes(packer.compress(rows.tobytes()))
 
 
+def band(rows: npt.NDArray[np.uint8], width: int) -> bytes:
+    table, content = b"", b""
+    for left in range(0, rows.shape[1], width):
+        tile = np.ascontiguousarray(rows[:, left : left + width])
+        content += (data := packed(tile, TILES, differences=True))
+        table += struct.pack("<IIQ", len(data), 0, xxhash.xxh3_64_intdigest(tile.tobytes()))
+    return table + content
+
+
 def test_a_bundle_is_rebuilt_from_the_page_byte_by_byte(full: Path, key: SigningKey) -> None:
     reader, data = documented_reader(), full.read_bytes()
     index = reader["read_index"](data, [bytes(key.verify_key)])
@@ -71,10 +81,10 @@ def test_a_bundle_is_rebuilt_from_the_page_byte_by_byte(full: Path, key: Signing
     for offset, (blob, kind) in blobs_of(index).items():
         rebuilt += bytes(-len(rebuilt) % 64)
         assert offset == len(rebuilt), "blobs stand at the next multiple of 64"
-        if kind[0] == "stripe":
-            rows = next(output["stripe_rows"] for output in index["outputs"] if output["name"] == kind[2])
-            image = reader["read_image"](data, index, kind[1], kind[2])[kind[3] : kind[3] + rows]
-            content = packed(image, STRIPES, differences=True)
+        if kind[0] == "band":
+            size = next(output for output in index["outputs"] if output["name"] == kind[2])
+            rows = reader["read_image"](data, index, kind[1], kind[2])[kind[3] : kind[3] + size["tile_height_px"]]
+            content = band(rows, size["tile_width_px"])
         elif kind[0] == "live":
             values = reader["read_live_array"](data, index, kind[1])
             content = packed(values, ARRAYS, differences=values.dtype.kind == "u")
@@ -86,7 +96,7 @@ def test_a_bundle_is_rebuilt_from_the_page_byte_by_byte(full: Path, key: Signing
     start = len(rebuilt)
     document = json.dumps(index, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
     size, digest = start + len(document) + 128, hashlib.sha256(document).digest()
-    header = struct.pack("<8sIIQQQ32s56x", b"VELBUNDL", 2, 0, start, len(document), size, digest)
+    header = struct.pack("<8sIIQQQ32s56x", b"VELBUNDL", 3, 0, start, len(document), size, digest)
     signature = key.sign(b"velatura bundle signature 1\0" + header + document).signature
     rebuilt += document + struct.pack("<8s32s64s24x", b"VELSIGN1", bytes(key.verify_key), signature)
     rebuilt[:128] = header
@@ -105,14 +115,14 @@ def test_the_documented_reader_refuses_every_flipped_byte_of_header_index_and_si
             reader["read_index"](bytes(changed), trusted)
 
 
-def test_the_documented_reader_refuses_what_is_wrong_in_a_stripe(full: Path, key: SigningKey) -> None:
+def test_the_documented_reader_refuses_what_is_wrong_in_a_band(full: Path, key: SigningKey) -> None:
     reader, data = documented_reader(), full.read_bytes()
     index = reader["read_index"](data, [bytes(key.verify_key)])
-    offset, length, _, _ = index["appearances"][0]["stripes"]["left"][0]
+    offset, length, _, _ = index["appearances"][0]["bands"]["left"][0]
     for place in range(offset, offset + length):
         changed = bytearray(data)
         changed[place] ^= 1 << place % 8
-        with pytest.raises(ValueError, match="damaged stripe"):
+        with pytest.raises(ValueError, match="damaged blob"):
             reader["read_image"](bytes(changed), index, index["appearances"][0]["name"], "left")
 
 
