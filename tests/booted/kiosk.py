@@ -108,11 +108,16 @@ class Kiosk:
         machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
         machine.wait_for(lambda: machine.velatura("status")["playing"] == "board")
 
+    def begin(self, command: str, *words: str | Path) -> None:
+        """Begin work, once what is still under way has ended."""
+        asked = ("velatura", command, STAGE, *words, "--no-wait")
+        self.machine.wait_for(lambda: self.machine.called(*asked, user="velatura").returncode == 0)
+
     def begin_appearance(self, name: str, seed: int) -> None:
         """Begin to compute an appearance from a picture that nobody has computed yet."""
         picture = Path(f"/opt/{name}-{seed}.png")
         cv2.imwrite(str(self.machine.at(picture)), np.random.default_rng(seed).integers(0, 256, (48, 48, 3), np.uint8))
-        self.machine.call("velatura", "compute", STAGE, name, picture, "--no-wait", user="velatura")
+        self.begin("compute", name, picture)
 
     def problems(self) -> dict[str, str]:
         """What the panel says of the devices that have one, by name."""

@@ -294,7 +294,7 @@ def test_power_cuts_while_it_calibrates_and_publishes_leave_the_picture_and_are_
     machine = playing.machine
     calibrated = len(list(machine.at(STAGE / "runs").iterdir()))
     machine.wait_for(lambda: playing.state == "playing" and not playing.problems())
-    machine.call("velatura", "recalibrate", STAGE, "--no-wait", user="velatura")
+    playing.begin("recalibrate")
     machine.wait_for(lambda: works(playing, "Full recalibration"))
     before, number = kept(playing), playing.events()[-1]["number"]
     assert cut_now(playing, playing.shows_installed) < PICTURE_S

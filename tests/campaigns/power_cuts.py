@@ -104,7 +104,7 @@ class Cuts:
             if number % 2:
                 self.kiosk.begin_appearance("new", number)
             else:
-                machine.call("velatura", "recalibrate", STAGE, "--no-wait", user="velatura")
+                self.kiosk.begin("recalibrate")
             time.sleep(self._chance.uniform(0.0, longest_s))
             job = machine.velatura("status")["job"] or {}
             took_s = cut_now(self.kiosk, self.kiosk.shows_installed)
@@ -144,7 +144,9 @@ def main(cuts: int, seed: int, suite: str, seconds: float) -> int:
             kiosk.calibrate()
             made.at_work(at_work)
             kiosk.machine.wait_for(lambda: kiosk.state == "playing" and not kiosk.problems())
-            kiosk.machine.call("velatura", "recalibrate", STAGE, user="velatura")
+            number = kiosk.events()[-1]["number"]
+            kiosk.begin("recalibrate")
+            kiosk.machine.wait_for(lambda: {"calibrated", "published"} <= set(kiosk.codes(number)))
             kiosk.machine.wait_for(kiosk.shows_installed)
     print(f"{len(made.back_s)} cuts; lost: {made.gone or 'nothing'}; the picture was back after {_spread(made.back_s)}")
     return 1 if made.gone else 0
