@@ -50,7 +50,7 @@ def measured(lenses: tuple[Pinhole, Pinhole], bend: float) -> tuple[Metapixels, 
     noisy = (place + rng.normal(0, NOISE_PX, place.shape)).astype(np.float32)
     valid = rng.random(place.shape[:2]) > 0.02
     noisy[~valid] = np.nan
-    shape = np.broadcast_to(np.float32([1.4, 0.1, 1.2]), (*valid.shape, 3)).copy()
+    shape = np.broadcast_to(np.array([1.4, 0.1, 1.2], np.float32), (*valid.shape, 3)).copy()
     return Metapixels(noisy, shape, valid), place
 
 
@@ -72,9 +72,12 @@ def test_the_homography_evens_the_noise_out_and_leaves_out_what_is_off_the_plane
 def test_a_surface_without_a_plane_is_refused(lenses: tuple[Pinhole, Pinhole]) -> None:
     metapixels, _ = measured(lenses, bend=0.0)
     x = np.arange(PROJECTOR[0]) / PROJECTOR[0] * 6
-    waves = np.float32(8 * np.sin(x))[None, :, None] * np.float32(np.sin(np.arange(PROJECTOR[1]) / 6))[:, None, None]
+    waves = 8 * np.sin(x)[None, :, None] * np.sin(np.arange(PROJECTOR[1]) / 6)[:, None, None]
     with pytest.raises(WorkError) as refused:
-        planar(Metapixels(metapixels.centre_px + waves, metapixels.covariance_px2, metapixels.valid), *lenses)
+        planar(
+            Metapixels((metapixels.centre_px + waves).astype(np.float32), metapixels.covariance_px2, metapixels.valid),
+            *lenses,
+        )
     assert refused.value.code == "benchmark-no-plane"
 
 
