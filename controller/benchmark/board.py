@@ -142,13 +142,15 @@ def write_page(out: Path, content: Mapping[str, Any], about: Mapping[str, str], 
 
 
 def _overall(results: Sequence[Mapping[str, Any]]) -> str:
-    columns = ("scene", "seed", "method", "photographs", *TITLES.values(), "targets made")
+    columns = ("scene", "seed", "method", "photographs", *TITLES.values(), "FLIP", "targets made")
     rows = []
     for row in results:
         made = [one for one in row["targets"].values() if one["pixels"] is not None]
         cells = [_mean([one["pixels"][key] for one in made]) for key in TITLES]
+        flips = [one["flip"] for one in made if one["flip"] is not None]
+        flip = f"{np.mean(flips):.3f}" if flips and len(flips) == len(made) else ""
         note = f"{len(made)}" if row["failed"] is None else f"none: {row['failed']['code']}"
-        rows.append((row["scene"], row["seed"], row["method"], row["photographs"], *cells, note))
+        rows.append((row["scene"], row["seed"], row["method"], row["photographs"], *cells, flip, note))
     return markdown(columns, rows)
 
 

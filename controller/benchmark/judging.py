@@ -76,7 +76,7 @@ class Judged:
 def fixed_targets(subject: Subject, only: Mask | None = None) -> dict[str, ReachableTarget]:
     """``TARGETS`` on this stage, each as bright as 95 % of the object can reach, by the reference calibration.
 
-    ``only`` (camera rows, columns): the part on which they are judged; None: all
+    ``only`` (camera rows, columns): the part of the object on which they are judged; None: all of it
     """
 
     def wanted(target: Target, transport: LightTransport | None = None) -> ReachableTarget:

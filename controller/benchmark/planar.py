@@ -71,7 +71,8 @@ def planar(seen: Metapixels, camera: Pinhole, projector: Pinhole) -> Metapixels:
             what="The object has no flat part that most pixels of a projector light.",
             remedy="Use this method on the scene flat.",
         )
-    back = np.linalg.inv(_slopes(projector, matrix, camera, here[on_plane]))
+    plane = np.asarray(matrix, np.float64)
+    back = np.linalg.inv(_slopes(projector, plane, camera, here[on_plane]))
     measured = _matrices(seen.covariance_px2[rows[on_plane], columns[on_plane]])
     own = np.median(back @ measured @ back.transpose(0, 2, 1), axis=0)
 
@@ -83,8 +84,8 @@ def planar(seen: Metapixels, camera: Pinhole, projector: Pinhole) -> Metapixels:
     here = np.stack([columns, rows], axis=-1).astype(np.float64)
     centre = np.full(seen.centre_px.shape, np.nan, np.float32)
     shape = np.full(seen.covariance_px2.shape, np.nan, np.float32)
-    centre[valid] = _through(projector, matrix, camera, here)
-    slope = _slopes(projector, matrix, camera, here)
+    centre[valid] = _through(projector, plane, camera, here)
+    slope = _slopes(projector, plane, camera, here)
     spread = slope @ own @ slope.transpose(0, 2, 1)
     shape[valid] = np.stack([spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]], axis=-1)
     return Metapixels(centre, shape, valid)

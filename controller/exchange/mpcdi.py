@@ -88,7 +88,10 @@ def write_mpcdi(content: Content, folder: Path) -> dict[str, int]:
 
 def _lamp(name: str, places: FloatImage, points_m: FloatImage, own: Pinhole) -> _Region:
     """Each pixel's point on the surface, and the projector's pose with y up."""
-    far = cv2.remap(points_m, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 3)
+    far = cv2.remap(
+        points_m, places[..., 0], places[..., 1], cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan, np.nan, np.nan),
+    )  # fmt: skip
     points = np.asarray(far @ _TO_Y_UP.astype(np.float32), np.float32)
     points[~np.isfinite(points).all(axis=2)] = np.nan
     rows, columns = places.shape[:2]
@@ -176,7 +179,7 @@ def _maps(fileset: ElementTree.Element, region: _Region) -> dict[str, bytes]:
            {"path": names["geometryWarpFile"], "interpolation": "linear", **unit})  # fmt: skip
     _texts(ElementTree.SubElement(fileset, "alphaMap"),
            {"path": names["alphaMap"], "componentDepth": "1", "bitDepth": "8", "gammaEmbedded": "1.0"})  # fmt: skip
-    known: Mask = np.isfinite(region.warp[..., :2]).all(axis=2)
+    known: Mask = np.asarray(np.isfinite(region.warp[..., :2]).all(axis=2), np.bool_)
     stored = {names["geometryWarpFile"]: _pfm(region.warp), names["alphaMap"]: _png(known)}
     if region.distortion is not None:
         stored[f"{plain}-distortion.pfm"] = _pfm(region.distortion)

@@ -51,9 +51,9 @@ def test_the_page_shows_every_score_and_every_failure(tmp_path: Path) -> None:
     assert "| grey | good | 1.00 / 4.0 | 2.00 / 9.0 |  | 25.0% |  | 30 + 2 |" in text
     assert "| photograph | partly | a-code: It \\| broke. |" in text
     assert "| photograph | bad | other-code: It broke at once. |" in text
-    assert "| dark | 1 | good | 120 | 1.50 / 6.0 | 2.50 / 9.0 |  | 2 |" in text
-    assert "| dark | 1 | partly | 12 | 3.00 / 12.0 | 4.00 / 9.0 |  | 1 |" in text
-    assert "| dark | 1 | bad | 3 |  |  |  | none: other-code |" in text
+    assert "| dark | 1 | good | 120 | 1.50 / 6.0 | 2.50 / 9.0 |  |  | 2 |" in text
+    assert "| dark | 1 | partly | 12 | 3.00 / 12.0 | 4.00 / 9.0 |  |  | 1 |" in text
+    assert "| dark | 1 | bad | 3 |  |  |  |  | none: other-code |" in text
     assert "- **partly**: what partly is." in text
 
 

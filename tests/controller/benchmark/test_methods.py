@@ -53,6 +53,7 @@ def test_each_pays_for_the_photographs_that_it_needs(found: dict[str, Judged]) -
         "inversion": all_projectors + dots,
         "feathering": all_projectors + own,
         "single": 5 + 10 + own,
+        "superresolution": all_projectors,
     }
 
 
@@ -86,6 +87,12 @@ def test_the_fixed_targets_are_in_reach_and_the_dim_one_is_darker(subject: Subje
     for wanted in targets.values():
         assert wanted.mask.sum() > 0.5 * subject.mask.sum()
         assert np.isfinite(wanted.radiance).all()
+    part = np.zeros_like(subject.mask)
+    part[20:50, 30:90] = True
+    for wanted in fixed_targets(subject, part).values():
+        assert not (wanted.valid & ~part).any()
+        assert not (wanted.mask & ~part).any()
+        assert (wanted.mask & part).sum() > 0.5 * (subject.mask & part).sum()
     inside = targets["grey"].radiance[subject.mask]
     assert np.allclose(inside, inside[0])
     assert np.ptp(targets["checkerboard"].radiance[subject.mask]) > 0.5 * targets["checkerboard"].white

@@ -119,7 +119,7 @@ def test_a_picture_warped_by_the_2d_profile_is_that_of_each_pixels_place(content
         known = np.isfinite(one.warp[..., :2]).all(axis=2)
         np.testing.assert_array_equal(known, metapixels.valid)
         at = (one.warp[..., :2] * (width, height) - 0.5).astype(np.float32)
-        seen = np.stack([cv2.remap(image, at, None, cv2.INTER_LINEAR) for image in (x, y)], axis=-1)
+        seen = np.stack([cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR) for image in (x, y)], axis=-1)
         inside = known & (metapixels.centre_px < (width - 1, height - 1)).all(axis=2)
         # OpenCV interpolates in steps of 1/32 pixel
         np.testing.assert_allclose(seen[inside], metapixels.centre_px[inside], atol=0.02)

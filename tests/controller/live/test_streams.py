@@ -131,8 +131,14 @@ def test_rtsp_from_gstreamers_server(tmp_path: Path) -> None:
         source = open_stream(f"rtsp://somebody:secret@127.0.0.1:{port}/stream", silent_s=3.0, retry_s=0.2)
         with contextlib.closing(source), running(command, env=environment):
             source.wait_for_picture(30)
-            pictures = []
-            wait_for(lambda: bool((found := newest(source)) and pictures.append(found)) or len(pictures) > 20)
+            pictures: list[LivePicture] = []
+
+            def enough() -> bool:
+                found = newest(source)
+                pictures.extend([] if found is None else [found])
+                return len(pictures) > 20
+
+            wait_for(enough)
             assert all(is_sent(one.pixels) for one in pictures)
             numbers = [one.number for one in pictures]
             assert numbers == sorted(set(numbers))

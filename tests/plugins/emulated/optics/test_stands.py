@@ -95,3 +95,16 @@ def test_a_wrong_stand_is_named(tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "stands.toml").write_text(text)
     with pytest.raises(DeviceError, match=told):
         prepared(tmp_path, stands=str(tmp_path / "stands.toml"))
+
+
+def test_light_between_surfaces_is_worked_out_by_the_engine_that_is_named(tmp_path: Path) -> None:
+    usual, traced = (
+        prepared(tmp_path, "usual", room="room"),
+        prepared(tmp_path, "traced", room="room", engine="mitsuba"),
+    )
+    assert (usual.engine, traced.engine) == ("radiosity", "mitsuba")
+    assert traced.surfaces == usual.surfaces
+    with pytest.raises(PluginError) as refused:
+        prepared(tmp_path, "wrong", engine="candle")
+    assert refused.value.code == "setting-wrong"
+    assert "mitsuba" in refused.value.remedy
