@@ -18,8 +18,8 @@ _last: dict[Path, bytes] = {}
 _lock = threading.Lock()
 
 
-def newest_photograph(stage: Path, now_s: float) -> bytes | None:
-    """As JPEG; None if no run has taken a photograph within ``AGE_S`` before ``now_s`` (Unix seconds)."""
+def newest_photograph(stage: Path, now_s: float, since_s: float = 0.0) -> bytes | None:
+    """As JPEG; None if no run has taken one since ``since_s``, nor within ``AGE_S`` before ``now_s`` (Unix seconds)."""
     try:
         # Each step of a run has a folder of its own for its photographs.
         folders = [step for step in (stage / "runs").glob(f"*/{CAPTURES}/*") if step.is_dir()]
@@ -28,7 +28,7 @@ def newest_photograph(stage: Path, now_s: float) -> bytes | None:
             return None
         files = [one for one in newest.iterdir() if one.is_file() and one.suffix.lower() not in _BESIDE]
         file = max(files, key=lambda one: one.stat().st_mtime, default=None)
-        if file is None or now_s - file.stat().st_mtime > AGE_S:
+        if file is None or file.stat().st_mtime < max(now_s - AGE_S, since_s):
             return None
     except OSError:
         # A run was removed in the meantime.

@@ -40,4 +40,6 @@ def test_the_newest_one_of_all_steps_of_all_runs_is_shown(tmp_path: Path) -> Non
 def test_one_of_another_job_is_not_shown(tmp_path: Path) -> None:
     taken(tmp_path / "runs" / "20260101-100000-calibrate" / CAPTURES / "black", "0", 30, 1000.0)
     assert newest_photograph(tmp_path, 1001.0 + AGE_S) is None
+    assert newest_photograph(tmp_path, 1002.0, since_s=1001.0) is None
+    assert newest_photograph(tmp_path, 1002.0, since_s=999.0) is not None
     assert newest_photograph(tmp_path / "nothing", 1000.0) is None
