@@ -63,6 +63,7 @@ def photograph(browser: Browser, address: str, name: str, target: Path) -> None:
         expect(page.locator("[data-running]")).to_have_count(0)
         page.goto("/aiming")
         page.get_by_role("button", name="Take test shots").click()
+        expect(page.locator("[data-running]")).to_have_count(1)
         expect(page.locator("[data-running]")).to_have_count(0)
         page.goto("/aiming")
         save(page, "panel-aiming")

@@ -294,7 +294,11 @@ class StageKiosk(FolderKiosk):
 
     def photograph(self) -> bytes | None:
         service = self.service
-        return None if service.jobs.running is None else newest_photograph(self.stage, self._world.wall())
+        return (
+            None
+            if service.jobs.running is None
+            else newest_photograph(self.stage, self._world.wall(), self._last.since_unix_s)
+        )
 
     def compare(self, name: str | None = None) -> Job:
         service = self.service

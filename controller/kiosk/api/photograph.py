@@ -13,20 +13,22 @@ from controller.artefacts.names import CAPTURES
 LONGEST_PX: Final = 480
 AGE_S: Final = 900.0
 """An older photograph is of another job."""
+_BESIDE: Final = (".json", ".toml", ".part")
 _last: dict[Path, bytes] = {}
 _lock = threading.Lock()
 
 
-def newest_photograph(stage: Path, now_s: float) -> bytes | None:
-    """As JPEG; None if no run has taken a photograph within ``AGE_S`` before ``now_s`` (Unix seconds)."""
+def newest_photograph(stage: Path, now_s: float, since_s: float = 0.0) -> bytes | None:
+    """As JPEG; None if no run has taken one since ``since_s``, nor within ``AGE_S`` before ``now_s`` (Unix seconds)."""
     try:
-        runs = [one for one in (stage / "runs").iterdir() if (one / CAPTURES).is_dir()]
-        newest = max(runs, key=lambda one: (one / CAPTURES).stat().st_mtime, default=None)
+        # Each step of a run has a folder of its own for its photographs.
+        folders = [step for step in (stage / "runs").glob(f"*/{CAPTURES}/*") if step.is_dir()]
+        newest = max(folders, key=lambda one: one.stat().st_mtime, default=None)
         if newest is None:
             return None
-        files = [one for one in (newest / CAPTURES).iterdir() if one.suffix.lower() not in (".json", ".toml", ".part")]
+        files = [one for one in newest.iterdir() if one.is_file() and one.suffix.lower() not in _BESIDE]
         file = max(files, key=lambda one: one.stat().st_mtime, default=None)
-        if file is None or now_s - file.stat().st_mtime > AGE_S:
+        if file is None or file.stat().st_mtime < max(now_s - AGE_S, since_s):
             return None
     except OSError:
         # A run was removed in the meantime.

@@ -66,7 +66,7 @@ def test_light_in_the_room_is_told_below_the_state_on_every_page(fresh: Served) 
 
 def test_the_lamps_page_tells_each_days_hours_and_what_happened(panel: Served) -> None:
     page = text_of(panel, "/lamps", "vera")
-    assert "2026-01-05" in page
+    assert "Mon 05 Jan" in page
     assert "7.0 h" in page
     assert "13.7 hours per strike" in page
 
@@ -126,10 +126,10 @@ def compared(running: Served, **fields: str) -> str:
 def test_appearances_are_photographed_and_the_results_show_the_newest_and_the_history(fresh: Served) -> None:
     assert "No appearance has been photographed yet." in text_of(fresh, "/results", "otto")
     page = compared(fresh)
-    assert page.count("(CIEDE2000) on the whole object") == 2
+    assert page.count("Colour difference, whole object") == 2
     again = compared(fresh, name="warm wood")
-    wood = again[again.index("<h3>warm wood") :]
-    assert "colour difference 2.25" in wood
+    wood = again[again.index(">warm wood</h3>") :]
+    assert "Colour difference, whole object</dt><dd>2.25</dd>" in wood
     assert wood.index(">2.25<") < wood.index(">1.25<"), "the newest first"
     with fresh.entered("vera") as vera:
         for kind in ("before", "target", "achieved", "error", "resolution"):
