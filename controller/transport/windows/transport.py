@@ -88,6 +88,8 @@ class WindowTransport(LightTransport):
         del ones
         light[:] = 1
         per_sum = made._sums(light, (0, len(maps)))
+        # 1 / a smaller sum, which only very sharp windows leave at a pixel beside them, would be infinite
+        per_sum[per_sum < np.finfo(np.float32).tiny] = 0
         np.divide(1, per_sum, out=per_sum, where=per_sum > 0)
         return cls(mixing, lit, per_sum.max(axis=0), sizes, windows, made.table, made.small, colours, per_sum)
 

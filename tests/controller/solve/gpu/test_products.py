@@ -68,6 +68,13 @@ def test_the_stages_of_these_tests_have_windows_of_every_sort() -> None:
     assert np.diff(transport.windows.first).reshape(-1, SORTS).sum(axis=0).min() > 20
 
 
+def test_a_pixel_beside_very_sharp_windows_has_no_infinite_mean() -> None:
+    """Its shares are the smallest numbers there are."""
+    transport = any_windows(4, mosaic=True)
+    assert isinstance(transport, WindowTransport)
+    assert np.isfinite(transport.per_sum).all()
+
+
 @few
 @stages
 def test_light_and_its_transpose_are_those_of_the_processor(
