@@ -71,4 +71,4 @@ def _elements(points: Floats, triangles: npt.NDArray[np.int64]) -> tuple[Any, Fl
         columns += [other, one, one, other]
         values += [-half, -half, half, half]
     parts = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_matrix(parts, shape=(count, count)), areas
+    return sparse.csr_matrix(parts, shape=(count, count)), np.asarray(areas, np.float64)

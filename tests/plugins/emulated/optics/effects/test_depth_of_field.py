@@ -64,8 +64,8 @@ def test_a_slanted_chequer_is_blurred_as_by_mitsubas_thin_lens() -> None:
     sharp, soft = picture(0.0), picture(0.5 * focal_m / aperture_f)
     # Mitsuba's camera has x to the left
     x = -(np.arange(width) - 0.5 * (width - 1)) / focal_px
-    depth = 1.2 / (1.0 - 1.5 * x)
-    blur = confusion_px(np.asarray(depth, np.float64), focal_px=focal_px, pixel_m=pixel_m, aperture_f=aperture_f, focus_m=1.2)
+    depth = np.asarray(1.2 / (1.0 - 1.5 * x), np.float64)
+    blur = confusion_px(depth, focal_px=focal_px, pixel_m=pixel_m, aperture_f=aperture_f, focus_m=1.2)
     found = defocused(sharp, np.broadcast_to(blur, sharp.shape[:2]).astype(np.float32))
     inside = np.s_[8:-8, 14:-14]
     change = float(np.sqrt(np.mean((sharp - soft)[inside] ** 2)))
