@@ -13,6 +13,7 @@ from controller.artefacts.geometry import write_geometry
 from controller.artefacts.kinds import StepKind, of_projectors
 from controller.artefacts.photographs import Developed, light_of, white_bracket
 from controller.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
+from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.geometry.self_calibration import reconstruct
 from controller.calibrate.geometry.values import CameraPrior
@@ -107,6 +108,9 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
     light = Light.read(context.folder, projector.name)
     taken = read_captures(context.folder, projector.name)
     captures = Developed(taken, {"black": light.black, "white": light.white + light.black})
+    shifts = colour_shifts(captures, plan, light.white, light.mixing)
+    if (said := misaligned(projector.name, shifts)) is not None:
+        context.reporter.say(said, Level.WARNING)
     correspondence = decode(captures, plan, camera_blur_px=float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5))
     if not correspondence.valid.any():
         raise CalibrationError(

@@ -18,7 +18,7 @@ XYZ_TO_LINEAR_SRGB: Final = (
     (-0.9692660, 1.8760108, 0.0415560),
     (0.0556434, -0.2040259, 1.0572252),
 )
-"""The camera's own colours are those of linear sRGB (D65), so this is its ColorMatrix1."""
+"""ColorMatrix1 of a camera whose own colours are those of linear sRGB (D65)."""
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _FORMAT: Final = {_BYTE: "B", _SHORT: "H", _LONG: "I", _RATIONAL: "II", _SRATIONAL: "ii"}
@@ -29,7 +29,10 @@ Entries: TypeAlias = Mapping[int, Entry]
 
 @dataclass(frozen=True, slots=True)
 class PictureFacts:
-    """What a picture's file says of how it was taken. ``taken``: "YYYY:MM:DD HH:MM:SS"."""
+    """What a picture's file says of how it was taken. ``taken``: "YYYY:MM:DD HH:MM:SS".
+
+    ``xyz_to_camera`` (3, 3): the camera's own colours, ColorMatrix1 for D65
+    """
 
     exposure_s: float
     iso: int
@@ -37,12 +40,13 @@ class PictureFacts:
     focal_length_mm: float
     taken: str
     serial_number: str
+    xyz_to_camera: npt.ArrayLike = XYZ_TO_LINEAR_SRGB
 
 
 def dng(mosaic: npt.NDArray[np.uint16], *, black_level: int, white_level: int, facts: PictureFacts) -> bytes:
     """A DNG of a Bayer mosaic (rows, columns), red first (RGGB), uncompressed in 16 bits."""
     rows, columns = mosaic.shape
-    matrix = [value for row in XYZ_TO_LINEAR_SRGB for value in row]
+    matrix = [float(value) for value in np.asarray(facts.xyz_to_camera).ravel()]
     size = rows * columns * 2
 
     def entries(strip: int, exif: int) -> Entries:

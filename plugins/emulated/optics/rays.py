@@ -21,6 +21,7 @@ from embreex.mesh_construction import TriangleMesh
 
 from hal.runtime.compute import usable_cpus
 from plugins.emulated.kept_light import read_kept, write_kept
+from plugins.emulated.optics.effects.varnish import reflected
 from plugins.emulated.optics.furnished import Scene, furnished
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.shapes import dot, length
@@ -51,6 +52,8 @@ class Samples:
     ``gain`` (projectors, N) float32: light on the point per linear light 1, 0 in shadow;
     ``blur`` (projectors, N) uint8: in SIGMA_STEP_PX
     ``gloss`` (projectors, N) float32: what highlights add to the albedo, divided by S * S too; (projectors, 0) without
+    ``points`` (P, 3) float32: the middle of what a pixel sees, world metres; (0, 3) where no effect needs it
+    ``on_object`` (P,) bool: it sees the object, not the room; (0,) as ``points``
     """
 
     pixels: npt.NDArray[np.int32]
@@ -60,6 +63,8 @@ class Samples:
     gain: npt.NDArray[np.float32]
     blur: npt.NDArray[np.uint8]
     gloss: npt.NDArray[np.float32]
+    points: npt.NDArray[np.float32]
+    on_object: npt.NDArray[np.bool_]
 
 
 def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None, progress: Progress) -> Samples:
@@ -108,6 +113,8 @@ def cast(truth: BenchTruth, stage_object: StageObject, progress: Progress) -> Sa
         gain=np.concatenate([block["gain"] for block in blocks], axis=1),
         blur=np.concatenate([block["blur"] for block in blocks], axis=1),
         gloss=np.concatenate([block["gloss"] for block in blocks], axis=1),
+        points=np.concatenate([block["points"] for block in blocks]),
+        on_object=np.concatenate([block["on_object"] for block in blocks]),
     )
 
 
@@ -152,6 +159,7 @@ def _cast_rows(truth: BenchTruth, things: Scene, scene: Any, first: int, last: i
     lit = [_lit(projector, scene, points, normals) for projector in truth.projectors]
     on_object = faces < things.object_faces
     gloss = [_highlight(truth, one, points, normals, ray, on_object) / (s * s) for one in truth.projectors]
+    places = _means(np.column_stack((points, on_object)), counts) if _needs_points(truth) else np.zeros((0, 4))
     return {
         "counts": counts,
         "albedo": (things.albedo(points, faces, weights) / (s * s)).astype(np.float32),
@@ -159,7 +167,22 @@ def _cast_rows(truth: BenchTruth, things: Scene, scene: Any, first: int, last: i
         "gain": np.stack([gain for _, gain, _ in lit]),
         "blur": np.stack([blur for _, _, blur in lit]),
         "gloss": np.stack(gloss).astype(np.float32),
+        "points": places[:, :3].astype(np.float32),
+        "on_object": places[:, 3] > 0.5,
     }
+
+
+def _needs_points(truth: BenchTruth) -> bool:
+    return truth.camera.focus_m > 0.0 or truth.object.subsurface.share > 0.0
+
+
+def _means(values: Floats, counts: npt.NDArray[np.int64]) -> Floats:
+    """Means (P, k) of the samples (N, k) of each pixel that has some."""
+    counts = counts[counts > 0]
+    if not len(counts):
+        return np.zeros((0, values.shape[1]))
+    first = np.concatenate(([0], np.cumsum(counts[:-1])))
+    return np.asarray(np.add.reduceat(values, first, axis=0) / counts[:, None])
 
 
 def _facing(geometric: Floats, normals: Floats, ray: Floats) -> Floats:
@@ -214,14 +237,18 @@ def _highlight(
     on_object: npt.NDArray[np.bool_],
 ) -> Floats:
     """What a highlight adds to the albedo at points, in the direction of the camera; nothing (0,) without gloss."""
-    strength, exponent = truth.object.gloss, truth.object.gloss_exponent
-    if strength <= 0.0:
+    strength, exponent, varnish = truth.object.gloss, truth.object.gloss_exponent, truth.object.varnish
+    if strength <= 0.0 and varnish.strength <= 0.0:
         return np.zeros(0)
     towards = np.asarray(projector.pose.position_m) - points
-    half = towards / np.maximum(length(towards), 1e-9)[:, None] - ray
+    towards /= np.maximum(length(towards), 1e-9)[:, None]
+    half = towards - ray
     half /= np.maximum(length(half), 1e-9)[:, None]
     cosine = np.clip(dot(half, normals), 0.0, 1.0)
-    return np.asarray(on_object * strength * (exponent + 8.0) / 8.0 * cosine**exponent)
+    found = strength * (exponent + 8.0) / 8.0 * cosine**exponent
+    if varnish.strength > 0.0:
+        found += varnish.strength * reflected(towards, -ray, normals, varnish.roughness, varnish.index)
+    return np.asarray(on_object * found)
 
 
 def _in_shadow(lens: Floats, scene: Any, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:
@@ -242,6 +269,7 @@ def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
     for part in (truth.camera.pose, truth.camera.lens, *projectors):
         digest.update(dump(part).encode())
     digest.update(f"{truth.subsamples} {truth.object.gloss} {truth.object.gloss_exponent}".encode())
+    digest.update(f"{dump(truth.object.varnish)} {_needs_points(truth)}".encode())
     for array in scene.fingerprint():
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

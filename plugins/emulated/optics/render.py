@@ -6,6 +6,7 @@ import functools
 import hashlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Final, Protocol, TypeAlias
 
 import cv2
@@ -13,9 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from hal.runtime.jit import compiled
-from plugins.emulated.optics.flaws import veiled
+from plugins.emulated.optics.effects.depth_of_field import confusion_px, defocused
+from plugins.emulated.optics.effects.dithering import shown
+from plugins.emulated.optics.effects.flaws import veiled
+from plugins.emulated.optics.effects.levels import Dithering
+from plugins.emulated.optics.effects.spectra import colours
+from plugins.emulated.optics.effects.subsurface import Spread
 from plugins.emulated.optics.footprints import KEPT_BYTES, Footprints, Lit
 from plugins.emulated.optics.rays import Samples
+from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM
 from plugins.emulated.optics.truth import BenchTruth, LightTruth, ProjectorTruth
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
@@ -28,6 +35,18 @@ SHADOW_EDGE: Final = 0.04
 """Width of a shadow's soft edge, in picture widths: who stands near the lens is far out of its focus."""
 
 
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """How long a picture is exposed, from which moment on, and through which aperture."""
+
+    start_s: float = 0.0
+    open_s: float = 1.0
+    aperture_f: float = 8.0
+
+
+ALWAYS: Final = Shutter()
+
+
 def response(light: LightTruth) -> npt.NDArray[np.float64]:
     """Linear light (256, 3) of each device value before black level and mixing: 0 at 0, 1 at 255, rising.
 
@@ -37,10 +56,19 @@ def response(light: LightTruth) -> npt.NDArray[np.float64]:
     return np.asarray(power + np.asarray(light.s_curve) * power * (1.0 - power) * (2.0 * power - 1.0))
 
 
-def channels(light: LightTruth, frame: ByteImage) -> FloatImage:
-    """Linear light (rows, columns, 3) of a frame's red, green and blue before mixing."""
-    table = light.black_level + (1.0 - light.black_level) * response(light)
-    each = np.stack([table[:, c].astype(np.float32)[frame[..., c]] for c in range(3)], axis=-1)
+def channels(
+    light: LightTruth, frame: ByteImage, dithering: Dithering | None = None, shutter: Shutter = ALWAYS
+) -> FloatImage:
+    """Linear light (rows, columns, 3) of a frame's red, green and blue before mixing, as ``shutter`` sees it."""
+    black, table = light.black_level, response(light)
+    if dithering is None or dithering.levels < 2:
+        table = black + (1.0 - black) * table
+        each = _looked_up(table, frame)
+    else:
+        start, frames = shutter.start_s / dithering.frame_s, shutter.open_s / dithering.frame_s
+        wanted = _looked_up(table, frame)
+        made = shown(wanted, levels=dithering.levels, turns=dithering.turns, start=start, frames=frames)
+        each = np.float32(black) + np.float32(1.0 - black) * made
     if light.white_segment > 0.0:
         each += np.float32(light.white_segment) * each.min(axis=-1, keepdims=True)
     if light.shadow > 0.0:
@@ -49,20 +77,26 @@ def channels(light: LightTruth, frame: ByteImage) -> FloatImage:
     return each
 
 
+def _looked_up(table: npt.NDArray[np.float64], frame: ByteImage) -> FloatImage:
+    return np.stack([table[:, c].astype(np.float32)[frame[..., c]] for c in range(3)], axis=-1)
+
+
 def emitted(light: LightTruth, frame: ByteImage) -> FloatImage:
     """Linear light (rows, columns, 3) in the camera's channels that a frame's pixels send out; white is about 1."""
     return veiled(channels(light, frame) @ np.asarray(light.mixing, dtype=np.float32).T, light.glare)
 
 
-def sent_by_panels(projector: ProjectorTruth, frame: ByteImage) -> Iterator[FloatImage]:
-    """Linear light (rows, columns, 3) that is sent out, in parts that lie alike: one for each of ``panel_places``."""
-    light = projector.light
+def sent_by_panels(projector: ProjectorTruth, each: FloatImage, mixing: FloatImage) -> Iterator[FloatImage]:
+    """Linear light (rows, columns, 3) that is sent out, in parts that lie alike: one for each of ``panel_places``.
+
+    ``each``: the light of its ``channels``; ``mixing`` (3, 3): of them into three colours
+    """
+    glare = projector.light.glare
     if projector.panels.aligned:
-        yield emitted(light, frame)
+        yield veiled(each @ mixing.T, glare)
         return
-    each, mixing = channels(light, frame), np.asarray(light.mixing, dtype=np.float32)
     for c in range(3):
-        yield veiled(each[..., c : c + 1] * mixing[:, c], light.glare)
+        yield veiled(each[..., c : c + 1] * mixing[:, c], glare)
 
 
 def panel_places(projector: ProjectorTruth, at_px: FloatImage) -> list[FloatImage]:
@@ -90,89 +124,181 @@ class Renderer:
         self._truth = truth
         self._transfer = transfer
         self._samples = samples
-        self._footprints: list[list[Footprints] | None] = [None] * len(truth.projectors)
+        self._footprints: list[tuple[list[Footprints], list[Footprints]] | None] = [None] * len(truth.projectors)
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
         of_all = 12 * max(len(samples.pixels), 1) * len(truth.projectors)
         self._layers_kept = max(1, min(LAYERS_KEPT, LAYERS_BYTES // of_all))
         self._vignette = _vignette(truth)
         self._albedo = _pixel_sums(samples.albedo, samples.starts)
         self._ambient = self._albedo * np.asarray(truth.ambient, dtype=np.float32)
+        self._tensors = [_colours(truth, projector) for projector in truth.projectors]
+        self._on_white = [
+            np.asarray(one.light.mixing if tensor is None else tensor.sum(axis=1), np.float32)
+            for one, tensor in zip(truth.projectors, self._tensors, strict=True)
+        ]
+        self._paint = _seen_paint(self._albedo, self._tensors)
+        spread = truth.object.subsurface
+        self._surface = None
+        if spread.share > 0.0:
+            width = truth.camera.lens.size_px[0]
+            self._surface = Spread.over(samples.pixels, samples.points, width, spread.spread_m)
         self._last: tuple[tuple[object, ...], FloatImage] | None = None
 
-    def light(self, frames: Sequence[ByteImage], levels: Sequence[float]) -> FloatImage:
+    def light(self, frames: Sequence[ByteImage], levels: Sequence[float], shutter: Shutter = ALWAYS) -> FloatImage:
         """Linear light (camera rows, columns, 3) float32; do not write to it.
 
         ``frames``: (rows, columns, 3) uint8 for each projector; ``levels``: its lamp's light, 0 dark to 1 full
         """
         digests = [hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() for frame in frames]
-        key = (*digests, *levels)
+        key = (*digests, *levels, *self._seen_of(shutter))
         if self._last is not None and self._last[0] == key:
             return self._last[1]
         total = self._ambient.copy()
         for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
             if level > 0.0:
-                total += np.float32(level) * self._layer(index, frame, digests[index])
+                total += np.float32(level) * self._layer(index, frame, digests[index], shutter)
         if self._transfer is not None:
-            total += self._albedo * self._returned(self._transfer, frames, levels)
+            total += self._paint * self._returned(self._transfer, frames, levels, shutter)
         if self._truth.indirect > 0.0:
             # The mean light on what the camera sees stands for what object and room throw back.
             lit = (total - self._ambient).sum(axis=0, dtype=np.float64) / np.maximum(self._albedo.sum(axis=0), 1e-9)
             total += self._albedo * (self._truth.indirect * lit).astype(np.float32)
-        image = self._through_lens(total)
+        image = self._through_lens(total, shutter.aperture_f)
         self._last = (key, image)
         return image
 
-    def _returned(self, transfer: Returning, frames: Sequence[ByteImage], levels: Sequence[float]) -> FloatImage:
+    def _seen_of(self, shutter: Shutter) -> tuple[object, ...]:
+        """What of a shutter makes pictures differ on this stage."""
+        dithered = any(projector.dithering.levels > 1 for projector in self._truth.projectors)
+        return (shutter,) if dithered or self._truth.camera.focus_m > 0.0 else ()
+
+    def _returned(
+        self, transfer: Returning, frames: Sequence[ByteImage], levels: Sequence[float], shutter: Shutter
+    ) -> FloatImage:
         """Irradiance (P, 3) that object and surfaces throw back."""
         sent = [
-            np.float32(level) * emitted(projector.light, frame) if level > 0.0 else None
-            for projector, frame, level in zip(self._truth.projectors, frames, levels, strict=True)
+            np.float32(level) * veiled(channels(one.light, frame, one.dithering, shutter) @ white.T, one.light.glare)
+            if level > 0.0
+            else None
+            for one, white, frame, level in zip(self._truth.projectors, self._on_white, frames, levels, strict=True)
         ]
         return transfer.light(sent)
 
-    def _layer(self, index: int, frame: ByteImage, digest: bytes) -> FloatImage:
+    def _layer(self, index: int, frame: ByteImage, digest: bytes, shutter: Shutter) -> FloatImage:
         """One projector's light (P, 3) at full lamp, summed over each camera pixel's samples."""
-        kept = self._layers[index]
+        projector, kept = self._truth.projectors[index], self._layers[index]
+        if projector.dithering.levels > 1:
+            digest += repr(shutter).encode()
         if digest in kept:
             kept.move_to_end(digest)
             return kept[digest]
-        sent = sent_by_panels(self._truth.projectors[index], frame)
-        parts = [lit.light(one) for lit, one in zip(self._footprints_of(index), sent, strict=True)]
-        layer = functools.reduce(np.add, parts)
+        each = channels(projector.light, frame, projector.dithering, shutter)
+        paint, gloss = self._footprints_of(index)
+        layer = self._spread(self._through(index, paint, each))
+        if gloss:
+            layer = layer + self._through(index, gloss, each)
         kept[digest] = layer
         if len(kept) > self._layers_kept:
             kept.popitem(last=False)
         return layer
 
-    def _footprints_of(self, index: int) -> list[Footprints]:
-        """Of each part of ``sent_by_panels``; made when the projector shows its first frame."""
+    def _through(self, index: int, footprints: Sequence[Footprints], each: FloatImage) -> FloatImage:
+        """Light (P, 3) of a frame's channels by the footprints of each of its ``panel_places``."""
+        projector, tensor = self._truth.projectors[index], self._tensors[index]
+        if tensor is None:
+            parts = sent_by_panels(projector, each, self._on_white[index])
+            return functools.reduce(np.add, (lit.light(one) for lit, one in zip(footprints, parts, strict=True)))
+        # The camera's red is a sum over the paint's three albedos, of which each channel lights its own part.
+        seen = []
+        for mixing in tensor:
+            parts = sent_by_panels(projector, each, mixing)
+            by_paint = (lit.light(one) for lit, one in zip(footprints, parts, strict=True))
+            seen.append(functools.reduce(np.add, by_paint).sum(axis=1))
+        return np.stack(seen, axis=1)
+
+    def _spread(self, layer: FloatImage) -> FloatImage:
+        """The light of a layer, part of which leaves the surface elsewhere."""
+        share = np.float32(self._truth.object.subsurface.share)
+        if self._surface is None:
+            return layer
+        falling = np.divide(layer, self._paint, out=np.zeros_like(layer), where=self._paint > 0.0)
+        on = self._samples.on_object[:, None]
+        spread = self._paint * self._surface.of(np.where(on, falling, np.float32(0.0)))
+        return np.where(on, (1 - share) * layer + share * spread, layer)
+
+    def _footprints_of(self, index: int) -> tuple[list[Footprints], list[Footprints]]:
+        """Of each part of ``sent_by_panels``, on paint and, where light spreads below, apart from it on the gloss.
+
+        Made when the projector shows its first frame.
+        """
         made = self._footprints[index]
         if made is None:
-            samples, projector, gloss = self._samples, self._truth.projectors[index], self._samples.gloss[index]
-            albedo = samples.albedo + gloss[:, None] if gloss.size else samples.albedo
-            places = panel_places(projector, samples.at_px[index])
-            made = self._footprints[index] = [
-                Footprints.of(
-                    Lit(samples.starts, at_px, samples.gain[index], samples.blur[index], albedo),
-                    projector.light.fill_factor,
-                    most_bytes=KEPT_BYTES // len(places),
-                )
-                for at_px in places
-            ]
+            samples, gloss = self._samples, self._samples.gloss[index]
+            white = np.repeat(gloss[:, None], 3, axis=1)
+            if self._surface is None:
+                paint = samples.albedo + white if gloss.size else samples.albedo
+                made = self._summed(index, paint), []
+            else:
+                made = self._summed(index, samples.albedo), self._summed(index, white) if gloss.size else []
+            self._footprints[index] = made
         return made
 
-    def _through_lens(self, total: FloatImage) -> FloatImage:
-        width, height = self._truth.camera.lens.size_px
+    def _summed(self, index: int, albedo: FloatImage) -> list[Footprints]:
+        samples, projector = self._samples, self._truth.projectors[index]
+        places = panel_places(projector, samples.at_px[index])
+        return [
+            Footprints.of(
+                Lit(samples.starts, at_px, samples.gain[index], samples.blur[index], albedo),
+                projector.light.fill_factor,
+                most_bytes=KEPT_BYTES // len(places),
+            )
+            for at_px in places
+        ]
+
+    def _through_lens(self, total: FloatImage, aperture_f: float) -> FloatImage:
+        camera = self._truth.camera
+        width, height = camera.lens.size_px
         flat = np.zeros((height * width, 3), dtype=np.float32)
         flat[self._samples.pixels] = total
         image: FloatImage = flat.reshape(height, width, 3)
-        sigma = self._truth.camera.psf_sigma_px
+        if camera.focus_m > 0.0:
+            image = defocused(image, self._confusion(aperture_f))
+        sigma = camera.psf_sigma_px
         if sigma > 0.05:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)
-        image = veiled(image, self._truth.camera.glare)
+        image = veiled(image, camera.glare)
         image *= self._vignette[..., None]
         image.flags.writeable = False
         return image
+
+    def _confusion(self, aperture_f: float) -> FloatImage:
+        """(rows, columns): standard deviation of each pixel's circle of confusion, px."""
+        camera = self._truth.camera
+        (width, height), pose = camera.lens.size_px, camera.pose
+        depth = (self._samples.points.astype(np.float64) - pose.position_m) @ pose.rotation[2]
+        flat = np.zeros(height * width, np.float32)
+        flat[self._samples.pixels] = confusion_px(
+            depth, focal_px=camera.lens.focal_px, pixel_m=1e-3 * SENSOR_WIDTH_MM / width,
+            aperture_f=aperture_f, focus_m=camera.focus_m,
+        )  # fmt: skip
+        return flat.reshape(height, width)
+
+
+def _colours(truth: BenchTruth, projector: ProjectorTruth) -> FloatImage | None:
+    """(3 camera, 3 paint, 3 channels): see ``spectra.colours``; None where light has no wavelengths."""
+    light = projector.light
+    if not truth.camera.spectral or not all(width > 0.0 for _, width in light.bands_nm):
+        return None
+    white = np.asarray(light.mixing).sum(axis=1)
+    return colours(light.bands_nm, truth.camera.bands_nm, white).astype(np.float32)
+
+
+def _seen_paint(albedo: FloatImage, tensors: Sequence[FloatImage | None]) -> FloatImage:
+    """(P, 3): the share of white light from all projectors that the camera sees of each pixel's paint."""
+    by_camera = [np.eye(3) if one is None else one.sum(axis=2) / one.sum(axis=(1, 2))[:, None] for one in tensors]
+    if all(one is None for one in tensors):
+        return albedo
+    return np.asarray(albedo @ np.mean(by_camera, axis=0).T, np.float32)
 
 
 def _vignette(truth: BenchTruth) -> FloatImage:

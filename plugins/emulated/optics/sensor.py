@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from plugins.emulated.optics.flaws import SensorFlaws
+from plugins.emulated.optics.effects.flaws import SensorFlaws
 from plugins.emulated.optics.truth import Sensor
 
 REFERENCE_APERTURE_F = 8.0

@@ -16,6 +16,16 @@ from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
 from hal.runtime.files import read_text
+from plugins.emulated.optics.effects.levels import (
+    BARE,
+    NO_BANDS,
+    OPAQUE,
+    STEADY,
+    Bands,
+    Dithering,
+    Subsurface,
+    Varnish,
+)
 from plugins.emulated.tables import Between, OneOf, dump, load
 
 Two: TypeAlias = tuple[float, float]
@@ -77,7 +87,9 @@ class Sensor:
 class CameraTruth:
     """The camera. ``vignetting``: share of light lost in the image's corners; ``raw``: False makes JPEG files only.
 
-    ``glare``: share of the light that its lens spreads over the whole picture (``flaws.veiled``).
+    ``glare``: share of the light that its lens spreads over the whole picture (``effects.flaws.veiled``);
+    ``focus_m``: where along its axis it is focused, 0: all is sharp (``effects.depth_of_field``);
+    ``bands_nm``: its filters, without which its colours are those of sRGB (``effects.spectra``).
     """
 
     pose: Pose
@@ -90,6 +102,12 @@ class CameraTruth:
     vignetting: Annotated[float, Between(0.0, 0.95)]
     raw: bool = True
     glare: Annotated[float, Between(0.0, 0.5)] = 0.0
+    focus_m: Annotated[float, Between(0.0, 100.0)] = 0.0
+    bands_nm: Annotated[Bands, Between(0.0, 2000.0)] = NO_BANDS
+
+    @property
+    def spectral(self) -> bool:
+        return all(width > 0.0 for _, width in self.bands_nm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +128,9 @@ class LightTruth:
     ``gamma``, ``s_curve``: response per channel, see ``render.response``; ``black_level``: share of white at value 0;
     ``glare``: share of the light that the lens spreads over the whole picture; ``white_segment``: of a colour wheel,
     which adds so many times the least of the three channels to each of them, so that colours do not add up to white;
-    ``shadow``: share of the picture's width, from its left, in which a visitor's body keeps the light
+    ``shadow``: share of the picture's width, from its left, in which a visitor's body keeps the light;
+    ``bands_nm``: the light of its channels by wavelength, where the camera has bands, too: white light then has the
+    colour of ``mixing``, the rest of which does not count
     """
 
     brightness: Annotated[float, Between(0.0, 1e3)]
@@ -124,6 +144,7 @@ class LightTruth:
     glare: Annotated[float, Between(0.0, 0.5)] = 0.0
     white_segment: Annotated[float, Between(0.0, 2.0)] = 0.0
     shadow: Annotated[float, Between(0.0, 1.0)] = 0.0
+    bands_nm: Annotated[Bands, Between(0.0, 2000.0)] = NO_BANDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +196,7 @@ class ProjectorTruth:
     light: LightTruth
     lamp: LampTruth
     panels: Panels = Panels()
+    dithering: Dithering = STEADY
     board: str = "optoma-later"
     tcp_port: Annotated[int, Between(0, 65_535)] = 0
     password: str = ""
@@ -187,7 +209,8 @@ class ObjectTruth:
     Without ``file`` the vase and the bust are computed again, which takes seconds.
 
     ``gloss``: strength of its highlights (Blinn and Phong, normalised): light added where the surface mirrors a lens
-    into the camera, relative to a perfect white; ``gloss_exponent``: how small they are.
+    into the camera, relative to a perfect white; ``gloss_exponent``: how small they are. ``varnish`` and
+    ``subsurface``: see ``effects``
     """
 
     kind: str
@@ -195,6 +218,8 @@ class ObjectTruth:
     seed: Annotated[int, Between(0, 2**63 - 1)]
     gloss: Annotated[float, Between(0.0, 1.0)] = 0.0
     gloss_exponent: Annotated[float, Between(1.0, 1e4)] = 60.0
+    varnish: Varnish = BARE
+    subsurface: Subsurface = OPAQUE
 
 
 @dataclass(frozen=True, slots=True)

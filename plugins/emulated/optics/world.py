@@ -16,12 +16,13 @@ from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
 from plugins.emulated.kept_light import kept_folder
 from plugins.emulated.optics.bumps import FILE as BUMPS
 from plugins.emulated.optics.bumps import bumped, read_bumps
-from plugins.emulated.optics.dng import PictureFacts, dng, with_exif
-from plugins.emulated.optics.flaws import exposed_s, flickering, sensor_flaws
+from plugins.emulated.optics.dng import XYZ_TO_LINEAR_SRGB, PictureFacts, dng, with_exif
+from plugins.emulated.optics.effects.flaws import exposed_s, flickering, sensor_flaws
+from plugins.emulated.optics.effects.spectra import xyz_to_camera
 from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.objects import StageObject, default_object
 from plugins.emulated.optics.rays import Progress, samples_of
-from plugins.emulated.optics.render import Renderer
+from plugins.emulated.optics.render import Renderer, Shutter
 from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM, jpeg, mosaic
 from plugins.emulated.optics.truth import FOLDER, BenchTruth, ObjectTruth
 from plugins.emulated.outputs import VisibleFrames, VisibleFrameSet
@@ -57,6 +58,7 @@ class World:
         self._visible = VisibleFrames(stage / truth.frames, truth.latency_s)
         self._rng = np.random.default_rng([truth.seed, 2])
         self._flicker = np.random.default_rng([truth.seed, 5])
+        self._moment = np.random.default_rng([truth.seed, 9])
         self._flaws = sensor_flaws(truth.camera, truth.seed)
 
     def __enter__(self) -> World:
@@ -106,17 +108,19 @@ class World:
         levels = [0.5 * (first + lamp.light_level()) for first, lamp in zip(before, self._lamps, strict=True)]
         for index, projector in enumerate(self._truth.projectors):
             levels[index] *= flickering(projector.lamp, settings.exposure_s, self._flicker)
-        light = self._mixed(self._visible.during(start_s, end_s), levels)
+        # Panels and shutter keep no time with each other.
+        shutter = Shutter(float(self._moment.random()), settings.exposure_s, settings.aperture_f)
+        light = self._mixed(self._visible.during(start_s, end_s), levels, shutter)
         return self._files(light, settings, taken)
 
     def _mixed(
-        self, visible: list[tuple[float, VisibleFrameSet | None]], levels: Sequence[float]
+        self, visible: list[tuple[float, VisibleFrameSet | None]], levels: Sequence[float], shutter: Shutter
     ) -> npt.NDArray[np.float32]:
         """The time-weighted mean of what was visible; of many frames, the longest-shown few stand for all."""
         longest = sorted(visible, key=lambda part: part[0], reverse=True)[:MOST_FRAMES_IN_A_SHOT]
         total = sum(share for share, _ in longest)
         pictures = [
-            (share / total, self._renderer.light([self._frame(i, shown) for i in range(len(levels))], levels))
+            (share / total, self._renderer.light([self._frame(i, shown) for i in range(len(levels))], levels, shutter))
             for share, shown in longest
         ]
         if len(pictures) == 1:
@@ -156,6 +160,7 @@ class World:
             focal_length_mm=float(round(camera.lens.focal_px / camera.lens.size_px[0] * SENSOR_WIDTH_MM)),
             taken=taken,
             serial_number=camera.serial_number,
+            xyz_to_camera=xyz_to_camera(camera.bands_nm) if camera.spectral else XYZ_TO_LINEAR_SRGB,
         )
         levels = {"black_level": camera.sensor.black_level, "white_level": camera.sensor.white_level}
         return ShotFiles(

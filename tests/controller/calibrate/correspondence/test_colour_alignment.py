@@ -1,0 +1,63 @@
+"""Colours of a projector that do not lie on each other, in pictures made by formula."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned
+from controller.capture.patterns import frame, plan_patterns
+from controller.core.arrays import Float64, FloatImage
+
+MIXING = np.array([[0.86, 0.10, 0.04], [0.07, 0.88, 0.05], [0.02, 0.09, 0.89]])
+PLAN = plan_patterns((96, 72))
+
+
+def pictures(shifts: Float64, noise: float = 0.01) -> dict[str, FloatImage]:
+    """A camera that sees 2.3 pixels for each of the projector's, whose colours are shifted by (3, 2) pixels."""
+    y, x = np.mgrid[0:150, 0:200] / 2.3 + 3.0
+    rng = np.random.default_rng(3)
+    paint = 0.2 + 0.6 * rng.random((1, 200, 3))
+    whole = np.broadcast_to(paint, (150, 200, 3)).astype(np.float32)
+    found = {"black": np.zeros_like(whole), "white": whole}
+    for prefix in ("blur-x", "blur-y"):
+        for step in PLAN.sinusoids(prefix):
+            fx, fy = step.frequency
+            # 0.6 of the contrast is left by blur
+            own = [
+                0.5 + 0.3 * np.cos(2 * np.pi * (fx * (x - dx) + fy * (y - dy)) - step.phase_rad) for dx, dy in shifts
+            ]  # fmt: skip
+            light = np.stack(own, axis=-1) @ MIXING.T * whole
+            found[step.name] = (light * (1 + noise * rng.standard_normal(light.shape))).astype(np.float32)
+    return found
+
+
+def test_the_formula_is_that_of_the_patterns() -> None:
+    (step,) = PLAN.sinusoids("blur-x")[1:2]
+    shown = frame(step, (96, 72))
+    x = np.arange(96)
+    np.testing.assert_allclose(
+        shown[0], 0.5 + 0.5 * np.cos(2 * np.pi * step.frequency[0] * x - step.phase_rad), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("shift", [((0.3, 0.0), (0.0, 0.0), (-0.1, 0.28)), ((-0.2, 0.15), (0.1, 0.1), (0.1, 0.1))])
+def test_shifts_are_found_and_named(shift: tuple[tuple[float, float], ...]) -> None:
+    wanted = np.asarray(shift)
+    found = colour_shifts(pictures(wanted), PLAN, pictures(wanted)["white"], MIXING)
+    np.testing.assert_allclose(found, wanted - wanted[1], atol=0.01)
+    said = misaligned("left", found)
+    assert said is not None
+    assert f"red by {wanted[0, 0] - wanted[1, 0]:+.1f} pixels across" in said
+    assert "convergence" in said
+
+
+def test_colours_that_lie_on_each_other_are_not_named_however_noisy() -> None:
+    for noise in (0.0, 0.05, 0.2):
+        made = pictures(np.zeros((3, 2)), noise)
+        assert misaligned("left", colour_shifts(made, PLAN, made["white"], MIXING)) is None
+
+
+def test_without_light_nothing_is_said() -> None:
+    made = {name: np.zeros_like(image) for name, image in pictures(np.zeros((3, 2))).items()}
+    assert misaligned("left", colour_shifts(made, PLAN, made["white"], MIXING)) is None

@@ -1,0 +1,46 @@
+"""Light that spreads below a surface: against the formula on a plane, and its laws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import k0
+
+from plugins.emulated.optics.effects.subsurface import Spread
+
+SIDE = 121
+
+
+def plane(step_m: float = 5e-4, slant: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    y, x = np.mgrid[0:SIDE, 0:SIDE]
+    points = np.stack([x * step_m, y * step_m * slant, y * 0.3 * step_m], axis=-1).reshape(-1, 3)
+    return np.arange(SIDE * SIDE, dtype=np.int32), points.astype(np.float32)
+
+
+@pytest.mark.parametrize("slant", [1.0, 2.0])
+def test_a_point_of_light_spreads_by_k0(slant: float) -> None:
+    pixels, points = plane(slant=slant)
+    spread_m = 2.5e-3
+    spread = Spread.over(pixels, points, SIDE, spread_m)
+    falling = np.zeros((SIDE * SIDE, 3), np.float32)
+    middle = SIDE * SIDE // 2
+    falling[middle] = 1.0
+    found = spread.of(falling)[:, 1]
+    away = np.linalg.norm(points - points[middle], axis=1)
+    some = (away > 3e-3) & (away < 9e-3)
+    wanted = spread.areas[middle] * k0(away[some] / spread_m) / (2 * np.pi * spread_m**2)
+    np.testing.assert_allclose(found[some], wanted, rtol=0.05)
+
+
+def test_no_light_is_lost_and_none_passes_a_depth_edge() -> None:
+    pixels, points = plane()
+    behind = (pixels % SIDE) > 60
+    points[behind, 2] += 0.1
+    spread = Spread.over(pixels, points, SIDE, 2e-3)
+    falling = np.random.default_rng(2).random((SIDE * SIDE, 3)).astype(np.float32)
+    falling[behind] = 0.0
+    found = spread.of(falling)
+    assert not found[behind].any()
+    sums = [(spread.areas[:, None] * light).sum(axis=0) for light in (falling, found)]
+    np.testing.assert_allclose(sums[0], sums[1], rtol=1e-4)
+    assert found.min() > -1e-4
