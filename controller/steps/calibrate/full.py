@@ -107,7 +107,8 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
     light = Light.read(context.folder, projector.name)
     taken = read_captures(context.folder, projector.name)
     captures = Developed(taken, {"black": light.black, "white": light.white + light.black})
-    correspondence = decode(captures, plan, camera_blur_px=float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5))
+    blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5)
+    correspondence = decode(captures, plan, camera_blur_px=blur_px, scratch=context.folder)
     if not correspondence.valid.any():
         raise CalibrationError(
             "projector-reaches-nothing",
