@@ -81,12 +81,13 @@ def test_where_nothing_was_decoded_nothing_is_known() -> None:
 def test_a_curved_fit_does_not_show_where_bands_of_rows_meet(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(7)
     y, x = np.mgrid[0:61, 0:40]
-    position = np.stack([0.4 * x + np.sin(y / 9), 0.4 * y + np.cos(x / 8)], -1) + random.normal(0, 0.03, (61, 40, 2))
+    smooth = np.stack([0.4 * x + np.sin(y / 9), 0.4 * y + np.cos(x / 8)], -1)
+    position = (smooth + random.normal(0, 0.03, smooth.shape)).astype(np.float32)
     valid = random.random((61, 40)) > 0.02
     position[~valid] = np.nan
-    position = position.astype(np.float32)
-    whole = smoothing.fit_curved(position, valid, position + 1)
+    otherwise = position + np.float32(1)
+    whole = smoothing.fit_curved(position, valid, otherwise)
     assert 0.1 < np.mean(np.abs(whole - position) < 0.5) < 0.95
     for rows in (1, 3, 7, 60, 61):
         monkeypatch.setattr(smoothing, "BAND_ROWS", rows)
-        np.testing.assert_array_equal(smoothing.fit_curved(position, valid, position + 1), whole)
+        np.testing.assert_array_equal(smoothing.fit_curved(position, valid, otherwise), whole)
