@@ -1,4 +1,4 @@
-"""How much memory a base image takes at its peak, calculated before it begins (docs/decisions/0055).
+"""How much memory calibrating and a base image take at their peak, calculated before they begin (docs/decisions/0055).
 
 Counted are arrays of the process itself. A calibration's own arrays lie in files, and what of them is in memory can be
 had back by the system at any time.
@@ -18,6 +18,11 @@ WINDOW: Final = 15
 LEAST_OBJECT: Final = 0.25
 """Share of the camera's picture; how much an object needs is not known before it is photographed, and what is refused
 then must certainly not fit."""
+DECODED: Final = 62
+"""Bytes of a camera pixel while one projector's photographs are decoded, sums in a file."""
+FITTED: Final = 75
+"""The same while its metapixels and its phase map are made, the projector's own arrays included: it has about a sixth
+as many pixels as the camera."""
 SPARE: Final = 1.1
 """Small arrays, stacks and tables of threads."""
 PROGRAM: Final = 300 * 1024 * 1024
@@ -80,12 +85,17 @@ def base_peak_bytes(size: StageSize) -> int:
     return int(SPARE * max(built, ties, begun, swept, ended, prepared)) + PROGRAM
 
 
-def check_memory(need: int, free: int | None) -> str:
+def calibration_peak_bytes(size: StageSize) -> int:
+    """Bytes at the peak of decoding photographs and fitting metapixels, one projector after the other."""
+    return int(SPARE * max(DECODED, FITTED) * size.camera) + PROGRAM
+
+
+def check_memory(need: int, free: int | None, work: str = "The solve") -> str:
     """One sentence on how much memory is needed and free. Raises WorkError("memory-too-small") where it does not fit.
 
-    ``free``: bytes, or None if not known; then nothing is refused
+    ``free``: bytes, or None if not known; then nothing is refused. ``work``: what needs it, one thing
     """
-    needed = f"The solve needs about {need / 1e9:.1f} GB of memory"
+    needed = f"{work} needs about {need / 1e9:.1f} GB of memory"
     if free is None:
         return f"{needed}; how much is free is not known."
     if need > free:

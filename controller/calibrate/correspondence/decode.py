@@ -7,6 +7,7 @@ fringe of the fine ones, and these where in it. Photographs are asked for one at
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numba
@@ -19,7 +20,7 @@ from controller.calibrate.correspondence.phase_shift import CODED, CONTRADICTED,
 from controller.calibrate.correspondence.smoothing import correct_for_paint, fit_planes
 from controller.calibrate.values import Correspondence
 from controller.capture.patterns import BLUR_FREQUENCIES, CELL_PX, PERIOD_PX, PHASE_STEPS, PatternPlan
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, array_in_file
 from controller.core.errors import CalibrationError
 from controller.core.jit import compiled
 
@@ -55,7 +56,12 @@ class _Sums:
 
 
 def decode(
-    captures: Captures, plan: PatternPlan, *, refine: bool = True, camera_blur_px: float = 0.0
+    captures: Captures,
+    plan: PatternPlan,
+    *,
+    refine: bool = True,
+    camera_blur_px: float = 0.0,
+    scratch: Path | None = None,
 ) -> Correspondence:
     """Decode one projector's Gray-code and sinusoid captures.
 
@@ -67,6 +73,7 @@ def decode(
         not on it, such as those that see two surfaces at once
     camera_blur_px : standard deviation of the camera's own blur, camera px; where known, positions are freed of the
         pull towards the paler paint within a camera pixel's reach
+    scratch : a folder on a disk, for the sums of a large camera (40 bytes a pixel), which then need not stay in memory
 
     Returns
     -------
@@ -79,7 +86,7 @@ def decode(
     CalibrationError("captures-inconsistent")  code and phases contradict each other: photographs in the wrong order
     """
     black = grey(captures, "black")
-    sums = _add_up(captures, plan, black.shape)
+    sums = _add_up(captures, plan, black.shape, scratch)
     half = sums.mean - black
     axes = tuple(decode_cells(captures, plan, axis, sums.mean, half) for axis in range(2))
     lit = _lit(sums, half)
@@ -104,8 +111,10 @@ def decode(
     return Correspondence(position, np.where(valid, modulation, 0).astype(np.float32), valid, as_seen)
 
 
-def _add_up(captures: Captures, plan: PatternPlan, shape: tuple[int, ...]) -> _Sums:
-    waves = np.zeros((2 * len(WAVES), *shape), np.float32)
+def _add_up(captures: Captures, plan: PatternPlan, shape: tuple[int, ...], scratch: Path | None) -> _Sums:
+    every = 2 * len(WAVES), *shape
+    waves = np.zeros(every, np.float32) if scratch is None else array_in_file(scratch, every)
+    waves.fill(0)
     first, total, square = (np.zeros(shape, np.float32) for _ in range(3))
     mean = np.zeros(shape, np.float32)
     for number, prefix in enumerate(WAVES):

@@ -99,21 +99,29 @@ def _nearest(values: FloatImage, known: Mask) -> FloatImage:
     return found
 
 
+def _nearest_pixel(
+    position_px: FloatImage, shape: tuple[int, ...]
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Row and column of the projector's pixel nearest to each position (..., 2)."""
+    x, y = (
+        np.clip(np.nan_to_num(np.rint(position_px[..., axis])), 0, shape[1 - axis] - 1).astype(np.int32)
+        for axis in range(2)
+    )
+    return y, x
+
+
 def _continued(correspondence: Correspondence, slope: Float64, known: Mask) -> FloatImage:
     """The camera's map, continued along the plane at the nearest decoded pixel whose slope is known."""
     position = correspondence.projector_px
-    rows, columns = known.shape
-    x = np.clip(np.nan_to_num(np.rint(position[..., 0])), 0, columns - 1).astype(np.int32)
-    y = np.clip(np.nan_to_num(np.rint(position[..., 1])), 0, rows - 1).astype(np.int32)
-    sure = correspondence.valid & known[y, x]
+    sure = correspondence.valid & known[_nearest_pixel(position, known.shape)]
     at, distance = _labels(sure)
     missing = ~correspondence.valid & (distance <= FARTHEST_PX)
     source = at[missing]
     row, column = np.nonzero(missing)
     width = position.shape[1]
     dx, dy = column - source % width, row - source // width
-    a, b, c, d = np.moveaxis(slope[y.ravel()[source], x.ravel()[source]], -1, 0)
     from_px = position.reshape(-1, 2)[source]
+    a, b, c, d = np.moveaxis(slope[_nearest_pixel(from_px, known.shape)], -1, 0)
     whole = np.where(correspondence.valid[..., None], position, np.float32(np.nan))
     whole[missing] = from_px + np.stack([a * dx + b * dy, c * dx + d * dy], axis=-1)
     return np.asarray(whole, np.float32)

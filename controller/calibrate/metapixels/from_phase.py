@@ -54,13 +54,14 @@ def fit_pixels(captures: Captures, plan: PatternPlan, correspondence: Correspond
     margin = int(np.ceil(frame_margin_px(correspondence.modulation[correspondence.valid])))
     metapixels = _extend_to_frame(centre, inverse.jacobian, covariance, valid, margin)
     single = captures[plan.sinusoids("blur-x")[0].name]
-    mosaic = find_bayer_pattern(single)
+    mosaic, light = find_bayer_pattern(single), _channels(single)
+    del single
     phase_map = make_phase_map(
         correspondence,
         inverse,
         blur,
         blur_valid,
-        light=_channels(single),
+        light=light,
         interpolated=mosaic is not None,
         white=_white(captures, plan),
     )

@@ -111,7 +111,8 @@ def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Seq
     shifts = colour_shifts(captures, plan, light.white, light.mixing)
     if (said := misaligned(projector.name, shifts)) is not None:
         context.reporter.say(said, Level.WARNING)
-    correspondence = decode(captures, plan, camera_blur_px=float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5))
+    blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5)
+    correspondence = decode(captures, plan, camera_blur_px=blur_px, scratch=context.folder)
     if not correspondence.valid.any():
         raise CalibrationError(
             "projector-reaches-nothing",

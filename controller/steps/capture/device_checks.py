@@ -16,7 +16,7 @@ from controller.rig.rig import Rig
 from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
-from controller.solve.memory_need import base_peak_bytes, check_memory, planned_size
+from controller.solve.memory_need import base_peak_bytes, calibration_peak_bytes, check_memory, planned_size
 from hal.runtime.memory import free_bytes
 
 Size = tuple[int, int]
@@ -27,7 +27,7 @@ def device_checks(rig: Rig, prior: CameraPrior) -> list[Step]:
 
     Warns of a RAW file without colour matrix or black level. Raises UsageError("display-outputs-differ"),
     ("camera-intrinsics-wrong-size") where the lens file is for another size, WorkError("memory-too-small") where a
-    solve of that size certainly does not fit, and as ``read_photograph``.
+    calibration or a solve of that size certainly does not fit, and as ``read_photograph``.
     """
     wanted = {projector.output: projector.size_px for projector in rig.projectors}
 
@@ -44,8 +44,9 @@ def device_checks(rig: Rig, prior: CameraPrior) -> list[Step]:
             file.path.unlink(missing_ok=True)
         if missing:
             context.reporter.say(missing, Level.WARNING)
-        need = base_peak_bytes(planned_size(size_px, list(wanted.values())))
-        context.reporter.say(check_memory(need, free_bytes()))
+        size, free = planned_size(size_px, list(wanted.values())), free_bytes()
+        needs = (base_peak_bytes(size), "The solve"), (calibration_peak_bytes(size), "The calibration")
+        context.reporter.say(check_memory(max(needs)[0], free, max(needs)[1]))
         if prior.size_px not in (None, size_px):
             raise _wrong_lens(prior.size_px or size_px, size_px)
         return ()

@@ -11,7 +11,15 @@ from benchmarks._synthetic import synthetic_calibration
 from controller.calibrate.values import Calibration
 from controller.core.errors import WorkError
 from controller.solve.appearance import base_image, solve_base
-from controller.solve.memory_need import PROGRAM, SPARE, base_peak_bytes, check_memory, planned_size, stage_size
+from controller.solve.memory_need import (
+    PROGRAM,
+    SPARE,
+    base_peak_bytes,
+    calibration_peak_bytes,
+    check_memory,
+    planned_size,
+    stage_size,
+)
 from controller.transport import build_transport
 
 
@@ -37,6 +45,14 @@ def test_the_need_told_covers_what_is_taken_and_is_not_far_above() -> None:
 
 def test_four_projectors_of_3840_by_2160_are_within_8_gb() -> None:
     assert base_peak_bytes(planned_size((8192, 5464), [(3840, 2160)] * 4)) < 8e9
+
+
+def test_calibrating_with_45_megapixels_is_within_4_gb_and_can_need_more_than_the_solve() -> None:
+    assert calibration_peak_bytes(planned_size((8192, 5464), [(3840, 2160)] * 4)) < 4.2e9
+    small = planned_size((8192, 5464), [(800, 600)])
+    assert calibration_peak_bytes(small) > base_peak_bytes(small)
+    with pytest.raises(WorkError, match="The calibration needs about"):
+        check_memory(calibration_peak_bytes(small), 1_000_000_000, "The calibration")
 
 
 def test_what_does_not_fit_is_refused_and_what_is_not_known_is_not() -> None:

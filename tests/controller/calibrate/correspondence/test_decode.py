@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import tracemalloc
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -7,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.calibrate.correspondence.decode import decode
+from controller.calibrate.values import Correspondence
 from controller.capture.patterns import CELL_PX, device_frame, plan_patterns
-from controller.core.arrays import FloatImage
+from controller.core.arrays import MAPPED_FROM, FloatImage
 from controller.core.errors import CalibrationError
+from controller.solve.memory_need import DECODED
 from tests.controller.calibrate.simulator import Scene, Stage, photographed, positions
 
 pytestmark = pytest.mark.slow
@@ -204,3 +209,30 @@ def test_a_known_blur_of_the_camera_frees_positions_from_the_pull_of_pale_paint(
     assert np.mean(both) > 0.35
     errors = [rms((found.projector_px - positions(scene))[both]) for found in (as_seen, freed)]
     assert errors[1] < 0.6 * errors[0]
+
+
+def test_sums_in_a_file_give_the_same_to_the_bit_and_leave_the_memory(tmp_path: Path) -> None:
+    captures, beside = photographed(Scene()), (6, 5, 1)
+    pixels = 30 * captures["black"].shape[0] * captures["black"].shape[1]
+    assert 40 * pixels >= MAPPED_FROM
+
+    class Lent(dict[str, FloatImage]):
+        """As a run has them, each read anew: many scenes side by side, for a file is used from some size on."""
+
+        def __getitem__(self, name: str) -> FloatImage:
+            return np.tile(captures[name], beside)
+
+    def decoded(scratch: Path | None) -> tuple[Correspondence, int]:
+        tracemalloc.start()
+        try:
+            found = decode(Lent(), PLAN, camera_blur_px=0.6, scratch=scratch)
+            return found, tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    (filed, least), (kept, most) = decoded(tmp_path), decoded(None)
+    for name in ("projector_px", "modulation", "valid", "as_seen_px"):
+        np.testing.assert_array_equal(getattr(filed, name), getattr(kept, name))
+    assert most - least == pytest.approx(40 * pixels, rel=0.02)
+    assert least < DECODED * pixels
+    assert list(tmp_path.iterdir()) == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from controller.calibrate.correspondence import smoothing
 from controller.calibrate.correspondence.inverse_map import invert_map
 from controller.calibrate.correspondence.phase_map import FARTHEST_PX, LEAST_VARIANCE_PX2, make_phase_map
 from controller.calibrate.values import Correspondence, PhaseMap
@@ -75,3 +76,18 @@ def test_where_nothing_was_decoded_nothing_is_known() -> None:
     found = make_phase_map(correspondence, inverse, blank, np.zeros((SIZE[1], SIZE[0]), np.bool_))
     assert np.isnan(found.projector_px).all()
     assert np.isnan(found.spread_px2).all()
+
+
+def test_a_curved_fit_does_not_show_where_bands_of_rows_meet(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(7)
+    y, x = np.mgrid[0:61, 0:40]
+    smooth = np.stack([0.4 * x + np.sin(y / 9), 0.4 * y + np.cos(x / 8)], -1)
+    position = (smooth + random.normal(0, 0.03, smooth.shape)).astype(np.float32)
+    valid = random.random((61, 40)) > 0.02
+    position[~valid] = np.nan
+    otherwise = position + np.float32(1)
+    whole = smoothing.fit_curved(position, valid, otherwise)
+    assert 0.1 < np.mean(np.abs(whole - position) < 0.5) < 0.95
+    for rows in (1, 3, 7, 60, 61):
+        monkeypatch.setattr(smoothing, "BAND_ROWS", rows)
+        np.testing.assert_array_equal(smoothing.fit_curved(position, valid, otherwise), whole)
