@@ -54,6 +54,7 @@ test-setup:
 	@.ci/system-packages
 	@.venv/bin/python -m hal.runtime.kernels compile
 	@.venv/bin/python -m tests.booted.trees
+	@.venv/bin/python -m tests.real_kernel.machine
 
 check:
 	@.ci/setup test

@@ -1,7 +1,7 @@
 """Emulated USB adapters with GPIO lines, as their data sheets and the kernel's drivers know them.
 
 ``Cp2112`` (Silicon Labs AN495): eight lines; its driver has interrupts. ``Mcp2221`` (Microchip DS20005565): four lines,
-without. ``levels``: what each line has now.
+without. ``levels``: what each line has now; ``looks``: how often levels were read.
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ class Cp2112(EmulatedHidDevice):
     def __init__(self) -> None:
         super().__init__(UsbNames(0x10C4, 0xEA90, "Silicon Labs", "CP2112", "GPIO-1"))
         self.levels = [True] * 8
+        self.looks = 0
         self._kept = {_CONFIG: bytes((_CONFIG, 0, 0, 0, 0)), _SMBUS: bytes((_SMBUS, *bytes(13)))}
 
     def get_report(self, kind: int, number: int) -> bytes:
         if kind != FEATURE:
             raise Stall
         if number == _GET:
+            self.looks += 1
             return bytes((_GET, sum(level << line for line, level in enumerate(self.levels))))
         if number == _VERSION:
             return bytes((_VERSION, 0x0C, 0x02))
@@ -63,12 +65,14 @@ class Mcp2221(EmulatedHidDevice):
     def __init__(self) -> None:
         super().__init__(UsbNames(0x04D8, 0x00DD, "Microchip", "MCP2221", "GPIO-2"))
         self.levels = [True] * 4
+        self.looks = 0
         self._directions = [self._INPUT] * 4
 
     def out(self, endpoint: int, data: bytes) -> None:
         command, told = data[0], bytearray(64)
         told[0] = command
         if command == self._GET_GPIO:
+            self.looks += 1
             for line, (level, direction) in enumerate(zip(self.levels, self._directions, strict=True)):
                 told[2 + 2 * line : 4 + 2 * line] = level, direction
         elif command == self._SET_GPIO:
