@@ -55,6 +55,7 @@ test-setup:
 	@.ci/setup-npm
 	@.venv/bin/python -m hal.runtime.kernels compile
 	@.venv/bin/python -m tests.booted.trees
+	@.venv/bin/python -m tests.real_kernel.machine
 
 check:
 	@.ci/setup test

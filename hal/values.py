@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +127,10 @@ class CapturedFile:
     kind: FileKind
     size: int
     sha256: str
+
+
+TECHNICIAN_KEYS: Final = ("state", "play", "stop", "recalibrate")
+"""What the keys of a button panel do, by number; the first only shows the state."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,7 +46,7 @@ class KeyCommand:
 def technicians_keys(
     play: Callable[[], None], stop: Callable[[], None], recalibrate: Callable[[], None]
 ) -> tuple[KeyCommand, ...]:
-    """The usual keys; the first only shows the state."""
+    """The usual keys, in the order of ``hal.values.TECHNICIAN_KEYS``; the first only shows the state."""
     return (
         KeyCommand("", None, lambda: None),
         KeyCommand("PLAY", Event.PLAY, play),

@@ -18,9 +18,7 @@ from hal.transcript import Entry, Way
 
 LARGEST_PIECE: Final = 256 << 20
 MOST_TRACKS: Final = 10_000
-_LINE: Final = re.compile(
-    r"(?P<at>\d{1,12}\.\d{1,9}) (?P<mark>[-+<>|{}]) (?P<track>\d{1,6}) (?P<text>[ -~]*)", re.ASCII
-)
+_LINE: Final = re.compile(r"(?P<at>\d{1,12}\.\d{1,9}) (?P<mark>[+<>|{}]) (?P<track>\d{1,6}) (?P<text>[ -~]*)", re.ASCII)
 _WAYS: Final = {**{way.value: way for way in Way}, **{mark: way for way, mark in PACKED.items()}}
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
 from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings, FileKind
 from plugins.genicam.aravis import AravisCamera, Frame
-from plugins.genicam.tiff import PixelFormat, best_format, encoded, pixel_format
 from plugins.library_process import Answer, Failed, served
 from plugins.ptp.body import nearest, no_such_file
 from plugins.ptp.files import PendingFile, commit_all
+from plugins.raw_file import Levels, PixelFormat, best_format, encoded, pixel_format
 
 _THIRDS: Final = tuple(2 ** (third / 3) for third in range(-48, 22))
 """Exposure times in seconds, from 1/65536 to 102, of which a camera has those within its bounds."""
@@ -23,14 +22,14 @@ _THIRDS: Final = tuple(2 ** (third / 3) for third in range(-48, 22))
 class Worker:
     """The camera; its public methods are the requests. Opened at the first of them, and again when it was lost."""
 
-    def __init__(self, name: str, wanted: str, black_level: int, matrix: Sequence[float], serial: str) -> None:
+    def __init__(self, name: str, wanted: str, levels: Levels, serial: str) -> None:
         self._name = name
         self._wanted = wanted
-        self._black_level = black_level
-        self._matrix = matrix
+        self._levels = levels
         self._serial = serial
         self._camera: AravisCamera | None = None
         self._pixels: PixelFormat | None = None
+        self._exposure_s: float | None = None
 
     def capabilities(self) -> CameraCapabilities:
         self._open()
@@ -52,6 +51,7 @@ class Worker:
             )
         wanted_s = nearest(self._times(), settings.exposure_s, setting="exposure time in seconds")
         has_s = camera.set_exposure(wanted_s)
+        self._exposure_s = wanted_s
         close = abs(has_s / wanted_s - 1) < 1e-3
         return ExposureSettings(wanted_s if close else round(has_s, 9), settings.iso, None, raw=True)
 
@@ -63,9 +63,9 @@ class Worker:
             frame.data,
             (frame.width_px, frame.height_px),
             pixel_format(frame.format) or self._pixels,
+            maker=camera.text("vendor_name"),
             model=camera.text("model_name"),
-            black_level=self._black_level,
-            matrix=self._matrix,
+            levels=self._levels,
         )
         path = destination.parent / f"{destination.name}{self._pixels.suffix}"
         with PendingFile(path, FileKind.RAW) as file:
@@ -119,6 +119,8 @@ class Worker:
         camera.set_format(self._pixels.name)
         for automatic in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto"):
             camera.choose(automatic, "Off")
+        if self._exposure_s is not None:
+            camera.set_exposure(self._exposure_s)  # it was off meanwhile
         self._serial = serial
 
     def _times(self) -> list[float]:

@@ -15,7 +15,7 @@ from typing import Final
 
 from sacn import DataPacket
 
-from controller.building import osc, pjlink_lines
+from controller.building import artnet_packets, osc, pjlink_lines
 from controller.building.sacn import SacnOptions, frame_of
 from controller.bundle import format as bundle_format
 from controller.bundle.index import parse_index
@@ -23,7 +23,7 @@ from controller.config import load_stage
 from controller.core.errors import BundleError, UsageError
 from hal.codecs.hid import light as hid_light
 from hal.codecs.hid import relay as hid_relay
-from hal.codecs.projectors import logins, pjlink, pjlink_udp
+from hal.codecs.projectors import json_rpc, logins, pjlink, pjlink_udp
 from hal.codecs.projectors.profiles import parse_profile
 from hal.codecs.projectors.serial_protocol import (
     command_bytes,
@@ -78,6 +78,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "sacn": Target(_sacn, _levels(), (), 700),
         "osc": Target(lambda data: list(osc.requests(data)), (osc.message("play", "marble", 2.5),), ()),
         "pjlink-questions": Target(_pjlink_asked, (b"%1POWR ?\r", b"%2INPT 31\r"), ()),
+        "art-net": Target(artnet_packets.read, _ARTNET, ()),
+        "json-rpc": Target(_json_rpc, _JSON_RPC),
         "escapes": Target(lambda data: unescaped(data.decode("latin-1")), (b"on\\r\\x00\\\\",)),
         "pjlink-udp": Target(pjlink_udp.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
         "tape": Target(_tape, _TAPES),
@@ -335,6 +337,20 @@ def _levels() -> tuple[bytes, ...]:
 def _pjlink_asked(data: bytes) -> None:
     if (command := pjlink_lines.asked(data)) is not None:
         pjlink_lines.meant(command, ("marble", "warm wood"))
+
+
+_ARTNET: Final = (
+    b"Art-Net\0\0\x50\0\x0e\x01\0\x05\0\0\x04abcd", b"Art-Net\0\0\x20\0\x0e\x20\0\0\x05\0\0",
+)  # fmt: skip
+_JSON_RPC: Final = (
+    b'{"jsonrpc":"2.0","result":{"on":[1,true,null]},"id":7}',
+    b'{"jsonrpc":"2.0","error":{"code":-32601,"message":"no"},"id":7}',
+)
+
+
+def _json_rpc(data: bytes) -> None:
+    json_rpc.is_whole(data)
+    json_rpc.parse_message(data, json_rpc.json_bytes("property.get system.state", 7))
 
 
 STAGE = """\

@@ -44,7 +44,7 @@ MISTAKES = {
         "stage-key-value",
         "'pttp' is not a camera driver",
         "driver",
-        "one of genicam, gphoto2, ptp.",
+        "one of genicam, gphoto2, ptp, v4l2.",
     ),
     "misspelt setting": Mistake(
         'port = "run/tty-left"', 'prt = "x"', "stage-key-unknown", "did you mean 'port'", "prt"

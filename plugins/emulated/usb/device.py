@@ -105,6 +105,10 @@ class InPipe:
         if whole and self._zero_packets and data and len(data) % self._packet == 0:
             self._waiting.append(memoryview(b""))
 
+    @property
+    def empty(self) -> bool:
+        return not self._waiting
+
     def clear(self) -> None:
         self._waiting.clear()
         self.halted = False

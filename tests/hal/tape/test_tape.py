@@ -52,6 +52,7 @@ def test_no_text_ends_in_an_untyped_error(text: str) -> None:
         "0.1 > 1 no track yet",
         "0.1 + 2 serial second-first",
         "0.1 + 1 serial a\n0.2 > 1 \\q",
+        "0.1 + 1 serial a\n0.2 - 1 ended",
         "x",
         "0.1 + 1 s a\n0.2 { 1 !!",
     ],

@@ -21,7 +21,7 @@ from hal.errors import DeviceError, DeviceGone, DeviceRefused, PluginError
 from hal.registry import OpenContext, check_device
 from hal.values import ExposureSettings
 from plugins.genicam.camera import DRIVER, GenicamCamera, open_camera
-from plugins.genicam.tiff import best_format, encoded, pixel_format
+from plugins.raw_file import Levels, best_format, encoded, pixel_format
 
 pytestmark = pytest.mark.slow
 ADDRESS = "127.0.0.1"
@@ -102,7 +102,7 @@ def test_its_files_go_through_the_measurement_of_black_level_and_linearity(tmp_p
         signal_ = random.poisson(np.minimum(light * scene * exposure_s, 60_000)) + 64
         mosaic = np.minimum(signal_, 4095).astype("<u2")
         path = tmp_path / f"{exposure_s}-{light}.dng"
-        path.write_bytes(encoded(mosaic.tobytes(), (64, 64), pixels, model="Test", black_level=0, matrix=()))
+        path.write_bytes(encoded(mosaic.tobytes(), (64, 64), pixels, maker="", model="Test", levels=Levels(0, ())))
         return RawExposure(read_mosaic(path).samples, exposure_s)
 
     dark = [exposed(time_s, 0.0) for time_s in (0.1, 0.4)]
@@ -151,4 +151,4 @@ def test_too_few_bytes_are_refused_for_every_format() -> None:
         pixels = pixel_format(f"{colour}{bits}")
         assert pixels is not None
         with pytest.raises(DeviceRefused):
-            encoded(bytes(15), (4, 4), pixels, model="", black_level=0, matrix=())
+            encoded(bytes(15), (4, 4), pixels, maker="", model="", levels=Levels(0, ()))

@@ -1,4 +1,4 @@
-"""Writes images of machine vision cameras: a Bayer mosaic as DNG 1.4, grey and colour images as TIFF of 16 bits."""
+"""Writes images of cameras that send samples: a Bayer mosaic as DNG 1.4, grey and colour images as TIFF of 16 bits."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from hal.errors import DeviceRefused
+from hal.errors import DeviceRefused, PluginError
+from hal.registry import setting
 
 _SHORT, _LONG, _SRATIONAL, _ASCII, _BYTE = 3, 4, 10, 2, 1
 _CODES: Final = {_SHORT: "H", _LONG: "I", _SRATIONAL: "i"}
@@ -52,10 +53,47 @@ def best_format(names: Sequence[str]) -> PixelFormat | None:
     return max(known, default=None, key=lambda one: (bool(one.bayer), one.channels, one.bits))
 
 
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """What a ``[camera]`` table says of the samples.
+
+    ``black_level``: raw steps without light; ``matrix``: XYZ (D65) to camera, nine numbers or none.
+    """
+
+    black_level: int
+    matrix: tuple[float, ...]
+
+
+LEVEL_SETTINGS: Final = {
+    "black_level": "raw steps without light, as the maker states them (default 0; the calibration measures it)",
+    "color_matrix": "nine numbers from XYZ (D65) to the camera's colours, row by row (default: unknown)",
+}
+
+
+def levels_of(settings: Mapping[str, Any]) -> Levels:
+    """The settings ``LEVEL_SETTINGS``. Raises PluginError."""
+    black_level = setting(settings, "black_level", int, 0)
+    matrix = setting(settings, "color_matrix", list, [])
+    numbers = [value for value in matrix if isinstance(value, int | float) and not isinstance(value, bool)]
+    if len(matrix) not in (0, 9) or len(numbers) != len(matrix) or not 0 <= black_level < 65535:
+        raise PluginError(
+            "camera-setting",
+            what="The camera's black_level or color_matrix is wrong.",
+            remedy="Write a whole number of raw steps for black_level, and nine numbers for color_matrix.",
+        )
+    return Levels(black_level, tuple(float(value) for value in numbers))
+
+
 def encoded(
-    data: bytes, size_px: tuple[int, int], pixels: PixelFormat, *, model: str, black_level: int, matrix: Sequence[float]
+    data: bytes | memoryview,
+    size_px: tuple[int, int],
+    pixels: PixelFormat,
+    *,
+    maker: str,
+    model: str,
+    levels: Levels,
 ) -> bytes:
-    """The file. ``data``: rows of little-endian samples; ``matrix``: XYZ (D65) to camera, nine numbers or none.
+    """The file. ``data``: rows of little-endian samples.
 
     Raises DeviceRefused("camera-image-size") for another number of bytes than the size says.
     """
@@ -70,31 +108,36 @@ def encoded(
         )
     samples = np.frombuffer(data, kind, count).astype("<u2")
     if pixels.bayer:
-        entries = _mosaic(pixels, model, black_level, matrix)
+        entries = _mosaic(pixels, (maker, model), levels)
     else:
         # A TIFF has no black level and no white level: zero is black, and the largest number is full scale.
         full = (1 << pixels.bits) - 1
-        scaled = np.clip(samples.astype(np.float64) - black_level, 0, None) * (65535 / max(1, full - black_level))
+        scaled = np.clip(samples.astype(np.float64) - levels.black_level, 0, None) * (
+            65535 / max(1, full - levels.black_level)
+        )
         samples = np.minimum(np.rint(scaled), 65535).astype("<u2")
         entries = {262: (_SHORT, [2 if pixels.channels == 3 else 1])}
     return _file(entries, samples.tobytes(), columns, rows, pixels.channels)
 
 
-def _mosaic(pixels: PixelFormat, model: str, black_level: int, matrix: Sequence[float]) -> dict[int, Entry]:
-    name = model.encode("ascii", "replace") + b"\0"
+def _mosaic(pixels: PixelFormat, names: tuple[str, str], levels: Levels) -> dict[int, Entry]:
+    maker, name = (text.encode("ascii", "replace") + b"\0" for text in names)
     entries: dict[int, Entry] = {
         262: (_SHORT, [32803]),  # colour filter array
-        271: (_ASCII, b"GenICam\0"),
+        271: (_ASCII, maker),
         272: (_ASCII, name),
         33421: (_SHORT, [2, 2]),
         33422: (_BYTE, bytes(pixels.bayer)),
         50706: (_BYTE, bytes((1, 4, 0, 0))),
         50708: (_ASCII, name),
-        50714: (_LONG, [black_level]),
+        50714: (_LONG, [levels.black_level]),
         50717: (_LONG, [(1 << pixels.bits) - 1]),
     }
-    if matrix:
-        entries[50721] = (_SRATIONAL, [part for value in matrix for part in (round(value * 1_000_000), 1_000_000)])
+    if levels.matrix:
+        entries[50721] = (
+            _SRATIONAL,
+            [part for value in levels.matrix for part in (round(value * 1_000_000), 1_000_000)],
+        )
         entries[50778] = (_SHORT, [_D65])
     return entries
 

@@ -1,0 +1,1 @@
+"""Keys on GPIO lines of this computer. Entry: `keys.DRIVER`."""

@@ -1,0 +1,85 @@
+"""A camera whose library runs in a process of its own: the controller's side, the same for every such driver."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Any, Final
+
+from hal.deadline import Deadline
+from hal.errors import DeviceGone
+from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
+from plugins.library_process import CRASHED, LibraryProcess
+
+_MOST_NOTES: Final = 1000
+_MARGIN_S: Final = 1.0
+
+
+class LibraryCamera:
+    """``hal.interfaces.WatchedCamera`` on a ``LibraryProcess``.
+
+    The worker has the methods ``capabilities``, ``identity``, ``configure`` and ``capture``, and sets its exposure
+    again when it opens the camera again. ``module``, ``library``, ``start``, ``serial``: as for ``LibraryProcess``.
+    """
+
+    def __init__(self, module: str, library: str, *, start: tuple[Any, ...], serial: str, deadline: Deadline) -> None:
+        self._troubles: deque[tuple[str, str]] = deque(maxlen=_MOST_NOTES)
+        self.process = LibraryProcess(
+            module,
+            library,
+            start=start,
+            serial=serial,
+            note=lambda code, what: self._troubles.append((code, what)),
+        )
+        self._settings: ExposureSettings | None = None
+        try:
+            self._capabilities: CameraCapabilities = self.process.request("capabilities", deadline=deadline)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def capabilities(self) -> CameraCapabilities:
+        return self._capabilities
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        identity: DeviceIdentity = self.process.request("identity", deadline=deadline)
+        return identity
+
+    def status(self, *, deadline: Deadline) -> CameraStatus:
+        """It has neither battery nor card; raises DeviceGone where it is not there."""
+        self.identity(deadline=deadline)
+        return CameraStatus()
+
+    def troubles(self) -> list[tuple[str, str]]:
+        return [self._troubles.popleft() for _ in range(len(self._troubles))]
+
+    def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
+        confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)
+        self._settings = confirmed
+        return confirmed
+
+    def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
+        """See ``hal.interfaces.Camera.capture``. Raises DeviceGone("camera-shot-lost") where the process ended."""
+        try:
+            if self.process.pid is None and self._settings is not None:
+                # A process that was ended by a deadline has forgotten its exposure.
+                self.process.request("configure", self._settings, deadline=deadline)
+            left_s = deadline.left_s()
+            # The worker ends before the caller does: it knows why there is no picture.
+            theirs_s = left_s - min(_MARGIN_S, left_s / 5)
+            files: list[CapturedFile] = self.process.request(
+                "capture", destination.absolute(), theirs_s, deadline=deadline, repeatable=False
+            )
+        except DeviceGone as error:
+            if error.code != CRASHED:
+                raise
+            raise DeviceGone(
+                "camera-shot-lost",
+                what=f"The connection to the camera was lost during a picture: {error.what}",
+                remedy="Check cable and power, then take this picture again. It was not taken twice.",
+            ) from error
+        return files
+
+    def close(self) -> None:
+        self.process.close()
