@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ from PIL import Image, ImageCms
 
 from controller.core.errors import UsageError
 from controller.kiosk.store.targets import fitted, regions_of, restricted
-from controller.kiosk.values import Fit
 from controller.solve.targets.profiles import with_profile
 
 VIEW = (60, 40)
@@ -49,7 +49,7 @@ def test_a_picture_of_the_right_size_stays_as_it_is() -> None:
     ],
 )  # fmt: skip
 def test_where_the_target_says_something_is_as_was_chosen(
-    how: Fit, size: tuple[int, int], said: tuple[int, int]
+    how: Literal["fit", "fill", "crop"], size: tuple[int, int], said: tuple[int, int]
 ) -> None:
     found = seen(fitted(png_of(*size), VIEW, how))
     assert found.shape == (VIEW[1], VIEW[0], 4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 from datetime import date, timedelta
+from typing import Literal, TypeAlias
 
 import pytest
 from babel.dates import get_day_names, get_month_names
@@ -17,6 +18,8 @@ from controller.panel.words.days import canonical, written
 from controller.panel.words.language import LANGUAGES, speaking
 from tests.controller.panel.served import Served, csrf
 
+Width: TypeAlias = Literal["wide", "abbreviated", "short"]
+
 
 def read(language: str, text: str) -> str:
     with speaking(language):
@@ -26,7 +29,7 @@ def read(language: str, text: str) -> str:
 @pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize("number", range(7))
 def test_every_name_of_a_day_is_understood_in_its_language(language: str, number: int) -> None:
-    widths = ("wide", "abbreviated") + (("short",) if language in ("de", "fr") else ())
+    widths: list[Width] = ["wide", "abbreviated", *(["short"] if language in ("de", "fr") else [])]
     for width in widths:
         name = get_day_names(width, "format", locale=language)[number]
         for text in (name, name.upper(), name.removesuffix(".")):

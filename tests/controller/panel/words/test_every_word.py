@@ -105,7 +105,7 @@ def test_all_that_the_panel_itself_says_is_translated(photographed: Served, monk
     known = ALLOWED | set(re.findall(r"[^\W\d_]+", said))
     # Dates and numbers have their own tables, which Babel judges.
     known |= {*figures.FIGURES["en"].weekdays, *figures.FIGURES["en"].months, "px"}
-    left = {}
+    left: dict[str, set[str]] = {}
     for path, texts in walked(photographed, "en").items():
         for text in texts:
             bare = re.sub(f"{LEFT}[^{LEFT}{RIGHT}]*{RIGHT}", "", text)
