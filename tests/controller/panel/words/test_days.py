@@ -29,7 +29,9 @@ def read(language: str, text: str) -> str:
 @pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize("number", range(7))
 def test_every_name_of_a_day_is_understood_in_its_language(language: str, number: int) -> None:
-    widths: list[Width] = ["wide", "abbreviated", *(["short"] if language in ("de", "fr") else [])]
+    widths: list[Width] = ["wide", "abbreviated"]
+    if language in ("de", "fr"):
+        widths.append("short")
     for width in widths:
         name = get_day_names(width, "format", locale=language)[number]
         for text in (name, name.upper(), name.removesuffix(".")):
