@@ -82,7 +82,7 @@ def test_other_names_are_refused(tmp_path: Path, name: str, code: str) -> None:
 
 
 def test_scenes_come_in_their_own_order() -> None:
-    assert [scene.name for scene in chosen_scenes(())] == ["dark", "room"]
+    assert [scene.name for scene in chosen_scenes(())] == ["dark", "flat", "room", "traced"]
     assert [scene.name for scene in chosen_scenes(("room", "dark"))] == ["dark", "room"]
     with pytest.raises(UsageError, match="no scene called hall"):
         chosen_scenes(("hall",))
