@@ -16,6 +16,7 @@ EXTRAS: Final = {
     "gphoto2": "cameras through libgphoto2",
     "mains": "mains by network: PDUs by SNMP, relays by Modbus",
     "building": "show control by OSC and sACN, dousers by sACN",
+    "gpio": "keys on GPIO lines",
     "cluster": "solve on many machines (--scheduler)",
     "ndi": "live targets by NDI",
     "gpu": "solve on a graphics processor",
@@ -23,14 +24,15 @@ EXTRAS: Final = {
 }
 """Purpose of each extra of pyproject.toml that people install."""
 _MODULES: Final = {
-    "": "nacl numpy pyglet xxhash zstandard",
-    "controller": "OpenEXR PIL StreamDeck cv2 cycler hid jinja2 llvmlite matplotlib numba pydantic pydantic_core rawpy"
-    " rich scipy serial skimage tomlkit trimesh typer usb",
+    "": "cramjam nacl numpy pyglet xxhash zstandard",
+    "controller": "OpenEXR PIL StreamDeck cv2 cycler hid jinja2 llvmlite lz4 matplotlib numba pydantic pydantic_core"
+    " rawpy rich scipy serial skimage tomlkit trimesh typer usb",
     "panel": "aiomqtt anyio argon2 multipart prometheus_client python_multipart starlette uvicorn",
     "bench": "embreex tifffile",
     "gphoto2": "gphoto2",
     "mains": "pymodbus pysnmp",
     "building": "pythonosc sacn",
+    "gpio": "gpiod",
     "cluster": "dask distributed",
     "ndi": "cyndilib",
     "gpu": "wgpu",

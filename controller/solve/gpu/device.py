@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -53,7 +55,7 @@ def adapters() -> list[Found]:
     """The graphics processors that wgpu finds, real ones first, discrete before integrated. None without drivers."""
     kinds = {"DiscreteGPU": 0, "IntegratedGPU": 1, SOFTWARE: 3}
     found = []
-    with _refusals("look for a graphics processor"):
+    with _refusals("look for a graphics processor"), _no_windows():
         for adapter in wgpu.gpu.enumerate_adapters_sync():
             info = adapter.info
             # OpenGL has no compute shaders that could be relied on
@@ -75,7 +77,7 @@ class Device:
         limits = {name: found.adapter.limits[name] for name in ("max-buffer-size", "max-storage-buffer-binding-size")}
         self.most_bytes = int(min(limits.values()))
         """The largest buffer that a kernel can use."""
-        with _refusals("open"):
+        with _refusals("open"), _no_windows():
             self._device = found.adapter.request_device_sync(
                 required_limits={**limits, "max-storage-buffers-per-shader-stage": STORAGE_BUFFERS}
             )
@@ -226,6 +228,23 @@ def spread(threads: int) -> tuple[int, int]:
 @cache
 def _source(name: str) -> str:
     return (resources.files(__package__) / "shaders" / f"{name}.wgsl").read_text("utf-8")
+
+
+@contextlib.contextmanager
+def _no_windows() -> Iterator[None]:
+    """Where this folder is not named, Mesa complains on standard error that it finds no Wayland, needed or not.
+
+    Meanwhile it is the folder that is used where none is named.
+    """
+    name = "XDG_RUNTIME_DIR"
+    if os.environ.get(name):
+        yield
+        return
+    os.environ[name] = tempfile.gettempdir()
+    try:
+        yield
+    finally:
+        del os.environ[name]
 
 
 @contextlib.contextmanager

@@ -99,7 +99,7 @@ class Hall:
     def examine(self, *, write: bool = False, stage: bool = True) -> Examination:
         finders, broken = load_finders()
         assert broken == ()
-        assert {one.bus for one in finders} == {"display", "hid", "network", "serial", "usb"}
+        assert {one.bus for one in finders} == {"display", "hid", "network", "serial", "usb", "video"}
         wanted = {"serial_ports": self.folder / "by-id", "system_ports": False, "search": None, "answer_s": 0.15}
         mine = [one for one in finders if one.bus in ("serial", "network")]
         tools = Tools((*mine, *self.others), self.drivers, wanted)

@@ -31,9 +31,9 @@ def test_a_change_is_on_every_one_of_fifty_open_panels(tmp_path: Path) -> None:
             client.cookies = cookies
             with client.stream("GET", "/live") as stream:
                 for line in stream.iter_lines():
-                    if line.startswith("data:") and "Playing" in line and "now for all" not in line:
+                    if line.startswith("data:") and "Playing" in line and "Now for all" not in line:
                         ready.release()
-                    if "now for all" in line:
+                    if "Now for all" in line:
                         arrived.append(line)
                         return
 
