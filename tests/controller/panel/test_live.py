@@ -151,7 +151,7 @@ def test_a_storm_of_changes_is_drawn_a_few_times_only(tmp_path: Path) -> None:
                     messages.append(json.loads(line[5:]))
                     if time.monotonic() - began > 1.5:
                         stop.set()
-                    if "the last one" in messages[-1].get("top", ""):
+                    if "The last one" in messages[-1].get("top", ""):
                         break
         thread.join()
     assert len(messages) <= 14
