@@ -116,4 +116,4 @@ lock:
 clean:
 	@if [ -x .venv/bin/python ]; then python=.venv/bin/python; else python=python3; fi; \
 	  PYTHONDONTWRITEBYTECODE=1 "$$python" -m hal.runtime.caches remove
-	rm -rf .venv .venv-blender .venv-homeassistant .venv-openapi build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-blender .venv-homeassistant .venv-openapi .venv-npm build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
