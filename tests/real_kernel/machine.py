@@ -37,7 +37,12 @@ $B mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000 out /out
 $B mount -t proc proc /new/proc
 $B mount -t sysfs sysfs /new/sys
 $B mount -t devtmpfs devtmpfs /new/dev
+$B mkdir /checkout
+$B mount --bind "/new{folder}" /checkout
 $B mount -t tmpfs tmpfs /new/tmp
+# A checkout in /tmp would be hidden by that.
+$B mkdir -p "/new{folder}"
+$B mount --bind /checkout "/new{folder}"
 $B mkdir /new/tmp/out
 $B mount --bind /out /new/tmp/out
 $B ip link set lo up
