@@ -16,8 +16,8 @@ import numpy.typing as npt
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
 from controller.transport.windows.cells import even_gains
-from controller.transport.windows.profiles import LANES, PHASE_BITS, PHASES, Profiles, SmallProfiles
-from controller.transport.windows.sample_kernels import NEAR, OTHER, SHEAR_BITS, SORTS, STRIP, TILE, Windows
+from controller.transport.windows.profiles import LANES, PHASE_BITS, PHASES, SHEAR_BITS, Profiles, SmallProfiles
+from controller.transport.windows.sample_kernels import NEAR, OTHER, SORTS, STRIP, TILE, Windows
 
 MARGIN: Final = 32
 """Windows begin at most so many pixels outside the frame."""

@@ -18,9 +18,9 @@ from controller.transport.simd.small_windows import (
     spread_skewed,
     spread_upright,
 )
-from controller.transport.simd.windows import window_add, window_sum
+from controller.transport.simd.windows import sheared_add, sheared_sum, window_add, window_sum
 from controller.transport.windows.profiles import GROUP, LANES, PHASE_BITS, PHASES, SKEW_STEPS, Profiles, SmallProfiles
-from controller.transport.windows.sample_kernels import NEAR, OTHER, SHEAR_BITS, SKEWED, SORTS, STRIP, UPRIGHT, Windows
+from controller.transport.windows.sample_kernels import NEAR, OTHER, SKEWED, SORTS, STRIP, UPRIGHT, Windows
 
 STRIPS: Final = STRIP - LANES
 """So many strips there are; each is LANES wide."""
@@ -91,36 +91,19 @@ def _see_other(
     for e in range(site.size):
         xs, ys, a, shear = np.int64(across[e]), np.int64(downs[e]), np.int64(at[e]), np.int64(shears[e])
         wide, high, fx, fy = xs >> PHASE_BITS, ys >> PHASE_BITS, xs & (PHASES - 1), ys & (PHASES - 1)
-        width, height = sizes[wide], sizes[high]
-        base, down = begins[wide], begins[high] + fy * height
-        dy = -(height // 2 - 1) * PHASES - fy
-        total = np.float32(0)
-        for j in range(0, height, LANES):
-            x0 = fx + ((shear * dy) >> SHEAR_BITS)
-            x1 = fx + ((shear * (dy + PHASES)) >> SHEAR_BITS)
-            x2 = fx + ((shear * (dy + 2 * PHASES)) >> SHEAR_BITS)
-            x3 = fx + ((shear * (dy + 3 * PHASES)) >> SHEAR_BITS)
-            a0, a1 = a + (x0 >> PHASE_BITS), a + side + (x1 >> PHASE_BITS)
-            a2, a3 = a + 2 * side + (x2 >> PHASE_BITS), a + 3 * side + (x3 >> PHASE_BITS)
-            s0, s1 = base + (x0 & (PHASES - 1)) * width, base + (x1 & (PHASES - 1)) * width
-            s2, s3 = base + (x2 & (PHASES - 1)) * width, base + (x3 & (PHASES - 1)) * width
-            for g in range(0, width, LANES):
-                rows, parts = (a0 + g, a1 + g, a2 + g, a3 + g), (s0 + g, s1 + g, s2 + g, s3 + g)
-                total += window_sum(light, rows, shares, parts, down + j)
-            a += LANES * side
-            dy += LANES * PHASES
+        width, height, base = sizes[wide], sizes[high], begins[wide]
+        down = begins[high] + fy * height
+        if shear == 0:
+            total = window_sum(light, a, side, shares, base + fx * width, down, width, height)
+        else:
+            below = -(height // 2 - 1) * PHASES - fy
+            total = sheared_sum(light, a, side, shares, base, down, width, height, fx, shear, below)
         out[site[e]] += gain[e] * total
 
 
 @compiled(fastmath=True)
 def _spread_other(
-    windows: Windows,
-    table: Profiles,
-    first: int,
-    last: int,
-    side: int,
-    values: FloatImage,
-    sums: FloatImage,
+    windows: Windows, table: Profiles, first: int, last: int, side: int, values: FloatImage, sums: FloatImage
 ) -> None:
     site, at, shears = windows.site[first:last], windows.at[first:last], windows.skew[first:last]
     across, downs, gain = windows.across[first:last], windows.down[first:last], windows.gain[first:last]
@@ -129,23 +112,13 @@ def _spread_other(
         value = values[site[e]] * gain[e]
         xs, ys, a, shear = np.int64(across[e]), np.int64(downs[e]), np.int64(at[e]), np.int64(shears[e])
         wide, high, fx, fy = xs >> PHASE_BITS, ys >> PHASE_BITS, xs & (PHASES - 1), ys & (PHASES - 1)
-        width, height = sizes[wide], sizes[high]
-        base, down = begins[wide], begins[high] + fy * height
-        dy = -(height // 2 - 1) * PHASES - fy
-        for j in range(0, height, LANES):
-            x0 = fx + ((shear * dy) >> SHEAR_BITS)
-            x1 = fx + ((shear * (dy + PHASES)) >> SHEAR_BITS)
-            x2 = fx + ((shear * (dy + 2 * PHASES)) >> SHEAR_BITS)
-            x3 = fx + ((shear * (dy + 3 * PHASES)) >> SHEAR_BITS)
-            a0, a1 = a + (x0 >> PHASE_BITS), a + side + (x1 >> PHASE_BITS)
-            a2, a3 = a + 2 * side + (x2 >> PHASE_BITS), a + 3 * side + (x3 >> PHASE_BITS)
-            s0, s1 = base + (x0 & (PHASES - 1)) * width, base + (x1 & (PHASES - 1)) * width
-            s2, s3 = base + (x2 & (PHASES - 1)) * width, base + (x3 & (PHASES - 1)) * width
-            for g in range(0, width, LANES):
-                rows, parts = (a0 + g, a1 + g, a2 + g, a3 + g), (s0 + g, s1 + g, s2 + g, s3 + g)
-                window_add(sums, rows, shares, parts, down + j, value)
-            a += LANES * side
-            dy += LANES * PHASES
+        width, height, base = sizes[wide], sizes[high], begins[wide]
+        down = begins[high] + fy * height
+        if shear == 0:
+            window_add(sums, a, side, shares, base + fx * width, down, width, height, value)
+        else:
+            below = -(height // 2 - 1) * PHASES - fy
+            sheared_add(sums, a, side, shares, base, down, width, height, fx, shear, below, value)
 
 
 @compiled(parallel=True)

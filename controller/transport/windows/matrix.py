@@ -11,8 +11,16 @@ import scipy.sparse as sp
 from controller.core.arrays import Float64, FloatImage
 from controller.core.jit import compiled
 from controller.transport.camera_box import CameraBox
-from controller.transport.windows.profiles import LANES, PHASE_BITS, PHASES, SKEW_STEPS, Profiles, SmallProfiles
-from controller.transport.windows.sample_kernels import NEAR, OTHER, SHEAR_BITS, SKEWED, SORTS, STRIP, TILE, Windows
+from controller.transport.windows.profiles import (
+    LANES,
+    PHASE_BITS,
+    PHASES,
+    SHEAR_BITS,
+    SKEW_STEPS,
+    Profiles,
+    SmallProfiles,
+)
+from controller.transport.windows.sample_kernels import NEAR, OTHER, SKEWED, SORTS, STRIP, TILE, Windows
 
 Sites = npt.NDArray[np.int64]
 

@@ -27,6 +27,9 @@ LANES: Final = 4
 """Windows are multiples of this wide and high."""
 SMALL_PHASES: Final = 2 * PHASES
 """Positions of small windows reach half a pixel beyond the gap between two pixels, because a skew moves them."""
+SHEAR_BITS: Final = 6
+SHEARS: Final = 1 << SHEAR_BITS
+"""Steps of a large window's shift, a projector row, in a pixel."""
 SKEWS: Final = 32
 """Steps of a small window's skew in an inverse square pixel."""
 SKEW_STEPS: Final = 127

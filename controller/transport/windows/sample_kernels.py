@@ -25,9 +25,6 @@ TILE: Final = 64
 NEAR: Final = 4
 STRIP: Final = TILE + 2 * NEAR
 """Rows and columns that the small windows of a tile reach; see ``simd.small_windows``."""
-SHEAR_BITS: Final = 6
-SHEARS: Final = 1 << SHEAR_BITS
-"""Steps of a window's shift, a projector row, in a pixel."""
 MOST_SHEAR: Final = 1.2
 """With the widest profile, windows reach less than half a tile beyond their tile: those of a turn stay apart."""
 LEAST_SHEAR: Final = 3

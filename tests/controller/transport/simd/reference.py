@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from controller.transport.simd.gaussians import LANES as WEIGHTS
 from controller.transport.simd.scaling import SIDE, STEPS
-from controller.transport.windows.profiles import GROUP, LANES, SKEW_STEPS, SmallProfiles
+from controller.transport.windows.profiles import GROUP, LANES, PHASES, SHEARS, SKEW_STEPS, SmallProfiles
 from controller.transport.windows.sample_kernels import STRIP, Windows
 
 Array = npt.NDArray[Any]
@@ -26,16 +26,21 @@ def collect_lanes(planes: list[Array], at: int, weights: Array, k: int, sums: Ar
         sums[WEIGHTS * i : WEIGHTS * (i + 1)] += weights[k : k + WEIGHTS] * plane[at : at + WEIGHTS]
 
 
-def window_sum(light: Array, at: Array, table: Array, shares: Array, down: int) -> float:
-    total = 0.0
-    for k in range(LANES):
-        total += table[down + k] * (light[at[k] : at[k] + LANES] * table[shares[k] : shares[k] + LANES]).sum()
-    return float(total)
+def rows_of_window(
+    side: int, table: Array, shares: int, down: int, size: tuple[int, int], sheared: tuple[int, int, int] | None
+) -> tuple[npt.NDArray[np.int64], Double]:
+    """(height, width): where a large window's values lie, from its first on, and its weights.
 
-
-def window_add(sums: Array, at: Array, table: Array, shares: Array, down: int, value: float) -> None:
-    for k in range(LANES):
-        sums[at[k] : at[k] + LANES] += value * table[down + k] * table[shares[k] : shares[k] + LANES]
+    ``sheared``: where its first row lies along x, its shear, and what row 0 lies below, as ``sheared_sum`` takes them.
+    """
+    height, width = size
+    row, column = np.mgrid[:height, :width]
+    step, phase = np.zeros_like(row), np.zeros_like(row)
+    if sheared is not None:
+        along, shear, below = sheared
+        step, phase = np.divmod(along + np.floor(shear * (PHASES * row + below) / SHEARS).astype(np.int64), PHASES)
+    weights = table[down + row].astype(np.float64) * table[shares + width * phase + column]
+    return row * side + column + step, weights
 
 
 def shares_of_window(windows: Windows, small: SmallProfiles, e: int, *, skewed: bool) -> Double:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.jit import compiled
 from controller.transport.simd import gaussians, scaling, small_windows, windows
-from controller.transport.windows.profiles import GROUP, LANES, SKEW_STEPS, SmallProfiles, build_small_profiles
+from controller.transport.windows.profiles import GROUP, LANES, PHASES, SKEW_STEPS, SmallProfiles, build_small_profiles
 from controller.transport.windows.sample_kernels import STRIP, Windows
 from tests.controller.transport.simd import reference
 
@@ -21,6 +21,8 @@ seeds = st.integers(0, 2**32 - 1)
 spare = st.integers(0, 21)
 """So many elements stand before and behind those that a kernel uses: no multiple of a register is preferred."""
 quick = settings(max_examples=40, deadline=None, derandomize=True)
+
+Size, Shear = tuple[int, int], tuple[int, int, int]
 
 # An intrinsic runs in compiled code only.
 
@@ -41,17 +43,31 @@ def collect_lanes(
     gaussians.collect_lanes(red, green, blue, at, weights, k, sums)
 
 
-Four = tuple[int, int, int, int]
+@compiled()
+def window_sum(light: FloatImage, at: int, side: int, table: FloatImage, shares: int, down: int, size: Size) -> float:
+    return windows.window_sum(light, at, side, table, shares, down, size[1], size[0])
 
 
 @compiled()
-def window_sum(light: FloatImage, at: Four, table: FloatImage, shares: Four, down: int) -> float:
-    return windows.window_sum(light, at, table, shares, down)
+def window_add(
+    sums: FloatImage, at: int, side: int, table: FloatImage, shares: int, down: int, size: Size, value: float
+) -> None:
+    windows.window_add(sums, at, side, table, shares, down, size[1], size[0], value)
 
 
 @compiled()
-def window_add(sums: FloatImage, at: Four, table: FloatImage, shares: Four, down: int, value: float) -> None:
-    windows.window_add(sums, at, table, shares, down, value)
+def sheared_sum(
+    light: FloatImage, at: int, side: int, table: FloatImage, shares: int, down: int, size: Size, shear: Shear
+) -> float:
+    return windows.sheared_sum(light, at, side, table, shares, down, size[1], size[0], shear[0], shear[1], shear[2])
+
+
+@compiled()
+def sheared_add(
+    sums: FloatImage, at: int, side: int, table: FloatImage, shares: int, down: int, size: Size, shear: Shear,
+    value: float,
+) -> None:  # fmt: skip
+    windows.sheared_add(sums, at, side, table, shares, down, size[1], size[0], shear[0], shear[1], shear[2], value)
 
 
 @compiled()
@@ -132,19 +148,36 @@ def test_weights_of_a_patch_are_spread_and_collected(seed: int, before: int, beh
 
 
 @quick
-@given(seed=seeds, length=st.integers(LANES, 60), value=st.floats(-3, 3, width=32))
-def test_four_rows_of_four_are_summed_and_added(seed: int, length: int, value: float) -> None:
-    random = np.random.default_rng(seed)
-    light, table = floats(random, length), floats(random, length)
-    at, shares = (tuple(int(k) for k in random.integers(0, length - LANES + 1, LANES)) for _ in range(2))
-    down = int(random.integers(0, length - LANES + 1))
-    found = window_sum(light, at, table, shares, down)  # type: ignore[arg-type]
-    wanted = reference.window_sum(light.astype(np.float64), np.array(at), table, np.array(shares), down)
-    close(np.array(found), np.array(wanted))
+@given(
+    seed=seeds,
+    fours=st.tuples(st.integers(1, 5), st.integers(1, 5)),
+    before=spare,
+    behind=spare,
+    value=st.floats(-3, 3, width=32),
+    shear=st.one_of(st.none(), st.integers(-77, 77)),
+)
+def test_large_windows_are_summed_and_added(
+    seed: int, fours: tuple[int, int], before: int, behind: int, value: float, shear: int | None
+) -> None:  # fmt: skip
+    random, size = np.random.default_rng(seed), (LANES * fours[0], LANES * fours[1])
+    side, shares, down = size[1] + int(random.integers(0, 9)), int(random.integers(0, 20)), int(random.integers(0, 20))
+    sheared = None if shear is None else (int(random.integers(0, PHASES)), shear, int(random.integers(-5000, 5000)))
+    table = floats(random, 20 + max(size[1] * PHASES, size[0]))
+    place, weights = reference.rows_of_window(side, table, shares, down, size, sheared)
+    at = before - min(int(place.min()), 0)
+    light = floats(random, at + int(place.max()) + 1 + behind)
+    wanted = (light.astype(np.float64)[at + place] * weights).sum()
     expected = light.astype(np.float64)
-    reference.window_add(expected, np.array(at), table, np.array(shares), down, value)
-    window_add(light, at, table, shares, down, value)  # type: ignore[arg-type]
-    close(light, expected, 10)
+    np.add.at(expected, at + place, value * weights)
+    where = light, at, side, table, shares, down, size
+    if sheared is None:
+        found = window_sum(*where)
+        window_add(*where, value)
+    else:
+        found = sheared_sum(*where, sheared)
+        sheared_add(*where, sheared, value)
+    close(np.array(found), wanted, 40)
+    close(light, expected, 40)
 
 
 def some_windows(random: np.random.Generator, groups: int, sites: int, places: int) -> Windows:
