@@ -40,7 +40,12 @@ class _Window:
     def __init__(self, context: Any, builder: Any, kinds: Any, args: Any, *, sheared: bool) -> None:
         self.builder = builder
         self.values, self.table = (pointer(context, builder, kinds[k], args[k]) for k in (0, 3))
-        self.at, self.side, self.shares, self.down, self.width, self.height = (*args[1:3], *args[4:8])
+        self.at: Any = args[1]
+        self.side: Any = args[2]
+        self.shares, self.down, self.width, self.height = args[4:8]
+        self.along: Any
+        self.shear: Any
+        self.below: Any
         self.along, self.shear, self.below = args[8:11] if sheared else (None, None, None)
 
     def columns(self, do: Callable[[Any, Any], None]) -> None:
@@ -87,11 +92,11 @@ def _types(array: Any, table: Any, sheared: bool) -> list[Any]:
 
 def _generate_sum(context: Any, builder: Any, signature: Any, args: Any, *, sheared: bool) -> Any:
     window = _Window(context, builder, signature.args, args, sheared=sheared)
-    total = cgutils.alloca_once_value(builder, FLOAT(0))
+    total = cgutils.alloca_once_value(builder, FLOAT(0))  # type: ignore[no-untyped-call]
 
     def add_columns(column: Any, vector: Any) -> None:
         # two, because each sum waits for the one before
-        parts = [cgutils.alloca_once(builder, vector) for _ in range(2)]
+        parts = [cgutils.alloca_once(builder, vector) for _ in range(2)]  # type: ignore[no-untyped-call]
         for part in parts:
             builder.store(splat(vector, 0.0), part)
 

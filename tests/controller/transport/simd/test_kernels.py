@@ -22,7 +22,8 @@ spare = st.integers(0, 21)
 """So many elements stand before and behind those that a kernel uses: no multiple of a register is preferred."""
 quick = settings(max_examples=40, deadline=None, derandomize=True)
 
-Size, Shear = tuple[int, int], tuple[int, int, int]
+Size = tuple[int, int]
+Shear = tuple[int, int, int]
 
 # An intrinsic runs in compiled code only.
 
