@@ -1,7 +1,12 @@
-"""How tests are spread over workers: by file, long files first, users of the finished demo when it is there."""
+"""How tests are spread over workers: by file, long files first, users of the finished demo when it is there.
+
+A file is run as a whole by one worker, for what its tests share. Two kinds of long files are divided: those whose tests
+share nothing, and those that hold two things.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 from xdist.scheduler import LoadFileScheduling
@@ -9,40 +14,67 @@ from xdist.scheduler import LoadFileScheduling
 MAKES_THE_DEMO: Final = "tests/end_to_end/test_demo.py"
 """Its first test makes it, for all workers."""
 NEEDS_THE_DEMO: Final = (
+    "tests/end_to_end/test_kiosk_targets.py",
     "tests/end_to_end/test_on_a_cluster.py",
-    "tests/end_to_end/test_takeover.py",
     "tests/end_to_end/test_live.py",
+    "tests/end_to_end/test_takeover.py",
+    "tests/end_to_end/test_refine.py",
     "tests/end_to_end/test_photograph.py",
     "tests/end_to_end/test_targets.py",
-    "tests/end_to_end/test_kiosk_targets.py",
 )
 """Meanwhile their workers would only wait: they have other tests first, and these at once when it is there."""
 LONGEST_FIRST: Final = (
-    MAKES_THE_DEMO,
     "tests/booted/test_kiosk.py",
+    MAKES_THE_DEMO,
     "tests/end_to_end/test_going_on.py",
+    "tests/end_to_end/test_drift.py",
+    "tests/real_kernel/test_on_kernel.py",
+    "tests/end_to_end/test_refusing_devices.py",
     "tests/plugins/test_on_usb_bus.py",
+    "tests/end_to_end/test_technician.py",
+    "tests/end_to_end/test_never_black.py",
+    "tests/end_to_end/test_usb_camera.py",
+    "tests/campaigns/test_serve_wires.py",
+    "tests/campaigns/test_kills.py",
     "tests/controller/panel/test_in_browser.py",
     "tests/plugins/emulated/cameras/test_gphoto2_peer.py",
     "tests/plugins/finding/test_serial_ports.py",
-    "tests/end_to_end/test_drift.py",
-    "tests/end_to_end/test_technician.py",
-    "tests/campaigns/test_kills.py",
-    "tests/campaigns/test_serve_wires.py",
-    "tests/end_to_end/test_usb_camera.py",
     "tests/controller/calibrate/geometry/test_self_calibration.py",
     "tests/controller/calibrate/geometry/test_self_calibration_failures.py",
     "tests/controller/calibrate/test_chain.py",
     "tests/controller/solve/regions/test_solver.py",
-    "tests/end_to_end/test_refusing_devices.py",
     "tests/controller/cluster/test_cluster.py",
+    "tests/controller/cli/test_extras.py",
     "tests/end_to_end/test_killed_demo.py",
     "tests/controller/study/test_beyond.py",
 )
 """What would keep one worker busy for a minute after the others have ended, were it to come last."""
-
-
 LONG: Final = (*NEEDS_THE_DEMO, *LONGEST_FIRST)
+
+SHARES_NOTHING: Final = (
+    "tests/end_to_end/test_kiosk_targets.py",
+    "tests/end_to_end/test_never_black.py",
+    "tests/end_to_end/test_refine.py",
+    "tests/controller/cli/test_extras.py",
+)
+"""Each of their tests takes long and starts with what it needs itself, so any worker may have it."""
+PARTS: Final[Mapping[str, tuple[str, ...]]] = {
+    "tests/booted/test_kiosk.py": ("[trixie",),
+    "tests/real_kernel/test_on_kernel.py": ("::test_keys_",),
+}
+"""Words in the ids of tests that are a file of their own: another machine is booted for them."""
+
+
+def scope_of(test: str) -> str:
+    """What one worker runs as a whole: a file, a part of it, or this one test; ``test``: its id."""
+    file = file_of(test)
+    if file in SHARES_NOTHING:
+        return test
+    return next((f"{file}::{part}" for part in PARTS.get(file, ()) if part in test), file)
+
+
+def file_of(scope: str) -> str:
+    return scope.split("::", 1)[0]
 
 
 class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
@@ -50,8 +82,11 @@ class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
 
     _demo_is_made = False
 
+    def _split_scope(self, nodeid: str) -> str:
+        return scope_of(nodeid)
+
     def mark_test_complete(self, node: Any, item_index: int, duration: float = 0) -> None:
-        self._demo_is_made |= self._split_scope(self.registered_collections[node][item_index]) == MAKES_THE_DEMO
+        self._demo_is_made |= file_of(self.registered_collections[node][item_index]) == MAKES_THE_DEMO
         super().mark_test_complete(node, item_index, duration)
 
     def _reschedule(self, node: Any) -> None:
@@ -61,9 +96,11 @@ class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
         super()._reschedule(node)
 
     def _assign_work_unit(self, node: Any) -> None:
-        unfinished = [file for file, tests in self.assigned_work[node].items() if not all(tests.values())]
+        unfinished = [file_of(scope) for scope, tests in self.assigned_work[node].items() if not all(tests.values())]
         busy = any(file in LONG for file in unfinished)
-        self.workqueue.move_to_end(min(self.workqueue, key=lambda file: self._rank(file, busy=busy)), last=False)
+        self.workqueue.move_to_end(
+            min(self.workqueue, key=lambda scope: self._rank(file_of(scope), busy=busy)), last=False
+        )
         super()._assign_work_unit(node)
 
     def _rank(self, file: str, *, busy: bool) -> int:

@@ -7,7 +7,17 @@ from typing import Any, cast
 
 import pytest
 
-from tests.scheduling import LONG, LONGEST_FIRST, MAKES_THE_DEMO, NEEDS_THE_DEMO, LongestFirst
+from tests.scheduling import (
+    LONG,
+    LONGEST_FIRST,
+    MAKES_THE_DEMO,
+    NEEDS_THE_DEMO,
+    PARTS,
+    SHARES_NOTHING,
+    LongestFirst,
+    file_of,
+    scope_of,
+)
 
 SHORT = [f"tests/short/test_{n}.py" for n in range(40)]
 
@@ -58,7 +68,7 @@ def all_tests(of_a_file: int = 3) -> list[str]:
 
 @pytest.mark.parametrize("of_a_file", [1, 2, 5])
 @pytest.mark.parametrize("workers", [1, 3, 5])
-def test_every_test_runs_once_and_a_files_tests_on_one_worker(workers: int, of_a_file: int) -> None:
+def test_every_test_runs_once_and_what_shares_something_on_one_worker(workers: int, of_a_file: int) -> None:
     tests = all_tests(of_a_file)
     scheduling, made = scheduled(tests, workers)
     while any(worker.can_run for worker in made):
@@ -67,13 +77,14 @@ def test_every_test_runs_once_and_a_files_tests_on_one_worker(workers: int, of_a
                 finish_one(scheduling, worker)
     assert sorted(test for worker in made for test in worker.given) == list(range(len(tests)))
     assert all(worker.done == len(worker.given) for worker in made)
-    files = [{tests[test].split("::")[0] for test in worker.given} for worker in made]
-    assert sum(map(len, files)) == len(SHORT) + len(LONG)
+    scopes = [{scope_of(tests[test]) for test in worker.given} for worker in made]
+    assert sum(map(len, scopes)) == len(SHORT) + len(LONG) + len(SHARES_NOTHING) * (of_a_file - 1)
 
 
 def test_what_needs_the_demo_waits_until_it_is_made_and_comes_soon_then() -> None:
     tests = all_tests()
-    scheduling, (maker, other) = scheduled(tests, 2)
+    scheduling, made = scheduled(tests, 2)
+    maker, other = sorted(made, key=lambda worker: not tests[worker.given[0]].startswith(MAKES_THE_DEMO))
     assert tests[maker.given[0]].startswith(MAKES_THE_DEMO)
     for _ in range(60):
         finish_one(scheduling, other)
@@ -100,6 +111,31 @@ def test_a_worker_gets_a_short_file_while_it_is_busy_with_a_long_one() -> None:
 
 def worker_file(tests: list[str], worker: Worker) -> str:
     return tests[worker.given[-1]].split("::")[0]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "together"),
+    [
+        ("tests/booted/test_kiosk.py::test_a[bookworm]", "tests/booted/test_kiosk.py::test_b[bookworm-x]", True),
+        ("tests/booted/test_kiosk.py::test_a[trixie]", "tests/booted/test_kiosk.py::test_b[trixie-x]", True),
+        ("tests/booted/test_kiosk.py::test_a[bookworm]", "tests/booted/test_kiosk.py::test_a[trixie]", False),
+        (f"{SHARES_NOTHING[0]}::test_a", f"{SHARES_NOTHING[0]}::test_b", False),
+    ],
+)
+def test_two_machines_of_a_file_are_two_scopes(one: str, other: str, together: bool) -> None:
+    assert (scope_of(one) == scope_of(other)) is together
+    assert file_of(scope_of(one)) == file_of(one)
+
+
+def test_a_file_whose_tests_are_spread_makes_nothing_once_for_all_of_them(pytestconfig: pytest.Config) -> None:
+    for file in SHARES_NOTHING:
+        assert 'scope="module"' not in (pytestconfig.rootpath / file).read_text()
+
+
+def test_every_part_is_in_its_file(pytestconfig: pytest.Config) -> None:
+    for file, parts in PARTS.items():
+        text = (pytestconfig.rootpath / file).read_text()
+        assert all(part.strip(":[") in text for part in parts)
 
 
 def test_every_long_file_exists(pytestconfig: pytest.Config) -> None:

@@ -22,6 +22,7 @@ from controller.calibrate.values import (
 from controller.capture.brackets import merge_brackets
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.core.arrays import FloatImage, Mask, array_in_file
+from controller.core.channels import smallest
 
 ROWS_AT_ONCE = 256
 LIT_SHARE = 0.004
@@ -97,6 +98,6 @@ def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.N
 def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:
     """Camera pixels that any projector lights noticeably in every channel."""
     brightest = max(float(np.percentile(part.white, 99.9)) for part in parts)
-    masks = [part.white.min(axis=2) > LIT_SHARE * brightest for part in parts]
+    masks = [smallest(part.white) > LIT_SHARE * brightest for part in parts]
     lit: Mask = np.logical_or.reduce(masks)
     return lit

@@ -20,6 +20,7 @@ from controller.capture.linear_files import is_linear
 from controller.capture.profile import CameraNoise
 from controller.capture.raw import is_jpeg, read_jpeg_values, read_mosaic, read_samples
 from controller.core.arrays import ByteImage, FloatImage
+from controller.core.channels import largest
 from controller.core.errors import CalibrationError
 
 LONGEST_S = 1.5
@@ -159,7 +160,7 @@ def changed_share(before: Mapping[str, ByteImage], after: Mapping[str, ByteImage
         if before[name].shape != image.shape:
             changed += image.shape[0] * image.shape[1]
         elif before[name] is not image:
-            changed += int(np.count_nonzero(cv2.absdiff(before[name], image).max(axis=2) > NOTICEABLE))
+            changed += int(np.count_nonzero(largest(cv2.absdiff(before[name], image)) > NOTICEABLE))
     share: float = changed / max(total, 1)
     return share
 

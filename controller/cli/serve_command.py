@@ -29,6 +29,7 @@ from controller.kiosk.store.accounts import FOLDER
 from controller.panel.mqtt.options import BrokerOptions, check_broker
 from controller.play.control.notify import Notifier
 from controller.run.progress import Level, Reporter
+from controller.stage.run import leave_runtime_folder, stage_lock
 from hal.errors import DeviceError
 
 RETRY_S: Final = 5.0
@@ -82,6 +83,7 @@ def serve(
     protocols = _protocols(kiosk, reporter)
     notifier = Notifier()
     with contextlib.ExitStack() as stack:
+        stack.callback(_leave_runtime_folder, stage)
         stack.callback(notifier.stopping)
         first, socket_served, entrance, told = True, False, None, ""
         while not cancel.is_set():
@@ -119,6 +121,12 @@ def serve(
                 with _set_up_picture(kiosk, entrance):
                     _wait(kiosk, cancel, notifier.alive, partial(_may_begin, stage, missing=missing, again_s=again_s))
     return {"served": str(stage)}
+
+
+def _leave_runtime_folder(stage: Path) -> None:
+    # Another program that has the stage by now uses the folder, too.
+    with contextlib.suppress(UsageError), stage_lock(stage):
+        leave_runtime_folder(stage)
 
 
 def _protocols(kiosk: StageKiosk, reporter: Reporter) -> Sequence[Configured]:

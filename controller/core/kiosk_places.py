@@ -13,6 +13,8 @@ RUNTIME: Final = Path("/run/velatura")
 PLAYER_SOCKET: Final = RUNTIME / "player.sock"
 PLAYER_OPTIONS: Final = STATE / "player.options"
 """One argument a line, for the player that systemd starts."""
+FIRST_LOGIN: Final = "first-login"
+"""In the runtime folder: the one-time password of a kiosk whose output goes to the journal, for the installation."""
 
 
 def is_installed(stage: Path) -> bool:

@@ -107,18 +107,34 @@ def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
         yield
 
 
-def runtime_folder(stage: Path) -> Path:
-    """A short, private folder for this stage's sockets (a unix socket's path has at most 107 bytes).
+def runtime_path(stage: Path) -> Path:
+    """Where the sockets of this stage are, if a program serves it.
 
-    Under ``$XDG_RUNTIME_DIR`` or the system's temporary folder; mode 0700 and owned by this user, or refused. The
-    stage of an installed kiosk has the folder of its services, so that commands find them.
+    Under ``$XDG_RUNTIME_DIR`` or the system's temporary folder; short, because a unix socket's path has at most 107
+    bytes. The stage of an installed kiosk has the folder of its services, so that commands find them.
+
+    Refused if another user owns it, or others may use it.
     """
     if kiosk_places.is_installed(stage):
         return kiosk_places.RUNTIME
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
     digest = hashlib.sha256(str(stage.resolve()).encode()).hexdigest()[:12]
     folder = base / f"velatura-{os.getuid()}-{digest}"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        _refuse_unsafe(folder)
+    return folder
+
+
+def runtime_folder(stage: Path) -> Path:
+    """``runtime_path``, created with mode 0700; ``stage.run.leave_runtime_folder`` removes it."""
+    folder = runtime_path(stage)
+    if not kiosk_places.is_installed(stage):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _refuse_unsafe(folder)
+    return folder
+
+
+def _refuse_unsafe(folder: Path) -> None:
     status = folder.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise UsageError(
@@ -126,4 +142,3 @@ def runtime_folder(stage: Path) -> Path:
             what=f"{folder} belongs to another user or is open to others.",
             remedy="Remove it, or set XDG_RUNTIME_DIR to a private folder, and start again.",
         )
-    return folder

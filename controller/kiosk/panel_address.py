@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from controller.core import kiosk_places
 from controller.core.storage import write_atomically
 
-FIRST_LOGIN: Final = "first-login"
-"""In the runtime folder: the one-time password of a kiosk whose output goes to the journal, for the installation."""
-
+FIRST_LOGIN: Final = kiosk_places.FIRST_LOGIN
 EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104 - compared with, not listened at
 _GET_ADDRESS: Final = 0x8915
 """SIOCGIFADDR: an interface's IPv4 address (netdevice(7))."""

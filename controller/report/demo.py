@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 
 from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.calibration import read_calibration
 from controller.artefacts.geometry import read_geometry_figures
 from controller.artefacts.grade import PICTURE, read_grade_figures
 from controller.artefacts.kinds import StepKind
@@ -55,9 +54,9 @@ class AppearanceComparison:
 
 def write_demo_report(out: Path, run: Path, checked: Checked) -> tuple[Path, Path]:
     """Write ``report.html`` and ``report.json`` of a finished demo run into ``out``."""
-    calibration = read_calibration(run, checked.names)
+    calibrated = Calibrated(run, checked.names)
+    calibration, reflectance = calibrated.calibration, calibrated.reflectance
     names = [table.name for table in checked.stage.tables.appearances]
-    reflectance = Calibrated(run, checked.names).reflectance
     found = [_judge(run, name, calibration, reflectance, checked.names) for name in names]
     with Journal(run) as journal:
         steps, shots = journal.steps(), journal.shot_count()

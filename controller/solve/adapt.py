@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask
+from controller.core.channels import largest
 from controller.core.errors import UsageError
 from controller.solve.bounded.solver import check_target
 from controller.solve.drive_levels import DriveLevels
@@ -85,8 +86,8 @@ def adapted_target(
 def _lifted(wanted: FloatImage, floor: FloatImage, drive: DriveLevels, sheet: Sheet) -> tuple[FloatImage, FloatImage]:
     """``wanted`` with its darkest parts raised by grey light, and (rows, columns) the darkest grey of each pixel."""
     grey = wanted @ GREY
-    lowest = _quotient(drive.of(floor), drive.of(np.ones_like(wanted)), otherwise=0.0).max(axis=2)
-    lowest = np.maximum(lowest, 0)
+    lowest = _quotient(drive.of(floor), drive.of(np.ones_like(wanted)), otherwise=0.0)
+    lowest = np.maximum(largest(lowest), 0)
     lacking = drive.mask & (grey < lowest)
     level = sheet.above(np.where(lacking, lowest, 0).astype(np.float32))
     raised = _soft_maximum(grey, level)

@@ -16,6 +16,7 @@ import numpy as np
 
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask
+from controller.core.channels import largest
 from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
 from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
@@ -74,9 +75,9 @@ def base_image(calibration: Calibration, kind: BaseKind = "white") -> FloatImage
     """
     # one projector after the other: their white images are in files, and together larger than all else
     first, *others = (p.white for p in calibration.projectors)
-    brightest = first.max(axis=2)
+    brightest = largest(first)
     for white in others:
-        np.maximum(brightest, white.max(axis=2), out=brightest)
+        np.maximum(brightest, largest(white), out=brightest)
     mask = calibration.object_mask & (brightest > 0)
     if kind == "minimum":
         light = _where_lit(first)

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask
+from controller.core.channels import largest
 from controller.core.errors import UsageError, WorkError
 from controller.solve.bounded.solver import check_target
 from controller.solve.drive_levels import DriveLevels
@@ -50,7 +51,7 @@ def feasibility(
     needed = drive.of(target - black)
     bright, dark = np.maximum(needed - 1, 0), np.maximum(-needed, 0)
     mask = drive.mask
-    reachable: Mask = mask & (bright.max(axis=2) <= margin) & (dark.max(axis=2) <= margin)
+    reachable: Mask = mask & (largest(bright) <= margin) & (largest(dark) <= margin)
     share = float(reachable[mask].mean()) if mask.any() else 0.0
     return Feasibility(bright, dark, reachable, share)
 

@@ -8,7 +8,7 @@ no projector pixel can follow, wider ones are shading. Arrays in, arrays out (do
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import finite
 
 SIZES: Final = (0.01, 0.02, 0.04, 0.08)
 """Borders of the bands: sizes relative to the picture's longer side, an octave each."""
@@ -75,15 +76,17 @@ def ghosting(
 
     Returns None where nothing (or too little) is out of reach, or the object has no pattern there.
     """
-    known = mask & np.isfinite(reflectance).all(axis=2) & np.isfinite(photograph).all(axis=2)
+    known = mask & finite(reflectance) & finite(photograph)
     where = known & _around(known & lacking)
     if where.sum() < LEAST_PIXELS or not (known & lacking).any():
         return None
-    error = opponent(photograph, camera_to_xyz, white) - opponent(asked, camera_to_xyz, white)
-    own = opponent(reflectance, camera_to_xyz, 1.0)
+    box = _box(known)  # beyond it there is nothing to compare
+    error = opponent(photograph[box], camera_to_xyz, white) - opponent(asked[box], camera_to_xyz, white)
+    own = opponent(reflectance[box], camera_to_xyz, 1.0)
+    inside, longest = where[box], max(mask.shape)
     pairs = [
-        tuple(band[where] - band[where].mean(axis=0) for band in both)
-        for both in zip(_bands(error, known), _bands(own, known), strict=True)
+        tuple(band[inside] - band[inside].mean(axis=0) for band in both)
+        for both in _bands((error, own), known[box], longest)
     ]
     if sum(float((pattern**2).mean()) for _, pattern in pairs) < FAINTEST**2:
         return None
@@ -108,16 +111,25 @@ def _around(lacking: Mask) -> Mask:
     return np.asarray(cv2.dilate(lacking.astype(np.uint8), disc) > 0)
 
 
-def _bands(image: FloatImage, mask: Mask) -> Iterator[FloatImage]:
-    """Differences of Gaussian means over the mask alone."""
+def _box(mask: Mask) -> tuple[slice, slice]:
+    """The rows and columns of a mask with a pixel."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def _bands(images: Sequence[FloatImage], mask: Mask, longest_px: int) -> Iterator[list[FloatImage]]:
+    """Of each image, differences of Gaussian means over the mask alone; ``longest_px``: the whole picture's side."""
     weight = mask.astype(np.float32)
+    weighted = [np.where(mask[..., None], image, np.float32(0)) for image in images]
     means = []
     for size in SIZES:
-        sigma = size * max(mask.shape) / SIGMAS_A_SIZE
-        total = cv2.GaussianBlur(np.where(mask[..., None], image, 0).astype(np.float32), (0, 0), sigma)
-        means.append(total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), np.float32(1e-4))[..., None])
+        sigma = size * longest_px / SIGMAS_A_SIZE
+        share, *totals = (
+            cv2.GaussianBlur(part, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) for part in (weight, *weighted)
+        )
+        means.append([total / np.maximum(share, np.float32(1e-4))[..., None] for total in totals])
     for finer, wider in itertools.pairwise(means):
-        yield np.asarray(finer - wider, np.float32)
+        yield [np.asarray(fine - wide, np.float32) for fine, wide in zip(finer, wider, strict=True)]
 
 
 def _ghost(pairs: list[tuple[FloatImage, FloatImage]]) -> Ghost:

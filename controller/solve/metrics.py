@@ -8,10 +8,11 @@ from typing import Final
 import cv2
 import numpy as np
 import numpy.typing as npt
-from skimage.color import deltaE_ciede2000
 
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import mean
 from controller.core.errors import UsageError
+from controller.solve.ciede2000 import ciede2000
 
 BAND_PIXELS: Final = 1 << 18
 """Pixels compared at a time, so that memory stays bounded at any size."""
@@ -55,10 +56,13 @@ def colour_difference(
     """
     difference = np.zeros(mask.shape, np.float32)
     ys, xs = np.nonzero(mask)
+    to_relative = np.ascontiguousarray(camera_to_xyz / (camera_to_xyz @ np.full(3, white))[:, None], np.float64)
     for first in range(0, ys.size, BAND_PIXELS):
         at = ys[first : first + BAND_PIXELS], xs[first : first + BAND_PIXELS]
-        a, b = (lab_of(image[at], camera_to_xyz, white) for image in (achieved, target))
-        difference[at] = deltaE_ciede2000(b, a)  # type: ignore[no-untyped-call]
+        a, b = (image[at].astype(np.float64) for image in (achieved, target))
+        found = np.empty(len(a))
+        ciede2000(a, b, to_relative, found)
+        difference[at] = found
     return difference
 
 
@@ -134,7 +138,7 @@ def _canny(gradient: tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]], thresh
 
 def _gradient(image: FloatImage, white: float) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]]:
     """Gradient of a picture's brightness after a display's gamma, so that edges in the dark count as they are seen."""
-    grey = np.clip(image.mean(axis=2) / white, 0, 1) ** np.float32(1 / 2.2)
+    grey = np.clip(mean(image) / white, 0, 1) ** np.float32(1 / 2.2)
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
     dx, dy = (cv2.Sobel(smooth, cv2.CV_32F, 1 - i, i) * GRADIENT_SCALE for i in range(2))
     return np.round(dx).astype(np.int16), np.round(dy).astype(np.int16)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import finite
 from controller.solve.bounded.solver import solve_bounded
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
@@ -80,7 +81,7 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     Left out is what was not measured, what changed while the photograph was taken, and areas whose error has nothing to
     do with that of the others.
     """
-    measured = mask & np.isfinite(photograph.radiance).all(axis=2)
+    measured = mask & finite(photograph.radiance)
     if not measured.any():
         return measured
     scale = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
@@ -90,7 +91,7 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     spread = 1.4826 * np.median(np.abs(inside - middle), axis=0)
     limit = np.maximum(LEAST_OUTLIER, OUTLIER_SPREADS * spread)
     strange = measured & (np.abs(error - middle) > limit).any(axis=2)
-    both = measured & np.isfinite(photograph.first).all(axis=2) & np.isfinite(photograph.last).all(axis=2)
+    both = measured & finite(photograph.first) & finite(photograph.last)
     moved = smoothed(np.abs(smoothed(photograph.last - photograph.first, both, EDGE_PX)), both, EDGE_PX)
     noise = 4 * np.sqrt(2 * noise_variance(photograph.sigma, both, EDGE_PX))
     strange |= both & (moved > CHANGED * scale + noise).any(axis=2)
@@ -104,7 +105,7 @@ def refusal(
     photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, mask: Mask, trusted: Mask
 ) -> str | None:
     """Why a photograph says nothing about the result, for people; None where it does."""
-    measured = mask & np.isfinite(photograph.radiance).all(axis=2)
+    measured = mask & finite(photograph.radiance)
     wanted = float((predicted - stage.black)[measured].sum(dtype=np.float64))
     seen = float((photograph.radiance - stage.black)[measured].sum(dtype=np.float64))
     if not measured.any() or seen < DARKEST * wanted:

@@ -26,6 +26,7 @@ from controller.solve.appearance import (
     make_appearance,
     solve_base,
 )
+from controller.solve.bounded.solver import TOLERANCE
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
 from controller.solve.engines.processor import Engine
@@ -42,6 +43,8 @@ ADVICE_FULL_SOLVE = (
 
 ADAPTATIONS: Final = 2
 """An adapted target throws back other light than was asked for, and so needs another floor."""
+FIRST_TOLERANCE: Final = 2 * TOLERANCE
+"""Of a solve that another one continues, without the momentum that makes up most of the KKT residual by then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +119,7 @@ def solve_appearance(
     began_s = time.perf_counter()
     solve = partial(_solved, transport, base, black, options, aim, progress=progress, cancelled=cancelled,
                     engine=engine)  # fmt: skip
-    made = solve(aim.direct)
+    made = solve(aim.direct, tolerance=TOLERANCE if indirect is None else FIRST_TOLERANCE)
     if indirect is not None:
         # what can't be reached throws back other light than was wanted of it
         light = indirect.forward(transport.forward(made.frames))
@@ -190,6 +193,7 @@ def _solved(
     target: FloatImage,
     *,
     start: Sequence[FloatImage] | None = None,
+    tolerance: float = TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     engine: Engine | None = None,
@@ -211,6 +215,7 @@ def _solved(
         weights=appearance_weights(target_radiance(aim.wanted, black, 1.0), aim.possible.reachable, aim.exposure),
         reachable=aim.possible.reachable,
         start=start,
+        tolerance=tolerance,
         progress=progress,
         cancelled=cancelled,
         engine=engine,

@@ -15,7 +15,6 @@ from controller.capture.acquire import Acquirer
 from controller.config import Stage
 from controller.config.models import OpenConfigTable
 from controller.core import kiosk_places
-from controller.core.storage import runtime_folder
 from controller.play.control.launch import PlayerProcess, PlayerSettings, replace_player
 from controller.rig.ambient_light import Darkness
 from controller.rig.doused import DousedProjector
@@ -25,6 +24,7 @@ from controller.rig.mains_relays import Circuit, close_circuits
 from controller.rig.rig import Rig, RigProjector
 from controller.stage.check import Checked, mistake_in
 from controller.stage.recording import open_context
+from controller.stage.run import used_runtime_folder
 from hal import registry
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, PluginError
@@ -44,8 +44,8 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
     Mains relays are closed first. This function switches no relay or lamp off: ``lit`` does that.
     """
     stage = checked.stage
-    context = open_context(stage.folder, runtime=runtime_folder(stage.folder))
     with contextlib.ExitStack() as stack:
+        context = open_context(stage.folder, runtime=stack.enter_context(used_runtime_folder(stage.folder)))
         darkness = light_sensor(checked, context, stack, deadline)
         circuits = mains_circuits(checked, context, stack, deadline)
         close_circuits(circuits, deadline=deadline)

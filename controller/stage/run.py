@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
-from controller.core.storage import exclusive
+from controller.core import kiosk_places
+from controller.core.storage import exclusive, runtime_folder, runtime_path
+from controller.play.control.launch import LOG_NAME
 from controller.run.journal import Journal
 from controller.run.runner import Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
+from hal.runtime.caches import in_use
 
 LONGEST_RUN_S = 12 * 3600.0
 LOCK = "run/lock"
@@ -25,6 +30,32 @@ def marker(kind: str, title: str, *, enter: Event | None = None, leave: Event | 
 def stage_lock(folder: Path) -> contextlib.AbstractContextManager[None]:
     """Hold the stage's lock. Raises UsageError("already-running")."""
     return exclusive(folder / LOCK, what_is_running="Velatura")
+
+
+@contextlib.contextmanager
+def used_runtime_folder(stage: Path) -> Iterator[Path]:
+    """``core.storage.runtime_folder``, and ``leave_runtime_folder`` on leaving. For the holder of the stage's lock."""
+    folder = runtime_folder(stage)
+    try:
+        yield folder
+    finally:
+        leave_runtime_folder(stage)
+
+
+def leave_runtime_folder(stage: Path) -> None:
+    """Remove the stage's runtime folder, unless a program serves in it, or it holds what somebody may still read: a
+    first login, or the words of a player.
+
+    For the holder of the stage's lock. The folder of an installed kiosk is systemd's.
+    """
+    folder = runtime_path(stage)
+    if kiosk_places.is_installed(stage) or not folder.exists() or in_use(folder):
+        return
+    with contextlib.suppress(FileNotFoundError):
+        if (folder / LOG_NAME).stat().st_size:
+            return
+    if not (folder / kiosk_places.FIRST_LOGIN).exists():
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:

@@ -97,7 +97,7 @@ def kept() -> list[Kept]:
     for path, what in _places():
         with contextlib.suppress(OSError):
             if path.is_dir() and not path.is_symlink() and path.stat().st_uid == os.getuid():
-                found.append(Kept(path, what, _size(path), _in_use(path)))
+                found.append(Kept(path, what, _size(path), in_use(path)))
     return found
 
 
@@ -120,7 +120,7 @@ def _places() -> Iterator[tuple[Path, str]]:
         yield from ((path, "files of one process") for path in sorted(base.glob(f"{TEMPORARY}*")))
 
 
-def _in_use(folder: Path) -> bool:
+def in_use(folder: Path) -> bool:
     """Whether a program listens at a socket in the folder, or holds its lock."""
     lock = folder / LOCK
     if lock.is_file():

@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
+from hal.errors import DeviceBusy, DeviceRefused, PluginError
 from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings, FileKind
 from plugins.genicam.aravis import AravisCamera, Frame
-from plugins.library_process import Answer, Failed, served
+from plugins.library_process import served
+from plugins.library_worker import DeviceWorker
 from plugins.ptp.body import nearest, no_such_file
 from plugins.ptp.files import PendingFile, commit_all
 from plugins.raw_file import Levels, PixelFormat, best_format, encoded, pixel_format
@@ -19,15 +20,14 @@ _THIRDS: Final = tuple(2 ** (third / 3) for third in range(-48, 22))
 """Exposure times in seconds, from 1/65536 to 102, of which a camera has those within its bounds."""
 
 
-class Worker:
-    """The camera; its public methods are the requests. Opened at the first of them, and again when it was lost."""
+class Worker(DeviceWorker[AravisCamera]):
+    """The camera."""
 
     def __init__(self, name: str, wanted: str, levels: Levels, serial: str) -> None:
+        super().__init__(serial)
         self._name = name
         self._wanted = wanted
         self._levels = levels
-        self._serial = serial
-        self._camera: AravisCamera | None = None
         self._pixels: PixelFormat | None = None
         self._exposure_s: float | None = None
 
@@ -72,43 +72,18 @@ class Worker:
             file.write(memoryview(data))
             return commit_all([file])
 
-    def answer(self, name: str, arguments: tuple[Any, ...]) -> Answer:
-        """Do a request. A lost camera is closed, so that the next request opens it again."""
-        began_s = time.monotonic()
-        try:
-            result = getattr(self, name)(*arguments)
-        except DeviceError as error:
-            lost = isinstance(error, DeviceGone | DeviceTimeout) and self._camera is not None
-            if lost:
-                self.close()
-            return Failed.of(error, lost=lost)
-        return result, self._serial, time.monotonic() - began_s
+    def _found(self) -> AravisCamera:
+        return AravisCamera(self._name)
 
-    def close(self) -> None:
-        camera, self._camera = self._camera, None
-        if camera is not None:
-            camera.close()
-
-    def _open(self) -> AravisCamera:
-        if self._camera is None:
-            camera = AravisCamera(self._name)
-            try:
-                self._prepare(camera)
-            except BaseException:
-                camera.close()
-                raise
-            self._camera = camera
-        return self._camera
-
-    def _prepare(self, camera: AravisCamera) -> None:
-        serial = camera.text(_SERIAL)
+    def _prepare(self, device: AravisCamera) -> None:
+        serial = device.text(_SERIAL)
         if self._serial and serial != self._serial:
             raise DeviceRefused(
                 "camera-other",
                 what=f"The connected camera has the serial number {serial or '(none)'}, not {self._serial}.",
                 remedy="Connect the right camera, or change serial in stage.toml and recalibrate.",
             )
-        names = camera.formats()
+        names = device.formats()
         self._pixels = pixel_format(self._wanted) if self._wanted else best_format(names)
         if self._pixels is None or self._pixels.name not in names:
             raise PluginError(
@@ -116,16 +91,15 @@ class Worker:
                 what=f"The camera has no format {self._wanted or 'that can be read'}; it has {', '.join(names)}.",
                 remedy="Write another one for format in the [camera] table, or leave it out.",
             )
-        camera.set_format(self._pixels.name)
+        device.set_format(self._pixels.name)
         for automatic in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto"):
-            camera.choose(automatic, "Off")
+            device.choose(automatic, "Off")
         if self._exposure_s is not None:
-            camera.set_exposure(self._exposure_s)  # it was off meanwhile
+            device.set_exposure(self._exposure_s)  # it was off meanwhile
         self._serial = serial
 
     def _times(self) -> list[float]:
-        assert self._camera is not None
-        low_s, high_s = self._camera.exposure_bounds_s()
+        low_s, high_s = self._open().exposure_bounds_s()
         return [round(time_s, 6) for time_s in _THIRDS if low_s <= round(time_s, 6) <= high_s]
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
+from hal.errors import DeviceRefused, PluginError
 from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings, FileKind
-from plugins.library_process import Answer, Failed, served
+from plugins.library_process import served
+from plugins.library_worker import DeviceWorker
 from plugins.ptp.body import nearest, no_such_file
 from plugins.ptp.files import PendingFile, commit_all
 from plugins.raw_file import encoded
@@ -24,14 +24,13 @@ _ABSOLUTE_S: Final = 1e-4
 """One step of the control Exposure, Absolute."""
 
 
-class Worker:
-    """The camera; its public methods are the requests. Opened at the first of them, and again when it was lost."""
+class Worker(DeviceWorker[VideoDevice]):
+    """The camera."""
 
     def __init__(self, settings: VideoSettings, serial: str) -> None:
+        super().__init__(serial)
         self._settings = settings
-        self._serial = serial
         self._bus = ""
-        self._device: VideoDevice | None = None
         self._control = (0, 0.0)
         self._steps: list[int] = []
         self._wanted: int | None = None
@@ -74,34 +73,8 @@ class Worker:
             file.write(memoryview(data))
             return commit_all([file])
 
-    def answer(self, name: str, arguments: tuple[Any, ...]) -> Answer:
-        """Do a request. A lost camera is closed, so that the next request opens it again."""
-        began_s = time.monotonic()
-        try:
-            result = getattr(self, name)(*arguments)
-        except DeviceError as error:
-            lost = isinstance(error, DeviceGone | DeviceTimeout) and self._device is not None
-            if lost:
-                self.close()
-            return Failed.of(error, lost=lost)
-        return result, self._serial, time.monotonic() - began_s
-
-    def close(self) -> None:
-        device, self._device = self._device, None
-        if device is not None:
-            device.close()
-
-    def _open(self) -> VideoDevice:
-        if self._device is None:
-            device = VideoDevice(chosen(self._settings.address, self._serial, self._bus).path)
-            try:
-                self._prepare(device)
-            except BaseException:
-                device.close()
-                raise
-            self._device = device
-            self._serial, self._bus = device.node.serial, device.node.bus
-        return self._device
+    def _found(self) -> VideoDevice:
+        return VideoDevice(chosen(self._settings.address, self._serial, self._bus).path)
 
     def _prepare(self, device: VideoDevice) -> None:
         settings = self._settings
@@ -121,6 +94,7 @@ class Worker:
         self._measure_exposure(device)
         if self._wanted is not None:
             self._expose(device)
+        self._serial, self._bus = device.node.serial, device.node.bus
 
     def _measure_exposure(self, device: VideoDevice) -> None:
         """Which control sets the exposure, and its steps."""

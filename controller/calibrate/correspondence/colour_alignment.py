@@ -14,6 +14,7 @@ from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.phase_shift import FRINGE_PX
 from controller.capture.patterns import PatternPlan
 from controller.core.arrays import Float64, FloatImage
+from controller.core.channels import finite, smallest
 
 FINE: Final = ("blur-x", "blur-y")
 LEAST_CONTRAST: Final = 0.25
@@ -38,13 +39,13 @@ def colour_shifts(captures: Captures, plan: PatternPlan, white: FloatImage, mixi
     Returns NaN where too little is seen. Raises CalibrationError as ``coloured``.
     """
     black = coloured(captures, "black", white.shape[:2])
-    bright = np.nanpercentile(white.min(axis=2), 99)
+    bright = np.nanpercentile(smallest(white), 99)
     found = np.full((3, 2), np.nan)
     for axis, prefix in enumerate(FINE):
         steps = plan.sinusoids(prefix)
         images = [coloured(captures, step.name, white.shape[:2]) - black for step in steps]
-        use = white.min(axis=2) > FAINTEST * bright
-        use &= np.logical_and.reduce([np.isfinite(image).all(axis=2) for image in images])
+        use = smallest(white) > FAINTEST * bright
+        use &= np.logical_and.reduce([finite(image) for image in images])
         at = np.flatnonzero(use)
         at = at[:: max(1, at.size // SOME_PIXELS)]
         seen = sum(

@@ -19,6 +19,7 @@ from controller.calibrate.correspondence.decode import FINE_TO_COARSE
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PHASE_STEPS, PatternPlan
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import every, finite
 from controller.core.jit import compiled
 
 COARSE: Final = ("phase-x", "phase-y")
@@ -147,9 +148,9 @@ def _im(value: complex) -> float:
 
 def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
     """How much brighter the lamp was at white than at each step: the steps must add up to half the white each."""
-    use = np.isfinite(white).all(axis=2) & (white > FAINTEST * 10 * _bright(white)).all(axis=2)
+    use = finite(white) & every(white > FAINTEST * 10 * _bright(white))
     for image in images:
-        use &= np.isfinite(image).all(axis=2)
+        use &= finite(image)
     at = np.flatnonzero(use)
     if at.size < 10 * len(images):
         return np.ones(len(images))
@@ -160,8 +161,8 @@ def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
 
 
 def _bright(white: FloatImage) -> FloatImage:
-    finite = white[np.isfinite(white).all(axis=2)]
-    some = finite[:: max(1, len(finite) // SOME_PIXELS)] if len(finite) else np.zeros((1, 3), np.float32)
+    known = white[finite(white)]
+    some = known[:: max(1, len(known) // SOME_PIXELS)] if len(known) else np.zeros((1, 3), np.float32)
     return np.asarray(np.percentile(some, 99, axis=0), np.float32)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import UsageError, VelaturaError
-from controller.core.storage import runtime_folder
+from controller.core.storage import runtime_path
 from controller.kiosk.operations.dispatch import CALLER
 from hal.errors import DeviceError
 
@@ -172,7 +172,7 @@ def _connected(stage: Path, timeout_s: float) -> socket.socket:
     channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         channel.settimeout(timeout_s)
-        channel.connect(str(runtime_folder(stage.resolve()) / NAME))
+        channel.connect(str(runtime_path(stage.resolve()) / NAME))
     except OSError:
         channel.close()
         raise

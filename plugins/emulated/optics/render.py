@@ -128,7 +128,8 @@ class Renderer:
         self._layers: list[OrderedDict[bytes, FloatImage]] = [OrderedDict() for _ in truth.projectors]
         of_all = 12 * max(len(samples.pixels), 1) * len(truth.projectors)
         self._layers_kept = max(1, min(LAYERS_KEPT, LAYERS_BYTES // of_all))
-        self._vignette = _vignette(truth)
+        self._vignette = np.repeat(_vignette(truth)[..., None], 3, axis=2)
+        self._sees_everywhere = np.array_equal(samples.pixels, np.arange(self._vignette[..., 0].size))
         self._albedo = _pixel_sums(samples.albedo, samples.starts)
         self._ambient = self._albedo * np.asarray(truth.ambient, dtype=np.float32)
         self._tensors = [_colours(truth, projector) for projector in truth.projectors]
@@ -157,8 +158,6 @@ class Renderer:
         for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
             if level > 0.0:
                 total += np.float32(level) * self._layer(index, frame, digests[index], shutter)
-        if self._transfer is not None:
-            total += self._paint * self._returned(self._transfer, frames, levels, shutter)
         if self._truth.indirect > 0.0:
             # The mean light on what the camera sees stands for what object and room throw back.
             lit = (total - self._ambient).sum(axis=0, dtype=np.float64) / np.maximum(self._albedo.sum(axis=0), 1e-9)
@@ -172,20 +171,17 @@ class Renderer:
         dithered = any(projector.dithering.levels > 1 for projector in self._truth.projectors)
         return (shutter,) if dithered or self._truth.camera.focus_m > 0.0 else ()
 
-    def _returned(
-        self, transfer: Returning, frames: Sequence[ByteImage], levels: Sequence[float], shutter: Shutter
-    ) -> FloatImage:
-        """Irradiance (P, 3) that object and surfaces throw back."""
-        sent = [
-            np.float32(level) * veiled(channels(one.light, frame, one.dithering, shutter) @ white.T, one.light.glare)
-            if level > 0.0
-            else None
-            for one, white, frame, level in zip(self._truth.projectors, self._on_white, frames, levels, strict=True)
-        ]
-        return transfer.light(sent)
+    def _returned(self, transfer: Returning, index: int, each: FloatImage) -> FloatImage:
+        """Light (P, 3) of a frame's channels that object and surfaces throw back."""
+        sent: list[FloatImage | None] = [None] * len(self._truth.projectors)
+        sent[index] = veiled(each @ self._on_white[index].T, self._truth.projectors[index].light.glare)
+        returned = transfer.light(sent)
+        return np.multiply(self._paint, returned, out=returned)
 
     def _layer(self, index: int, frame: ByteImage, digest: bytes, shutter: Shutter) -> FloatImage:
-        """One projector's light (P, 3) at full lamp, summed over each camera pixel's samples."""
+        """One projector's light (P, 3) at full lamp, summed over each camera pixel's samples, with what comes back of
+        it from object and surfaces.
+        """
         projector, kept = self._truth.projectors[index], self._layers[index]
         if projector.dithering.levels > 1:
             digest += repr(shutter).encode()
@@ -197,6 +193,8 @@ class Renderer:
         layer = self._spread(self._through(index, paint, each))
         if gloss:
             layer = layer + self._through(index, gloss, each)
+        if self._transfer is not None:
+            layer = np.add(layer, returned := self._returned(self._transfer, index, each), out=returned)
         kept[digest] = layer
         if len(kept) > self._layers_kept:
             kept.popitem(last=False)
@@ -258,8 +256,10 @@ class Renderer:
     def _through_lens(self, total: FloatImage, aperture_f: float) -> FloatImage:
         camera = self._truth.camera
         width, height = camera.lens.size_px
-        flat = np.zeros((height * width, 3), dtype=np.float32)
-        flat[self._samples.pixels] = total
+        flat = total
+        if not self._sees_everywhere:
+            flat = np.zeros((height * width, 3), dtype=np.float32)
+            flat[self._samples.pixels] = total
         image: FloatImage = flat.reshape(height, width, 3)
         if camera.focus_m > 0.0:
             image = defocused(image, self._confusion(aperture_f))
@@ -267,7 +267,7 @@ class Renderer:
         if sigma > 0.05:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)
         image = veiled(image, camera.glare)
-        image *= self._vignette[..., None]
+        image *= self._vignette
         image.flags.writeable = False
         return image
 

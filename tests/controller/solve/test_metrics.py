@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from skimage.color import rgb2lab
+from skimage.color import deltaE_ciede2000, rgb2lab
 
 from controller.core.errors import UsageError
 from controller.solve.metrics import colour_difference, compare, lab_of, sharpness
@@ -44,6 +44,16 @@ def test_a_published_pair_has_its_published_difference() -> None:
     a, b = (row.astype(np.float32).reshape(1, 1, 3) for row in xyz)
     difference = colour_difference(a, b, np.eye(3), 1.0, np.ones((1, 1), np.bool_))
     assert difference[0, 0] == pytest.approx(27.1492, abs=1e-3)
+
+
+def test_differences_are_those_of_an_independent_formula_also_of_greys_black_and_hues_across_the_circle() -> None:
+    rng = np.random.default_rng(3)
+    one = (rng.random((60, 70, 3)) ** 2).astype(np.float32)
+    other = np.clip(one + 0.1 * rng.normal(size=one.shape), -0.1, 1).astype(np.float32)
+    one[:4], other[2:6], one[8:10], other[9:12] = 0, 0.3, 0.5, 0
+    found = colour_difference(one, other, SRGB, 0.7, np.ones((60, 70), np.bool_))
+    expected = deltaE_ciede2000(lab_of(one, SRGB, 0.7), lab_of(other, SRGB, 0.7))  # type: ignore[no-untyped-call]
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_a_perfect_result_has_no_error_and_all_its_edges() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 
 from controller.core.errors import UsageError, WorkError
-from controller.core.storage import exclusive
+from controller.core.storage import exclusive, runtime_folder, runtime_path
 from controller.rig.rig import Rig
 from controller.run.journal import Journal
 from controller.run.progress import Level, Progress
@@ -183,6 +184,31 @@ def test_lamps_are_lit_while_the_work_goes_on_and_off_afterwards(models: Models)
     ]  # fmt: skip
     with Journal(run) as journal:
         assert journal.outcomes() == [("trial", "done")]
+
+
+def test_the_folder_of_sockets_goes_with_the_run_unless_a_player_has_said_something(models: Models) -> None:
+    folder = runtime_path(models.folder)
+
+    def work(context: Context) -> Sequence[Path]:
+        assert folder.is_dir()
+        return ()
+
+    models.run(work)
+    assert not folder.exists()
+    (runtime_folder(models.folder) / "player.log").write_text("no display")
+    models.run(work)
+    assert [path.name for path in folder.iterdir()] == ["player.log"]
+
+
+def test_the_folder_of_sockets_stays_while_a_program_serves_in_it(models: Models) -> None:
+    folder = runtime_folder(models.folder)
+    with socket.socket(socket.AF_UNIX) as served:
+        served.bind(str(folder / "player.sock"))
+        served.listen()
+        models.run()
+        assert folder.is_dir()
+    models.run()
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError(), Cancelled(), WorkError("bad", what="Bad.", remedy="Mend.")])

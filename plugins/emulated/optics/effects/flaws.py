@@ -74,4 +74,4 @@ def veiled(image: npt.NDArray[np.float32], share: float) -> npt.NDArray[np.float
     coarse = cv2.resize(image, (COARSE_PX, max(1, round(COARSE_PX * rows / columns))), interpolation=cv2.INTER_AREA)
     veil = cv2.GaussianBlur(coarse, (0, 0), SPREAD * COARSE_PX, borderType=cv2.BORDER_CONSTANT)
     whole = cv2.resize(veil, (columns, rows), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(np.float32(1.0 - share) * image + np.float32(share) * whole, dtype=np.float32)
+    return np.asarray(cv2.addWeighted(image, 1.0 - share, whole, share, 0.0), dtype=np.float32)

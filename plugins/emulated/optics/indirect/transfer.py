@@ -61,7 +61,7 @@ class Transfer:
     def returned(self, direct: FloatImage) -> FloatImage:
         """Irradiance (pixels, 3) that comes back, where each camera pixel looks, for ``direct`` on the patches."""
         light = np.stack([self.back[channel] @ direct[:, channel] for channel in range(3)], axis=1)
-        return np.asarray((self.blend @ light)[self.cells], dtype=np.float32)
+        return np.take(np.asarray(self.blend @ light, dtype=np.float32), self.cells, axis=0)
 
 
 def transfer_of(truth: BenchTruth, scattering: Scattering, pixels: npt.NDArray[np.int32]) -> Transfer:
