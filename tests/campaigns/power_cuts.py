@@ -69,7 +69,7 @@ def lost(kiosk: Kiosk, before: dict[str, bytes]) -> list[str]:
     bundle = STAGE / "bundles" / "current"
     checked = kiosk.machine.called("velatura", "bundle", "verify", bundle, "--stage", STAGE, user="velatura")
     gone += ["bundle"] if checked.returncode else []
-    events = {row["code"] for row in kiosk.machine.velatura("events")["events"]}
+    events = set(kiosk.codes())
     return gone + ([] if "playing" in events else ["events"])
 
 
@@ -107,12 +107,12 @@ class Cuts:
             else:
                 self.kiosk.begin("recalibrate")
             time.sleep(self._chance.uniform(0.0, longest_s))
-            job = machine.velatura("status")["job"] or {}
+            job = self.kiosk.status()["job"] or {}
             took_s = cut_now(self.kiosk, self.kiosk.shows_installed)
             lost_of_it = lost(self.kiosk, {**kept(self.kiosk), KEPT[1]: key})
             after = {row["number"]: row for row in self.kiosk.events()}
             lost_of_it += [f"event {row['number']}" for row in rows if after.get(row["number"]) != row]
-            lost_of_it += [one for one in machine.velatura("status")["warnings"] if "settings" in one]
+            lost_of_it += [one for one in self.kiosk.status()["warnings"] if "settings" in one]
             self._note(f"while {_step(job)}", took_s, lost_of_it)
 
     def _note(self, when: str, back_s: float, gone: list[str]) -> None:
