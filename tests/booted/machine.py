@@ -158,15 +158,15 @@ class Machine:
 
     def switch_on(self, *, read_only: bool = False) -> None:
         """Boot, until the machine takes commands. ``read_only``: nothing can be written to its disk, and /tmp is on it;
-        only the devices, which stand outside, have a folder of their own in the stage's ``run``.
+        only the devices, which stand outside, write to copies of two folders.
         """
         options, settings = [], dict(os.environ)
         if read_only:
-            outside = self._folder / "devices"
-            outside.mkdir(exist_ok=True)
-            owner = self.at(STAGE).stat()
-            os.chown(outside, owner.st_uid, owner.st_gid)
-            options = ["--read-only", f"--bind={outside}:{STAGE / 'run'}"]
+            for place in (STAGE / "run", STAGE.parent / ".cache"):
+                outside = self._folder / f"devices-{place.name}"
+                subprocess.run(["cp", "--archive", str(self.at(place)), str(outside)], check=True)
+                options.append(f"--bind={outside}:{place}")
+            options.append("--read-only")
             settings["SYSTEMD_NSPAWN_TMPFS_TMP"] = "0"
         with (self._folder / "console").open("ab") as console:
             self._container = subprocess.Popen(
