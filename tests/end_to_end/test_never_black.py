@@ -221,6 +221,8 @@ def test_a_damaged_stage_toml_lamps_that_are_awaited_and_a_full_disk_are_said_as
             problems = {row["name"]: row["problem"] for row in now["devices"] if row["problem"]}
             wait_for(lambda: "disk-full" in codes(stage))
             assert set(problems) <= {"disk"}
+            values = [value for row in now["devices"] for value in row["values"] if value["label"] == "Lamp"]
+            assert "broken" not in {value["text"] for value in values}
             new = [row for row in call_kiosk(stage, "events") if row["number"] > before and row["level"] == "error"]
             assert sorted(row["code"] for row in new) == ["disk-full", "state"]
             assert not any(lamps(stage).values())
