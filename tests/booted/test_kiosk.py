@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from playwright.sync_api import APIResponse, Page, expect
+from playwright.sync_api import expect
 
 from controller.bundle.format import FIRST_BLOB
 from controller.kiosk.install.steps import DEBIAN
@@ -33,7 +33,7 @@ from tests.booted.kiosk import (
 )
 from tests.booted.machine import ADDRESS, STAGE
 from tests.booted.trees import obstacle
-from tests.booted.visitor import visiting
+from tests.booted.visitor import check_damaged_settings, check_guessed_tokens, log_in, visiting
 from tests.campaigns.power_cuts import cut, cut_now, kept, lost
 from tests.controller.panel.browser import CHROMIUM
 
@@ -133,13 +133,6 @@ def test_user_and_root_reach_the_running_kiosk(playing: Kiosk) -> None:
     assert "playing" in playing.machine.call("velatura", "status", STAGE)
 
 
-def log_in(page: Page, password: str) -> None:
-    page.goto("/login")
-    page.get_by_label("Name").fill("technician")
-    page.get_by_label("Password").fill(password)
-    page.get_by_role("button", name="Log in").click()
-
-
 @pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 @pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
 def test_a_browser_on_another_computer_logs_in_and_sees_what_happens(playing: Kiosk, tmp_path: Path) -> None:
@@ -162,45 +155,8 @@ def test_a_browser_on_another_computer_logs_in_and_sees_what_happens(playing: Ki
         page.get_by_role("button", name="Close", exact=True).click()
         expect(page.get_by_text("Close the stage?")).to_be_visible()
         assert playing.shows()
-        a_damaged_file_is_shown_with_its_line(playing, page)
-        guesses_lock_out_nobody_else(playing, page)
-
-
-def a_damaged_file_is_shown_with_its_line(playing: Kiosk, page: Page) -> None:
-    """Also where the kiosk starts with it: picture and panel are there, by the last good settings."""
-    machine, described = playing.machine, playing.machine.at(STAGE / "stage.toml")
-    good = described.read_text()
-    described.write_text(f"{good}[[projectors\n")
-    machine.call("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "velatura-controller")
-    machine.wait_for(lambda: playing.answers() and playing.status()["warnings"])
-    page.goto("/")
-    shown = page.locator("p.warning")
-    expect(shown).to_contain_text("last good settings")
-    line = good.count("\n") + 1
-    expect(shown).to_contain_text(f"line {line}")
-    assert playing.shows()
-    described.write_text(good)
-    machine.wait_for(lambda: playing.answers() and not playing.status()["warnings"])
-    machine.wait_for(lambda: playing.state == "playing")
-    expect(shown).to_be_hidden()
-
-
-def guesses_lock_out_nobody_else(playing: Kiosk, page: Page) -> None:
-    """A program that guesses, and one with a good token, at the same address."""
-    token = playing.machine.call(
-        "velatura", "account", "add-token", STAGE, "robot", "--role", "viewer", user="velatura"
-    )
-    found = re.search(r"velatura_\w+", token)
-    assert found is not None, token
-
-    def answer(path: str, secret: str) -> APIResponse:
-        return page.request.get(path, headers={"authorization": f"Bearer {secret}"})
-
-    assert {answer("/api/v1/state", "velatura_guess").status for _ in range(25)} == {401, 429}
-    assert answer("/api/v1/state", found[0]).json()["state"] == "playing"
-    free = re.search(r"^velatura_disk_free_bytes\S* (\S+)$", answer("/metrics", found[0]).text(), re.MULTILINE)
-    assert free is not None
-    assert float(free[1]) > 0
+        check_damaged_settings(playing, page)
+        check_guessed_tokens(playing, page)
 
 
 @pytest.mark.parametrize("service", SERVICES)
