@@ -222,14 +222,16 @@ def test_after_a_power_cut_the_appearance_is_there_soon_after_the_x_server_and_n
 def test_a_disk_that_is_read_only_from_the_boot_on_is_told_and_the_picture_is_there(playing: Kiosk) -> None:
     machine, before = playing.machine, kept(playing)
     playing.boot(read_only=True)
-    machine.wait_for(playing.shows)
-    # The devices begin anew, too.
-    machine.wait_for(lambda: set(playing.problems()) == {"disk"} and "disk" in playing.status()["reason"])
-    assert "can't be written to" in playing.problems()["disk"]
-    assert 'name="password"' in machine.fetched(f"https://{ADDRESS}:8377/login")
-    assert {machine.restarts(name) for name in SERVICES} == {0}
-    assert playing.shows()
-    playing.boot()
+    try:
+        machine.wait_for(playing.shows)
+        # The devices begin anew, too.
+        machine.wait_for(lambda: set(playing.problems()) == {"disk"} and "disk" in playing.status()["reason"])
+        assert "can't be written to" in playing.problems()["disk"]
+        assert 'name="password"' in machine.fetched(f"https://{ADDRESS}:8377/login")
+        assert {machine.restarts(name) for name in SERVICES} == {0}
+        assert playing.shows()
+    finally:
+        playing.boot()
     machine.wait_for(playing.shows)
     machine.wait_for(lambda: playing.state == "playing")
     assert lost(playing, before) == []
