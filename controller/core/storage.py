@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -61,8 +62,6 @@ def sync_folder(folder: Path) -> None:
 
 
 def _explained(error: OSError, path: Path) -> WorkError:
-    import errno
-
     # EFBIG: a limit on the size of files, of the user's or the disk's format (FAT: 4 GiB).
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return WorkError(
@@ -87,17 +86,17 @@ def sha256_of(path: Path) -> str:
 def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
     """Hold the lock file ``path`` for the duration, or raise UsageError("already-running").
 
-    The lock ends with the process, so a power cut leaves none. Raises WorkError("no-space" or "cannot-write")
-    if the file can't be created.
+    The lock ends with the process, so a power cut leaves none. On a read-only disk, a file that is not there is
+    stood in for by its folder. Raises WorkError("no-space" or "cannot-write") if the file can't be created.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        opened = path.open("a")
+        opened = _opened_lock(path)
     except OSError as error:
         raise _explained(error, path) from error
-    with opened as file:
+    with contextlib.ExitStack() as stack:
+        stack.callback(os.close, opened)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise UsageError(
                 "already-running",
@@ -105,6 +104,17 @@ def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
                 remedy="Wait for it to end, or stop it first.",
             ) from error
         yield
+
+
+def _opened_lock(path: Path) -> int:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        if error.errno != errno.EROFS:
+            raise
+    # Nobody can have made the file since; who holds it from before holds it still.
+    return os.open(path if path.exists() else path.parent, os.O_RDONLY | os.O_CLOEXEC)
 
 
 def runtime_path(stage: Path) -> Path:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +23,11 @@ import numpy as np
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
+from controller.core.kiosk_places import RUNTIME
+from controller.kiosk.api.control import NAME as SOCKET
 from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.install.steps import PYTHON
+from controller.kiosk.panel_address import FIRST_LOGIN
 from tests.booted.machine import STAGE, Machine
 from tests.booted.trees import ROOT, built_packages, tree
 from tests.controller.play.wire import Frames, noise, same
@@ -31,7 +36,9 @@ from tests.end_to_end.kernel_copy import kernels_of_the_tables
 OUTPUTS: Final = [(name, 280, 210) for name in ("P1", "P2", "P3")]
 SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
 APPEARANCE: Final = "1"
-_SEED: Final = 1
+FIRST, DAMAGED_LATER, AGAIN = "first.vel", "damaged.vel", "again.vel"
+_SEED, OTHER_SEED = 1, 2
+"""Of the noise that the first bundle and the third show, and the second."""
 _HOURS: Final = STAGE / "schedule.toml"
 _DEVICES_FIRST: Final = Path("/etc/systemd/system/bench.service.d/first.conf")
 _UNTIL_THERE: Final = f"""
@@ -56,21 +63,46 @@ class Kiosk:
 
     @property
     def password(self) -> str:
+        """Of the first log-in: the installation told it, and each later start of the service keeps a new one."""
+        kept = self.machine.called("cat", RUNTIME / FIRST_LOGIN)
+        if kept.returncode == 0:
+            return kept.stdout.split()[1]
         found = re.search(r"password (\S+) \(once\)", self.told)
         assert found is not None, self.told
         return found[1]
 
     @property
     def state(self) -> str:
-        return str(self.machine.velatura("status")["state"])
+        return str(self.status()["state"])
 
-    def shows(self) -> bool:
-        """Whether the X server shows the stage's appearance, to the byte, and nothing else."""
+    def status(self) -> dict[str, Any]:
+        """As `velatura status` tells it."""
+        return dict(self._asked("status") or self.machine.velatura("status"))
+
+    def _asked(self, operation: str) -> Any:
+        """What the service answers at its socket, where its commands ask it, too: each takes a second to start. None
+        where none answers.
+        """
+        place = self.machine.seen_here(RUNTIME / SOCKET)
+        with contextlib.suppress(OSError, ValueError), socket.socket(socket.AF_UNIX) as channel:
+            channel.settimeout(30.0)
+            channel.connect(str(place))
+            with channel.makefile("rwb") as lines:
+                lines.write(json.dumps({"op": operation}).encode() + b"\n")
+                lines.flush()
+                answer = json.loads(lines.readline() or b"{}")
+            return answer.get("result")
+        return None
+
+    def shows(self, seed: int = _SEED) -> bool:
+        """Whether the X server shows the stage's appearance, to the byte, and nothing else. ``seed``: of
+        its noise.
+        """
         screen = self.machine.screen()
         if screen is None:
             return False
         wanted = np.zeros_like(screen)
-        beside = np.concatenate(list(noise(OUTPUTS, _SEED).values()), axis=1)
+        beside = np.concatenate(list(noise(OUTPUTS, seed).values()), axis=1)
         wanted[: beside.shape[0], : beside.shape[1]] = beside
         return bool(np.array_equal(screen, wanted))
 
@@ -101,12 +133,18 @@ class Kiosk:
         machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
         machine.wait_for(self.answers)
 
-    def calibrate(self) -> None:
-        """Calibrate, and play what was made; after ``let_the_camera_see``."""
-        machine = self.machine
-        machine.call("velatura", "recalibrate", STAGE, user="velatura")
+    def calibrate(self, look: Callable[[dict[str, Any]], object] = lambda _: None) -> None:
+        """Calibrate, and play what was made; after ``let_the_camera_see``. ``look`` gets the job again and again."""
+        machine, number = self.machine, self.events()[-1]["number"]
+        self.begin("recalibrate")
+
+        def made() -> bool:
+            look(self.status()["job"] or {})
+            return {"calibrated", "published"} <= set(self.codes(number))
+
+        machine.wait_for(made)
         machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
-        machine.wait_for(lambda: machine.velatura("status")["playing"] == "board")
+        machine.wait_for(lambda: self.status()["playing"] == "board")
 
     def begin(self, command: str, *words: str | Path) -> None:
         """Begin work, once what is still under way has ended."""
@@ -121,11 +159,12 @@ class Kiosk:
 
     def problems(self) -> dict[str, str]:
         """What the panel says of the devices that have one, by name."""
-        return {row["name"]: row["problem"] for row in self.machine.velatura("status")["devices"] if row["problem"]}
+        return {row["name"]: row["problem"] for row in self.status()["devices"] if row["problem"]}
 
     def events(self) -> list[dict[str, Any]]:
         """Of the log, oldest first."""
-        return sorted(self.machine.velatura("events")["events"], key=lambda row: int(row["number"]))
+        rows = self._asked("events") or self.machine.velatura("events")["events"]
+        return sorted(rows, key=lambda row: int(row["number"]))
 
     def codes(self, after: int = 0) -> list[str]:
         """Of the events with a larger number."""
@@ -141,15 +180,26 @@ class Kiosk:
     def remove_hours(self) -> None:
         self.machine.call("rm", _HOURS)
 
+    def install_bundle(self, name: str) -> Path:
+        """Install one of the stage's bundles; where it lies then, on this computer."""
+        self.machine.call("velatura", "bundle", "install", STAGE / name, STAGE, user="velatura")
+        return self.machine.at(STAGE / "bundles" / "current").resolve()
+
     def answers(self) -> bool:
         """Whether a command reaches the service, and not the folder alone."""
-        done = self.machine.called("velatura", "status", STAGE, "--json", user="velatura")
-        return done.returncode == 0 and json.loads(done.stdout)["result"].get("serving", True)
+        return self._asked("status") is not None
 
     def read_code(self) -> str:
         """What a telephone reads from the projectors; empty without a QR code."""
         screen = self.machine.screen()
         return "" if screen is None else str(cv2.QRCodeDetector().detectAndDecode(np.ascontiguousarray(screen))[0])
+
+    def boot(self, *, read_only: bool = False) -> float:
+        """Cut the power and switch on again; when that was, in seconds of ``time.monotonic``."""
+        self.machine.cut_off()
+        began_s = time.monotonic()
+        self.machine.switch_on(read_only=read_only)
+        return began_s
 
     def boot_beside_devices(self) -> float:
         """Boot where the devices are on before X starts, as projectors are that stand around a real computer.
@@ -158,8 +208,7 @@ class Kiosk:
         """
         machine = self.machine
         machine.write(_DEVICES_FIRST, _UNTIL_THERE)
-        machine.cut_off()
-        machine.switch_on()
+        self.boot()
         machine.wait_for(self.shows)
         now_s = time.monotonic()
         machine.at(_DEVICES_FIRST).unlink()
@@ -177,7 +226,7 @@ class Kiosk:
         machine.call("chown", "velatura:velatura", STAGE / "new.toml")
         machine.call("mv", STAGE / "new.toml", STAGE / described.name)
         machine.wait_for(self.answers)
-        machine.call("velatura", "bundle", "install", STAGE / "noise.vel", STAGE, user="velatura")
+        self.install_bundle(FIRST)
         showing = ("velatura", "show", STAGE, APPEARANCE)
         machine.wait_for(lambda: machine.called(*showing, user="velatura").returncode == 0)
         machine.wait_for(self.shows)
@@ -210,19 +259,21 @@ def _compile_kernels(machine: Machine, suite: str) -> None:
 
 
 def prepared_stage(folder: Path) -> Path:
-    """The demo's stage for projectors at an X server, with a bundle beside it."""
+    """The demo's stage for projectors at an X server, with three bundles beside it, the first for ``put_stage``."""
     words = ["demo", "--prepare-only", "--room", "dark", "--out", str(folder / "out")]
     subprocess.run([sys.executable, "-m", "controller", *words], check=True, cwd=ROOT, capture_output=True)
     stage = folder / "out" / "stage"
     described = stage / "stage.toml"
     described.write_text(re.sub(r"^frames = .*\n", "", described.read_text(), flags=re.MULTILINE))
-    write_bundle(
-        stage / "noise.vel",
-        stage="demo small",
-        calibration="c",
-        created_unix_s=0,
-        outputs=OUTPUTS,
-        appearances=[NewAppearance(APPEARANCE, noise(OUTPUTS, _SEED))],
-        key=load_signing_key(stage / "keys" / "stage.key"),
-    )
+    for revision, (name, seed) in enumerate(((FIRST, _SEED), (DAMAGED_LATER, OTHER_SEED), (AGAIN, _SEED))):
+        write_bundle(
+            stage / name,
+            stage="demo small",
+            calibration="c",
+            created_unix_s=revision,
+            outputs=OUTPUTS,
+            revision=revision,
+            appearances=[NewAppearance(APPEARANCE, noise(OUTPUTS, seed))],
+            key=load_signing_key(stage / "keys" / "stage.key"),
+        )
     return stage

@@ -156,15 +156,26 @@ class Machine:
         # The disk of this machine is thrown away: nothing has to reach it for good.
         return self.call("dpkg", "--force-unsafe-io", "--install", f"/opt/{package.name}")
 
-    def switch_on(self) -> None:
-        """Boot, until the machine takes commands."""
+    def switch_on(self, *, read_only: bool = False) -> None:
+        """Boot, until the machine takes commands. ``read_only``: nothing can be written to its disk, and /tmp is on it;
+        only the devices, which stand outside, write to copies of two folders.
+        """
+        options, settings = [], dict(os.environ)
+        if read_only:
+            for place in (STAGE / "run", STAGE.parent / ".cache"):
+                outside = self._folder / f"devices-{place.name}"
+                subprocess.run(["cp", "--archive", str(self.at(place)), str(outside)], check=True)
+                options.append(f"--bind={outside}:{place}")
+            options.append("--read-only")
+            settings["SYSTEMD_NSPAWN_TMPFS_TMP"] = "0"
         with (self._folder / "console").open("ab") as console:
             self._container = subprocess.Popen(
                 [
                     "systemd-nspawn", "--quiet", "--boot", "--private-network", "--register=no", "--keep-unit",
                     "--console=pipe", f"--machine=velatura-{os.getpid()}", f"--directory={self._root}",
+                    *options,
                 ],
-                stdin=subprocess.DEVNULL, stdout=console, stderr=console,
+                stdin=subprocess.DEVNULL, stdout=console, stderr=console, env=settings,
             )  # fmt: skip
         self.wait_for(lambda: self._find_init() != 0)
         self.wait_for(lambda: self.called("systemctl", "is-system-running").stdout.strip() != "")

@@ -10,18 +10,30 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from playwright.sync_api import expect
 
+from controller.bundle.format import FIRST_BLOB
 from controller.kiosk.install.steps import DEBIAN
+from controller.run.time_left import RISE, SLACK_S
 from tests.booted.faults import Disk, clock_of_its_own, disk_of_its_own
-from tests.booted.kiosk import APPEARANCE, SERVICES, Kiosk, installed, prepared_stage
+from tests.booted.kiosk import (
+    AGAIN,
+    APPEARANCE,
+    DAMAGED_LATER,
+    OTHER_SEED,
+    SERVICES,
+    Kiosk,
+    installed,
+    prepared_stage,
+)
 from tests.booted.machine import ADDRESS, STAGE
 from tests.booted.trees import obstacle
-from tests.booted.visitor import visiting
+from tests.booted.visitor import check_damaged_settings, check_guessed_tokens, log_in, visiting
 from tests.campaigns.power_cuts import cut, cut_now, kept, lost
 from tests.controller.panel.browser import CHROMIUM
 
@@ -45,8 +57,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module", params=DEBIAN)
 def bare(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kiosk]:
     """Installed, without a stage; the projectors show the way to the panel."""
-    versions = ("1", "2") if request.param == "bookworm" else ("1",)
-    with installed(request.param, tmp_path_factory.mktemp(request.param), versions=versions) as kiosk:
+    with installed(request.param, tmp_path_factory.mktemp(request.param), versions=("1", "2")) as kiosk:
         assert kiosk.machine.wait_for(lambda: kiosk.read_code() != "") < PICTURE_S
         yield kiosk
 
@@ -109,6 +120,14 @@ def test_installing_again_changes_nothing(bare: Kiosk) -> None:
     assert [bare.machine.call("systemctl", "show", "--property=MainPID", *SERVICES)] == before
 
 
+def test_a_boot_without_a_stage_leads_to_the_panel_within_a_minute(bare: Kiosk) -> None:
+    began_s = bare.boot()
+    bare.machine.wait_for(lambda: bare.read_code() == f"https://{ADDRESS}:8377/")
+    took_s = time.monotonic() - began_s
+    print(f"{took_s:.1f} s from the boot to the set-up picture")
+    assert took_s < PICTURE_S
+
+
 def test_user_and_root_reach_the_running_kiosk(playing: Kiosk) -> None:
     assert playing.machine.velatura("status")["playing"] == "1"
     assert "playing" in playing.machine.call("velatura", "status", STAGE)
@@ -116,20 +135,28 @@ def test_user_and_root_reach_the_running_kiosk(playing: Kiosk) -> None:
 
 @pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 @pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
-def test_a_browser_on_another_computer_logs_in_and_sees_it_play(playing: Kiosk, tmp_path: Path) -> None:
-    with visiting(playing.machine, tmp_path) as page:
-        page.goto("/login")
-        page.get_by_label("Name").fill("technician")
-        page.get_by_label("Password").fill(playing.password)
-        page.get_by_role("button", name="Log in").click()
+def test_a_browser_on_another_computer_logs_in_and_sees_what_happens(playing: Kiosk, tmp_path: Path) -> None:
+    machine, number = playing.machine, playing.events()[-1]["number"]
+    with visiting(machine, tmp_path) as page:
+        log_in(page, "a wrong password")
+        first = playing.password
+        log_in(page, first)
         page.wait_for_url("**/password")
-        page.get_by_label("The one-time password").fill(playing.password)
+        page.get_by_label("The one-time password").fill(first)
         for label in ("New password, 10 characters or more", "New password again"):
             page.get_by_label(label).fill("seven tall horses")
         page.get_by_role("button", name="Change").click()
         page.wait_for_url("**/")
         expect(page.locator("p.state")).to_contain_text(f"Playing {APPEARANCE}")
         expect(page.locator("#live-devices")).to_contain_text("left")
+        said = [row["text"] for row in playing.events() if row["number"] > number]
+        assert "A log-in as technician from 192.0.2.8 was refused." in said
+        assert "technician logged in from 192.0.2.8." in said
+        page.get_by_role("button", name="Close", exact=True).click()
+        expect(page.get_by_text("Close the stage?")).to_be_visible()
+        assert playing.shows()
+        check_damaged_settings(playing, page)
+        check_guessed_tokens(playing, page)
 
 
 @pytest.mark.parametrize("service", SERVICES)
@@ -192,13 +219,48 @@ def test_after_a_power_cut_the_appearance_is_there_soon_after_the_x_server_and_n
     assert {playing.machine.restarts(name) for name in SERVICES} == {0}
 
 
+def test_a_disk_that_is_read_only_from_the_boot_on_is_told_and_the_picture_is_there(playing: Kiosk) -> None:
+    machine, before = playing.machine, kept(playing)
+    playing.boot(read_only=True)
+    try:
+        machine.wait_for(playing.shows)
+        # The devices begin anew, too.
+        machine.wait_for(lambda: set(playing.problems()) == {"disk"} and "disk" in playing.status()["reason"])
+        assert "can't be written to" in playing.problems()["disk"]
+        assert 'name="password"' in machine.fetched(f"https://{ADDRESS}:8377/login")
+        assert {machine.restarts(name) for name in SERVICES} == {0}
+        assert playing.shows()
+    finally:
+        playing.boot()
+    machine.wait_for(playing.shows)
+    machine.wait_for(lambda: playing.state == "playing")
+    assert lost(playing, before) == []
+
+
+@pytest.mark.parametrize("bare", ["trixie"], indirect=True)
+def test_a_bundle_that_was_damaged_gives_way_to_the_one_before_and_that_is_said(playing: Kiosk) -> None:
+    machine, number = playing.machine, playing.events()[-1]["number"]
+    damaged = playing.install_bundle(DAMAGED_LATER)
+    machine.wait_for(lambda: playing.shows(OTHER_SEED))
+    data = bytearray(damaged.read_bytes())
+    data[FIRST_BLOB : len(data) * 8 // 10] = np.random.default_rng(3).bytes(len(data) * 8 // 10 - FIRST_BLOB)
+    damaged.chmod(0o600)
+    damaged.write_bytes(data)
+    machine.call("systemctl", "kill", "--signal=KILL", "velatura-player")
+    machine.wait_for(playing.shows)
+    machine.wait_for(lambda: any("the previous one" in warning for warning in playing.status()["warnings"]))
+    assert "bundle-older-plays" in playing.codes(number)
+    playing.install_bundle(AGAIN)
+    machine.wait_for(lambda: not playing.status()["warnings"] and playing.state == "playing")
+    assert playing.shows()
+
+
 def told_full(playing: Kiosk, disk: Disk) -> bool:
     """Whether the panel says that the disk is full, where another program takes all that becomes free."""
     disk.fill()
     return "is full" in playing.problems().get("disk", "")
 
 
-@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 def test_a_full_disk_is_told_once_and_the_picture_stays(playing: Kiosk) -> None:
     machine = playing.machine
     with disk_of_its_own(machine) as disk:
@@ -228,7 +290,6 @@ def test_a_full_disk_is_told_once_and_the_picture_stays(playing: Kiosk) -> None:
     machine.wait_for(lambda: playing.state == "playing")
 
 
-@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler (a package of the test set-up)")
 def test_hours_are_not_followed_by_a_clock_that_was_lost(playing: Kiosk) -> None:
     machine = playing.machine
@@ -254,16 +315,15 @@ def test_hours_are_not_followed_by_a_clock_that_was_lost(playing: Kiosk) -> None
     machine.wait_for(lambda: playing.state == "playing")
 
 
-@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kiosk) -> None:
     machine = playing.machine
     version = ("dpkg-query", "--show", "--showformat=${Version}", "velatura")
     first, second = playing.packages
     before = kept(playing)
-    for package, wanted in ((second, "2-1~deb12"), (first, "1-1~deb12")):
+    for package, wanted in ((second, "2-1~deb"), (first, "1-1~deb")):
         with machine.watched() as seen:
             machine.install(package)
-            assert machine.call(*version) == wanted
+            assert machine.call(*version).startswith(wanted)
             machine.wait_for(playing.shows)
             machine.wait_for(lambda: playing.state == "playing")
         shown = [what for _, what in seen[:-1]]
@@ -278,14 +338,25 @@ def test_a_calibration_uses_the_same_player_and_what_it_made_plays(playing: Kios
     machine = playing.machine
     playing.let_the_camera_see()
     player = machine.call("systemctl", "show", "--property=MainPID", "velatura-player")
-    playing.calibrate()
+    shown: list[tuple[float, str]] = []
+
+    def note(job: dict[str, Any]) -> None:
+        if not job.get("ended", True) and job["left_s"] is not None and job["name"] == "Full recalibration":
+            shown.append((job["left_s"], job["why"]))
+
+    playing.calibrate(note)
+    assert len(shown) > 10
+    least_s = float("inf")
+    for left_s, why in shown:
+        assert left_s <= RISE * least_s + SLACK_S or why, "the time left rose, and nobody said why"
+        least_s = min(least_s, left_s)
     assert playing.shows_installed()
     assert machine.call("systemctl", "show", "--property=MainPID", "velatura-player") == player
     assert machine.restarts("velatura-controller") == 0
 
 
 def works(playing: Kiosk, name: str) -> bool:
-    job = playing.machine.velatura("status")["job"] or {}
+    job = playing.status()["job"] or {}
     return str(job.get("name", "")).startswith(name) and bool(job["steps"]) and not job["ended"]
 
 
@@ -360,8 +431,8 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
     machine.call("sh", "-c", f"cp -a /opt/devices/bench* {STAGE}; chown -R velatura:velatura {STAGE}/bench*")
     machine.call("systemctl", "restart", "bench")
     machine.wait_for(playing.answers)
-    machine.wait_for(lambda: machine.velatura("status")["playing"] in ("1", "board"))
-    if machine.velatura("status")["playing"] == "1":
+    machine.wait_for(lambda: playing.status()["playing"] in ("1", "board"))
+    if playing.status()["playing"] == "1":
         machine.wait_for(playing.shows)
     # where this Debian was calibrated, `board` plays into the file that the bench's camera sees, not on X
     assert time.monotonic() - began_s < RESTORED_S

@@ -19,6 +19,7 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.config.loader import FILE
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
+from controller.kiosk.decide.hours import WEEKDAYS
 from controller.services.calibrate import KEY_FILE, output_sizes
 from controller.stage.check import check_stage
 from tests.campaigns.mini_stage import prepare_mini
@@ -90,6 +91,12 @@ def watched(stage: Path, seconds: float) -> list[dict[str, Any]]:
     return seen
 
 
+def every_day(appearance: str) -> dict[str, Any]:
+    """Hours without an end, in which this one is shown."""
+    rows = [{"day": day, "opens": "00:00", "closes": "00:00", "appearance": appearance} for day in WEEKDAYS]
+    return {"time_zone": "UTC", "rows": rows}
+
+
 def playing(now: dict[str, Any]) -> bool:
     return now["state"] == "playing" and bool(now["playing"])
 
@@ -110,6 +117,14 @@ def test_appearances_in_turn_a_damaged_bundle_and_changed_settings(tmp_path: Pat
         assert {one["appearance"] for one in watched(stage, 1.5 * SHOWN_MS / 1000)} == {"new-2"}
         call_kiosk(stage, "rotate")
         until(stage, lambda now: now["playing"] in ("new-1", "new-3"))
+        # The schedule names one, and later all; without hours the stage is open, and says so.
+        call_kiosk(stage, "set-schedule", **every_day("new-3"))
+        until(stage, lambda now: now["playing"] == "new-3" and not now["in_turn"])
+        call_kiosk(stage, "set-schedule", **every_day("*"))
+        until(stage, lambda now: playing(now) and now["in_turn"])
+        call_kiosk(stage, "set-schedule", time_zone="UTC", rows=[])
+        now = until(stage, lambda now: playing(now) and now["next_event"] is None)
+        assert "closed" not in now["reason"]
 
         # Settings: a comment restarts nothing, what a device is opened with restarts the devices, and no lamp.
         struck, pid, text = strikes(stage), player_pid(stage), call_kiosk(stage, "settings")
@@ -142,6 +157,14 @@ def test_appearances_in_turn_a_damaged_bundle_and_changed_settings(tmp_path: Pat
         assert (stage / "bundles" / CURRENT).resolve() != newest
         install_bundle(stage, 3, "third")
         until(stage, lambda now: now["playing"] == "third" and not now["warnings"])
+        # A backup in the place of settings, calibration and appearances: no lamp is switched.
+        call_kiosk(stage, "backup")
+        (backup,) = (stage / "kiosk" / "archives").glob("backup-*")
+        begun = codes(stage).count("service-started")
+        call_kiosk(stage, "restore", backup=str(backup))
+        wait_for(lambda: codes(stage).count("service-started") == begun + 1)
+        until(stage, lambda now: now["playing"] == "third")
+        assert (strikes(stage), all(lamps(stage).values())) == (struck, True)
         # As systemd ends it before it starts it again.
         kiosk.process.send_signal(signal.SIGUSR1)
         assert kiosk.outcome(timeout_s=180).code == 0
@@ -198,6 +221,8 @@ def test_a_damaged_stage_toml_lamps_that_are_awaited_and_a_full_disk_are_said_as
             problems = {row["name"]: row["problem"] for row in now["devices"] if row["problem"]}
             wait_for(lambda: "disk-full" in codes(stage))
             assert set(problems) <= {"disk"}
+            values = [value for row in now["devices"] for value in row["values"] if value["label"] == "Lamp"]
+            assert "broken" not in {value["text"] for value in values}
             new = [row for row in call_kiosk(stage, "events") if row["number"] > before and row["level"] == "error"]
             assert sorted(row["code"] for row in new) == ["disk-full", "state"]
             assert not any(lamps(stage).values())

@@ -234,15 +234,16 @@ _DARKEN: Final = "Switch the lights off and close the blinds. Other light makes 
 def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
     """The row of a projector on the panel."""
     hours = f"{view.hours:,.0f} h with Velatura, {view.strikes} strikes"
-    values = [LiveValue("Lamp", view.condition.value), LiveValue("Hours", hours)]
+    problem = view.problem
+    # The disk has a row of its own, and the lamp is not broken.
+    of_disk = problem is not None and problem.code == DISK_FULL
+    lamp = Condition.DARK if of_disk and view.condition is Condition.BROKEN else view.condition
+    values = [LiveValue("Lamp", lamp.value), LiveValue("Hours", hours)]
     if view.counter_hours is not None:
         values.append(LiveValue("Projector's counter", f"{view.counter_hours:,} h"))
     if view.condition is Condition.LIT and view.stable_left_s > 0:
         values.append(LiveValue("Stable in", f"{view.stable_left_s:.0f} s"))
-    problem = view.problem
-    # The disk has a row of its own.
-    its_own = problem is not None and problem.code != DISK_FULL
-    what, remedy = (problem.reason, problem.remedy) if problem is not None and its_own else (None, "")
+    what, remedy = (None, "") if problem is None or of_disk else (problem.reason, problem.remedy)
     return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy)
 
 

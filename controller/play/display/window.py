@@ -37,11 +37,12 @@ class WindowOutput:
     def __init__(self, sizes: Sequence[OutputSize], where: Mapping[str, str] | None = None) -> None:
         """Open the window. ``where``: connector or serial number by the output's name, where that is another.
 
-        Raises WorkError("display-gone", "display-unfit", "output-gamma" or "output-range"), UsageError as
-        ``find_connectors`` and ``check_rates``, and as ``unfit`` if no output is as it should be.
+        Raises WorkError("display-gone", "display-taken", "display-unfit", "output-gamma" or "output-range"), UsageError
+        as ``find_connectors`` and ``check_rates``, and as ``unfit`` if no output is as it should be.
         """
         self._sizes, self._where = tuple(sizes), dict(where or {})
         self._server = XServer()
+        self._server.claim()
         found, connectors = self._find()
         self._beside = not found and not self._where
         self._missing: tuple[str, ...] = ()

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import ctypes
 import ctypes.util
+import os
+import time
 from collections.abc import Callable, Iterator
 from ctypes import POINTER, byref, c_int, c_ubyte, c_ulong, c_ushort, c_void_p
 from dataclasses import dataclass
@@ -23,6 +25,10 @@ _NOTIFY_EVERYTHING: Final = 0b1111
 _GAMMA_TOLERANCE: Final = 0x0100
 """One step of an 8-bit value in the 16 bits of a gamma ramp."""
 _LONGEST_PROPERTY_WORDS: Final = 8192
+_ONE_PLAYER: Final = b"_VELATURA_PLAYER"
+_PROCESS: Final = b"_NET_WM_PID"
+_PREDECESSOR_S: Final = 1.0
+"""Until the server has noticed that a player which was just killed is gone."""
 
 
 class _Gamma(ctypes.Structure):
@@ -92,6 +98,53 @@ class XServer:
     def close(self) -> None:
         """Hang up."""
         xlib.XCloseDisplay(self._display)
+
+    def claim(self) -> None:
+        """Be this server's only player, until this connection ends. Raises WorkError("display-taken").
+
+        The claim is the ownership of a selection (X11 protocol, SetSelectionOwner), which ends with its client.
+        """
+        selection, until_s = xlib.XInternAtom(self._display, _ONE_PLAYER, 0), time.monotonic() + _PREDECESSOR_S
+        while (holder := self._claimed(selection)) is not None:
+            if time.monotonic() > until_s:
+                raise WorkError(
+                    "display-taken",
+                    what=f"Another player{holder} already shows its pictures on this X server.",
+                    remedy="End the kiosk or command that it belongs to, or give this stage an X server of its own.",
+                )
+            time.sleep(0.05)
+
+    def _claimed(self, selection: int) -> str | None:
+        """None if it is ours now, else which process has it, as far as that is known."""
+        # While the server is held, no other player comes between question and claim, and the owner's window stays.
+        xlib.XGrabServer(self._display)
+        try:
+            owner = xlib.XGetSelectionOwner(self._display, selection)
+            if owner:
+                process = self._window_number(owner, _PROCESS)
+                return f" (process {process})" if process else ""
+            window = xlib.XCreateSimpleWindow(self._display, self._root, -1, -1, 1, 1, 0, 0, 0)
+            atom, number = xlib.XInternAtom(self._display, _PROCESS, 0), c_ulong(os.getpid())
+            value = ctypes.cast(byref(number), POINTER(c_ubyte))
+            xlib.XChangeProperty(self._display, window, atom, _CARDINAL, 32, 0, value, 1)
+            xlib.XSetSelectionOwner(self._display, selection, window, 0)
+            return None
+        finally:
+            xlib.XUngrabServer(self._display)
+            xlib.XSync(self._display, 0)
+
+    def _window_number(self, window: int, name: bytes) -> int:
+        """A window's property that is one number; 0 where it has none."""
+        kind, width, count, left = c_ulong(), c_int(), c_ulong(), c_ulong()
+        data = POINTER(c_ubyte)()
+        atom = xlib.XInternAtom(self._display, name, 0)
+        xlib.XGetWindowProperty(self._display, window, atom, 0, 1, 0, _CARDINAL, byref(kind), byref(width),
+                                byref(count), byref(left), byref(data))  # fmt: skip
+        if not data:
+            return 0
+        number = c_ulong.from_address(ctypes.addressof(data.contents)).value if count.value else 0
+        xlib.XFree(data)
+        return number
 
     def changed(self) -> bool:
         """Whether outputs came, went or changed since the last call."""

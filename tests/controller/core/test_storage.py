@@ -100,6 +100,22 @@ def test_a_lock_is_held_by_one_process_and_dies_with_it(tmp_path: Path) -> None:
             assert lock.exists()
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_on_a_read_only_disk_a_lock_is_held_by_one_process_also_without_its_file(tmp_path: Path, there: bool) -> None:
+    lock = tmp_path / "lock"
+    lock.touch() if there else None
+    own = [] if os.geteuid() == 0 else ["--map-root-user"]
+    mounts = 'mount --bind "$1" "$1" && mount -o remount,bind,ro "$1" && exec "$0" -c "$2" "$3"'
+    command = ["unshare", *own, "--mount", "sh", "-c", mounts, sys.executable, str(tmp_path), HOLDER, str(lock)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        second = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert "Calibration is already running" in second.stderr
+        holder.kill()
+    assert lock.exists() is there
+
+
 def test_the_runtime_folder_is_short_private_and_the_same_each_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

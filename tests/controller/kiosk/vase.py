@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from controller.artefacts.kinds import CALIBRATED
+from controller.calibrate.verify.grade import grade_of
 from controller.run.journal import Journal
 
 TEXT = """
@@ -62,6 +63,6 @@ def graded_run(stage: Path, name: str, errors: dict[str, float], *, finished: bo
     with Journal(run) as journal, journal.run("calibrate"):
         if finished:
             journal.complete(CALIBRATED, {}, (), began_at_s=0.0)
-    letters = {key: {"relative_rms": value, "grade": "A" if value < 0.02 else "D"} for key, value in errors.items()}
+    letters = {key: {"relative_rms": value, "grade": grade_of(value).value} for key, value in errors.items()}
     (run / "verification.json").write_text(json.dumps(letters))
     return run

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.config.models import CalibrationTable
 from controller.core.errors import UsageError
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
@@ -33,7 +34,7 @@ def test_a_damaged_grade_hides_its_own_run_alone(tmp_path: Path, how: str) -> No
     damaged = graded_run(tmp_path, SECOND, {"left": 0.02})
     (damaged / "verification.json").write_text(DAMAGE[how])
     (grade,) = runs.grades(tmp_path, 8.0)
-    assert (grade.run, grade.grade, grade.kept) == (FIRST, "D", True)
+    assert (grade.run, grade.grade, grade.kept) == (FIRST, "B", True)
     assert grade.note == "Largest predicted error: 3.1 % in right"
     assert runs.names(tmp_path) == (FIRST,)
     with pytest.raises(UsageError) as caught:
@@ -120,6 +121,15 @@ def test_a_kept_grade_is_one_that_passes_or_was_accepted(tmp_path: Path) -> None
     assert [one.kept for one in runs.grades(tmp_path, 8.0)] == [False]
     (run / "accepted.json").write_text(json.dumps({}))
     assert [one.kept for one in runs.grades(tmp_path, 8.0)] == [True]
+
+
+@pytest.mark.parametrize(("error", "letter", "kept"), [(0.039, "B", True), (0.041, "C", False)])
+def test_without_a_setting_a_calibration_of_grade_c_is_not_used(
+    tmp_path: Path, error: float, letter: str, kept: bool
+) -> None:
+    graded_run(tmp_path, FIRST, {"left": error})
+    (found,) = runs.grades(tmp_path, CalibrationTable().worst_grade)
+    assert (found.grade, found.kept) == (letter, kept)
 
 
 def test_a_report_that_is_there_is_not_made_again_and_an_unknown_run_has_none(tmp_path: Path) -> None:

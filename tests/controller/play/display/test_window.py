@@ -16,8 +16,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.play.control.launch import PlayerProcess
+from controller.kiosk.decide.interfaces import Showing
+from controller.kiosk.store.event_log import Decision
+from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
+from controller.play.control.launch import PlayerProcess, PlayerSettings
 from tests.controller.play.wire import Frames, Pictures, Wire, noise
+from tests.waiting import wait_for
 
 Outputs = list[tuple[str, int, int]]
 Start = Callable[..., PlayerProcess]
@@ -136,3 +140,33 @@ def test_without_a_display_it_says_so(start: Start, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("DISPLAY", ":987")
     with pytest.raises(Exception, match="found no display"):
         start(frames=None)
+
+
+def test_a_second_player_on_the_same_server_is_refused_and_may_come_when_the_first_is_gone(
+    framebuffer: Framebuffer, start: Start, bundle: Path, outputs: Outputs, tmp_path: Path
+) -> None:
+    second = tmp_path / "second"
+    second.mkdir()
+    told: list[Decision] = []
+    settings = PlayerSettings(outputs, None, bundle=bundle, allow_unsigned=True)
+    supervisor = PlayerSupervisor(second, lambda _: settings, told.append)
+    supervisor.want = Showing(bundle, "3")
+    first = start(frames=None, bundle=bundle, allow_unsigned=True)
+    try:
+        with Wire(first.socket) as wire:
+            wire.ask("play", appearance="2")
+            supervisor.step()
+            problem = supervisor.view.problem
+            assert problem is not None
+            assert f"Another player (process {first.pid}) already shows its pictures on this X server" in problem.reason
+            np.testing.assert_array_equal(framebuffer.picture(), spanned(noise(outputs, 2), outputs))
+            first.kill()
+
+        def shown() -> bool:
+            supervisor.step()
+            return supervisor.view.problem is None and supervisor.view.shown == supervisor.want
+
+        wait_for(shown)
+        np.testing.assert_array_equal(framebuffer.picture(), spanned(noise(outputs, 3), outputs))
+    finally:
+        supervisor.close()
