@@ -12,6 +12,7 @@ from prometheus_client.registry import Collector
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
+from controller.building.rates import Rate, Rates
 from controller.kiosk.operations.fields import object_schema
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import OPERATIONS
@@ -28,7 +29,10 @@ _ERROR: Final = {"$ref": "#/components/responses/Error"}
 
 def entries(panel: Panel) -> list[Entry]:
     """The routes of the API."""
-    table = [Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op)) for op in panel.operations]
+    rates = Rates(Rate())
+    table = [
+        Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op, rates)) for op in panel.operations
+    ]
     table.append(Entry("GET", PREFIX + "/openapi.json", "token", Role.VIEWER, _document(panel.operations)))
     table.append(Entry("GET", "/metrics", "token", Role.VIEWER, _metrics(panel)))
     return table
@@ -45,10 +49,14 @@ def body_limits(panel: Panel) -> dict[str, int]:
     }
 
 
-def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
+def _endpoint(panel: Panel, operation: Operation, rates: Rates) -> Endpoint:
+    """``rates``: of each token, for the verbs of a building."""
+
     async def answer(request: Request, visitor: Visitor) -> Response:
         uploaded = None
         try:
+            if operation.building_verb:
+                rates.take(visitor.name)
             values = answers.scalar_values(operation, request)
             if operation.upload is not None:
                 uploaded = await answers.body_file(request, panel.options.folder / answers.INCOMING)
