@@ -101,7 +101,6 @@ class TestGpioKeys(ButtonPanelConformance):
             button_panel.show(0, np.zeros((8, 8, 3), np.uint8), deadline=in_seconds(PATIENCE_S))
 
 
-@pytest.mark.parametrize("board", [Cp2112], indirect=True, ids=["Cp2112"])
 def test_each_key_is_told_once_and_in_its_order(board: Board, keys: GpioKeys) -> None:
     for line in (2, 0, 1):
         press(board[0], line)
@@ -123,7 +122,6 @@ def test_edges_are_used_where_the_chip_has_interrupts(board: Board, keys: GpioKe
     assert edges is isinstance(board[0], Cp2112)
 
 
-@pytest.mark.parametrize("board", [Cp2112], indirect=True, ids=["Cp2112"])
 def test_a_contact_that_bounces_is_one_press(board: Board, keys: GpioKeys) -> None:
     adapter = board[0]
     for _ in range(6):
