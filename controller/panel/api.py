@@ -192,6 +192,8 @@ class KioskFigures(Collector):
             "velatura_brightness_ratio", "The share of the light that is shown; 0 for black",
             0.0 if now.black else now.brightness / 100,
         )  # fmt: skip
+        if now.dose_klx_h is not None:
+            yield GaugeMetricFamily("velatura_light_dose_lux_seconds", "Light on the object", 3.6e6 * now.dose_klx_h)
         yield GaugeMetricFamily(
             "velatura_open_panels", "Open panels with live updates", float(self._panel.hub.listening)
         )
