@@ -79,10 +79,10 @@ def test_a_damaged_file_begins_at_nothing(tmp_path: Path, content: str) -> None:
 
 def test_a_stages_light_sensor_makes_the_dose_and_a_stage_without_one_has_none(tmp_path: Path) -> None:
     class Later(World):
-        now_s = 0.0
+        at_s = 0.0
 
         def monotonic(self) -> float:
-            return self.now_s
+            return self.at_s
 
     hall, world = Hall(tmp_path, LIGHT), Later()
     checked = check_stage(hall.folder, drivers=hall.drivers)
@@ -91,7 +91,7 @@ def test_a_stages_light_sensor_makes_the_dose_and_a_stage_without_one_has_none(t
         hall.sensor.lux = 150.0
         for _ in range(721):
             devices.sensor.step()
-            world.now_s += 10
+            world.at_s += 10
         assert devices.dose_klx_h == pytest.approx(0.3)
     with contextlib.closing(Devices(checked, tmp_path, lambda _: None, world)) as devices:
         assert devices.dose_klx_h == pytest.approx(0.3)
