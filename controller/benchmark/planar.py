@@ -95,13 +95,15 @@ def descended(transport: LightTransport, light: FloatImage, where: Mask, *, step
     """Frames in [0, 1] whose light is nearest to ``light`` (camera rows, columns, 3) ``where`` it counts.
 
     Steepest descent, clipped after each step, as the paper's: its limit is the best of all frames that can be shown.
+    Pixels that light nothing of ``where`` stay black.
     """
     counts = where[..., None].astype(np.float32)
 
     def back(image: FloatImage) -> list[FloatImage]:
         return list(transport.adjoint(np.ascontiguousarray(image * counts)))
 
-    frames = [np.full_like(one, FIRST) for one in back(light)]
+    first = [np.where(one > 0, np.float32(FIRST), np.float32(0)) for one in back(np.ones_like(light))]
+    frames = first
     length = 1.0
     for _ in range(POWERS):
         ahead = back(transport.forward(frames))
@@ -109,7 +111,7 @@ def descended(transport: LightTransport, light: FloatImage, where: Mask, *, step
         frames = [np.asarray(one / np.float32(max(length, 1e-30)), np.float32) for one in ahead]
     # A little less than the largest step that surely descends: the power method ends just below the true length.
     step = np.float32(0.95 / max(length, 1e-30))
-    frames = [np.full_like(one, FIRST) for one in frames]
+    frames = first
     for _ in range(steps):
         missing = back(light - transport.forward(frames))
         frames = [np.clip(one + step * more, 0, 1) for one, more in zip(frames, missing, strict=True)]

@@ -1,7 +1,7 @@
 """The stage as a PJLink class 2 projector: a line of bytes to the verb it means and its answer. No I/O.
 
 Sources: "PJLink Specifications" 1.04 and 2.10 of JBMIA. Input 31 is the first appearance, up to 39, then 41
-to 49 and 51 to 59; there is no sound, no filter, no volume.
+to 49 and 51 to 59; input 21 is the playlist. There is no sound, no filter, no volume.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from hal.codecs.projectors.pjlink import LONGEST_LINE, MOST_LAMPS
 
 INPUTS: Final = tuple(f"{kind}{number}" for kind in "345" for number in range(1, 10))
 """The codes of the appearances, in the bundle's order; any more of them have none."""
+PLAYLIST: Final = "21"
 _COMMAND: Final = re.compile(rb"%([12])([A-Za-z0-9]{4}) ([^\r\n]{1,128})\r?\n?")
 _CLASS_2: Final = {"INNM", "FREZ", "IRES", "RRES", "FILT", "RLMP", "RFIL", "SNUM", "SVER", "SVOL", "MVOL"}
 _MUTES: Final = {"10": False, "11": True, "30": False, "31": True}
@@ -62,13 +63,16 @@ def inputs(names: Sequence[str]) -> dict[str, str]:
 
 def meant(command: Asked, names: Sequence[str]) -> Wanted | str:
     """What a command that changes something means, or the error code of the specification (2.2)."""
-    value, coded = command.parameter, inputs(names)
+    value = command.parameter
+    shown = {code: Wanted("play", {"name": name}) for code, name in inputs(names).items()}
+    if shown:
+        shown[PLAYLIST] = Wanted("rotate", {})
     if not _known(command):
         return "ERR1"
     if command.name == "POWR" and value in ("0", "1"):
         return Wanted("open" if value == "1" else "close", {})
-    if command.name == "INPT" and value.upper() in coded:
-        return Wanted("play", {"name": coded[value.upper()]})
+    if command.name == "INPT" and value.upper() in shown:
+        return shown[value.upper()]
     if command.name == "AVMT" and value in _MUTES:
         return Wanted("black", {"on": _MUTES[value]})
     if command.name == "FREZ" and value in ("0", "1"):
@@ -81,14 +85,14 @@ def answer(command: Asked, now: KioskState, names: Sequence[str], version: str) 
     if not _known(command):
         return "ERR1"
     if command.name == "INNM":
-        return inputs(names).get(command.parameter[1:].upper(), "ERR2")
+        return {PLAYLIST: "Playlist", **inputs(names)}.get(command.parameter[1:].upper(), "ERR2")
     answers = {
         "POWR": _power(now),
-        "INPT": next((code for code, name in inputs(names).items() if name == now.playing), "ERR3"),
+        "INPT": _input(now, names),
         "AVMT": "31" if now.black else "30",
         "ERST": _errors(now),
         "LAMP": _lamps(now),
-        "INST": " ".join(inputs(names)) or "ERR3",
+        "INST": " ".join((PLAYLIST, *inputs(names))) if names else "ERR3",
         "NAME": _short(now.stage, 64),
         "INF1": _MAKER,
         "INF2": "Stage",
@@ -120,6 +124,12 @@ def _power(now: KioskState) -> str:
     if now.state == State.FAULT.value:
         return "1" if any(lamp.lit for lamp in now.lamps) else "0"
     return "1"
+
+
+def _input(now: KioskState, names: Sequence[str]) -> str:
+    if now.in_turn and names:
+        return PLAYLIST
+    return next((code for code, name in inputs(names).items() if name == now.playing), "ERR3")
 
 
 def _errors(now: KioskState) -> str:

@@ -12,7 +12,8 @@ from typing import Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from controller.building.verbs import Rate, Verbs
+from controller.building.rates import Rate
+from controller.building.verbs import Verbs
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
 from controller.core.files import read_text

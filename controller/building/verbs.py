@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
-from controller.core.errors import UsageError, WorkError
+from controller.building.rates import Rate, Rates
+from controller.core.errors import UsageError
 from controller.kiosk.interface import Kiosk, KioskState
 from controller.kiosk.operations.fields import Field, parse
 from controller.kiosk.operations.operation import Operation, Values
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.roles import Role
-
-MOST_SOURCES: Final = 256
-
-
-@dataclass(frozen=True, slots=True)
-class Rate:
-    """At most ``burst`` verbs at once, and ``per_s`` a second from then on, from each source."""
-
-    burst: int = 20
-    per_s: float = 10.0
 
 
 class Verbs:
@@ -40,10 +28,8 @@ class Verbs:
         operations: Sequence[Operation] = OPERATIONS, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         self._kiosk, self._who, self._role = kiosk, who, role
-        self._rate, self._clock = rate or Rate(), clock
+        self._rates = Rates(rate or Rate(), clock=clock)
         self._table = {operation.building_verb: operation for operation in operations if operation.building_verb}
-        self._used: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        self._lock = threading.Lock()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,7 +82,7 @@ class Verbs:
                 remedy='Set role = "operator" for it in building.toml.',
             )  # fmt: skip
         values = self.values(verb, sent)
-        self._count(source)
+        self._rates.take(source)
         named = f"{self._who} ({source})" if source else self._who
         self._kiosk.record("done-by", operation.done_by(named, values))
         operation.of(self._kiosk, values)
@@ -112,20 +98,6 @@ class Verbs:
                 "verb-unknown", what="There is no such verb.", remedy=f"Use one of {', '.join(self._table)}."
             )
         return operation
-
-    def _count(self, source: str) -> None:
-        with self._lock:
-            now = self._clock()
-            level, then = self._used.get(source, (0.0, now))
-            level = max(0.0, level - (now - then) * self._rate.per_s)
-            if level > self._rate.burst - 1:
-                raise WorkError(
-                    "too-many-verbs", what="Too many requests came from this source.", remedy="Send them more slowly."
-                )
-            self._used[source] = (level + 1, now)
-            self._used.move_to_end(source)
-            while len(self._used) > MOST_SOURCES:
-                self._used.popitem(last=False)
 
 
 def _object(text: str) -> Mapping[str, Any]:

@@ -39,6 +39,12 @@ BEFORE_CLIPPING = 0.9
 """Of full scale: up to this level a longer exposure is surely not clipped."""
 FEWEST_WHITES = 2
 """One exposure alone would show neither the camera's noise nor whether it is linear."""
+FLICKER = 0.02
+"""A longer exposure may show this share less than shorter ones: lamps are not steady."""
+SPREADS = 3.0
+"""Standard deviations by which a longer exposure may be below what shorter ones predict."""
+ROUNDED = 0.5 / 255
+"""Of full scale: the error of a sample of 8 bits, where nothing is known of the camera's noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +66,9 @@ def merge_brackets(
     The variance is taken from a first estimate of the radiance and not from each value itself: a value that noise
     made small would otherwise get more weight, and the mean would be too dark.
 
+    A sample that is clearly darker than shorter exposures predict does not count. It is clipped, or mixed with clipped
+    neighbours by a picture that was made smaller, and does not say so: the longest exposure has the most weight.
+
     Parameters
     ----------
     images : (rows, columns, 3) float32, 0 at black and 1 at full scale, NaN where saturated
@@ -67,7 +76,7 @@ def merge_brackets(
 
     Raises UsageError("bracket-mismatch").
     """
-    noise = noise or CameraNoise()
+    rounded, noise = (ROUNDED, CameraNoise()) if noise is None else (0.0, noise)
     if not images or len(images) != len(exposures_s) or len({image.shape for image in images}) != 1:
         raise UsageError(
             "bracket-mismatch",
@@ -78,19 +87,47 @@ def merge_brackets(
         raise UsageError(
             "bracket-mismatch", what="An exposure time is not above zero.", remedy="Give exposure times in seconds."
         )
-    estimate = _weighted(images, exposures_s, None, noise)[0]
-    radiance, weight = _weighted(images, exposures_s, np.maximum(np.nan_to_num(estimate), 0), noise)
+    counting = _counting(images, exposures_s, noise, rounded)
+    estimate = _weighted(images, exposures_s, counting, None, noise)[0]
+    radiance, weight = _weighted(images, exposures_s, counting, np.maximum(np.nan_to_num(estimate), 0), noise)
     with np.errstate(divide="ignore"):
         sigma = np.where(weight > 0, 1 / np.sqrt(weight), np.nan)
     return MergedBracket(radiance, sigma.astype(np.float32))
 
 
+def _counting(
+    images: Sequence[FloatImage], exposures_s: Sequence[float], noise: CameraNoise, rounded: float
+) -> list[Mask]:
+    """Which samples of each image count: measured, and not clearly below what shorter exposures predict.
+
+    ``rounded``: spread that ``noise`` does not have, of full scale
+    """
+    still = np.float32(noise.read**2 + rounded**2)
+    counting = [np.isfinite(image) for image in images]
+    total, weights = np.zeros(images[0].shape, np.float32), np.zeros(images[0].shape, np.float32)
+    for n in sorted(range(len(images)), key=lambda n: exposures_s[n]):
+        seconds = np.float32(exposures_s[n])
+        if np.any(weights):
+            # with weights of t^2, the shorter exposures together are as one of sqrt(sum t^2) seconds
+            longer = np.where(weights > 0, seconds / np.sqrt(np.maximum(weights, np.float32(1e-30))), np.float32(1e15))
+            predicted = total / np.maximum(weights, np.float32(1e-30)) * seconds
+            shot = np.float32(noise.shot) * np.maximum(predicted, 0)
+            spread = np.sqrt((shot / longer + still) * longer**2 + shot + still)
+            counting[n] &= ~(images[n] < (1 - np.float32(FLICKER)) * predicted - np.float32(SPREADS) * spread)
+        total += np.where(counting[n], images[n], 0) * seconds
+        weights += np.where(counting[n], seconds**2, np.float32(0))
+    return counting
+
+
 def _weighted(
-    images: Sequence[FloatImage], exposures_s: Sequence[float], radiance: FloatImage | None, noise: CameraNoise
+    images: Sequence[FloatImage],
+    exposures_s: Sequence[float],
+    counting: Sequence[Mask],
+    radiance: FloatImage | None,
+    noise: CameraNoise,
 ) -> tuple[FloatImage, FloatImage]:
     total, weights = np.zeros(images[0].shape, np.float32), np.zeros(images[0].shape, np.float32)
-    for image, exposure_s in zip(images, exposures_s, strict=True):
-        measured = np.isfinite(image)
+    for image, exposure_s, measured in zip(images, exposures_s, counting, strict=True):
         signal = radiance * np.float32(exposure_s) if radiance is not None else np.float32(0)
         variance = (np.float32(noise.shot) * signal + np.float32(noise.read**2)) / np.float32(exposure_s**2)
         weight = np.where(measured, 1 / variance, 0).astype(np.float32)

@@ -20,7 +20,9 @@ def benchmark(
         list[str] | None,
         typer.Option(help="A method's name, module:function or file.py:function; repeat it for more (default: all)."),
     ] = None,
-    scene: Annotated[list[str] | None, typer.Option(help="dark or room; repeat it for more (default: all).")] = None,
+    scene: Annotated[
+        list[str] | None, typer.Option(help="dark, flat, room or traced; repeat it for more (default: all).")
+    ] = None,
     size: BenchSize = "small",
     out: Annotated[Path, typer.Option(help="Folder for the stages, the page and the results.")] = Path("benchmark"),
     seed: Seeds = None,

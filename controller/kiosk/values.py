@@ -165,7 +165,7 @@ class KioskState:
     ``places`` of the projectors, empty until they are calibrated. ``drifts``: the drift checks, newest first.
     ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
     has no valid stage.toml. ``black``, ``paused``, ``brightness`` (percent): what people changed of the picture until
-    the stage closes.
+    the stage closes. ``dose_klx_h``: light on the object since its light sensor was first used, None without one.
     """
 
     revision: int
@@ -191,6 +191,7 @@ class KioskState:
     paused: bool = False
     brightness: float = 100.0
     drifts: tuple[DriftCheck, ...] = ()
+    dose_klx_h: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

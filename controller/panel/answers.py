@@ -33,11 +33,12 @@ INCOMING: Final = "incoming"
 
 
 def status_of(error: Failure) -> int:
-    """404: does not exist; 422: wrong request; 409: not possible now; 502: a device failed; 507: an upload could not be
-    saved.
+    """404: does not exist; 422: wrong request; 409: not possible now; 429: too often; 502: a device failed; 507: an
+    upload could not be saved.
     """
-    if error.code == NOT_KEPT:
-        return 507
+    special = {NOT_KEPT: 507, "too-many-verbs": 429}
+    if error.code in special:
+        return special[error.code]
     if error.code.endswith("-unknown") and not error.code.startswith(("field-", "stage-key-")):
         return 404
     if isinstance(error, UsageError):

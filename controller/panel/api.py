@@ -12,6 +12,7 @@ from prometheus_client.registry import Collector
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
+from controller.building.rates import Rate, Rates
 from controller.kiosk.operations.fields import object_schema
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import OPERATIONS
@@ -28,7 +29,10 @@ _ERROR: Final = {"$ref": "#/components/responses/Error"}
 
 def entries(panel: Panel) -> list[Entry]:
     """The routes of the API."""
-    table = [Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op)) for op in panel.operations]
+    rates = Rates(Rate())
+    table = [
+        Entry(op.method, PREFIX + op.path, "token", op.role, _endpoint(panel, op, rates)) for op in panel.operations
+    ]
     table.append(Entry("GET", PREFIX + "/openapi.json", "token", Role.VIEWER, _document(panel.operations)))
     table.append(Entry("GET", "/metrics", "token", Role.VIEWER, _metrics(panel)))
     return table
@@ -45,10 +49,14 @@ def body_limits(panel: Panel) -> dict[str, int]:
     }
 
 
-def _endpoint(panel: Panel, operation: Operation) -> Endpoint:
+def _endpoint(panel: Panel, operation: Operation, rates: Rates) -> Endpoint:
+    """``rates``: of each token, for the verbs of a building."""
+
     async def answer(request: Request, visitor: Visitor) -> Response:
         uploaded = None
         try:
+            if operation.building_verb:
+                rates.take(visitor.name)
             values = answers.scalar_values(operation, request)
             if operation.upload is not None:
                 uploaded = await answers.body_file(request, panel.options.folder / answers.INCOMING)
@@ -184,6 +192,8 @@ class KioskFigures(Collector):
             "velatura_brightness_ratio", "The share of the light that is shown; 0 for black",
             0.0 if now.black else now.brightness / 100,
         )  # fmt: skip
+        if now.dose_klx_h is not None:
+            yield GaugeMetricFamily("velatura_light_dose_lux_seconds", "Light on the object", 3.6e6 * now.dose_klx_h)
         yield GaugeMetricFamily(
             "velatura_open_panels", "Open panels with live updates", float(self._panel.hub.listening)
         )

@@ -1,11 +1,12 @@
 """A small machine with Debian's own kernel, in qemu: real drivers of the kernel, without a hold on this computer's.
 
 Its processor is emulated, so it needs no rights and is the same everywhere. It sees this computer's files, read-only,
-and runs this Python. ``python -m tests.real_kernel.machine`` (`make test-setup`) loads the kernel.
+and runs this Python. ``python -m tests.real_kernel.machine`` (`make test-setup`) loads the kernels.
 """
 
 from __future__ import annotations
 
+import lzma
 import re
 import shutil
 import subprocess
@@ -18,7 +19,8 @@ from typing import Final
 
 from hal.runtime.caches import cache_folder
 
-SUITE: Final = "bookworm"
+SUITES: Final = ("bookworm", "trixie")
+"""Debian 12 with Linux 6.1, Debian 13 with Linux 6.12."""
 LONGEST_S: Final = 570.0
 _MEMORY_MIB: Final = 640
 _BUSYBOX: Final = Path("/bin/busybox")
@@ -61,20 +63,21 @@ def obstacle() -> str | None:
     return None if _BUSYBOX.exists() else "busybox-static is not installed"
 
 
-def kernel() -> Path:
-    """A folder with the kernel ``vmlinuz`` and its modules, made if it is not there. Raises CalledProcessError."""
-    folder = cache_folder() / "tests" / f"kernel-{SUITE}-{'-'.join(sorted(_KEPT))}"
+def kernel(suite: str) -> Path:
+    """A folder with a Debian's ``vmlinuz`` and its modules, made if it is not there. Raises CalledProcessError."""
+    folder = cache_folder() / "tests" / f"kernel-{suite}-{'-'.join(sorted(_KEPT))}"
     if not folder.exists():
-        part = folder.parent / f".{SUITE}-kernel.part"
+        part = folder.parent / f".{suite}-kernel.part"
         shutil.rmtree(part, ignore_errors=True)
         part.parent.mkdir(parents=True, exist_ok=True)
-        loading = ["mmdebstrap", "--quiet", "--variant=extract", "--include=linux-image-amd64", SUITE, str(part)]
+        loading = ["mmdebstrap", "--quiet", "--variant=extract", "--include=linux-image-amd64", suite, str(part)]
         subprocess.run(loading, check=True)
         made = part / "made"
         made.mkdir()
         next((part / "boot").glob("vmlinuz-*")).rename(made / "vmlinuz")
-        for module in _with_needs({_name(path): path for path in (part / "lib" / "modules").rglob("*.ko")}, _KEPT):
-            module.rename(made / module.name)
+        there = {_name(path): path for path in part.glob("**/modules/**/*.ko*")}
+        for module in _with_needs(there, _KEPT):
+            (made / f"{_name(module)}.ko").write_bytes(_content(module))
         made.rename(folder)
         shutil.rmtree(part)
     return folder
@@ -89,21 +92,21 @@ class Outcome:
     took_s: float
 
 
-def run(command: Sequence[str | Path], modules: Mapping[str, str], folder: Path, out: Path) -> Outcome:
-    """Boot, load ``modules`` (name: parameters), run a command in ``folder`` as root, switch off.
+def run(command: Sequence[str | Path], modules: Mapping[str, str], folder: Path, out: Path, suite: str) -> Outcome:
+    """Boot ``suite``'s kernel, load ``modules`` (name: parameters), run a command in ``folder`` as root, switch off.
 
     ``out`` is the machine's /tmp/out. Raises TimeoutExpired.
     """
     began_s = time.monotonic()
     shared, start = out / "shared", out / "initrd"
     shared.mkdir(parents=True)
-    start.write_bytes(_initrd(command, modules, folder))
+    start.write_bytes(_initrd(command, modules, folder, kernel(suite)))
     with (out / "console").open("wb") as console:
         subprocess.run(
             [
                 "qemu-system-x86_64", "-accel", "tcg", "-cpu", "max", "-m", str(_MEMORY_MIB), "-nodefaults",
                 "-no-reboot", "-display", "none", "-serial", "stdio",
-                "-kernel", str(kernel() / "vmlinuz"), "-initrd", str(start),
+                "-kernel", str(kernel(suite) / "vmlinuz"), "-initrd", str(start),
                 "-append", "console=ttyS0 panic=-1 quiet",
                 "-virtfs", "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap",
                 "-virtfs", f"local,path={shared},mount_tag=out,security_model=none",
@@ -116,8 +119,8 @@ def run(command: Sequence[str | Path], modules: Mapping[str, str], folder: Path,
     return Outcome(int(code.read_text()) if code.exists() else -1, said, time.monotonic() - began_s)
 
 
-def _initrd(command: Sequence[str | Path], modules: Mapping[str, str], folder: Path) -> bytes:
-    ours = {_name(path): path for path in kernel().glob("*.ko")}
+def _initrd(command: Sequence[str | Path], modules: Mapping[str, str], folder: Path, kept: Path) -> bytes:
+    ours = {_name(path): path for path in kept.glob("*.ko")}
     wanted = _with_needs(ours, (*_DISK, *modules))
     loading = [f"$B insmod /modules/{path.name} {modules.get(_name(path), '')}" for path in wanted]
     script = _INIT.format(modules="\n".join(loading), folder=folder, command=" ".join(map(str, command)))
@@ -135,7 +138,7 @@ def _with_needs(there: Mapping[str, Path], names: Sequence[str]) -> list[Path]:
 
     def add(name: str) -> None:
         if name in there and name not in found:
-            for needs in re.findall(rb"\0depends=([^\0]*)\0", there[name].read_bytes()):
+            for needs in re.findall(rb"\0depends=([^\0]*)\0", _content(there[name])):
                 for other in filter(None, needs.decode().split(",")):
                     add(other.replace("-", "_"))
             found[name] = there[name]
@@ -146,7 +149,12 @@ def _with_needs(there: Mapping[str, Path], names: Sequence[str]) -> list[Path]:
 
 
 def _name(module: Path) -> str:
-    return module.stem.replace("-", "_")
+    return module.name.split(".")[0].replace("-", "_")
+
+
+def _content(module: Path) -> bytes:
+    data = module.read_bytes()
+    return lzma.decompress(data) if module.suffix == ".xz" else data
 
 
 def _cpio(files: Mapping[str, bytes | None]) -> bytes:
@@ -164,6 +172,7 @@ def _cpio(files: Mapping[str, bytes | None]) -> bytes:
 
 if __name__ == "__main__":
     if (why := obstacle()) is None:
-        kernel()
+        for name in SUITES:
+            kernel(name)
     else:
         sys.stderr.write(f"The tests on a real kernel can't run: {why}.\n")

@@ -7,17 +7,20 @@ left out here: ``test_on_kernel`` judges the files.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from controller.core.errors import VelaturaError
 from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
@@ -32,6 +35,10 @@ from plugins.v4l2.formats import video_format
 from plugins.v4l2.nodes import asked, paths
 from tests.real_kernel.usb_ip import Cable
 from tests.real_kernel.uvc_camera import BLACK, FULL, HEIGHT, INTERVAL_S, WIDTH, UvcCamera
+
+if TYPE_CHECKING:
+    from controller.live.sources import LivePicture
+    from controller.live.streams import StreamSource
 
 CONTEXT = OpenContext(Path())
 OUT = Path("/tmp/out")
@@ -267,6 +274,60 @@ def test_a_camera_that_another_program_uses_is_named(vivid: Path) -> None:
         other.kill()
         other.communicate()
     assert caught.value.code == "camera-taken"
+
+
+def test_the_kernels_own_camera_is_a_live_stream_with_its_colours(vivid: Path) -> None:
+    with contextlib.closing(live(vivid)) as source:
+        for pattern, colour in ((7, (255, 0, 0)), (6, (255, 255, 255)), (8, (0, 255, 0))):
+            v4l2_ctl(vivid, "--set-ctrl", f"test_pattern={pattern}")
+            shows(source, partial(is_even, colour))
+        first = shows(source, lambda _: True)
+        later = shows(source, lambda _: True)
+        assert later.number > first.number
+
+
+def test_a_live_camera_that_is_pulled_is_lost_once_and_comes_back(cable: list[Cable], webcam: UvcCamera) -> None:
+    webcam.light = 1.0
+    path = node("uvcvideo")
+    with contextlib.closing(live(path)) as source:
+        shows(source, lambda picture: picture.shape == (HEIGHT, WIDTH, 3))
+        cable[-1].pull()
+        told = []
+        for _ in range(30):
+            try:
+                source.next(0.0)
+            except VelaturaError as error:
+                told.append(error.code)
+            time.sleep(0.1)
+        assert told == ["live-source-gone"]
+        cable.append(Cable(webcam, 0))
+        assert node("uvcvideo") == path
+        shows(source, lambda picture: picture.shape == (HEIGHT, WIDTH, 3))
+
+
+def is_even(colour: tuple[int, int, int], picture: Any) -> bool:
+    return bool(np.abs(picture.mean(axis=(0, 1)) - colour).max() < 12)
+
+
+def live(path: Path) -> StreamSource:
+    """The device as a live target, with its first picture."""
+    from controller.live.readers import open_stream
+
+    source = open_stream(str(path), silent_s=20.0, retry_s=0.2)
+    source.wait_for_picture(PATIENCE_S)
+    return source
+
+
+def shows(source: StreamSource, so: Callable[[Any], Any]) -> LivePicture:
+    """The next picture of which something is true."""
+    ends = in_seconds(PATIENCE_S)
+    while True:
+        with contextlib.suppress(VelaturaError):
+            found = source.next(0.0)
+            if found is not None and so(found.pixels):
+                return found
+        assert not ends.passed, found
+        time.sleep(0.05)
 
 
 def test_a_device_that_is_unplugged_by_its_driver_is_gone(vivid: Path) -> None:

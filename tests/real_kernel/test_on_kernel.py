@@ -19,14 +19,14 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.slow
 
 
-def on_the_machine(file: str, modules: dict[str, str], out: Path, *more: str) -> list[str]:
+def on_the_machine(file: str, modules: dict[str, str], out: Path, *more: str, suite: str = "bookworm") -> list[str]:
     """Run a file of tests there; the names of those that passed. All must."""
     assert (why := obstacle()) is None, f"{why}: run `make test`, whose set-up installs it"
     # No plugins and no settings of ours: they take longer to load than the tests take.
     alone = ["-c", "/dev/null", f"--rootdir={ROOT}", "-p", "no:cacheprovider", "--noconftest", "--basetemp=/tmp/pytest"]
     pytest_ = ["PYTEST_DISABLE_PLUGIN_AUTOLOAD=1", sys.executable, "-u", "-m", "pytest", "-v", "--durations=12"]
     words = [*pytest_, *alone, "--junitxml=/tmp/out/junit.xml", f"tests/real_kernel/{file}", *more]
-    done = run(words, modules, ROOT, out)
+    done = run(words, modules, ROOT, out, suite)
     print(done.said, f"{done.took_s:.1f} s")
     assert done.code == 0, done.said[-6000:]
     cases = ET.parse(out / "shared" / "junit.xml").iter("testcase")
@@ -39,7 +39,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("video")
     vivid = "n_devs=1 node_types=0x1 num_inputs=1 input_types=0"
     modules = {"vhci_hcd": "", "uvcvideo": "nodrop=1", "videobuf2_vmalloc": "", "vivid": vivid}
-    assert len(on_the_machine("on_video.py", modules, out)) > 40
+    assert len(on_the_machine("on_video.py", modules, out)) > 42
     return out / "shared"
 
 
@@ -85,4 +85,5 @@ def test_a_finished_picture_of_a_usb_camera_is_read_by_another_program(pictures:
 
 def test_keys_on_lines_of_the_kernels_own_gpio_chips(tmp_path: Path) -> None:
     modules = {"vhci_hcd": "", "usbhid": "", "hid_cp2112": "", "hid_mcp2221": ""}
-    assert len(on_the_machine("on_gpio.py", modules, tmp_path)) > 25
+    # Linux 6.1 of bookworm takes the direction of an MCP2221's line for its level (kernel bug 216736).
+    assert len(on_the_machine("on_gpio.py", modules, tmp_path, suite="trixie")) > 29

@@ -67,6 +67,7 @@ class Snapshots:
             black=live.black,
             paused=bool(live.held),
             brightness=round(100 * live.brightness, 1),
+            dose_klx_h=service.devices.dose_klx_h,
         )
 
     def _rows(self, service: Service) -> tuple[DeviceRow, ...]:

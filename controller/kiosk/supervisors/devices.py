@@ -16,6 +16,7 @@ from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorVi
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
+from controller.kiosk.supervisors.light_dose import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import World
@@ -50,6 +51,7 @@ class Devices:
         tables = checked.stage.tables
         self.scene: Callable[[], str | None] = lambda: None
         self._room: str | None = None
+        self._dose = LightDose(checked.stage.folder, monotonic=self._world.monotonic)
         self.camera = DeviceSupervisor(
             "camera",
             "camera",
@@ -75,6 +77,11 @@ class Devices:
     def warnings(self) -> tuple[str, ...]:
         """Problems that belong to no device."""
         return () if self._room is None else (f"{self._room} {_DARKEN}",)
+
+    @property
+    def dose_klx_h(self) -> float | None:
+        """The object's light dose, in steps of 0.01 klx h; None without a light sensor."""
+        return None if self.sensor is None else round(self._dose.lux_hours / 1000, 2)
 
     def rows(self) -> tuple[DeviceRow, ...]:
         """The rows that the panel shows."""
@@ -149,6 +156,7 @@ class Devices:
             projector.close()
         for supervisor in self.others:
             supervisor.close()
+        self._dose.save()
 
     # -- opening
 
@@ -196,6 +204,7 @@ class Devices:
         def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
             lux = cast("LightSensor", device).illuminance_lux(deadline=deadline)
             self._report_light(watch.saw(lux, self.scene()))
+            self._dose.saw(lux)
             dark = "dark enough to calibrate" if lux <= table.most_lux else "too bright to calibrate"
             return (LiveValue("Light", f"{lux:.2f} lux ({dark})"),)
 

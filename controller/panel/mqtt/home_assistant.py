@@ -121,6 +121,9 @@ def _reports(state: str, now: KioskState) -> Iterator[_Entity]:
         yield _Entity("sensor", "drift", "Drift", moved)
         advice = reads("value_json.drift.advice", device_class="enum", options=list(ADVICE))
         yield _Entity("sensor", "drift-advice", "Advice of the drift check", advice | {"entity_category": "diagnostic"})
+    if now.dose_klx_h is not None:
+        dose = measured("value_json.dose_klx_h", "klx·h", state_class="total_increasing")
+        yield _Entity("sensor", "dose", "Light dose", dose)
     for lamp in now.lamps:
         key, there = f"lamp-{node(lamp.projector)}", f"(value_json.lamps.get({json.dumps(lamp.projector)}) or {{}})"
         lit = reads(f"'ON' if {there}.get('lit') else 'OFF'")

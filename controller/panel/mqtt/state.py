@@ -33,6 +33,7 @@ def published(now: KioskState) -> dict[str, Any]:
             lamp.projector: {"lit": lamp.lit, "hours": round(lamp.hours, 1), "strikes": lamp.strikes}
             for lamp in now.lamps
         },
+        "dose_klx_h": now.dose_klx_h,
         "drift": _drift(now.drifts[0]) if now.drifts else None,
     }
 

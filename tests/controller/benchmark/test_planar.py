@@ -86,7 +86,7 @@ def test_the_descent_ends_where_scipys_optimiser_ends() -> None:
     rng = np.random.default_rng(5)
     light = (rng.random((15, 20, 3)) * transport.reach().mean()).astype(np.float32)
     where = np.ones((15, 20), np.bool_)
-    where[:, :4] = False
+    where[:, :10] = False
     frames = descended(transport, light, where, steps=500)
     shapes = [one.shape for one in frames]
     sizes = np.cumsum([0, *(int(np.prod(shape)) for shape in shapes)])
@@ -108,6 +108,10 @@ def test_the_descent_ends_where_scipys_optimiser_ends() -> None:
     ours = 0.5 * float(np.sum(np.square(missed(frames), dtype=np.float64)))
     assert all(((one >= 0) & (one <= 1)).all() for one in frames)
     assert ours <= 1.01 * best.fun
+    beside = [np.asarray(one == 0) for one in transport.adjoint(np.where(where[..., None], np.ones_like(light), 0))]
+    assert any(one.any() for one in beside)
+    for frame, unseen in zip(frames, beside, strict=True):
+        assert not frame[unseen].any(), "what lights nothing that counts stays black"
 
 
 def test_the_flat_part_is_the_plate_without_its_rim(lenses: tuple[Pinhole, Pinhole]) -> None:

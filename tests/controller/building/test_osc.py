@@ -17,8 +17,9 @@ from pythonosc.osc_packet import OscPacket
 
 from controller.building.osc import OscOptions, message, named, requests, state_of
 from controller.building.protocol import read
+from controller.building.rates import Rate
 from controller.building.server import serving
-from controller.building.verbs import Rate, Verbs
+from controller.building.verbs import Verbs
 from controller.kiosk.operations.table import FADE, PERCENT
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.ports import kept_port

@@ -53,8 +53,11 @@ def test_aiopjlink_drives_the_stage(kiosk: MemoryKiosk, tmp_path: Path) -> None:
         sources = link.sources
         assert (await link.power.get()).name == "ON"
         named = await sources.available_with_names()
-        assert [name for *_, name in named] == ["marble", "warm wood"]
+        assert [name for *_, name in named] == ["Playlist", "marble", "warm wood"]
         assert (await sources.get())[1] == "1"
+        await sources.set(sources.Mode.VIDEO, 1)
+        assert kiosk.snapshot().in_turn
+        assert await sources.get() == (sources.Mode.VIDEO, "1")
         await sources.set(sources.Mode.DIGITAL, 2)
         assert kiosk.snapshot().playing == "warm wood"
         await link.mute.both(True)
@@ -79,7 +82,7 @@ def test_aiopjlink_drives_the_stage(kiosk: MemoryKiosk, tmp_path: Path) -> None:
 
     with stage(kiosk, tmp_path) as port:
         talk(f"127.0.0.1:{port}", drive)
-    assert kiosk.recorded[0] == ("done-by", "PJLink (127.0.0.1): Show this appearance now (warm wood).")
+    assert kiosk.recorded[1] == ("done-by", "PJLink (127.0.0.1): Show this appearance now (warm wood).")
 
 
 def test_pypjlink2_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp_path: Path) -> None:
@@ -87,7 +90,7 @@ def test_pypjlink2_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp_path
         with contextlib.closing(PyPjLink.from_address("127.0.0.1", port, timeout=20)) as link:
             assert link.authenticate(PASSWORD) is True
             assert link.get_power() == "on"
-            assert link.get_inputs() == [("DIGITAL", 1), ("DIGITAL", 2)]
+            assert link.get_inputs() == [("VIDEO", 1), ("DIGITAL", 1), ("DIGITAL", 2)]
             link.set_input("DIGITAL", 2)
             assert link.get_input() == ("DIGITAL", 2)
             link.set_mute(MUTE_VIDEO | MUTE_AUDIO, True)
@@ -112,7 +115,8 @@ def test_the_npm_client_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp
         assert told("wrong")[0] == ["getPowerState", "Authorization failed"]
         assert kiosk.snapshot().state == "playing"
         found = told(PASSWORD)
-    inputs = [{"source": 3, "channel": n, "code": f"3{n}", "name": f"DIGITAL - {n}"} for n in (1, 2)]
+    inputs = [{"source": 2, "channel": 1, "code": "21", "name": "VIDEO - 1"}]
+    inputs += [{"source": 3, "channel": n, "code": f"3{n}", "name": f"DIGITAL - {n}"} for n in (1, 2)]
     silent = {"audio": True, "video": True}
     assert found == [
         ["getPowerState", None, 1],
@@ -124,7 +128,7 @@ def test_the_npm_client_drives_the_stage_with_a_password(kiosk: MemoryKiosk, tmp
         ["getErrors", None, dict.fromkeys(("fan", "temperature", "cover", "filter", "other"), False)
          | {"lamp": "warning"}],
         ["setInput", None],
-        ["getInput", None, inputs[1]],
+        ["getInput", None, inputs[2]],
         ["setInput", "Out of parameter"],
         ["setMute", None],
         ["getMute", None, silent],

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from controller.building.protocol import NetworkOptions, read
-from controller.building.verbs import Rate, Verbs
+from controller.building.rates import Rate
+from controller.building.verbs import Verbs
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.roles import Role
 from tests.controller.panel.memory_kiosk import MemoryKiosk

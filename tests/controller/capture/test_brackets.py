@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -44,6 +45,51 @@ def test_saturated_in_every_exposure_is_not_measured() -> None:
     lost = truth * 0.01 > 1.1
     assert np.all(np.isnan(merged.radiance[lost]))
     assert np.isfinite(merged.radiance[truth * 0.01 < 0.9]).all()
+
+
+def made_smaller(radiance: FloatImage, exposure_s: float, seed: int) -> FloatImage:
+    """A photograph of 8 bits, made smaller after it was clipped: what is mixed with clipped light does not say so."""
+    full = np.nan_to_num(expose(radiance, exposure_s, seed), nan=1.0)
+    rows, columns, _ = full.shape
+    small = full.reshape(rows // 2, 2, columns // 2, 2, 3).mean(axis=(1, 3))
+    value = np.clip(np.round(small * 255), 0, 255) / 255
+    return np.where(value < 1, value, np.nan).astype(np.float32)
+
+
+@pytest.mark.parametrize("decades", [0.5, 1.0])
+def test_light_that_was_clipped_before_a_picture_was_made_smaller_does_not_count(decades: float) -> None:
+    """OpenCV's MergeDebevec, which trusts values near clipping little, gets the same pictures, a channel at a time."""
+    over_the_picture = np.arange(160)[None, :, None] / 160
+    random = np.random.default_rng(4)
+    radiance = (10 ** (random.uniform(0, decades, (120, 160, 3)) + over_the_picture)).astype(np.float32)
+    parts = radiance.reshape(60, 2, 80, 2, 3)
+    truth = parts.mean(axis=(1, 3))
+    times = np.array([1 / 100, 1 / 25, 1 / 6], np.float32) * 10 ** (1 - decades)
+    images = [made_smaller(radiance, float(one), n) for n, one in enumerate(times)]
+    ours = merge_brackets(images, times.tolist()).radiance
+    pictures = [np.round(np.nan_to_num(one, nan=1.0) * 255).astype(np.uint8) for one in images]
+    line = np.repeat(np.maximum(np.arange(256) / 255, 1e-6)[:, None, None], 3, axis=2).astype(np.float32)
+    grey = [[np.repeat(one[..., c : c + 1], 3, axis=2) for one in pictures] for c in range(3)]
+    merged = [np.asarray(cv2.createMergeDebevec().process(one, times, line))[..., 0] for one in grey]
+    theirs = np.stack(merged, axis=-1)
+    judged = (truth * times[0] > 8 / 255) & (parts.max(axis=(1, 3)) * times[0] < 0.9)
+    assert judged.mean() > 0.9
+    off, off_theirs = (float(np.percentile(np.abs(one / truth - 1)[judged], 95)) for one in (ours, theirs))
+    assert off < 0.045
+    assert off < 0.5 * off_theirs
+
+
+@pytest.mark.parametrize("change", [0.97, 1.0, 1.03, 1.5])
+def test_a_flickering_lamp_takes_no_exposure_out_of_the_bracket(change: float) -> None:
+    """Nor does light that came on during the longer one: only what clipping does is looked for."""
+    radiance = scene(0.5)
+    times = (0.02, 0.2)
+    images = [expose(radiance, times[0]), expose(radiance * change, times[1], 1)]
+    merged = merge_brackets(images, times, noise=NOISE)
+    longer = np.isfinite(images[1])
+    alone = np.sqrt(NOISE.shot * merged.radiance / times[0] + (NOISE.read / times[0]) ** 2)
+    assert longer.mean() > 0.5
+    assert (merged.sigma < 0.5 * alone)[longer].mean() > 0.98
 
 
 def test_a_bracket_that_does_not_fit_together_is_refused() -> None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pytest
 import tifffile
 
+from controller.capture.brackets import merge_brackets
 from controller.capture.demosaic import SensorLevels
 from controller.capture.jpeg_response import measure_response
 from controller.capture.linearity import RawExposure, check_series
@@ -53,6 +54,28 @@ def test_the_response_of_a_linear_camera_is_found_linear_better_than_by_opencv(f
     theirs = shape(cv2.createCalibrateDebevec(samples=400, lambda_=10.0).process(images, times)[:, 0, 0])
     assert np.abs(ours - 1).max() < 0.05
     assert np.abs(ours - 1).mean() < np.abs(theirs - 1).mean()
+
+
+@pytest.mark.parametrize("held_ms", [100, 250])
+@pytest.mark.parametrize("filter_nm", [450, 500, 550, 600])
+def test_a_photograph_that_was_left_out_is_predicted_better_than_by_opencvs_merge(filter_nm: int, held_ms: int) -> None:
+    photographs = series(filter_nm)
+    held = next(one for one in photographs if one.exposure_s == held_ms / 1000)
+    used = [one for one in photographs if one is not held]
+    times = [one.exposure_s for one in used]
+    images = [np.repeat(one.samples.astype(np.uint8)[:, :, None], 3, axis=2) for one in used]
+    ours = merge_brackets([np.where(one < 255, one / np.float32(255), np.nan) for one in images], times).radiance
+    line = np.repeat(np.maximum(np.arange(256) / 255, 1e-6)[:, None, None], 3, axis=2).astype(np.float32)
+    theirs = np.asarray(cv2.createMergeDebevec().process(images, np.array(times, np.float32), line))
+    # Near a clipped sample the photograph that judges does not say itself what the light was.
+    clipped = cv2.dilate((held.samples > 220).astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
+    judged = (held.samples > 8) & ~clipped
+    assert judged.mean() > 0.05
+    off, off_theirs = (
+        np.abs(one[..., 0] * held.exposure_s * 255 / np.maximum(held.samples, 1) - 1)[judged] for one in (ours, theirs)
+    )
+    assert np.percentile(off, 95) < 0.06
+    assert np.percentile(off, 95) < np.percentile(off_theirs, 95)
 
 
 def test_real_noise_is_explained_by_shot_and_read_noise() -> None:

@@ -118,7 +118,8 @@ class MemoryKiosk:
             ),
         )
         self.change(
-            drifts=tuple(DriftCheck(f"night-{n}", BORN - n * 86400, "nothing", 0.04 + 0.01 * n) for n in range(5))
+            dose_klx_h=12.34,
+            drifts=tuple(DriftCheck(f"night-{n}", BORN - n * 86400, "nothing", 0.04 + 0.01 * n) for n in range(5)),
         )
         self._finish(run, "full")
         for number in range(12):

@@ -107,12 +107,12 @@ def test_home_assistant_finds_a_stage_reads_it_and_controls_it(tmp_path: Path, p
             "button.next_appearance": "unknown", "button.playlist": "unknown",
             "select.appearance": "marble", "number.brightness": "100.0",
             "sensor.state": "playing", "binary_sensor.problem": "on",
-            "sensor.drift": "0.04", "sensor.advice_of_the_drift_check": "nothing",
+            "sensor.light_dose": "12.34", "sensor.drift": "0.04", "sensor.advice_of_the_drift_check": "nothing",
             "binary_sensor.lamp_left": "on", "sensor.lamp_left_hours": "1204.0",
             "binary_sensor.lamp_right": "off", "sensor.lamp_right_hours": "3120.0",
         }  # fmt: skip
-        wait_until(lambda: states(ask(wait=16)) == expected)
-        found = ask(wait=16)
+        wait_until(lambda: states(ask(wait=17)) == expected)
+        found = ask(wait=17)
         assert found[f"select.{STAGE}_appearance"]["options"] == ["marble", "warm wood"]
         assert found[f"binary_sensor.{STAGE}_problem"]["problems"][0]["device"] == "right"
         assert "one projector" in found[f"sensor.{STAGE}_state"]["reason"]
@@ -206,9 +206,9 @@ def test_each_verb_of_a_building_has_an_entity(tmp_path: Path) -> None:
 
 
 def test_what_a_stage_does_not_have_yet_has_no_entity(tmp_path: Path) -> None:
-    new = replace(MemoryKiosk(tmp_path / "pictures").snapshot(), drifts=(), lamps=())
+    new = replace(MemoryKiosk(tmp_path / "pictures").snapshot(), drifts=(), lamps=(), dose_klx_h=None)
     topics = messages("homeassistant", "hall", new, [], "1")
-    assert not [one for one in topics if "/select/" in one or "drift" in one or "lamp" in one]
+    assert not [one for one in topics if any(word in one for word in ("/select/", "drift", "lamp", "dose"))]
 
 
 @given(st.lists(st.text(st.characters(blacklist_categories=["Cs"]), min_size=1), min_size=2, unique=True))
