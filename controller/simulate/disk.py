@@ -23,7 +23,6 @@ STAGE: Final = Path("stage")
 TOTAL_BYTES: Final = 64_000_000_000
 _WRITES: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _CHANGES: Final = frozenset({"os.rename", "os.remove", "os.mkdir", "os.symlink", "os.truncate", "os.rmdir"})
-_PREFIX: Final = f"{STAGE}/"
 
 
 class Disk:
@@ -40,7 +39,7 @@ class Disk:
 
     @contextlib.contextmanager
     def untouched(self) -> Iterator[None]:
-        """What happens inside is not done by the kiosk."""
+        """What happens inside is done by another program of the computer: kills do not meet it, a full disk does."""
         self._outside += 1
         try:
             yield
@@ -54,6 +53,8 @@ class Disk:
     def changes(self) -> None:
         """The present task is about to change a file. Raises OSError and Killed."""
         program = self._scheduler.present.program
+        if self._outside:
+            self._refuse()
         if program is None or self._outside:
             return
         self._scheduler.check()
@@ -63,6 +64,9 @@ class Disk:
                 self.kill_after = None
                 self._scheduler.kill(program)
                 raise Killed
+        self._refuse()
+
+    def _refuse(self) -> None:
         if self.full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -105,22 +109,22 @@ class Database(sqlite3.Connection):
             raise full from error
 
 
-_watched: list[Disk] = []
-"""The disk of the life that runs; audit hooks can't be taken away again, so there is one for all lives."""
+_watched: list[tuple[Disk, tuple[str, str]]] = []
+"""The disk of the life that runs, and how its paths begin; audit hooks can't be taken away again, so there is one."""
 _hooked: list[bool] = []
 
 
 @contextlib.contextmanager
 def watched(disk: Disk) -> Iterator[None]:
-    """The disk hears of the file operations of this process."""
+    """The disk hears of the file operations of this process below the present folder."""
     if not _hooked:
         _hooked.append(True)
         sys.addaudithook(_heard)
-    _watched.append(disk)
+    _watched.append((disk, (f"{STAGE}/", f"{STAGE.absolute()}/")))
     try:
         yield
     finally:
-        _watched.remove(disk)
+        _watched.pop()
 
 
 def _heard(event: str, arguments: tuple[Any, ...]) -> None:
@@ -130,5 +134,7 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
         changes = bool(arguments[2] & _WRITES) if isinstance(arguments[2], int) else False
     else:
         changes = event in _CHANGES
-    if changes and isinstance(arguments[0], str | Path) and str(arguments[0]).startswith(_PREFIX):
-        _watched[-1].changes()
+    if changes and isinstance(arguments[0], str | Path):
+        disk, beginnings = _watched[-1]
+        if str(arguments[0]).startswith(beginnings):
+            disk.changes()
