@@ -26,13 +26,13 @@ _CHANGES: Final = frozenset({"os.rename", "os.remove", "os.mkdir", "os.symlink",
 
 
 class Disk:
-    """``full``: nothing can be written; ``free_bytes``: what it tells; ``kill_after``: so many more operations happen
-    before the program that does the next one is killed.
+    """``full``: nothing can be written; ``blind``: no bundle can be read; ``free_bytes``: what it tells;
+    ``kill_after``: so many more operations happen before the program that does the next one is killed.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
         self._scheduler = scheduler
-        self.full = False
+        self.full = self.blind = False
         self.free_bytes = TOTAL_BYTES // 2
         self.kill_after: int | None = None
         self._outside = 0
@@ -69,6 +69,11 @@ class Disk:
     def _refuse(self) -> None:
         if self.full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def reads(self, path: str) -> None:
+        """Somebody is about to read this file. Raises OSError."""
+        if self.blind and path.endswith(".vel"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     def connect(self, *arguments: Any, **settings: Any) -> sqlite3.Connection:
         """As ``sqlite3.connect``."""
@@ -134,7 +139,8 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
         changes = bool(arguments[2] & _WRITES) if isinstance(arguments[2], int) else False
     else:
         changes = event in _CHANGES
-    if changes and isinstance(arguments[0], str | Path):
+    if (changes or event == "open") and isinstance(arguments[0], str | Path):
         disk, beginnings = _watched[-1]
-        if str(arguments[0]).startswith(beginnings):
-            disk.changes()
+        path = str(arguments[0])
+        if path.startswith(beginnings):
+            disk.changes() if changes else disk.reads(path)

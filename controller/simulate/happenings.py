@@ -327,6 +327,21 @@ def _bundle_damaged(life: Living, item: Item) -> None:
     life.later(repaired_s, repair)
 
 
+def _bundles_unreadable(life: Living, item: Item) -> None:
+    """The disk gives errors where bundles are, and then no more: a cable, a controller, no file handle left."""
+    disk, witness = life.world.disk, life.witness
+    disk.blind = True
+    witness.disturb(item.for_s)
+    witness.player_disturbed_until_s = max(
+        witness.player_disturbed_until_s, life.world.scheduler.now_s + item.for_s + PLAYER_S
+    )
+
+    def repair() -> None:
+        disk.blind = False
+
+    life.later(item.for_s, repair)
+
+
 def _spoil(file: Path) -> None:
     content = file.read_bytes()
     half = len(content) // 2
@@ -351,9 +366,9 @@ def _command(life: Living, item: Item) -> None:
 _DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
     "line": _line, "lamp fails": _lamp_fails, "lamp reports": _lamp_reports, "lamp switched by hand": _by_hand,
     "player": _player, "camera gone": _camera, "disk full": _disk_full, "disk low": _disk_low,
-    "file damaged": _file_damaged, "bundle damaged": _bundle_damaged, "killed": _killed,
-    "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted, "clock set": _clock,
-    "network gone": _no_network, "drift": _drift, "command": _command,
+    "file damaged": _file_damaged, "bundle damaged": _bundle_damaged, "bundles unreadable": _bundles_unreadable,
+    "killed": _killed, "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted,
+    "clock set": _clock, "network gone": _no_network, "drift": _drift, "command": _command,
 }  # fmt: skip
 
 

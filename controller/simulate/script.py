@@ -223,8 +223,8 @@ def _command(at_s: float, chance: random.Random, who: str) -> Item:
 _KINDS: Final = (
     ("line", 14), ("lamp fails", 4), ("lamp reports", 3), ("lamp switched by hand", 3), ("player", 8),
     ("camera gone", 3), ("disk full", 6), ("disk low", 1), ("file damaged", 4), ("bundle damaged", 3), ("killed", 5),
-    ("killed while writing", 6), ("power cut", 5), ("restarted", 4), ("clock set", 3), ("network gone", 3),
-    ("drift", 4), ("command", 28),
+    ("bundles unreadable", 2), ("killed while writing", 6), ("power cut", 5), ("restarted", 4), ("clock set", 3),
+    ("network gone", 3), ("drift", 4), ("command", 28),
 )  # fmt: skip
 _COMMANDS: Final = (
     ("start", 6), ("stop", 6), ("play", 4), ("rotate", 2), ("next", 3), ("black", 3), ("pause", 3), ("brightness", 3),
