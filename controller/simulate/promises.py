@@ -110,7 +110,7 @@ class Witness:
         self._judged_s = 0.0
         self.stays_lit: dict[str, float | None] = {}
         self._work: Request | None = None
-        self._work_since_s = 0.0
+        self._work_since_s = self._worked_s = 0.0
 
     # -- what is wanted
 
@@ -334,7 +334,9 @@ class Witness:
         works = service.reconciler.working or now_s < self.light_until_s
         if works:
             self.changed_s = max(self.changed_s, now_s - BLACK_S - 1)
-        if shut_s > BLACK_S and not works and state not in _RESTING:
+            self._worked_s = now_s
+        # Work that is given up in a step leaves the stage as it is until the next.
+        if min(shut_s, now_s - self._worked_s) > BLACK_S and state not in _RESTING:
             raise Broken("rests while closed", f"it is {state.value}, {shut_s:.0f} s after it closed")
         burning = [name for name, lamp in world.lamps.items() if lamp.lit]
         if shut_s > DARK_S and burning and not works and self.calm:
