@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
@@ -168,12 +169,13 @@ def _switch(folder: Path, target: Path) -> None:
 
 
 def _target(folder: Path, link: str) -> Path | None:
+    # By the names alone: a kiosk asks this several times at each of its steps.
     try:
-        name = str((folder / link).readlink())
+        name = os.readlink(os.path.join(folder, link))  # noqa: PTH115, PTH118
     except OSError:
         return None
-    file = folder / name
-    return file if _INSTALLED.fullmatch(name) and file.is_file() else None
+    sound = _INSTALLED.fullmatch(name) and os.path.isfile(os.path.join(folder, name))  # noqa: PTH113, PTH118
+    return folder / name if sound else None
 
 
 def _link(folder: Path, link: str, target: Path) -> None:

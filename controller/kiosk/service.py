@@ -77,7 +77,7 @@ class Service:
         self.cools: tuple[str, ...] | None = None
         self.checked, self.log, self.stage = checked, log, stage.folder
         self.runtime = runtime_folder(stage.folder)
-        self.bundles = BundleStore(stage.folder, stage_trust(stage))
+        self.bundles = BundleStore(stage.folder, stage_trust(stage), world.monotonic)
         self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
         attach = partial(AttachedPlayer, kiosk_places.PLAYER_SOCKET, kiosk_places.PLAYER_OPTIONS)
         installed = kiosk_places.is_installed(stage.folder)

@@ -60,6 +60,8 @@ class LampGuard:
         self._ledger = ledger
         self._clock = clock or SystemClock()
         self._known = projector.capabilities
+        # Once: looking at a protocol takes longer than all else that a status needs of the processor.
+        self._watched = projector if isinstance(projector, WatchedProjector) else None
         self._rules = stricter(self._known.lamp_rules, at_least)
         self._lock: AbstractContextManager[object] = lock or threading.RLock()
         self._record = self._remembered()
@@ -102,7 +104,7 @@ class LampGuard:
 
     def troubles(self) -> list[tuple[str, str]]:
         """As ``hal.interfaces.WatchedProjector``; empty if the driver reports none."""
-        return self._projector.troubles() if isinstance(self._projector, WatchedProjector) else []
+        return [] if self._watched is None else self._watched.troubles()
 
     def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
         """As ``hal.interfaces.AdjustedProjector``; empty if the driver reads none."""

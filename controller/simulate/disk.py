@@ -23,24 +23,23 @@ STAGE: Final = Path("stage")
 TOTAL_BYTES: Final = 64_000_000_000
 _WRITES: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _CHANGES: Final = frozenset({"os.rename", "os.remove", "os.mkdir", "os.symlink", "os.truncate", "os.rmdir"})
-_PREFIX: Final = f"{STAGE}/"
 
 
 class Disk:
-    """``full``: nothing can be written; ``free_bytes``: what it tells; ``kill_after``: so many more operations happen
-    before the program that does the next one is killed.
+    """``full``: nothing can be written; ``blind``: no bundle can be read; ``free_bytes``: what it tells;
+    ``kill_after``: so many more operations happen before the program that does the next one is killed.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
         self._scheduler = scheduler
-        self.full = False
+        self.full = self.blind = False
         self.free_bytes = TOTAL_BYTES // 2
         self.kill_after: int | None = None
         self._outside = 0
 
     @contextlib.contextmanager
     def untouched(self) -> Iterator[None]:
-        """What happens inside is not done by the kiosk."""
+        """What happens inside is done by another program of the computer: kills do not meet it, a full disk does."""
         self._outside += 1
         try:
             yield
@@ -54,6 +53,8 @@ class Disk:
     def changes(self) -> None:
         """The present task is about to change a file. Raises OSError and Killed."""
         program = self._scheduler.present.program
+        if self._outside:
+            self._refuse()
         if program is None or self._outside:
             return
         self._scheduler.check()
@@ -63,8 +64,16 @@ class Disk:
                 self.kill_after = None
                 self._scheduler.kill(program)
                 raise Killed
+        self._refuse()
+
+    def _refuse(self) -> None:
         if self.full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def reads(self, path: str) -> None:
+        """Somebody is about to read this file. Raises OSError."""
+        if self.blind and path.endswith(".vel"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     def connect(self, *arguments: Any, **settings: Any) -> sqlite3.Connection:
         """As ``sqlite3.connect``."""
@@ -105,22 +114,22 @@ class Database(sqlite3.Connection):
             raise full from error
 
 
-_watched: list[Disk] = []
-"""The disk of the life that runs; audit hooks can't be taken away again, so there is one for all lives."""
+_watched: list[tuple[Disk, tuple[str, str]]] = []
+"""The disk of the life that runs, and how its paths begin; audit hooks can't be taken away again, so there is one."""
 _hooked: list[bool] = []
 
 
 @contextlib.contextmanager
 def watched(disk: Disk) -> Iterator[None]:
-    """The disk hears of the file operations of this process."""
+    """The disk hears of the file operations of this process below the present folder."""
     if not _hooked:
         _hooked.append(True)
         sys.addaudithook(_heard)
-    _watched.append(disk)
+    _watched.append((disk, (f"{STAGE}/", f"{STAGE.absolute()}/")))
     try:
         yield
     finally:
-        _watched.remove(disk)
+        _watched.pop()
 
 
 def _heard(event: str, arguments: tuple[Any, ...]) -> None:
@@ -130,5 +139,8 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
         changes = bool(arguments[2] & _WRITES) if isinstance(arguments[2], int) else False
     else:
         changes = event in _CHANGES
-    if changes and isinstance(arguments[0], str | Path) and str(arguments[0]).startswith(_PREFIX):
-        _watched[-1].changes()
+    if (changes or event == "open") and isinstance(arguments[0], str | Path):
+        disk, beginnings = _watched[-1]
+        path = str(arguments[0])
+        if path.startswith(beginnings):
+            disk.changes() if changes else disk.reads(path)

@@ -9,7 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from controller.bundle.install import current
+from controller.bundle.fallback import Starts
+from controller.bundle.install import current, previous
+from controller.bundle.reader import Bundle
+from controller.core.errors import VelaturaError
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.service import Service
 from controller.simulate.calendar import Calendar
@@ -18,7 +21,7 @@ from controller.simulate.lamps import RULES, Lamp
 from controller.simulate.promises import REPAIR_S, SETTLING_S, Witness
 from controller.simulate.scheduler import Event, Killed
 from controller.simulate.script import Item
-from controller.simulate.stage import publish
+from controller.simulate.stage import TRUST, publish
 from controller.simulate.world import SimulatedWorld
 
 
@@ -47,6 +50,7 @@ class Living(Protocol):
 
 PLAYER_S: Final = 120.0
 """After trouble with the player: its longest pause before a start, and a start that fails."""
+SECTOR_BYTES: Final = 512
 MEND_FILE_S: Final = 600.0
 GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
@@ -281,7 +285,11 @@ def _damaged(content: bytes, item: Item) -> bytes:
         return b""
     if item.how == "cut":
         return content[:at]
-    return content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + 64]) + content[at + 64 :]
+    size = 64
+    if len(content) > 8 * SECTOR_BYTES:
+        # Disks lose whole sectors; in a small file that would be all of it.
+        at, size = at - at % SECTOR_BYTES, SECTOR_BYTES
+    return content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + size]) + content[at + size :]
 
 
 def _put_right(life: Living, path: Path) -> None:
@@ -294,16 +302,20 @@ def _put_right(life: Living, path: Path) -> None:
 
 
 def _bundle_damaged(life: Living, item: Item) -> None:
-    """The installed bundle's file goes bad, and the player dies. After a while the appearances are published again."""
-    file = current(STAGE / "bundles")
-    if file is None:
+    """The file of the installed bundle goes bad, or those of all, and the player dies.
+
+    After a while the appearances are published again. Until then the bundle before plays, where there is a sound one.
+    """
+    bundles, world, witness = STAGE / "bundles", life.world, life.witness
+    newest, earlier = current(bundles), previous(bundles)
+    if newest is None:
         return
-    content = file.read_bytes()
-    file.write_bytes(content[: len(content) // 2] + bytes(byte ^ 0xA5 for byte in content[len(content) // 2 :]))
+    _spoil(newest)
+    if item.how == "all" and earlier is not None:
+        _spoil(earlier)
     _player(life, Item(item.at_s, "player", "", "killed"))
     repaired_s = item.for_s or MEND_FILE_S
-    life.witness.disturb(repaired_s)
-    world, witness = life.world, life.witness
+    witness.disturb(0.0 if _goes_back(bundles, earlier) else repaired_s)
     witness.player_disturbed_until_s = max(
         witness.player_disturbed_until_s, world.scheduler.now_s + repaired_s + PLAYER_S
     )
@@ -315,6 +327,38 @@ def _bundle_damaged(life: Living, item: Item) -> None:
     life.later(repaired_s, repair)
 
 
+def _bundles_unreadable(life: Living, item: Item) -> None:
+    """The disk gives errors where bundles are, and then no more: a cable, a controller, no file handle left."""
+    disk, witness = life.world.disk, life.witness
+    disk.blind = True
+    witness.disturb(item.for_s)
+    witness.player_disturbed_until_s = max(
+        witness.player_disturbed_until_s, life.world.scheduler.now_s + item.for_s + PLAYER_S
+    )
+
+    def repair() -> None:
+        disk.blind = False
+
+    life.later(item.for_s, repair)
+
+
+def _spoil(file: Path) -> None:
+    content = file.read_bytes()
+    half = len(content) // 2
+    file.write_bytes(content[:half] + bytes(byte ^ 0xA5 for byte in content[half:]))
+
+
+def _goes_back(bundles: Path, earlier: Path | None) -> bool:
+    """Whether the player can play the bundle before instead of the newest."""
+    if earlier is None or earlier.name == Starts.read(bundles).given_up:
+        return False
+    try:
+        Bundle.open_trusted(earlier, TRUST).close()
+    except VelaturaError:
+        return False
+    return True
+
+
 def _command(life: Living, item: Item) -> None:
     life.command(item)
 
@@ -322,9 +366,9 @@ def _command(life: Living, item: Item) -> None:
 _DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
     "line": _line, "lamp fails": _lamp_fails, "lamp reports": _lamp_reports, "lamp switched by hand": _by_hand,
     "player": _player, "camera gone": _camera, "disk full": _disk_full, "disk low": _disk_low,
-    "file damaged": _file_damaged, "bundle damaged": _bundle_damaged, "killed": _killed,
-    "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted, "clock set": _clock,
-    "network gone": _no_network, "drift": _drift, "command": _command,
+    "file damaged": _file_damaged, "bundle damaged": _bundle_damaged, "bundles unreadable": _bundles_unreadable,
+    "killed": _killed, "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted,
+    "clock set": _clock, "network gone": _no_network, "drift": _drift, "command": _command,
 }  # fmt: skip
 
 

@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import heapq
 import os
-import random
 import tempfile
 import threading
 import time
@@ -29,7 +28,7 @@ from controller.simulate.disk import STAGE, watched
 from controller.simulate.jobs import SimulatedJobs
 from controller.simulate.promises import Broken, Witness, after_the_end
 from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
-from controller.simulate.script import ZONES, Item, begins, draw, hours
+from controller.simulate.script import Item, Setting, draw, setting
 from controller.simulate.stage import make_stage
 from controller.simulate.world import SimulatedWorld
 from hal.deadline import Stop
@@ -51,10 +50,14 @@ class Halt(Event, Stop):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a life. ``broken``: the promise's name, and how; ``digest``: of every line of its event log."""
+    """What became of a life at ``place``.
+
+    ``broken``: the promise's name, and how; ``digest``: of every line of its event log.
+    """
 
     seed: str
     days: float
+    place: Setting
     items: tuple[Item, ...]
     digest: str
     broken: str = ""
@@ -67,17 +70,19 @@ class Outcome:
 
 
 class Life:
-    """``items``: the script; None: drawn. ``days``: for so long, less if a promise is broken."""
+    """``items``: the script, and ``place`` its setting; None: drawn.
 
-    def __init__(self, seed: str, days: float = LIFE_DAYS, items: Sequence[Item] | None = None) -> None:
+    ``days``: for so long, less if a promise is broken.
+    """
+
+    def __init__(
+        self, seed: str, days: float = LIFE_DAYS, items: Sequence[Item] | None = None, place: Setting | None = None
+    ) -> None:
         self.seed, self.days = seed, days
         self.items = tuple(draw(seed, days) if items is None else items)
-        chance = random.Random(f"{seed} life")
-        self.zone, self.rows = chance.choice(ZONES), hours(chance)
-        unix_s = begins(chance, self.zone).timestamp()
-        self.drift_check = chance.choice(["03:30", "02:30", "23:00"])
-        self.world = SimulatedWorld(seed, unix_s)
-        self.witness = Witness(self.world, Calendar(self.zone, self.rows))
+        self.place = setting(seed) if place is None else place
+        self.world = SimulatedWorld(seed, self.place.begins_unix_s)
+        self.witness = Witness(self.world, Calendar(self.place.zone, self.place.rows))
         self.program: Program | None = None
         self.kiosk: StageKiosk | None = None
         self.service: Service | None = None
@@ -97,9 +102,11 @@ class Life:
 
     def live(self) -> Outcome:
         began_s = time.process_time()
-        with _folder(), watched(self.world.disk):
-            rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.rows)
-            make_stage(STAGE, Schedule(self.zone, rows, self.drift_check))
+        with _folder() as here, watched(self.world.disk):
+            # It has another name each time, and the kiosk names files of which its disk takes no more.
+            self.witness.here = f"{here}/"
+            rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.place.rows)
+            make_stage(STAGE, Schedule(self.place.zone, rows, self.place.drift_check))
             self.world.scheduler.on_kill = self.news.set
             self.boot()
             try:
@@ -115,7 +122,7 @@ class Life:
         lamps = " ".join(f"{name} {lamp.strikes} {lamp.off_at_s!r}" for name, lamp in self.world.lamps.items())
         broken = self.broken
         return Outcome(
-            self.seed, self.days, self.items, hashlib.sha256(f"{text}\n{lamps}".encode()).hexdigest(),
+            self.seed, self.days, self.place, self.items, hashlib.sha256(f"{text}\n{lamps}".encode()).hexdigest(),
             "" if broken is None else broken.promise, "" if broken is None else str(broken),
             self.world.scheduler.now_s, len(witness.digested), time.process_time() - began_s, witness.minutes,
             tuple(witness.digested[-30:]),
@@ -275,8 +282,8 @@ class Life:
 
 
 @contextlib.contextmanager
-def _folder() -> Iterator[None]:
-    """A folder in memory as the present one, and UTC as this computer's time zone."""
+def _folder() -> Iterator[Path]:
+    """A folder in memory as the present one, and UTC as this computer's time zone; gives its path."""
     before, memory = Path.cwd(), Path("/dev/shm")  # noqa: S108 - the folder in it has a name of its own
     kept = {name: os.environ.get(name) for name in ("TZ", "XDG_RUNTIME_DIR")}
     stack = threading.stack_size(STACK_BYTES)
@@ -285,7 +292,7 @@ def _folder() -> Iterator[None]:
         time.tzset()
         os.chdir(name)
         try:
-            yield
+            yield Path.cwd()
         finally:
             os.chdir(before)
             threading.stack_size(stack)

@@ -140,7 +140,7 @@ class SimulatedPlayer:
                 if link.name == CURRENT and link.is_symlink():
                     before = link.resolve()
                     self._start = CountedStart(link.parent, lambda _: None)
-                    self._bundle = link.resolve().name
+                    self._bundle = self._start.file.resolve().name
                     self._given_up(before)
                     self.load(self._start.file)
                 elif link.exists():
@@ -151,7 +151,7 @@ class SimulatedPlayer:
 
     def _given_up(self, before: Path) -> None:
         """Whether that was right, as far as it was."""
-        vain = self._screen.vain_starts.pop(before.name, 0) if self._bundle != before.name else MOST_FAILED_STARTS
+        vain = self._screen.vain_starts.get(before.name, 0) if self._bundle != before.name else MOST_FAILED_STARTS
         if vain < MOST_FAILED_STARTS and before.is_file():
             self._screen.sins.append(f"the bundle {before.name} was given up after {vain} starts without a picture")
 

@@ -27,6 +27,7 @@ PROMISES: Final = {
     "state": "The log's last word on the state is the state.",
     "black while closed": "No picture is shown while the stage is closed.",
     "dark while closed": "No lamp burns while the stage is closed and no work needs it.",
+    "rests while closed": "A closed stage without work is off, cools, or says what is wrong.",
     "lit through a restart": "A service that is killed or restarted leaves the lamps of an open stage lit.",
     "serves": "A service that was started runs, also with a damaged stage.toml, as long as the last good one is there.",
     "off is off": "When a stage says that every lamp is off, none burns that it struck.",
@@ -60,6 +61,7 @@ WORDS_S: Final = 300.0
 STAYS_S: Final = 120.0
 WORK_S: Final = 3600.0
 LOOKED_S: Final = 300.0
+_RESTING: Final = (State.OFF, State.COOLING, State.FAULT)
 _SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
 
 
@@ -76,7 +78,7 @@ class Witness:
     """Sees what really is, and judges.
 
     ``disturbed_until_s``: until when a fault, or what follows of it, excuses; ``paused_long``: whether the decider's
-    pause that begins now is stretched.
+    pause that begins now is stretched; ``here``: the folder of this life, which is left out of what is logged.
     """
 
     def __init__(self, world: SimulatedWorld, calendar: Calendar) -> None:
@@ -93,6 +95,7 @@ class Witness:
         self.rows: dict[int, EventRow] = {}
         self._held: deque[EventRow] = deque(maxlen=SHOWN)
         self.digested: list[str] = []
+        self.here = "\0"
         self._logged_state = ""
         self._black_since_s: float | None = None
         self._back_by_s: float | None = None
@@ -107,7 +110,7 @@ class Witness:
         self._judged_s = 0.0
         self.stays_lit: dict[str, float | None] = {}
         self._work: Request | None = None
-        self._work_since_s = 0.0
+        self._work_since_s = self._worked_s = 0.0
 
     # -- what is wanted
 
@@ -234,7 +237,8 @@ class Witness:
             return False
         for row in service.log.after(self.read):
             self.read = row.number
-            self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {row.text}")
+            text = row.text.replace(self.here, "")
+            self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {text}")
             if service.log.problem is None:
                 self.rows[row.number] = row
             else:
@@ -330,6 +334,10 @@ class Witness:
         works = service.reconciler.working or now_s < self.light_until_s
         if works:
             self.changed_s = max(self.changed_s, now_s - BLACK_S - 1)
+            self._worked_s = now_s
+        # Work that is given up in a step leaves the stage as it is until the next.
+        if min(shut_s, now_s - self._worked_s) > BLACK_S and state not in _RESTING:
+            raise Broken("rests while closed", f"it is {state.value}, {shut_s:.0f} s after it closed")
         burning = [name for name, lamp in world.lamps.items() if lamp.lit]
         if shut_s > DARK_S and burning and not works and self.calm:
             raise Broken("dark while closed", f"the lamp of {burning[0]} burns, {shut_s:.0f} s after it closed")
@@ -399,7 +407,8 @@ def after_the_end(witness: Witness, service: Service, *, damaged: frozenset[str]
     there = {row.number: row for row in rows}
     if damaged & {"kiosk/events.sqlite", "kiosk/events.sqlite-wal"}:
         witness.rows.clear()
-    least = min(there, default=0)
+    # A full log forgets its oldest; one that is not full has all of them.
+    least = min(there) if len(rows) >= SHOWN else 0
     for number, row in list(witness.rows.items()):
         if number < least:
             del witness.rows[number]

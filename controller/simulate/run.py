@@ -63,7 +63,7 @@ def _report(outcome: Outcome, shrink_s: float, keep: Path | None, reporter: Repo
     for line in short.last:
         reporter.say(line)
     if keep is not None:
-        keep.write_text(to_json(short.items), "utf-8")
+        keep.write_text(to_json(short.place, short.items), "utf-8")
     raise WorkError(
         "promise-broken",
         what=f"A promise was broken: {PROMISES[outcome.broken]} (seed {short.seed}, day {short.at_s / DAY_S:.3f}: "

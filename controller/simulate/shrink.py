@@ -25,7 +25,7 @@ def shortened(
     def breaks(items: Sequence[Item]) -> bool:
         nonlocal best, tries
         tries += 1
-        found = Life(outcome.seed, min(outcome.days, best.at_s / DAY_S + 0.5), items).live()
+        found = Life(outcome.seed, min(outcome.days, best.at_s / DAY_S + 0.5), items, outcome.place).live()
         if found.broken == outcome.broken:
             best = found
             said(f"{len(items)} things, {found.at_s / DAY_S:.2f} days")

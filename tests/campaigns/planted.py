@@ -1,10 +1,10 @@
 """How good the simulation is: bugs planted in a copy of the kiosk's code, and how many of them it finds.
 
-    python -m tests.campaigns.planted [SECONDS] [WORD]
+    python -m tests.campaigns.planted [SECONDS] [WORD ...]
 
 Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
-the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. WORD: only
-the patches that have it in their names.
+the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. With
+WORDs only the patches that have one in their names.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,8 +44,8 @@ class Found:
     took_s: float
 
 
-def patches(word: str = "") -> list[Path]:
-    return sorted(path for path in BUGS.glob("*.patch") if word in path.stem)
+def patches(words: Sequence[str] = ("",)) -> list[Path]:
+    return sorted(path for path in BUGS.glob("*.patch") if any(word in path.stem for word in words))
 
 
 def planted(patch: Path | None, folder: Path) -> Path:
@@ -76,9 +77,11 @@ def search(patch: Path | None, seconds: float) -> Found:
 def main() -> int:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 120.0
     began_s, found, all_s = time.monotonic(), 0, 0.0
-    control = search(None, seconds)
-    print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
-    bugs = patches(sys.argv[2] if len(sys.argv) > 2 else "")
+    words = sys.argv[2:]
+    if not words:
+        control = search(None, seconds)
+        print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
+    bugs = patches(words or [""])
     for patch in bugs:
         one = search(patch, seconds)
         found += bool(one.how)

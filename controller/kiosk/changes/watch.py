@@ -77,24 +77,36 @@ class InventoryWatch:
     ) -> None:  # fmt: skip
         self._stage, self._taken, self._worst_grade, self._log = stage, taken, worst_grade, log
         self._busy, self._wall = busy, wall
-        self._complete_at_s = 0.0
+        self._complete_at_s = self._again_at_s = 0.0
+        self._failed = False
 
     def step(self) -> None:
-        """Take an inventory if one is due."""
-        if self._busy():
+        """Take an inventory if one is due. One that can't be written is tried again, and told once."""
+        if self._busy() or _ahead(self._again_at_s, self._wall()):
             return
+        try:
+            self._take_due()
+        except (VelaturaError, OSError) as error:
+            self._again_at_s = self._wall() + COMPLETE_S
+            if not self._failed:
+                self._log.add(_not_kept(error))
+            self._failed = True
+        else:
+            self._failed = False
+
+    def _take_due(self) -> None:
         good, now_s = inventory.last_good(self._stage), self._wall()
         run = newest_good(self._stage, self._worst_grade())
         if run and (good is None or run > good.run):
             self._after_good(good, run)
-        elif good is not None and now_s >= self._complete_at_s:
+        elif good is not None and not _ahead(self._complete_at_s, now_s):
             self._complete_at_s = now_s + COMPLETE_S
             self._complete(good)
         now = datetime.fromtimestamp(now_s).astimezone()
         key = f"inventory {now.date().isoformat()}"
         if now.hour in NIGHT_H and key not in self._log.done():
-            self._log.mark_done(key, "taken")
             self._night(f"{now:%Y%m%d}")
+            self._log.mark_done(key, "taken")
 
     def _after_good(self, before: Inventory | None, run: str) -> None:
         taken = self._taken(run)
@@ -130,3 +142,17 @@ class InventoryWatch:
             more = f" And {len(unreported) - MOST_NAMED} more." if len(unreported) > MOST_NAMED else ""
             remedy = "See `velatura changes`, or the page Changes in the panel."
             self._log.add(Decision("stage-changed", f"Since the last good day: {text}{more}", remedy, "warning"))
+
+
+def _ahead(at_s: float, now_s: float) -> bool:
+    """Whether that time is still to come; not if the clock was set back since."""
+    return now_s < at_s <= now_s + COMPLETE_S
+
+
+def _not_kept(error: VelaturaError | OSError) -> Decision:
+    if isinstance(error, VelaturaError):
+        why, remedy = error.what, error.remedy
+    else:
+        why, remedy = f"{error.strerror or error}.", "Check the disk of the stage."
+    what = f"What the kiosk consists of could not be recorded. {why}"
+    return Decision("inventory-not-kept", what, f"It is tried again. {remedy}", "warning")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import shutil
 import threading
-from collections.abc import Collection, Sequence
+import time
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +25,8 @@ PREVIEWS: Final = "kiosk/previews"
 OUTPUTS: Final = "kiosk/outputs"
 OUTPUT_PX: Final = 320
 """The longer side of a small picture of what an output shows."""
+UNREAD_S: Final = 20.0
+"""A bundle that could not be read is read again after this time: the disk may have failed for a moment."""
 WITHOUT: Final = "bundles-without"
 """Folder of the stage with a subfolder like ``bundles`` for each set of missing projectors."""
 
@@ -35,11 +38,11 @@ def slots_without(stage: Path, missing: Collection[str]) -> Path:
 
 
 class BundleStore:
-    """Reads the installed bundles, again only when their links change. See ``interfaces.Bundles``."""
+    """Reads the installed bundles, again only when their links change, or after a while. See ``interfaces.Bundles``."""
 
-    def __init__(self, stage: Path, trust: Trust) -> None:
-        self._stage, self._trust = stage, trust
-        self._known: dict[Path, Index | None] = {}
+    def __init__(self, stage: Path, trust: Trust, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._stage, self._trust, self._monotonic = stage, trust, monotonic
+        self._known: dict[Path, tuple[Index | None, float]] = {}
         self._previewing = threading.Lock()
 
     def bundle(self) -> Path | None:
@@ -153,8 +156,11 @@ class BundleStore:
         if path is None:
             return None
         # Another thread may clear the cache at any time.
+        now_s = self._monotonic()
         with contextlib.suppress(KeyError):
-            return self._known[path]
+            index, again_at_s = self._known[path]
+            if index is not None or now_s < again_at_s:
+                return index
         if len(self._known) > 64:
             self._known.clear()
         index = None
@@ -163,5 +169,5 @@ class BundleStore:
             Bundle.open_trusted(path, self._trust) as bundle,
         ):
             index = bundle.index
-        self._known[path] = index
+        self._known[path] = index, now_s + UNREAD_S
         return index

@@ -68,7 +68,7 @@ class EventLog:
         self._lock = threading.RLock()
         self.problem: str | None = None
         self._retry_at_s = 0.0
-        self._unavailable = False
+        self._unavailable = self._torn = False
         self._database = self._opened()
         self._recent: deque[EventRow] = deque(self._load(), SHOWN)
         self._number = self._last_number()
@@ -77,6 +77,8 @@ class EventLog:
         self._kept: dict[str, str] = dict(self._query("SELECT name, value FROM kept"))
         self._failures = self._read_failures()
         self._unwritten: dict[tuple[str, str], None] = {}
+        if self._torn:
+            self._put_aside()
 
     # -- events
 
@@ -260,14 +262,18 @@ class EventLog:
         if rows:
             return int(rows[0][0])
         # After a damaged or unreadable log, numbers continue far above all that it can have had.
-        return int(self._wall()) if self._unavailable or list(self.path.parent.glob("*.damaged-*")) else 0
+        lost = self._unavailable or self._torn or list(self.path.parent.glob("*.damaged-*"))
+        return int(self._wall()) if lost else 0
 
     def _query(self, statement: str) -> list[tuple]:  # type: ignore[type-arg]
+        """Its rows; of a damaged file those before the damage, which are the newest where they come first."""
+        rows: list[tuple] = []  # type: ignore[type-arg]
         try:
-            return self._database.execute(statement).fetchall()
+            for row in self._database.execute(statement):
+                rows.append(row)
         except sqlite3.Error as error:
-            self.problem = str(error)
-            return []
+            self.problem, self._torn = str(error), self._torn or _is_corrupt(error)
+        return rows
 
 
 def _is_damage(error: sqlite3.Error) -> bool:

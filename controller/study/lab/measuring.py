@@ -14,7 +14,7 @@ from skimage.metrics import structural_similarity
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.report.pictures import Crop, crop_around
 from controller.solve.judged import TITLES, PixelSet, by_pixels
-from controller.solve.metrics import compare, sharpness_windows
+from controller.solve.metrics import compare, sharpness_around
 from controller.solve.targets.values import linear_to_srgb
 from controller.study.lab.subject import ReachableTarget, Subject
 from controller.study.output.drawing import LabelledPicture, detail, screen, strip
@@ -191,8 +191,8 @@ def normalised_residual(achieved: FloatImage, wanted: ReachableTarget, mask: Mas
 def sharpness_map(
     achieved: FloatImage, wanted: ReachableTarget, mask: Mask, size_px: int, least_edges: int = 12
 ) -> tuple[FloatImage, float]:
-    """lambda (paper 6, eq. 9) in each square window, NaN where the target has too few edges; and over all of them."""
-    return sharpness_windows(achieved, wanted.radiance, wanted.white, mask, size_px, least_edges=least_edges)
+    """lambda (paper 6, eq. 9) around each pixel, NaN where the target has too few edges; and over all of them."""
+    return sharpness_around(achieved, wanted.radiance, wanted.white, mask, size_px, least_edges=least_edges)
 
 
 def unbounded_inverse(

@@ -34,10 +34,11 @@ known to the degree either: places and squares were chosen before anything was m
 smaller squares, more regions contain an edge, and every figure is larger.""",
     "sharpness": """\
 lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels
-(eq. 9), in windows; edges are Canny's, at the target's own threshold. *Naive* is the light of photographed
-dots, inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated
-shares. All four make the same target at an exposure that one projector can reach. The number of windows that
-count as best varies by some percent between two solves of the same residual.""",
+(eq. 9), in the neighbourhood of each pixel; edges are Canny's, at the target's own threshold. Two targets: a
+checkerboard, as in the paper, and a photograph, whose edges have all directions and strengths. *Naive* is the light of
+photographed dots, inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated
+shares. All four make the same target at an exposure that one projector can reach. The paper does not say how
+large its neighbourhoods are: ours were chosen before anything was measured.""",
     "frequency": """\
 Bands of upright waves around a grey, faint and bold, their frequency rising downwards, over the middle of a
 pale shell, at an exposure that one projector can reach. *Contrast kept* is the amplitude in phase with the

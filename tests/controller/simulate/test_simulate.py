@@ -9,7 +9,7 @@ import pytest
 
 from controller.simulate.life import Life
 from controller.simulate.promises import PROMISES
-from controller.simulate.script import draw, from_json, to_json
+from controller.simulate.script import draw, from_json, setting, to_json
 
 FOUND = Path(__file__).parent / "found"
 ONE = "from controller.simulate.life import Life; print(Life('same', 0.5).live().digest)"
@@ -33,8 +33,8 @@ def test_another_seed_gives_another_life() -> None:
 
 
 def test_a_script_is_the_same_after_it_was_kept() -> None:
-    script = draw("kept", 5.0)
-    assert from_json(to_json(script)) == script
+    place, script = setting("kept"), draw("kept", 5.0)
+    assert from_json(to_json(place, script)) == (place, script)
 
 
 def test_each_life_leaves_some_kinds_of_things_out_and_all_of_them_have_all() -> None:
@@ -46,8 +46,8 @@ def test_each_life_leaves_some_kinds_of_things_out_and_all_of_them_have_all() ->
 @pytest.mark.parametrize("file", sorted(FOUND.glob("*.json")), ids=lambda path: path.stem)
 def test_what_was_found_once_is_not_found_again(file: Path) -> None:
     """A file is named after its seed; its script broke a promise of the kiosk when it was kept."""
-    items = from_json(file.read_text("utf-8"))
-    outcome = Life(file.stem.partition(".")[0], items[-1].at_s / 86_400 + 0.25, items).live()
+    place, items = from_json(file.read_text("utf-8"))
+    outcome = Life(file.stem.partition(".")[0], items[-1].at_s / 86_400 + 0.25, items, place).live()
     assert outcome.how == ""
 
 

@@ -122,6 +122,23 @@ def test_every_night_has_one_and_a_change_is_told_once(days: Days) -> None:
     assert len(list((days.stage / inventory.FOLDER).glob("night-*.json"))) == 4
 
 
+def test_a_night_that_can_not_be_written_is_told_once_and_taken_later(days: Days) -> None:
+    days.now_s = NIGHT_S
+    (days.stage / inventory.FOLDER).parent.mkdir(exist_ok=True)
+    (days.stage / inventory.FOLDER).write_text("in the way")
+    for _ in range(5):
+        days.step(COMPLETE_S + 1)
+    assert days.codes == ["inventory-not-kept"]
+    assert days.taken == 5
+    days.step(1)
+    assert days.taken == 5
+    (days.stage / inventory.FOLDER).unlink()
+    days.step(COMPLETE_S + 1)
+    days.step(COMPLETE_S + 1)
+    assert (days.codes, days.taken) == (["inventory-not-kept"], 6)
+    assert len(list((days.stage / inventory.FOLDER).glob("night-*.json"))) == 1
+
+
 @pytest.mark.parametrize("damage", ["{", "[]", '{"facts": 3}', "\udcff"])
 def test_a_damaged_inventory_is_as_none(days: Days, damage: str) -> None:
     graded_run(days.stage, FIRST, {"left": 0.01})

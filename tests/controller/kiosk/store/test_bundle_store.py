@@ -18,7 +18,7 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.store import bundle_store as stock_module
-from controller.kiosk.store.bundle_store import PREVIEWS, BundleStore, slots_without
+from controller.kiosk.store.bundle_store import PREVIEWS, UNREAD_S, BundleStore, slots_without
 from tests.controller.artefacts.names import projectors as stages
 
 UNSIGNED = Trust((), allow_unsigned=True)
@@ -103,3 +103,18 @@ def test_every_set_of_lost_projectors_has_a_folder_of_its_own_inside_the_stage(n
     for folder in folders:
         assert Path(os.path.normpath(folder)).parent == Path("stage") / "bundles-without"
         assert len(folder.name.encode()) <= 255
+
+
+def test_a_bundle_that_could_not_be_read_for_a_moment_is_read_again(tmp_path: Path) -> None:
+    installed(tmp_path, 1, ("marble", "bare"))
+    now_s = [100.0]
+    bundles = BundleStore(tmp_path, UNSIGNED, lambda: now_s[0])
+    file = bundles.bundle()
+    assert file is not None
+    content = file.read_bytes()
+    file.write_bytes(b"")
+    assert bundles.names() == ()
+    file.write_bytes(content)
+    assert bundles.names() == ()
+    now_s[0] += UNREAD_S
+    assert sorted(bundles.names()) == ["bare", "marble"]

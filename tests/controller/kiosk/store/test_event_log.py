@@ -102,6 +102,26 @@ def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) 
     assert len(list(path.parent.glob("*.damaged-*"))) == 1
 
 
+def test_a_log_that_is_damaged_in_its_middle_keeps_what_came_after(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for number in range(300):
+        log.add(Decision(f"before-{number}", "One. " * 50))
+    log.keep("override", "open")
+    log.close()
+    content, middle = path.read_bytes(), 4096 * (path.stat().st_size // 8192)
+    path.write_bytes(content[:middle] + b"\xa5" * 4096 + content[middle + 4096 :])
+    log = EventLog(path, durable=False)
+    log.add(Decision("after", "Two."))
+    log.close()
+    log = EventLog(path, durable=False)
+    codes = [row.code for row in log.after(0)]
+    assert codes[-101:] == [*(f"before-{number}" for number in range(200, 300)), "after"]
+    assert (log.value("override"), log.number, log.problem) == ("open", 301, None)
+    log.close()
+    assert len(list(path.parent.glob("*.damaged-*"))) == 1
+
+
 def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_path: Path) -> None:
     killed, left = EventLog(tmp_path / "before" / "events.sqlite"), tmp_path / "left" / "events.sqlite"
     killed.add(Decision("last", "It was the last."))

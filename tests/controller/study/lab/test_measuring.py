@@ -46,6 +46,9 @@ def test_the_map_of_sharpness_agrees_with_the_figure_of_the_whole_picture() -> N
     assert one == 1
     assert np.nanmin(same) == 1
     assert np.nanmean(local) < 1
+    widest = 2 * max(wanted.mask.shape) + 1
+    everywhere, _ = sharpness_map(np.asarray(blurred, np.float32), wanted, wanted.mask, widest)
+    assert everywhere == pytest.approx(np.full(wanted.mask.shape, whole), rel=1e-6)
 
 
 def test_structural_similarity_falls_with_error_and_is_one_without() -> None:
