@@ -48,7 +48,8 @@ def test_runs_from_before_it_was_measured(tmp_path: Path) -> None:
 
 def test_what_stripes_tell_is_kept(tmp_path: Path) -> None:
     stripes = np.random.default_rng(1).random((6, 12, 3)).astype(np.float32)
-    Indirect(np.zeros((2, 3, 3), np.float32), np.full((3, 256), 0.5), np.eye(3), stripes=stripes).write(tmp_path, "left")
+    share, response = np.zeros((2, 3, 3), np.float32), np.full((3, 256), 0.5)
+    Indirect(share, response, np.eye(3), stripes=stripes).write(tmp_path, "left")
     found = Indirect.read(tmp_path, "left")
     np.testing.assert_array_equal(found.stripes, stripes)
     assert found.segment is None
