@@ -28,6 +28,7 @@ from controller.capture.raw import CAMERA_BLUR_PX, SRGB_TO_XYZ
 from controller.core.errors import CalibrationError, UsageError
 from controller.transport import LightTransport
 from controller.transport.indirect import IndirectLight
+from controller.transport.indirect_stripes import dark_light
 
 PASSES: Final = 2
 """Of telling light apart: the share follows from the response, the response from the share."""
@@ -148,7 +149,8 @@ def _calibrated(
         known = KnownIndirect(share * white, radiometry)
         radiometry = measure_radiometry(captures.pictures, plan, indirect=known)[0]
     thrown = share * white
-    part = ProjectorCalibration(name, fitted.metapixels, radiometry, white - thrown, fitted.phase_map, thrown)
+    stripes = dark_light(captures.pictures, plan, fitted.phase_map.projector_px)
+    part = ProjectorCalibration(name, fitted.metapixels, radiometry, white - thrown, fitted.phase_map, thrown, stripes)
     return part, fitted.mosaic
 
 

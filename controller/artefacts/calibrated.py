@@ -76,7 +76,7 @@ class Calibrated:
             return None
         direct = self.transport.forward_part(n, frame)
         room = beside(self.calibration.projectors[n], frame, self.transport.object_mask)
-        return self.indirect.forward(direct + room)
+        return self.indirect.forward(direct, room)
 
     def seen(self, frames: Sequence[FloatImage]) -> FloatImage:
         """What the camera sees of linear frames (rows, columns, 3), one a projector, without the black image."""

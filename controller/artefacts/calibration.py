@@ -63,11 +63,14 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
         light = Light.read(folder, name)
         phase_map, mosaic = read_phase_map(folder, name)
         # in place: of a mapped file, only the pages with saturated pixels become memory of this process
-        white, indirect, radiometry = np.nan_to_num(light.white, copy=False), None, light.radiometry
+        white, radiometry = np.nan_to_num(light.white, copy=False), light.radiometry
+        indirect = stripes = None
         if found is not None:
             radiometry = found[number].radiometry
             white, indirect = _parted(white, found[number].share, folder)
-        parts.append(ProjectorCalibration(name, read_metapixels(folder, name), radiometry, white, phase_map, indirect))
+            stripes = found[number].stripes
+        metapixels = read_metapixels(folder, name)
+        parts.append(ProjectorCalibration(name, metapixels, radiometry, white, phase_map, indirect, stripes))
     black = np.nan_to_num(light.black, copy=False)
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)

@@ -215,13 +215,14 @@ class Indirect:
     """``indirect-PROJECTOR.npz``: the share of its white that is indirect, and its radiometry in direct light.
 
     ``share`` (camera rows, columns, 3), 0 to 1, float16 in the file; ``response``, ``mixing``, ``segment``: as of
-    ``Light``
+    ``Light``; ``stripes``: as of ``ProjectorCalibration``
     """
 
     share: npt.NDArray[np.floating]
     response: Float64
     mixing: Float64
     segment: Float64 | None = None
+    stripes: FloatImage | None = None
 
     @property
     def radiometry(self) -> Radiometry:
@@ -231,13 +232,15 @@ class Indirect:
         path = npz_path(run, StepKind.INDIRECT, projector)
         kept: dict[str, npt.NDArray[Any]] = {"response": self.response, "mixing": self.mixing}
         kept["share"] = self.share.astype(np.float16)
-        save_arrays(path, kept if self.segment is None else kept | {"segment": self.segment})
+        more = {"segment": self.segment, "stripes": self.stripes}
+        save_arrays(path, kept | {name: array for name, array in more.items() if array is not None})
         return path
 
     @classmethod
     def read(cls, run: Path, projector: str) -> Self:
         arrays = load_arrays(npz_path(run, StepKind.INDIRECT, projector))
-        return cls(arrays["share"], arrays["response"], arrays["mixing"], arrays.get("segment"))
+        found = arrays["share"], arrays["response"], arrays["mixing"]
+        return cls(*found, arrays.get("segment"), arrays.get("stripes"))
 
 
 @dataclass(frozen=True, slots=True)

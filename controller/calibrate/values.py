@@ -97,6 +97,7 @@ class ProjectorCalibration:
     ``phase_map``: None where metapixels are all that is known
     ``indirect`` like ``white``: what reached the camera by way of other surfaces, and is not in ``white``; None where
     there is none to speak of
+    ``stripes`` (patterns, blocks, 3): of ``transport.indirect_stripes.dark_light``; None where not measured
     """
 
     name: str
@@ -105,6 +106,7 @@ class ProjectorCalibration:
     white: FloatImage
     phase_map: PhaseMap | None = None
     indirect: FloatImage | None = None
+    stripes: FloatImage | None = None
 
 
 @dataclass(frozen=True, slots=True)

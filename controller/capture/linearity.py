@@ -29,6 +29,8 @@ PILED = 1.15
 HOT_SIGMAS = 12.0
 SMALLEST_CORRECTION = 0.015
 """Spread of the corrections of an exposure series from which the camera's exposure times are corrected."""
+NAMED_HOT = 5e-5
+"""Share of all samples: a sound sensor has fewer hot ones."""
 WORST_BLACK_STEPS = 64.0
 """A black level farther from the file's value than this is not the camera's; the light changed in between."""
 
@@ -147,6 +149,22 @@ def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) 
     if np.ptp(correction) < SMALLEST_CORRECTION:
         return np.empty((0, 2))
     return np.stack((np.array(reported), np.array(reported) * np.exp(correction)), axis=1)
+
+
+def camera_faults(exposures: Float64, hot: int, samples: int) -> str | None:
+    """What a technician should know of ``true_exposures``, and of ``hot`` of all samples; None if there is nothing."""
+    parts = []
+    if len(exposures):
+        off = float(np.ptp(np.log(exposures[:, 1] / exposures[:, 0])))
+        parts.append(f"its exposure times differ from what it reports, by {100 * off:.1f} % between two of them")
+    if hot > NAMED_HOT * samples:
+        parts.append(f"{hot} of its pixels are hot")
+    if not parts:
+        return None
+    return (
+        f"The camera has faults that are measured and corrected: {', and '.join(parts)}. Nothing has to be done. If "
+        "they grow from one calibration to the next, let the camera cool down, or replace it."
+    )
 
 
 def _limits(shorter: RawExposure, longer: RawExposure, levels: SensorLevels, ratio: float) -> tuple[Float64, float]:

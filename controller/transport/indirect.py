@@ -7,6 +7,7 @@ makes of the light that falls on it, and holds the paint (docs/decisions/0045).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -29,6 +30,7 @@ class IndirectLight:
     ``scale`` (rows, columns, 3) float32: S, 0 where the camera sees no indirect light
     ``lit`` (rows, columns) bool: camera pixels whose direct light the transport knows
     ``grid``: (rows, columns) of the blocks; ``side``: camera pixels along a block
+    ``room`` like ``factors``: of light on surfaces that are none of the object; None: as of the object
     """
 
     factors: FloatImage
@@ -36,14 +38,20 @@ class IndirectLight:
     lit: Mask
     grid: tuple[int, int]
     side: int
+    room: FloatImage | None = None
 
-    def forward(self, direct: FloatImage) -> FloatImage:
-        """G d: (rows, columns, 3) indirect light of a direct camera image of that shape."""
-        return self.scale * self.falling(direct)
+    def forward(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
+        """G d: (rows, columns, 3) indirect light of a direct camera image of that shape.
 
-    def falling(self, direct: FloatImage) -> FloatImage:
+        ``beside`` like ``direct``: light on surfaces of the room, which the transport does not know
+        """
+        return self.scale * self.falling(direct, beside)
+
+    def falling(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""
         blocks = self.factors @ down(direct, self.grid, self.side)
+        if beside is not None:
+            blocks = blocks + (self.factors if self.room is None else self.room) @ down(beside, self.grid, self.side)
         return up(blocks, self.grid, self.side, self.lit.shape)
 
     def adjoint(self, image: FloatImage) -> FloatImage:
@@ -99,6 +107,20 @@ def up(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, .
     size_px = (grid[1] * side, grid[0] * side)
     whole = cv2.resize(np.ascontiguousarray(blocks.reshape(*grid, -1)), size_px, interpolation=cv2.INTER_LINEAR)
     return np.ascontiguousarray(whole[: shape[0], : shape[1]], np.float32).reshape(*shape[:2], -1)
+
+
+def down_up(grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> Callable[[FloatImage], FloatImage]:
+    """down(up(blocks)), without the picture of ``shape`` between them; blocks (blocks, 3)."""
+    rows, columns = (
+        np.add.reduceat(_between(shape[n], grid[n], side), np.arange(0, shape[n], side), axis=0) / np.float32(side)
+        for n in (0, 1)
+    )
+
+    def across(blocks: FloatImage) -> FloatImage:
+        planes = np.moveaxis(blocks.reshape(*grid, -1), 2, 0)
+        return np.asarray(np.moveaxis(rows @ planes @ columns.T, 0, 2).reshape(len(blocks), -1), np.float32)
+
+    return across
 
 
 def up_adjoint(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
-from scipy.optimize import nnls
 
 from controller.calibrate.values import Calibration, ProjectorCalibration
+from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.indirect import IndirectLight, down, up
+from controller.transport.indirect_stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
+from controller.transport.indirect_weights import Part, Shown, Term, fit_weights, shown
 
-BLOCKS: Final = 1200
-"""About so many in the whole picture."""
-NEAR_BLOCKS: Final = 1.0
-"""Standard deviation of near light, in blocks: what spreads under the surface, or between neighbours."""
+NEAR_BLOCKS: Final = (1.0, 3.0)
+"""Standard deviations of near light, in blocks: what spreads under the surface, or between neighbours."""
 LEAST_KNOWN: Final = 0.2
 """Share of a block's pixels with a point, for light to be exchanged by shape."""
 FAINTEST: Final = 1e-4
 """Of the brightest: less falling light says nothing of what a surface makes of it."""
-ROUNDS: Final = 12
 
 
 def fit_indirect(
@@ -32,7 +30,8 @@ def fit_indirect(
 
     Parameters
     ----------
-    calibration : with the indirect light of each projector's white, camera (rows, columns, 3)
+    calibration : with the indirect light of each projector's white, camera (rows, columns, 3), and what coarse stripes
+        throw back, where that is known
     lit : (rows, columns) camera pixels whose direct light the transport knows
     points_m, normals : (rows, columns, 3) of the surface in the camera's frame, NaN where unknown; None: not known
     """
@@ -40,28 +39,52 @@ def fit_indirect(
     if len(indirect) < len(calibration.projectors) or not indirect:
         return None
     shape = calibration.black.shape
-    side = max(1, round(float(np.sqrt(shape[0] * shape[1] / BLOCKS))))
-    grid = -(-shape[0] // side), -(-shape[1] // side)
-    direct = [down(part.white, grid, side) for part in calibration.projectors]
-    terms = [_even(grid), _near(grid)]
+    grid, side = blocks_of(shape)
+    kinds = [_even(grid), *(_near(grid, deviation) for deviation in NEAR_BLOCKS)]
     if points_m is not None and normals is not None:
-        terms.append(form_factors(points_m, normals, grid, side))
-    terms = _alike(terms, direct)
-    factors = np.tensordot(_weights(terms, direct, indirect, grid, side), np.stack(terms), axes=1).astype(np.float32)
-    falling = up(factors @ np.sum(direct, axis=0), grid, side, shape)
-    faint = FAINTEST * falling.max(initial=0)
+        kinds.append(form_factors(points_m, normals, grid, side))
     whole = np.sum(indirect, axis=0)
+    whites = [
+        shown(part.white, down(image, grid, side), whole, lit, grid, side)
+        for part, image in zip(calibration.projectors, indirect, strict=True)
+    ]
+    stripes = [one for part in calibration.projectors for one in _striped(part, whole, lit, grid, side)]
+    # Only stripes tell the light of the object from that of table and walls.
+    parts: tuple[Part, ...] = ("object", "room") if stripes else ("all",)
+    terms = [Term(kind, part) for kind in kinds for part in parts]
+    weights = fit_weights(terms, whites, stripes, grid, side, shape)
+    own, room = (
+        np.sum([w * t.matrix for w, t in zip(weights, terms, strict=True) if t.part in (part, "all")], axis=0)
+        for part in ("object", "room")
+    )
+    arriving = np.sum([own @ one.own + room @ one.room for one in whites], axis=0)
+    falling = up(np.asarray(arriving, np.float32), grid, side, shape)
+    faint = FAINTEST * falling.max(initial=0)
     scale = np.divide(whole, falling, out=np.zeros_like(whole), where=falling > faint)
-    return IndirectLight(factors, scale.astype(np.float32), lit, grid, side)
+    return IndirectLight(own, scale.astype(np.float32), lit, grid, side, room)
 
 
-def beside(part: ProjectorCalibration, shown: FloatImage, lit: Mask) -> FloatImage:
+def _striped(part: ProjectorCalibration, whole: FloatImage, lit: Mask, grid: tuple[int, int], side: int) -> list[Shown]:
+    """What a projector's coarse stripes throw back."""
+    if part.stripes is None or part.phase_map is None:
+        return []
+    stride, (rows, columns) = stride_of(whole.shape), part.metapixels.valid.shape
+    at, white, few = (thinned(image, stride) for image in (part.phase_map.projector_px, part.white, whole))
+    found = []
+    for pattern, seen in zip(coarse_stripes(plan_patterns((columns, rows))), part.stripes, strict=True):
+        light, dark = stripe_parts(pattern, (columns, rows), at)
+        direct = white * light[..., None]
+        found.append(shown(direct, seen, few, lit[::stride, ::stride], grid, side // stride, dark))
+    return found
+
+
+def beside(part: ProjectorCalibration, frame: FloatImage, lit: Mask) -> FloatImage:
     """Direct light (rows, columns, 3) of a projector's frame where the transport knows none: on table and walls."""
     if part.phase_map is None:
-        light = np.broadcast_to(shown.mean(axis=(0, 1)), part.white.shape)
+        light = np.broadcast_to(frame.mean(axis=(0, 1)), part.white.shape)
     else:
         at = np.nan_to_num(part.phase_map.projector_px, nan=-1e4)
-        light = cv2.remap(shown, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        light = cv2.remap(frame, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     mixed = part.white * (light @ part.radiometry.mixing.T.astype(np.float32))
     return np.where(lit[..., None], np.float32(0), mixed).astype(np.float32)
 
@@ -118,51 +141,7 @@ def _even(grid: tuple[int, int]) -> FloatImage:
     return np.full((count, count), 1 / count, np.float32)
 
 
-def _near(grid: tuple[int, int]) -> FloatImage:
-    """A block's neighbourhood."""
-    one = [np.exp(-0.5 * (np.subtract.outer(np.arange(n), np.arange(n)) / NEAR_BLOCKS) ** 2) for n in grid]
+def _near(grid: tuple[int, int], deviation: float) -> FloatImage:
+    """A block's neighbourhood, as a Gaussian."""
+    one = [np.exp(-0.5 * (np.subtract.outer(np.arange(n), np.arange(n)) / deviation) ** 2) for n in grid]
     return np.asarray(np.kron(*(part / part.sum(axis=1, keepdims=True) for part in one)), np.float32)
-
-
-def _alike(terms: Sequence[FloatImage], direct: Sequence[FloatImage]) -> list[FloatImage]:
-    """Terms that give as much light each for all whites together; without those that give none."""
-    whole = np.sum(direct, axis=0)
-    means = [float((term @ whole).mean()) for term in terms]
-    return [term / np.float32(mean) for term, mean in zip(terms, means, strict=True) if mean > 0]
-
-
-def _weights(
-    terms: Sequence[FloatImage],
-    direct: Sequence[FloatImage],
-    indirect: Sequence[FloatImage],
-    grid: tuple[int, int],
-    side: int,
-) -> FloatImage:
-    """How much of each term, >= 0 and 1 in all, tells the projectors' indirect light apart best.
-
-    S follows from all projectors together, so a projector's light is predicted as its part of what falls, times the
-    light of all. Least squares by blocks, relative to the light; the part's denominator is that of the round before.
-    """
-    seen = np.stack([down(image, grid, side) for image in indirect])
-    whole = seen.sum(axis=0)
-    light = whole + np.sum(direct, axis=0)
-    shape = indirect[0].shape
-    falling = np.stack(
-        [[down(up(term @ one, grid, side, shape), grid, side) for term in terms] for one in direct]
-    )  # fmt: skip
-    found = np.full(len(terms), 1 / len(terms))
-    use = (whole > 0) & (light > 1e-3 * light.max(initial=0))
-    if len(direct) < 2 or not use.any():
-        return found.astype(np.float32)
-    for _ in range(ROUNDS):
-        every = np.tensordot(falling.sum(axis=0), found, axes=(0, 0))
-        gain = np.divide(whole / np.sqrt(np.maximum(light, 1e-30)), every, out=np.zeros_like(whole), where=every > 0)
-        gain = np.where(use, gain, 0)
-        # sum of terms (falling_n - part_n falling) = 0, which alone would have the answer 0; the sum of all is 1
-        part = np.divide(seen, whole, out=np.zeros_like(seen), where=whole > 0)
-        rows = (falling - part[:, None] * falling.sum(axis=0)) * gain
-        equations = rows.transpose(0, 2, 3, 1).reshape(-1, len(terms))
-        heavy = 1e3 * float(np.abs(equations).max(initial=0)) * np.sqrt(len(equations))
-        after, _ = nnls(np.vstack([equations, np.full(len(terms), heavy)]), np.append(np.zeros(len(equations)), heavy))
-        found = after / max(after.sum(), 1e-30)
-    return found.astype(np.float32)

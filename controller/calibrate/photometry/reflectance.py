@@ -28,7 +28,7 @@ def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> Floa
         light, falling = whites.sum(axis=0), np.ones_like(whites[0])
     else:
         lit = whites.min(axis=3) > 1e-3 * whites.max(initial=0)
-        shapes = np.stack([np.where(on, shape, 0) for on, shape in zip(lit, _falling(geometry), strict=True)])
+        shapes = np.stack([np.where(on, shape, 0) for on, shape in zip(lit, falling_light(geometry), strict=True)])
         light = np.where(shapes[..., None] > 0, whites, 0).sum(axis=0)
         falling = np.einsum("nyx,nc->yxc", shapes, _strengths(whites, shapes)).astype(np.float32)
     known = mask & (falling.min(axis=2) > FAINTEST * float(np.median(falling[mask]) if mask.any() else 1.0))
@@ -38,7 +38,7 @@ def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> Floa
     return np.asarray(found / np.percentile(found[known], WHITEST), np.float32)
 
 
-def _falling(geometry: Geometry) -> list[FloatImage]:
+def falling_light(geometry: Geometry) -> list[FloatImage]:
     """Light of each projector (rows, columns) by cos / r^2, up to a factor; 0 where nothing is known."""
     shapes = []
     for projector in geometry.projectors:

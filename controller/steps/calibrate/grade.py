@@ -10,6 +10,7 @@ import numpy as np
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.camera import Exposures
+from controller.artefacts.geometry import has_geometry, read_geometry
 from controller.artefacts.grade import (
     PICTURE,
     ErrorMaps,
@@ -25,6 +26,7 @@ from controller.artefacts.kinds import StepKind
 from controller.artefacts.photographs import PATTERN, VERIFICATION, Taken, codes_of
 from controller.artefacts.projectors import IndirectFigures, Light
 from controller.bundle.export import png
+from controller.calibrate.photometry.gloss import gloss_strength, glossy
 from controller.calibrate.values import ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
 from controller.calibrate.verify.grade import Verification, verify
@@ -108,6 +110,9 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         figures[part.name] = _figures(found, why) | _indirect_figures(context.folder, part.name)
         maps[part.name] = ErrorMaps(found.error_map, why.labels)
         pictures.append(attribution_picture(why, calibration, part.name))
+    geometry = read_geometry(context.folder, calibrated.projectors) if has_geometry(context.folder) else None
+    if (said := glossy(gloss_strength(calibration, geometry))) is not None:
+        context.reporter.say(said, Level.WARNING)
     return write_grade(context.folder, figures, maps, png(np.concatenate(pictures, axis=0)))
 
 

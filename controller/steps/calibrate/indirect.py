@@ -20,6 +20,7 @@ from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
+from controller.transport.indirect_stripes import dark_light
 
 PASSES: Final = 2
 """The share follows from the response by which sinusoids were shown, the response from the share."""
@@ -52,7 +53,9 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     figures = IndirectFigures(median, p95, tuple(float(value) for value in change))
     segment = np.array([radiometry.segment]) if radiometry.segment else None
-    found = Indirect(share, radiometry.response, radiometry.mixing, segment)
+    known = pixels.phase_map
+    stripes = None if known is None else dark_light(captures, plan, known.projector_px)
+    found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes)
     return [found.write(folder, name), figures.write(folder, name)]
 
 

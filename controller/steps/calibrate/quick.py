@@ -133,7 +133,7 @@ def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
     if kind == StepKind.LIGHT:
         return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
     if kind == StepKind.INDIRECT:
-        return Way.CORRECT if one.dimmed else Way.KEEP
+        return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
     return Way.CORRECT if kind == StepKind.PIXELS and one.moved else Way.KEEP
 
 
@@ -167,8 +167,9 @@ def _correct(rig: Rig, last: Calibrated, step: StepId, kept: list[Path], context
         _shift_pixels(context.folder, name, one)
     elif step.kind == StepKind.INDIRECT:
         found = Indirect.read(context.folder, name)
-        mixing = update_radiometry(found.radiometry, one.gain).mixing
-        dataclasses.replace(found, mixing=mixing).write(context.folder, name)
+        mixing = update_radiometry(found.radiometry, one.gain).mixing if one.dimmed else found.mixing
+        # its stripes lay elsewhere or were brighter; those of the others are enough
+        dataclasses.replace(found, mixing=mixing, stripes=None).write(context.folder, name)
     else:
         _correct_light(context.folder, name, one)
     return kept

@@ -21,6 +21,7 @@ from controller.capture.linear_files import is_linear
 from controller.capture.linearity import (
     RawExposure,
     black_offset,
+    camera_faults,
     check_series,
     common_limit,
     find_hot,
@@ -31,6 +32,7 @@ from controller.capture.profile import CameraProfile
 from controller.capture.raw import RawMosaic, is_jpeg, read_jpeg_values, read_mosaic, read_photograph
 from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
+from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
@@ -187,6 +189,8 @@ def _of_raw(
     profile = replace(profile, clip=clip, exposures=true_exposures(ratios))
     if noise is not None:
         profile = replace(profile, noise=noise.noise)
+    if (said := camera_faults(profile.exposures, len(hot), dark[0][1].samples.size)) is not None:
+        context.reporter.say(said, Level.WARNING)
     figures = {
         "kind": "raw",
         "black_offset_steps": offset.tolist(),

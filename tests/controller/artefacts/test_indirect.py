@@ -44,3 +44,12 @@ def test_a_stage_with_next_to_none_is_taken_as_one_without(
 def test_runs_from_before_it_was_measured(tmp_path: Path) -> None:
     write(tmp_path, "left", 0.2, 0.4)
     assert read_indirect(tmp_path, NAMES) is None
+
+
+def test_what_stripes_tell_is_kept(tmp_path: Path) -> None:
+    stripes = np.random.default_rng(1).random((6, 12, 3)).astype(np.float32)
+    share, response = np.zeros((2, 3, 3), np.float32), np.full((3, 256), 0.5)
+    Indirect(share, response, np.eye(3), stripes=stripes).write(tmp_path, "left")
+    found = Indirect.read(tmp_path, "left")
+    np.testing.assert_array_equal(found.stripes, stripes)
+    assert found.segment is None

@@ -3,7 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.capture.linearity import black_offset, check_series, common_limit, find_hot, true_exposures
+from controller.capture.linearity import (
+    black_offset,
+    camera_faults,
+    check_series,
+    common_limit,
+    find_hot,
+    true_exposures,
+)
 from tests.controller.capture.sensor_model import SensorModel, textured
 
 LIGHT = textured()
@@ -89,3 +96,15 @@ def test_a_limit_seen_once_too_low_does_not_count() -> None:
     np.testing.assert_array_equal(common_limit([low, high, none]), high)
     np.testing.assert_array_equal(common_limit([none]), none)
     np.testing.assert_array_equal(common_limit([]), none)
+
+
+def test_faults_of_a_camera_are_named() -> None:
+    sound = np.empty((0, 2))
+    assert camera_faults(sound, 3, 400_000) is None
+    said = camera_faults(np.array([[0.1, 0.101], [0.4, 0.392]]), 80, 400_000)
+    assert said is not None
+    assert "3.0 %" in said
+    assert "80 of its pixels" in said
+    only_hot = camera_faults(sound, 80, 400_000)
+    assert only_hot is not None
+    assert "exposure" not in only_hot

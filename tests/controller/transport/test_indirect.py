@@ -9,9 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controller.calibrate.values import Calibration, PhaseMap
+from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.indirect import IndirectLight
 from controller.transport.indirect_fit import beside, fit_indirect, form_factors
+from controller.transport.indirect_stripes import blocks_of, coarse_stripes, dark_light, stripe_parts
 from tests.controller.solve.conftest import plane_calibration
 
 SHAPE = (22, 27)
@@ -163,3 +166,65 @@ def test_light_beside_the_object_is_that_of_the_frame() -> None:
     found = beside(stage.projectors[0], np.full((20, 26, 3), 0.5, np.float32), lit)
     np.testing.assert_array_equal(found[:30], 0)
     np.testing.assert_allclose(found[30:], 0.5 * stage.projectors[0].white[30:], rtol=1e-5)
+
+
+def with_and_without_stripes(own: float, room: float, far: float) -> tuple[float, float]:
+    """Relative error of the object's indirect light, from whites and stripes, and from whites alone.
+
+    Of a stage whose object gives ``own`` of the form factors, its room ``room`` of them and ``far`` of even light.
+    """
+    stage = plane_calibration(projectors=3, projector=(72, 96))
+    grid, side = blocks_of((60, 80))
+    points, normals = corner()
+    shape = form_factors(points, normals, grid, side)
+    even = np.full_like(shape, 1 / len(shape))
+    y, x = np.mgrid[0:60, 0:80].astype(np.float32)
+    lit: Mask = np.asarray((x > 15) & (x < 60))
+    paint = np.full((60, 80, 3), 0.3, np.float32)
+    truth = IndirectLight(
+        np.float32(own) * shape, paint, lit, grid, side, np.float32(room) * shape + np.float32(far) * even
+    )
+    plan, parts = plan_patterns((96, 72)), []
+
+    def thrown(direct: FloatImage) -> FloatImage:
+        lighted = np.where(lit[..., None], direct, np.float32(0))
+        return truth.forward(lighted, direct - lighted)
+
+    for n, part in enumerate(stage.projectors):
+        at = np.stack([1.2 * x - 2.0 * n, 1.2 * y], axis=-1)
+        white = part.white.copy()
+        white[:, 60 - 15 * n :] *= 0.3
+        pictures = {"black": np.zeros_like(white)}
+        for pattern in coarse_stripes(plan):
+            shown, dark = stripe_parts(pattern, (96, 72), at)
+            assert 0.1 < dark.mean() < 0.7
+            assert not shown[dark].any()
+            direct = white * shown[..., None]
+            pictures[pattern.name] = direct + thrown(direct)
+        stripes = dark_light(pictures, plan, at)
+        phase_map = PhaseMap(at, np.ones((60, 80, 3), np.float32))
+        parts.append(replace(part, white=white, indirect=thrown(white), phase_map=phase_map, stripes=stripes))
+
+    def error(calibration: Calibration) -> float:
+        found = fit_indirect(calibration, lit, points, normals)
+        assert found is not None
+        light = np.where(lit[..., None], parts[0].white, np.float32(0))
+        wanted = truth.forward(light)[lit]
+        return float(np.sqrt(np.mean((found.forward(light)[lit] - wanted) ** 2) / np.mean(wanted**2)))
+
+    blind = replace(stage, projectors=tuple(replace(part, stripes=None) for part in parts))
+    return error(replace(stage, projectors=tuple(parts))), error(blind)
+
+
+def test_stripes_tell_the_light_of_the_object_from_that_of_the_room() -> None:
+    """White images alone can't: in them, table and walls are as bright as ever."""
+    known, blind = with_and_without_stripes(0.6, 0.1, 0.3)
+    # the rest is what holds both together
+    assert known < 0.2
+    assert blind > 2 * known
+
+
+def test_stripes_make_nothing_worse_where_object_and_room_are_alike() -> None:
+    known, blind = with_and_without_stripes(0.5, 0.5, 0.0)
+    assert known < 0.01 + blind
+    assert known < 0.05

@@ -56,8 +56,8 @@ def test_nothing_is_repeated_when_nothing_has_changed() -> None:
 @pytest.mark.parametrize(
     ("bumped", "ways"),
     [
-        (projector("b", gain=0.9), {"light": Way.CORRECT, "codes": Way.KEEP, "pixels": Way.KEEP}),
-        (projector("b", MOVED), {"light": Way.CORRECT, "codes": Way.KEEP, "pixels": Way.CORRECT}),
+        (projector("b", gain=0.9), {"light": Way.CORRECT, "indirect": Way.CORRECT, "pixels": Way.KEEP}),
+        (projector("b", MOVED), {"light": Way.CORRECT, "codes": Way.KEEP, "indirect": Way.CORRECT}),
         (projector("b", MOVED, local_px=0.8), {"light": Way.RUN, "codes": Way.RUN, "pixels": Way.RUN}),
         (projector("b", LOST), {"light": Way.RUN, "codes": Way.RUN, "pixels": Way.RUN}),
     ],
