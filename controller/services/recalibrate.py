@@ -12,7 +12,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.drift import read_drift_figures
 from controller.artefacts.grade import passes
 from controller.artefacts.kinds import CALIBRATED, StepKind
-from controller.artefacts.modes import MODES, CalibrationMode, DotOptions, mode_of
+from controller.artefacts.modes import MODES, CalibrationMode, DotOptions, PhotographOptions, mode_of
 from controller.core.errors import UsageError
 from controller.rig.ambient_light import dark_after
 from controller.rig.rig import Rig
@@ -81,7 +81,8 @@ def recalibrate(
     def steps(rig: Rig, run: Path) -> Sequence[Step]:
         longest_s = _longest_s(checked)
         mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
-        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+        taking = PhotographOptions(checked.stage.tables.calibration.photographs, last)
+        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking),
                 *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
         repeated = (
             quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)
