@@ -168,8 +168,9 @@ def calibrate(
         session = OwnSession(stage)
         if quick or projector is not None:
             return recalibrate(
-                session=session, accept_grade=accept_grade, projector=projector, reporter=reporter, cancel=cancel
-            )
+                session=session, accept_grade=accept_grade, projector=projector, photographs=photographs,
+                reporter=reporter, cancel=cancel,
+            )  # fmt: skip
         return calibrate(
             session=session, mode=mode, dot_spacing=dot_spacing, photographs=photographs,
             accept_grade=accept_grade, reporter=reporter, cancel=cancel,

@@ -15,7 +15,7 @@ from controller.calibrate.values import Metapixels
 from controller.capture.dots import LEAST_SPACING_PX, PAPER_SPACING_PX
 from controller.capture.patterns import Code, PatternPlan, plan_patterns
 from controller.core.arrays import FloatImage
-from controller.core.errors import UsageError
+from controller.core.errors import CalibrationError, UsageError
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 
@@ -73,10 +73,20 @@ class PlanUsed:
         return plan_patterns(size_px, few=self.few, code=self.code)
 
     def known_px(self, run: Path, projector: str) -> FloatImage | None:
-        """The earlier map, (rows, columns, 2) projector px; None where the plan has a code."""
+        """The earlier map, (rows, columns, 2) projector px; None where the plan has a code.
+
+        Raises CalibrationError("map-missing") if the run that it is from was deleted meanwhile.
+        """
         if self.code is not Code.KNOWN:
             return None
-        return known_map(run.parent / self.known_from, projector)
+        try:
+            return known_map(run.parent / self.known_from, projector)
+        except UsageError as error:
+            raise CalibrationError(
+                "map-missing",
+                what=f"The calibration {self.known_from}, from which that of {projector} started, can't be read.",
+                remedy="Calibrate the projector again with --photographs few.",
+            ) from error
 
     def write(self, run: Path, projector: str) -> Path:
         return write_json(json_path(run, PATTERNS, projector), asdict(self))

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from controller.artefacts.camera import Exposures
-from controller.artefacts.modes import PhotographOptions, Photographs, PlanUsed
+from controller.artefacts.modes import PhotographOptions, Photographs, PlanUsed, photographs_named
 from controller.artefacts.photographs import BLACK, light_of
 from controller.artefacts.projectors import Light, Pixels
 from controller.capture.acquire import Acquirer
-from controller.capture.patterns import Code
+from controller.capture.patterns import Code, plan_patterns
+from controller.core.errors import CalibrationError, UsageError
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.rig import Rig, RigProjector
 from controller.run.journal import Journal
@@ -120,6 +121,24 @@ def calibrated_before(folder: Path, scene: Scene, *, moved_px: float = 0.0) -> N
     ).write(run, NAME)
     picture = np.zeros((*at.shape[:2], 3), np.float32)
     Light(scene.response(), np.array(scene.mixing), picture, picture, np.eye(3)).write(run, NAME)
+
+
+def test_an_unknown_set_of_photographs_is_refused() -> None:
+    assert [photographs_named(name) for name in ("full", "few", "fewest")] == ["full", "few", "fewest"]
+    with pytest.raises(UsageError, match="full, few, fewest") as caught:
+        photographs_named("none")
+    assert caught.value.code == "photographs-unknown"
+
+
+def test_a_run_from_before_there_was_a_choice_has_all_photographs(tmp_path: Path) -> None:
+    assert PlanUsed.read(tmp_path, NAME).plan((1400, 1050)) == plan_patterns((1400, 1050))
+
+
+def test_a_deleted_calibration_whose_map_is_needed_is_named(tmp_path: Path) -> None:
+    used = PlanUsed(few=True, code=Code.KNOWN, known_from="before")
+    with pytest.raises(CalibrationError, match="before") as caught:
+        used.known_px(tmp_path / "now", NAME)
+    assert caught.value.code == "map-missing"
 
 
 def test_all_photographs_are_taken_where_nothing_else_is_asked_for(tmp_path: Path, journal: Journal) -> None:
