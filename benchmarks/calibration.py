@@ -18,11 +18,12 @@ from benchmarks._stage import FIRST_SEED, CalibratedStage, calibrated_stage, ove
 from benchmarks._truth import Truth
 from controller.artefacts.calibration import read_calibration, read_captures
 from controller.artefacts.kinds import StepKind
+from controller.artefacts.modes import PlanUsed
 from controller.artefacts.photographs import Developed
 from controller.artefacts.projectors import Light, Pixels
 from controller.calibrate.correspondence.decode import decode
+from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.metapixels.from_phase import fit_metapixels
-from controller.capture.patterns import plan_patterns
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
 from controller.demo.stage import DEFAULT_ROOM
@@ -78,9 +79,9 @@ def _timed(run: Path, name: str) -> dict[str, float]:
     light = Light.read(run, name)
     taken = read_captures(run, name)
     ready: dict[str, FloatImage] = {"black": light.black, "white": light.white + light.black}
-    captures = Developed(taken, ready)
     rows, columns = Pixels.read(run, name).valid.shape
-    plan = plan_patterns((columns, rows))
+    plan = PlanUsed.read(run, name).plan((columns, rows))
+    captures = completed(Developed(taken, ready), plan)
     reading = _seconds(lambda: [captures[key] for key in taken if key.startswith(CODES)])
     correspondence = decode(captures, plan)
     return {

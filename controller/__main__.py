@@ -143,6 +143,13 @@ def calibrate(
     dot_spacing: Annotated[
         str | None, typer.Option(help='Projector pixels between dots, or "auto" (from the blur).')
     ] = None,
+    photographs: Annotated[
+        str | None,
+        typer.Option(
+            help="full; few (white instead of opposite pictures, code in colours); fewest (few, and no code where "
+            "nothing moved). Default: from stage.toml."
+        ),
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Redo only what changed since the last calibration.")] = False,
     projector: Annotated[
         str | None,
@@ -161,11 +168,12 @@ def calibrate(
         session = OwnSession(stage)
         if quick or projector is not None:
             return recalibrate(
-                session=session, accept_grade=accept_grade, projector=projector, reporter=reporter, cancel=cancel
-            )
+                session=session, accept_grade=accept_grade, projector=projector, photographs=photographs,
+                reporter=reporter, cancel=cancel,
+            )  # fmt: skip
         return calibrate(
-            session=session, mode=mode, dot_spacing=dot_spacing, accept_grade=accept_grade,
-            reporter=reporter, cancel=cancel,
+            session=session, mode=mode, dot_spacing=dot_spacing, photographs=photographs,
+            accept_grade=accept_grade, reporter=reporter, cancel=cancel,
         )  # fmt: skip
 
     work(do, as_json=as_json, stage=stage)

@@ -11,7 +11,7 @@ import numpy as np
 
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.names import CAPTURES, read_json, safe_name, stem, write_json
-from controller.capture.profile import CameraProfile, load_profile
+from controller.capture.profile import CameraNoise, CameraProfile, load_profile
 from controller.capture.raw import Photograph, read_photograph
 from controller.core.arrays import FloatImage
 from controller.run.step_id import ShotId
@@ -112,6 +112,12 @@ class PhotographSet:
         if self.kind == StepKind.VERIFICATION_PHOTOGRAPHS:
             return PATTERN, name.removeprefix("verify-")
         return name, None
+
+
+def noise_of(taken: Taken) -> CameraNoise:
+    """Noise of a photograph's samples in full scales per second; as measured, or as cameras have it."""
+    noise = CameraNoise() if taken.profile is None else taken.profile.noise
+    return noise.per_second(taken.exposure_s)
 
 
 def light_of(projector: str) -> PhotographSet:

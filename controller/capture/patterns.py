@@ -4,6 +4,9 @@ Everything is a pure function of the projector's size. Cells and phases fit toge
 ambiguous: the Gray code counts cells of half the coarse phase's period, so a pixel whose cell is read one off, which
 happens only at the border of two cells, still lies 6 px inside the period it is given. The coarse phase in turn only
 chooses among the fringes of the fine sinusoids, which give the position and, by the contrast they lose, the blur.
+
+A plan with few pictures leaves out what others tell: the opposite of a sinusoid is white less the sinusoid, three bits
+of the Gray code are shown at once, one in each colour, and a map from before can stand for the code.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -26,6 +29,7 @@ __all__ = [
     "CELL_PX",
     "PERIOD_PX",
     "TILE_PATTERNS",
+    "Code",
     "Pattern",
     "PatternKind",
     "PatternPlan",
@@ -43,7 +47,9 @@ PHASE_STEPS = 3
 BLUR_STEPS = 3
 BLUR_FREQUENCIES = {"x": (1 / 5, 0.0), "y": (0.0, 1 / 5), "d": (1 / 7, 1 / 7)}
 """Cycles per projector pixel of the three fine sinusoids: position within their fringe, and blur."""
-TILE_PATTERNS = 2
+ONLY_STRENGTH: Final = {"blur-d": 1}
+"""Steps of a sinusoid from which, in a plan with few pictures, only the blur is measured: x and y tell the place."""
+TILE_PATTERNS, FEWER_TILE_PATTERNS = 2, 1
 FEW_CELLS = 1000
 """With fewer Gray cells on the whole frame, one more set of colour tiles is shown."""
 MOST_TILES = 4000
@@ -61,9 +67,18 @@ class PatternKind(enum.Enum):
 
     FLAT = "flat"
     GRAY = "gray"
+    COLOUR_GRAY = "gray in colours"
     COLOUR_TILES = "mosaic"
     SINUSOID = "sinusoid"
     RANDOM = "random"
+
+
+class Code(enum.StrEnum):
+    """What tells the cells: Gray code, the same with a bit in each colour, or a map from before."""
+
+    GRAY = "gray"
+    COLOURS = "colours"
+    KNOWN = "known"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +86,9 @@ class Pattern:
     """One picture of the plan.
 
     ``colour`` (FLAT) fraction of full light per channel; ``axis`` (GRAY) 0 for x, 1 for y; ``bit`` (GRAY) 0 is the
-    coarsest of ``bits``; ``tile_cells`` (MOSAIC) Gray cells along a tile's side; ``frequency`` (SINUSOID) x and y in
+    coarsest of ``bits``; ``coloured_bits`` (COLOUR_GRAY) axis, bit and bits in red, green and blue, None for a channel
+    that shows nothing; ``opposite`` (SINUSOID) the picture that shows the light that this one lacks: then this one is
+    not shown; ``tile_cells`` (MOSAIC) Gray cells along a tile's side; ``frequency`` (SINUSOID) x and y in
     cycles per projector pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (MOSAIC, RANDOM); ``coarse`` (RANDOM) with
     large bright and dark parts, too, which throw light on each other.
     """
@@ -82,6 +99,8 @@ class Pattern:
     axis: int = 0
     bit: int = 0
     bits: int = 0
+    coloured_bits: tuple[tuple[int, int, int] | None, ...] = ()
+    opposite: str = ""
     tile_cells: int = 1
     frequency: tuple[float, float] = (0.0, 0.0)
     phase_rad: float = 0.0
@@ -98,11 +117,14 @@ class Pattern:
 class PatternPlan:
     """The patterns of one projector in the order in which they are shown; those that need the response come last.
 
-    ``size_px`` (width, height) of the projector.
+    ``size_px`` (width, height) of the projector; ``computed``: sinusoids that need not be shown, because white and
+    their opposites tell them; ``code``: what tells the cells
     """
 
     size_px: tuple[int, int]
     patterns: tuple[Pattern, ...]
+    computed: tuple[Pattern, ...] = ()
+    code: Code = Code.GRAY
 
     def __iter__(self) -> Iterator[Pattern]:
         return iter(self.patterns)
@@ -118,15 +140,32 @@ class PatternPlan:
         return tuple(pattern for pattern in self.of_kind(PatternKind.GRAY) if pattern.axis == axis)
 
     def sinusoids(self, prefix: str) -> tuple[Pattern, ...]:
-        """The steps of one sinusoid in order; ``prefix`` is e.g. ``"phase-x"`` or ``"blur-d"``."""
-        return tuple(p for p in self.of_kind(PatternKind.SINUSOID) if p.name.rpartition("-")[0] == prefix)
+        """The steps of one sinusoid; ``prefix`` is e.g. ``"phase-x"`` or ``"blur-d"``. An opposite follows its own."""
+        found = []
+        for pattern in self.of_kind(PatternKind.SINUSOID):
+            if pattern.name.rpartition("-")[0] == prefix:
+                found += [pattern, *(other for other in self.computed if other.opposite == pattern.name)]
+        return tuple(found)
+
+    def tells_phase(self, prefix: str) -> bool:
+        """Whether the steps of a sinusoid tell its phase; one picture and its opposite tell only how strong it is."""
+        return len(self.sinusoids(prefix)) > 2
 
 
-def plan_patterns(size_px: tuple[int, int], *, random_patterns: int = 1) -> PatternPlan:
+def plan_patterns(
+    size_px: tuple[int, int], *, few: bool = False, code: Code = Code.GRAY, random_patterns: int = 1
+) -> PatternPlan:
     """The plan for a projector of ``size_px`` (width, height).
 
     Names: ``black white``, ``gray-x-0``.., ``gray-y-0``.., ``mosaic-0``.., ``phase-x-0..2``, ``phase-y-0..2``,
     ``blur-x-0..2``, ``blur-y-0..2``, ``blur-d-0..2``, ``random-0``...
+
+    Parameters
+    ----------
+    few : two steps of each sinusoid, a quarter of a period apart, and one of the diagonal one; the opposites are
+        computed. One mosaic less
+    code : ``COLOURS``: ``gray-rgb-0``.. with three bits each; ``KNOWN``: no code
+
 
     Raises UsageError("projector-too-small") below 2 cells a side.
     """
@@ -140,21 +179,39 @@ def plan_patterns(size_px: tuple[int, int], *, random_patterns: int = 1) -> Patt
     patterns = [
         Pattern("black", PatternKind.FLAT, colour=(0.0, 0.0, 0.0)),
         Pattern("white", PatternKind.FLAT),
-        *_gray_bits("x", 0, width),
-        *_gray_bits("y", 1, height),
-        *_tile_patterns(size_px),
-        *_steps("phase-x", (1 / PERIOD_PX, 0.0), PHASE_STEPS),
-        *_steps("phase-y", (0.0, 1 / PERIOD_PX), PHASE_STEPS),
+        *_code_patterns(size_px, code),
+        *_tile_patterns(size_px, few),
     ]
-    for name, frequency in BLUR_FREQUENCIES.items():
-        patterns += _steps(f"blur-{name}", frequency, BLUR_STEPS)
+    sinusoids = {"phase-x": (1 / PERIOD_PX, 0.0), "phase-y": (0.0, 1 / PERIOD_PX)}
+    sinusoids |= {f"blur-{name}": frequency for name, frequency in BLUR_FREQUENCIES.items()}
+    computed: list[Pattern] = []
+    for prefix, frequency in sinusoids.items():
+        if few:
+            shown = _quarters(prefix, frequency, ONLY_STRENGTH.get(prefix, 2))
+            patterns += shown
+            computed += [_opposite(pattern, prefix, len(shown) + n) for n, pattern in enumerate(shown)]
+        else:
+            patterns += _steps(prefix, frequency, PHASE_STEPS if prefix.startswith("phase") else BLUR_STEPS)
     patterns += [Pattern(f"random-{n}", PatternKind.RANDOM, seed=n, coarse=True) for n in range(random_patterns)]
-    return PatternPlan(size_px, tuple(patterns))
+    return PatternPlan(size_px, tuple(patterns), tuple(computed), code)
 
 
-def _tile_patterns(size_px: tuple[int, int]) -> list[Pattern]:
+def _code_patterns(size_px: tuple[int, int], code: Code) -> list[Pattern]:
+    if code is Code.KNOWN:
+        return []
+    bits = [*_gray_bits("x", 0, size_px[0]), *_gray_bits("y", 1, size_px[1])]
+    if code is Code.GRAY:
+        return bits
+    places = [(pattern.axis, pattern.bit, pattern.bits) for pattern in bits]
+    pictures = [(*places[first : first + 3], None, None)[:3] for first in range(0, len(places), 3)]
+    return [
+        Pattern(f"gray-rgb-{n}", PatternKind.COLOUR_GRAY, coloured_bits=picture) for n, picture in enumerate(pictures)
+    ]
+
+
+def _tile_patterns(size_px: tuple[int, int], few: bool) -> list[Pattern]:
     across, down = cells_of_frame(size_px)
-    number = TILE_PATTERNS + (across * down < FEW_CELLS)
+    number = (FEWER_TILE_PATTERNS if few else TILE_PATTERNS) + (across * down < FEW_CELLS)
     tile_cells = 2 if across * down > MOST_TILES else 1
     return [Pattern(f"mosaic-{n}", PatternKind.COLOUR_TILES, tile_cells=tile_cells, seed=n) for n in range(number)]
 
@@ -192,6 +249,18 @@ def _steps(prefix: str, frequency: tuple[float, float], steps: int) -> list[Patt
     ]
 
 
+def _quarters(prefix: str, frequency: tuple[float, float], steps: int) -> list[Pattern]:
+    """Steps a quarter of a period apart: with their opposites, four steps of the whole period."""
+    return [
+        Pattern(f"{prefix}-{n}", PatternKind.SINUSOID, frequency=frequency, phase_rad=math.pi * n / 2)
+        for n in range(steps)
+    ]
+
+
+def _opposite(pattern: Pattern, prefix: str, number: int) -> Pattern:
+    return replace(pattern, name=f"{prefix}-{number}", phase_rad=pattern.phase_rad + math.pi, opposite=pattern.name)
+
+
 def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
     """The pattern as linear light.
 
@@ -210,6 +279,14 @@ def frame(pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
             line = _gray_line(pattern, (width, height)[pattern.axis])
             across = line[None, :] if pattern.axis == 0 else line[:, None]
             return np.broadcast_to(across, (height, width)).copy()
+        case PatternKind.COLOUR_GRAY:
+            image = np.zeros((height, width, 3), np.float32)
+            for channel, place in enumerate(pattern.coloured_bits):
+                if place is not None:
+                    axis, bit, bits = place
+                    one = Pattern("", PatternKind.GRAY, axis=axis, bit=bit, bits=bits)
+                    image[..., channel] = frame(one, size_px)
+            return image
         case PatternKind.SINUSOID:
             angle = 2 * np.pi * (pattern.frequency[0] * x + pattern.frequency[1] * y) - pattern.phase_rad
             return (0.5 + 0.5 * np.cos(angle)).astype(np.float32)

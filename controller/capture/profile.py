@@ -21,6 +21,10 @@ class CameraNoise:
     shot: float = 1 / 30_000
     read: float = 6 / 30_000
 
+    def per_second(self, exposure_s: float) -> CameraNoise:
+        """The same of values in full scales per second, from photographs of this exposure."""
+        return CameraNoise(self.shot / exposure_s, self.read / exposure_s)
+
 
 def _nothing_clips() -> Float64:
     return np.full((2, 2), np.inf)

@@ -118,6 +118,11 @@ class CalibrationTable(ConfigTable):
         description="the largest prediction error, in per cent, at which a calibration may be published, above 0, at "
         "most 1000; the default refuses grade C",
     )
+    photographs: Literal["full", "few", "fewest"] = Field(
+        default="full",
+        description='"full" (about 36 photographs a projector), "few" (about 20), or "fewest" (about 15 where nothing '
+        "has moved since the last calibration, else as few)",
+    )
     photograph_at_night: bool = Field(
         default=False,
         description="true or false: whether the kiosk photographs the appearances after a nightly recalibration",

@@ -24,7 +24,9 @@ KIND is the kind of the photographs, and the projector that was lit. In `index.j
 divided by its exposure is in full scales per second, the unit of all other light here.
 
 `gray-x-N` and `gray-y-N` are Gray code of cells 12 projector pixels wide, coarsest bit first. `phase-*` are sinusoids
-of 24 pixels in three steps; `blur-*` are finer ones. `mosaic-*` are coloured tiles. `random-*` pictures only check the
+of 24 pixels in three steps; `blur-*` are finer ones. With few photographs (`patterns-NAME.json`), `gray-rgb-N` hold
+three bits each, and sinusoids have two steps, a quarter of a period apart.
+`mosaic-*` are coloured tiles. `random-*` pictures only check the
 result.
 
 ## Calibration

@@ -23,6 +23,7 @@ from controller.artefacts.grade import (
     read_error_maps,
     read_grade_figures,
 )
+from controller.artefacts.modes import patterns_figures, told
 from controller.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.bundle.export import png
 from controller.calibrate.values import Calibration
@@ -70,7 +71,8 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
     _keep(run / RESOLUTION, fine)
     page = Page(
         title=f"{asked.stage}: calibration of {moment(run.name)}",
-        summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work.",
+        summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work. "
+        f"By projector: {told(run, asked.projectors)}.",
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
         tables=(_compared(run, figures, earlier[-COMPARED:], last),),
@@ -102,6 +104,7 @@ def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
     return {
         "run": run.name,
         "photographs": shots,
+        "patterns": {name: patterns_figures(run, name) for name in projectors},
         "seconds": sum(steps.values()),
         "geometry": {key: geometry.get(key) for key in ("reprojection_rms_px", "shape_rel_sigma", "inlier_share")},
         "metapixels": {name: None if one is None else one.fitted for name, one in pixels.items()},

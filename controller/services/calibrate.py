@@ -10,7 +10,7 @@ from typing import Any
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.grade import is_graded, passes
-from controller.artefacts.modes import DotOptions, dot_options
+from controller.artefacts.modes import DotOptions, PhotographOptions, dot_options, photographs_named, told
 from controller.bundle.install import current
 from controller.bundle.signing import Trust, load_signing_key
 from controller.core.errors import UsageError
@@ -61,19 +61,23 @@ def calibrate(
     cancel: threading.Event,
     mode: str = "fast",
     dot_spacing: str | None = None,
+    photographs: str | None = None,
     accept_grade: bool = False,
 ) -> Mapping[str, Any]:
     """Calibrate the stage, or continue an unfinished calibration; returns where the results are.
 
-    ``mode``, ``dot_spacing`` and their errors: see ``artefacts.modes.dot_options``.
+    ``mode``, ``dot_spacing`` and their errors: see ``artefacts.modes.dot_options``. ``photographs``: which set, instead
+    of stage.toml's; its error: see ``photographs_named``.
     """
     options = dot_options(mode, dot_spacing)
+    chosen = None if photographs is None else photographs_named(photographs)
     checked = check_stage(session.stage)
     prior = checked.prior
     last = next(iter(finished_calibrations(checked.stage.folder)), None)
+    taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
     run = session.run(
         checked,
-        lambda rig, run: calibrating(rig, run, checked=checked, options=options),
+        lambda rig, run: calibrating(rig, run, checked=checked, options=options, photographs=taking),
         name="calibrate",
         reporter=reporter,
         cancel=cancel,
@@ -81,19 +85,27 @@ def calibrate(
         before=lambda rig: device_checks(rig, prior),
     )
     tell_grade(checked, run, last, reporter, accept_grade=accept_grade)
-    return {"run": str(run), **grade_figures(run)}
+    return {"run": str(run), **grade_figures(run), "photographs": told(run, checked.names)}
 
 
 def calibrating(
-    rig: Rig, run: Path, *, checked: Checked, options: DotOptions | None = None, calibrated: Calibrated | None = None
+    rig: Rig,
+    run: Path,
+    *,
+    checked: Checked,
+    options: DotOptions | None = None,
+    photographs: PhotographOptions | None = None,
+    calibrated: Calibrated | None = None,
 ) -> Sequence[Step]:
     """The calibration's steps between their state markers; grading is the last.
 
+    ``photographs``: stage.toml's if omitted, without a calibration from before
     ``calibrated``: what reads the calibration of ``run``, where the caller needs it too.
     """
     longest_s = checked.stage.tables.capture.longest_exposure_s
     scale = costs.scale(projector.size_px for projector in rig.projectors)
-    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+    taking = photographs or PhotographOptions(checked.stage.tables.calibration.photographs)
+    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking),
              *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s)]  # fmt: skip
     return [
         marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),

@@ -12,7 +12,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.drift import read_drift_figures
 from controller.artefacts.grade import passes
 from controller.artefacts.kinds import CALIBRATED, StepKind
-from controller.artefacts.modes import MODES, CalibrationMode, DotOptions, mode_of
+from controller.artefacts.modes import MODES, CalibrationMode, DotOptions, PhotographOptions, mode_of, photographs_named
 from controller.core.errors import UsageError
 from controller.rig.ambient_light import dark_after
 from controller.rig.rig import Rig
@@ -65,14 +65,17 @@ def recalibrate(
     cancel: threading.Event,
     accept_grade: bool = False,
     projector: str | None = None,
+    photographs: str | None = None,
 ) -> Mapping[str, Any]:
     """Bring the last calibration up to date, repeating only what has changed; continues an unfinished run.
 
+    ``photographs``: which set of what is photographed again, instead of stage.toml's; its error: ``photographs_named``.
     ``projector``: measure only this one again, completely. The others get one photograph each, for the grade.
     Raises UsageError("not-calibrated", "projector-unknown"), CalibrationError("projector-dark"),
     CalibrationError("calibration-below-grade") for a result that may not replace the last calibration, and what the
     devices raise.
     """
+    chosen = None if photographs is None else photographs_named(photographs)
     checked = check_stage(session.stage)
     check_name(checked, projector)
     last = finished_calibration(checked.stage.folder)
@@ -81,7 +84,8 @@ def recalibrate(
     def steps(rig: Rig, run: Path) -> Sequence[Step]:
         longest_s = _longest_s(checked)
         mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
-        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s),
+        taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
+        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking),
                 *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
         repeated = (
             quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)

@@ -14,7 +14,7 @@ from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.phase_shift import FRINGE_PX
 from controller.capture.patterns import PatternPlan
 from controller.core.arrays import Float64, FloatImage
-from controller.core.channels import finite, smallest
+from controller.core.channels import smallest
 
 FINE: Final = ("blur-x", "blur-y")
 LEAST_CONTRAST: Final = 0.25
@@ -43,16 +43,14 @@ def colour_shifts(captures: Captures, plan: PatternPlan, white: FloatImage, mixi
     found = np.full((3, 2), np.nan)
     for axis, prefix in enumerate(FINE):
         steps = plan.sinusoids(prefix)
-        images = [coloured(captures, step.name, white.shape[:2]) - black for step in steps]
-        use = smallest(white) > FAINTEST * bright
-        use &= np.logical_and.reduce([finite(image) for image in images])
-        at = np.flatnonzero(use)
+        at = np.flatnonzero(smallest(white) > FAINTEST * bright)
         at = at[:: max(1, at.size // SOME_PIXELS)]
-        seen = sum(
-            (2 / len(steps)) * np.exp(-1j * step.phase_rad) * image.reshape(-1, 3)[at].astype(np.float64)
-            for step, image in zip(steps, images, strict=True)
-        )
-        own = np.linalg.solve(mixing, (2 * np.asarray(seen) / white.reshape(-1, 3)[at]).T).T
+        seen = np.zeros((at.size, 3), np.complex128)
+        for step in steps:
+            image = (coloured(captures, step.name, white.shape[:2]) - black).reshape(-1, 3)[at]
+            seen += (2 / len(steps)) * np.exp(-1j * step.phase_rad) * image
+        own = np.linalg.solve(mixing, (2 * seen / white.reshape(-1, 3)[at]).T).T
+        # what is not a number in one of the steps is left out, too
         own = own[(np.abs(own) > LEAST_CONTRAST).all(axis=1)]
         if len(own) >= FEWEST_PIXELS:
             turned = np.angle(own * np.conj(own[:, 1:2]))

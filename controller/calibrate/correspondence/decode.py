@@ -1,7 +1,8 @@
 """Gray code and sinusoids to correspondences: where on the projector's image each camera pixel looks.
 
 Gray-code cells of 12 px tell which period of the 24-px sinusoid a camera pixel is in, that sinusoid's phase which
-fringe of the fine ones, and these where in it. Photographs are asked for one at a time and added up at once.
+fringe of the fine ones, and these where in it. Photographs are asked for one at a time and added up at once. With few
+photographs, the code is in colours or a map from before stands for it (``patterns.Code``).
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, grey
-from controller.calibrate.correspondence.gray_code import decode_cells
+from controller.calibrate.correspondence.codes import read_code
+from controller.calibrate.correspondence.opposites import step_variance
 from controller.calibrate.correspondence.phase_shift import CODED, CONTRADICTED, FINE, WAVES, locate_pixel
 from controller.calibrate.correspondence.smoothing import correct_for_paint, fit_planes
 from controller.calibrate.values import Correspondence
 from controller.capture.patterns import BLUR_FREQUENCIES, CELL_PX, PERIOD_PX, PHASE_STEPS, PatternPlan
+from controller.capture.profile import CameraNoise
 from controller.core.arrays import FloatImage, Mask, array_in_file
 from controller.core.errors import CalibrationError
 from controller.core.jit import compiled
@@ -33,10 +36,13 @@ WORST_NOISE_PX = 0.6
 LEAST_CONSISTENT = 0.6
 LEAST_STEADY = 0.75
 LEAST_UNCONTRADICTED = 0.5
+WITHOUT_DIAGONAL = 0.7
+"""The same where no diagonal phase helps to contradict: by chance, a wrong fine phase fits the coarse one in 56 %."""
 BRIGHT_SHARE = 0.1
 BRIGHT_SIGMAS = 2.0
 """Of one photograph's noise; the mean over a neighbourhood has a sixth of it, so none is bright by chance."""
 NOISE_WINDOW = (7, 7)
+CHANNELS = 3
 FEWEST_PIXELS = 100
 FINE_TO_COARSE = (BLUR_FREQUENCIES["x"][0] * PERIOD_PX) ** -2
 """A Gaussian blur that lowers the fine contrast to M lowers the coarse one to M to the power of this."""
@@ -62,18 +68,22 @@ def decode(
     refine: bool = True,
     camera_blur_px: float = 0.0,
     scratch: Path | None = None,
+    known_px: FloatImage | None = None,
+    noise: CameraNoise | None = None,
 ) -> Correspondence:
     """Decode one projector's Gray-code and sinusoid captures.
 
     Parameters
     ----------
     captures : linear photographs by pattern name, (rows, columns) or (rows, columns, 3); needs ``black``, ``gray-*``,
-        ``phase-*`` and ``blur-*``; each is asked for once and not kept
+        ``phase-*`` and ``blur-*``; each is asked for once and not kept. A plan with few: ``completed``, with ``white``
     refine : replace each pixel by the plane through its neighbours on the same surface, and drop pixels that are
         not on it, such as those that see two surfaces at once
     camera_blur_px : standard deviation of the camera's own blur, camera px; where known, positions are freed of the
         pull towards the paler paint within a camera pixel's reach
     scratch : a folder on a disk, for the sums of a large camera (40 bytes a pixel), which then need not stay in memory
+    known_px : (rows, columns, 2) a map from before, for a plan without code; it may be off by 8 px
+    noise : of a camera sample, in the captures' unit, where the plan shows too few pictures to measure it
 
     Returns
     -------
@@ -86,19 +96,20 @@ def decode(
     CalibrationError("captures-inconsistent")  code and phases contradict each other: photographs in the wrong order
     """
     black = grey(captures, "black")
-    sums = _add_up(captures, plan, black.shape, scratch)
+    noise = noise or CameraNoise()
+    sums = _add_up(captures, plan, black.shape, scratch, noise)
     half = sums.mean - black
-    axes = tuple(decode_cells(captures, plan, axis, sums.mean, half) for axis in range(2))
+    sure, near = _near(captures, plan, sums.mean, half, known_px, noise)
     lit = _lit(sums, half)
     position = np.full((*black.shape, 2), np.nan, np.float32)
     modulation, state = np.zeros(black.shape, np.float32), np.zeros(black.shape, np.uint8)
     seen = lit | _bright(sums, half)
     # A dark pixel among bright ones can be as dark under the patterns as without them; its contrast has no meaning.
-    wanted = seen & axes[0].sure & axes[1].sure & (half > 0)
-    _locate(sums.waves, axes[0].cell, axes[1].cell, wanted, half, sums.noise, position, modulation, state)
-    _check_order(seen, lit, state, position)
+    wanted = seen & sure & (half > 0)
+    _locate(sums.waves, near[0], near[1], wanted, half, sums.noise, position, modulation, state)
+    _check_order(seen, lit, state, position, WITHOUT_DIAGONAL if plan.computed else LEAST_UNCONTRADICTED)
     valid = lit & ((state & CODED) > 0) & ((state & CONTRADICTED) == 0)
-    del sums, axes
+    del sums, near
     valid &= _inside(position, plan.size_px, 0.0)
     valid &= _inside(position, plan.size_px, frame_margin_px(modulation[valid]))
     as_seen = position
@@ -111,13 +122,34 @@ def decode(
     return Correspondence(position, np.where(valid, modulation, 0).astype(np.float32), valid, as_seen)
 
 
-def _add_up(captures: Captures, plan: PatternPlan, shape: tuple[int, ...], scratch: Path | None) -> _Sums:
+def _near(
+    captures: Captures,
+    plan: PatternPlan,
+    threshold: FloatImage,
+    half: FloatImage,
+    known_px: FloatImage | None,
+    noise: CameraNoise,
+) -> tuple[Mask, list[FloatImage]]:
+    """Where the code is sure, and x and y px near which the phases have to be."""
+    cells = list(read_code(captures, plan, threshold, half, known_px, noise))
+    sure: Mask = cells[0].sure & cells[1].sure
+    if known_px is not None:
+        return sure, [np.ascontiguousarray(known_px[..., axis], np.float32) for axis in range(2)]
+    # one after the other, so that a large camera's cells and their middles need not lie in memory together
+    return sure, [cells.pop(0).middle_px() for _ in range(2)]
+
+
+def _add_up(
+    captures: Captures, plan: PatternPlan, shape: tuple[int, ...], scratch: Path | None, camera: CameraNoise
+) -> _Sums:
     every = 2 * len(WAVES), *shape
     waves = np.zeros(every, np.float32) if scratch is None else array_in_file(scratch, every)
     waves.fill(0)
     first, total, square = (np.zeros(shape, np.float32) for _ in range(3))
     mean = np.zeros(shape, np.float32)
     for number, prefix in enumerate(WAVES):
+        if not plan.tells_phase(prefix):
+            continue
         light = np.zeros(shape, np.float32)
         steps = plan.sinusoids(prefix)
         for pattern in steps:
@@ -129,7 +161,11 @@ def _add_up(captures: Captures, plan: PatternPlan, shape: tuple[int, ...], scrat
         if number < 2:
             mean += light / 2
         # every sinusoid has the same mean: what differs is noise
-        _add_difference(light, first, total, square)
+        if not plan.computed:
+            _add_difference(light, first, total, square)
+    if plan.computed:
+        variance = CHANNELS * step_variance(np.asarray(mean / CHANNELS, np.float32), camera)
+        return _Sums(waves, mean, np.asarray(np.sqrt(variance), np.float32))
     count = len(WAVES)
     variance = np.maximum(square - total * total / count, 0) * np.float32(PHASE_STEPS / (count - 1))
     noise = np.sqrt(np.maximum(cv2.boxFilter(variance, -1, NOISE_WINDOW), 0))
@@ -168,8 +204,8 @@ def _add_difference(light: FloatImage, first: FloatImage, total: FloatImage, squ
 @compiled(parallel=True)
 def _locate(
     waves: FloatImage,
-    cell_x: npt.NDArray[np.int32],
-    cell_y: npt.NDArray[np.int32],
+    near_x: FloatImage,
+    near_y: FloatImage,
     wanted: Mask,
     half: FloatImage,
     noise: FloatImage,
@@ -183,8 +219,8 @@ def _locate(
         for column in range(columns):
             if not wanted[row, column]:
                 continue
-            x, y, light = cell_x[row, column], cell_y[row, column], half[row, column]
-            found = locate_pixel(waves, row, column, x, y, float(CELL_PX), light, noise[row, column], work)
+            x, y, light = near_x[row, column], near_y[row, column], half[row, column]
+            found = locate_pixel(waves, row, column, x, y, light, noise[row, column], work)
             state[row, column] = found
             position[row, column, 0], position[row, column, 1] = work[0, 0], work[0, 1]
             fine = _contrast(waves, 4, row, column) / light
@@ -234,7 +270,9 @@ def _brightest(image: FloatImage) -> float:
     return float(np.percentile(finite[:: max(1, finite.size // 100_000)], 99)) if finite.size else 0.0
 
 
-def _check_order(seen: Mask, lit: Mask, state: npt.NDArray[np.uint8], position: FloatImage) -> None:
+def _check_order(
+    seen: Mask, lit: Mask, state: npt.NDArray[np.uint8], position: FloatImage, least_uncontradicted: float
+) -> None:
     """Refuse captures that contradict each other: code against phase, fine phases against coarse, jumping codes."""
     pixels = int(np.count_nonzero(seen))
     if pixels < FEWEST_PIXELS:
@@ -244,7 +282,7 @@ def _check_order(seen: Mask, lit: Mask, state: npt.NDArray[np.uint8], position: 
     contradicted = int(np.count_nonzero(agreeing & ((state & CONTRADICTED) > 0)))
     share, uncontradicted = agree / pixels, 1 - contradicted / max(agree, 1)
     steady = min(_steady_share(position[:, :, axis], agreeing) for axis in range(2))
-    if share < LEAST_CONSISTENT or steady < LEAST_STEADY or uncontradicted < LEAST_UNCONTRADICTED:
+    if share < LEAST_CONSISTENT or steady < LEAST_STEADY or uncontradicted < least_uncontradicted:
         raise CalibrationError(
             "captures-inconsistent",
             what=f"The patterns do not agree: Gray code and phase match on {100 * share:.0f} % of the lit pixels, "

@@ -1,4 +1,4 @@
-"""Gray code to cells: which cell of the projector's frame each camera pixel looks at."""
+"""Codes to cells: which cell of the projector's frame each camera pixel looks at."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, grey
-from controller.capture.patterns import PatternPlan
+from controller.capture.patterns import CELL_PX, PatternPlan
 from controller.core.arrays import FloatImage, Mask
 from controller.core.jit import compiled
 
@@ -32,6 +32,21 @@ class Cells:
     def sure(self) -> Mask:
         """Where the cell is right or one off."""
         return np.asarray(self.weak <= 1)
+
+    def middle_px(self) -> FloatImage:
+        """(rows, columns) float32: the middle of the cell, projector px."""
+        middle = self.cell.astype(np.float32)
+        middle *= CELL_PX
+        middle += (CELL_PX - 1) / 2
+        return middle
+
+
+def known_cells(known_px: FloatImage) -> tuple[Cells, Cells]:
+    """The cells of x and y of a map from before: (rows, columns, 2), NaN where it tells nothing."""
+    weak = np.where(np.isfinite(known_px).all(axis=2), 0, 2).astype(np.uint8)
+    with np.errstate(invalid="ignore"):
+        cell = np.floor((np.nan_to_num(known_px) + 0.5) / CELL_PX).astype(np.int32)
+    return tuple(Cells(np.ascontiguousarray(cell[..., axis]), weak) for axis in range(2))  # type: ignore[return-value]
 
 
 def decode_cells(captures: Captures, plan: PatternPlan, axis: int, threshold: FloatImage, half: FloatImage) -> Cells:

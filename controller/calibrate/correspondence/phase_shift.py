@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from controller.capture.patterns import BLUR_FREQUENCIES, PERIOD_PX
+from controller.capture.patterns import BLUR_FREQUENCIES, CELL_PX, PERIOD_PX
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
 
@@ -35,7 +35,8 @@ LEAST_FINE_CONTRAST = 0.05
 SURE_BY = 9.0
 """Squared standard deviations by which the best fringes must be better than the second best."""
 WORST_FIT = 16.0
-CELL_SLACK_PX = 2.0
+CODE_REACH_PX = CELL_PX / 2 + 2.0
+"""Of the coarse phase's position from the middle of the cell that the code tells, or from a map from before."""
 PHASE_NOISE = float(np.sqrt(2 / 3))
 """Of a three-step phase, in radians, for noise of one amplitude."""
 
@@ -111,15 +112,14 @@ def _combine(
 
 
 @compiled()
-def _coarse_of(within: float, cell: int, cell_px: float) -> tuple[float, bool]:
-    middle = cell * cell_px + (cell_px - 1) / 2
-    position = _nearest(within, float(PERIOD_PX), middle)
-    return position, abs(position - middle) <= cell_px / 2 + CELL_SLACK_PX
+def _coarse_of(within: float, near_px: float) -> tuple[float, bool]:
+    position = _nearest(within, float(PERIOD_PX), near_px)
+    return position, abs(position - near_px) <= CODE_REACH_PX
 
 
 @compiled()
 def locate_pixel(
-    waves: FloatImage, row: int, column: int, cell_x: int, cell_y: int, cell_px: float, half: float, sigma: float,
+    waves: FloatImage, row: int, column: int, near_x: float, near_y: float, half: float, sigma: float,
     work: npt.NDArray[np.float64],
 ) -> int:  # fmt: skip
     """Position of one camera pixel into ``work[0]``, x and y px; its state is returned.
@@ -127,7 +127,7 @@ def locate_pixel(
     Parameters
     ----------
     waves : (10, rows, columns) cosine and sine amplitude of each of ``WAVES`` in turn
-    cell_x, cell_y : Gray-code cell; ``cell_px`` its size
+    near_x, near_y : px, the middle of the Gray code's cell, or what a map from before tells
     half : half the white's light; ``sigma`` noise of one photograph, same unit
     work : (5, 3) float64 scratch
     """
@@ -138,9 +138,7 @@ def locate_pixel(
         amplitude = np.sqrt(a * a + b * b)
         if not amplitude > 0:  # a dark pixel, the same value in every photograph
             return DARK
-        coarse[axis], near = _coarse_of(
-            np.arctan2(b, a) * (PERIOD_PX / (2 * np.pi)), cell_x if axis == 0 else cell_y, cell_px
-        )
+        coarse[axis], near = _coarse_of(np.arctan2(b, a) * (PERIOD_PX / (2 * np.pi)), near_x if axis == 0 else near_y)
         agree = agree and near
         spread[axis] = PHASE_NOISE * sigma / amplitude * (PERIOD_PX / (2 * np.pi))
         best[axis] = coarse[axis]

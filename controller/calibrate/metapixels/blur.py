@@ -33,7 +33,7 @@ def measure_blur(captures: Captures, plan: PatternPlan, correspondence: Correspo
 
     Parameters
     ----------
-    captures : needs ``black``, ``phase-*`` and ``blur-*``; linear, in one unit
+    captures : needs ``black``, ``phase-*`` and ``blur-*``, ``completed``; linear, in one unit
     correspondence : of the same projector
 
     Returns
@@ -97,9 +97,11 @@ def _contrast(
     images = [grey(captures, pattern.name, black.shape) for pattern in steps]
     # a wave of which a step is missing would have another contrast
     whole = np.where(np.isfinite(sum(images, -black)), cells, np.int32(-1))
+    alone = not plan.tells_phase(prefix)
     for pattern, image in zip(steps, images, strict=True):
-        _add_step(image, black, position, whole, along, pattern.phase_rad, wave, light)
-    # n pictures of W/2 (1 + M cos) each: the light adds up to n W/2, the wave to n W M/4
+        _add_step(image, black, position, whole, along, pattern.phase_rad, alone, wave, light)
+    # n pictures of W/2 (1 + M cos) each: the light adds up to n W/2, the wave to n W M/4; one step and its opposite
+    # have a wave of W M cos^2, and light that is weighted by the same square adds up to 2 W cos^2
     size = (NEIGHBOURHOOD, NEIGHBOURHOOD)
     around = [cv2.boxFilter(sums.reshape(height, width), -1, size, normalize=False) for sums in (wave, light)]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -114,6 +116,7 @@ def _add_step(
     cells: npt.NDArray[np.int32],
     frequency: Float64,
     phase_rad: float,
+    alone: bool,
     wave: Float64,
     light: Float64,
 ) -> None:
@@ -124,8 +127,9 @@ def _add_step(
             value = image[row, column] - black[row, column]
             if cell >= 0:
                 along = frequency[0] * position[row, column, 0] + frequency[1] * position[row, column, 1]
-                wave[cell] += value * np.cos(2 * np.pi * along - phase_rad)
-                light[cell] += value
+                cosine = np.cos(2 * np.pi * along - phase_rad)
+                wave[cell] += value * cosine
+                light[cell] += value * (2 * cosine * cosine if alone else 1.0)
 
 
 def _covariance(fine: FloatImage, coarse: FloatImage) -> tuple[FloatImage, Mask]:

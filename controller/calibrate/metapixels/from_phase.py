@@ -24,7 +24,7 @@ def fit_metapixels(captures: Captures, plan: PatternPlan, correspondence: Corres
 
     Parameters
     ----------
-    captures : needs ``black``, ``phase-*`` and ``blur-*``; linear photographs in one unit
+    captures : needs ``black``, ``phase-*`` and ``blur-*``; linear photographs in one unit, ``completed``
     correspondence : what ``decode`` made of the same captures
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
@@ -69,7 +69,7 @@ def fit_pixels(captures: Captures, plan: PatternPlan, correspondence: Correspond
 
 
 def _white(captures: Captures, plan: PatternPlan) -> FloatImage:
-    """Twice the mean of a sinusoid's three steps, less black: (rows, columns)."""
+    """Twice the mean of a sinusoid's steps, less black: (rows, columns)."""
     black = grey(captures, "black")
     steps = [grey(captures, pattern.name, black.shape) for pattern in plan.sinusoids("blur-x")]
     return np.asarray(sum(steps, -len(steps) * black) * np.float32(2 / len(steps)), np.float32)

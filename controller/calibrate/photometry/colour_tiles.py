@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, coloured
-from controller.calibrate.correspondence.gray_code import decode_cells
+from controller.calibrate.correspondence.codes import read_code
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternKind, PatternPlan, cells_of_frame, tile_levels
+from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage, Mask
 
 LIT_SHARE = 0.05
@@ -69,21 +70,24 @@ def measure_tiles(
     white: FloatImage,
     *,
     indirect: KnownIndirect | None = None,
+    known_px: FloatImage | None = None,
+    noise: CameraNoise | None = None,
 ) -> TileMeasurements:
-    """Find the tiles by the Gray code and measure each.
+    """Find the tiles by the code and measure each.
 
     Parameters
     ----------
     captures : needs ``gray-*`` and ``mosaic-*``
     black, white : (rows, columns, 3) linear light of black, and of white above black; NaN where not known
     indirect : is taken away from tiles and white
+    known_px, noise : as for ``decode``
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
     tiles_patterns = plan.of_kind(PatternKind.COLOUR_TILES)
     side = tiles_patterns[0].tile_cells
     half = np.asarray(white.sum(axis=2) / 2, np.float32)
-    axes = [decode_cells(captures, plan, axis, black.sum(axis=2) + half, half) for axis in range(2)]
+    axes = read_code(captures, plan, black.sum(axis=2) + half, half, known_px, noise or CameraNoise())
     across, down = cells_of_frame(plan.size_px)
     tile = (axes[1].cell // side) * -(-across // side) + axes[0].cell // side
     framed = (axes[0].cell < across) & (axes[1].cell < down)

@@ -16,7 +16,8 @@ from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.photometry.colour_tiles import KnownIndirect, TileMeasurements, measure_tiles
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternPlan
-from controller.core.arrays import Float64
+from controller.capture.profile import CameraNoise
+from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 
 FEWEST_TILES = 60
@@ -70,7 +71,12 @@ class RadiometryReport:
 
 
 def measure_radiometry(
-    captures: Captures, plan: PatternPlan, *, indirect: KnownIndirect | None = None
+    captures: Captures,
+    plan: PatternPlan,
+    *,
+    indirect: KnownIndirect | None = None,
+    known_px: FloatImage | None = None,
+    noise: CameraNoise | None = None,
 ) -> tuple[Radiometry, RadiometryReport]:
     """Response and mixing of one projector.
 
@@ -78,6 +84,7 @@ def measure_radiometry(
     ----------
     captures : linear RGB photographs in one unit: ``black white``, ``gray-*`` and ``mosaic-*``; NaN where saturated
     indirect : what is known of it by an earlier measurement; the response is then fitted to direct light alone
+    known_px, noise : as for ``decode``
 
     Returns
     -------
@@ -92,7 +99,7 @@ def measure_radiometry(
     """
     black = coloured(captures, "black")
     white = coloured(captures, "white", black.shape[:2]) - black
-    tiles = measure_tiles(captures, plan, black, white, indirect=indirect)
+    tiles = measure_tiles(captures, plan, black, white, indirect=indirect, known_px=known_px, noise=noise)
     if tiles.ratio.shape[0] < FEWEST_TILES:
         raise CalibrationError(
             "projector-dark",

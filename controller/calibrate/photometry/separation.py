@@ -7,6 +7,7 @@ sinusoids, which lose the same share by indirect light but far more by blur, tel
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,8 +17,10 @@ import numpy as np
 
 from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.decode import FINE_TO_COARSE
+from controller.calibrate.correspondence.opposites import step_variance
 from controller.calibrate.values import Radiometry
-from controller.capture.patterns import PHASE_STEPS, PatternPlan
+from controller.capture.patterns import PHASE_STEPS, Pattern, PatternPlan
+from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.channels import every, finite
 from controller.core.jit import compiled
@@ -57,21 +60,24 @@ def indirect_share(
     position_px: FloatImage,
     *,
     linearity: Float64 | None = None,
+    noise: CameraNoise | None = None,
 ) -> FloatImage:
     """The share (rows, columns, 3) of a projector's white that is indirect, 0 to 1.
 
     Parameters
     ----------
-    captures : linear photographs in one unit; needs ``black``, ``phase-*``, ``blur-x-*`` and ``blur-y-*``
+    captures : linear photographs in one unit, ``completed``; needs ``black``, ``phase-*``, ``blur-x-*``, ``blur-y-*``
     white : (rows, columns, 3) less the black image, NaN where not known
     position_px : (rows, columns, 2) where the camera pixels look in the projector's image, NaN where not known
     linearity : (3,) contrast that sinusoids truly had, see ``shown_contrast``; 1 if omitted
+    noise : of a camera sample, in the captures' unit, where the plan shows too few pictures to measure it
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
     black = coloured(captures, "black", white.shape[:2])
-    coarse = _measured(captures, plan, COARSE, black, white)
-    fine = _measured(captures, plan, FINE, black, white)
+    noise = noise or CameraNoise()
+    coarse = _measured(captures, plan, COARSE, black, white, noise)
+    fine = _measured(captures, plan, FINE, black, white, noise)
     full = np.ones(3) if linearity is None else linearity
     with np.errstate(invalid="ignore", divide="ignore"):
         s = coarse.contrast / full.astype(np.float32)
@@ -117,19 +123,28 @@ def indirect_figures(share: FloatImage, white: FloatImage) -> tuple[float, float
 
 
 def _measured(
-    captures: Captures, plan: PatternPlan, prefixes: tuple[str, ...], black: FloatImage, white: FloatImage
+    captures: Captures,
+    plan: PatternPlan,
+    prefixes: tuple[str, ...],
+    black: FloatImage,
+    white: FloatImage,
+    camera: CameraNoise,
 ) -> Sinusoids:
     """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise."""
     product = np.ones_like(white)
     noise = np.zeros_like(white)
     for prefix in prefixes:
         steps = plan.sinusoids(prefix)
-        images = [coloured(captures, step.name, black.shape[:2]) - black for step in steps]
-        images = [image * np.float32(gain) for image, gain in zip(images, _gains(images, white), strict=True)]
-        weights = [np.float32(2 / len(steps)) * np.exp(-1j * step.phase_rad) for step in steps]
-        along, across = (sum(float(part(w)) * i for w, i in zip(weights, images, strict=True)) for part in (_re, _im))
-        residual = np.nan_to_num(sum(images) - np.float32(len(steps) / 2) * white)
-        variance = cv2.boxFilter(residual * residual, -1, NOISE_WINDOW) / np.float32(len(steps))
+        images = (coloured(captures, step.name, black.shape[:2]) - black for step in steps)
+        if plan.computed:  # of one strength already, and adding up to white: none has to be kept
+            along, across = _amplitude(images, steps)
+            variance = step_variance(np.nan_to_num(white / 2 + black), camera)
+        else:
+            kept = list(images)
+            kept = [image * np.float32(gain) for image, gain in zip(kept, _gains(kept, white), strict=True)]
+            along, across = _amplitude(kept, steps)
+            residual = np.nan_to_num(sum(kept) - np.float32(len(steps) / 2) * white)
+            variance = cv2.boxFilter(residual * residual, -1, NOISE_WINDOW) / np.float32(len(steps))
         product *= np.maximum(along * along + across * across - np.float32(4 / PHASE_STEPS) * variance, 0)
         noise += variance / np.float32(len(prefixes))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -138,12 +153,14 @@ def _measured(
     return Sinusoids(np.asarray(contrast, np.float32), np.asarray(sigma, np.float32))
 
 
-def _re(value: complex) -> float:
-    return value.real
-
-
-def _im(value: complex) -> float:
-    return value.imag
+def _amplitude(images: Iterable[FloatImage], steps: Sequence[Pattern]) -> tuple[FloatImage, FloatImage]:
+    """Cosine and sine part of a sinusoid's steps."""
+    along: FloatImage | float = 0.0
+    across: FloatImage | float = 0.0
+    for image, step in zip(images, steps, strict=True):
+        along = along + np.float32(2 / len(steps) * np.cos(step.phase_rad)) * image
+        across = across - np.float32(2 / len(steps) * np.sin(step.phase_rad)) * image
+    return np.asarray(along, np.float32), np.asarray(across, np.float32)
 
 
 def _gains(images: list[FloatImage], white: FloatImage) -> Float64:

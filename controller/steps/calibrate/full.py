@@ -11,15 +11,16 @@ import numpy as np
 from controller.artefacts.calibration import merge_photographs, read_black, read_captures, read_correspondence
 from controller.artefacts.geometry import write_geometry
 from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.photographs import Developed, light_of, white_bracket
+from controller.artefacts.modes import PhotographOptions, PlanUsed
+from controller.artefacts.photographs import Developed, light_of, noise_of, white_bracket
 from controller.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
 from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned
 from controller.calibrate.correspondence.decode import decode
+from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.geometry.self_calibration import reconstruct
 from controller.calibrate.geometry.values import CameraPrior
 from controller.calibrate.metapixels.from_phase import fit_pixels
 from controller.calibrate.photometry.radiometry import measure_radiometry, white_segment
-from controller.capture.patterns import PatternPlan, plan_patterns
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig, RigProjector
@@ -32,14 +33,16 @@ from controller.steps.capture.camera import camera_step
 from controller.steps.capture.patterns import capture_steps, code_step
 
 
-def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float) -> list[Step]:
+def calibration_steps(
+    rig: Rig, prior: CameraPrior, *, longest_exposure_s: float, options: PhotographOptions | None = None
+) -> list[Step]:
     """All steps from the first photograph to metapixels and geometry."""
-    steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
+    steps = capture_steps(rig, longest_exposure_s=longest_exposure_s, options=options)
     steps.append(camera_step(rig))
     names = [projector.name for projector in rig.projectors]
     for projector in rig.projectors:
         steps.append(_radiometry_step(projector))
-        steps.append(code_step(rig, projector))
+        steps.append(code_step(rig, projector, options))
         steps.append(_pixels_step(projector))
         steps.append(indirect_step(projector))
     steps.append(
@@ -56,10 +59,9 @@ def calibration_steps(rig: Rig, prior: CameraPrior, *, longest_exposure_s: float
 
 
 def _radiometry_step(projector: RigProjector) -> Step:
-    plan = plan_patterns(projector.size_px)
     return Step(
         StepId(StepKind.RADIOMETRY, projector.name),
-        lambda context: _radiometry(projector, plan, context),
+        lambda context: _radiometry(projector, context),
         after=(StepId(StepKind.BLACK), StepId(StepKind.LIGHT, projector.name), StepId(StepKind.CAMERA)),
         title=f"Measuring the response of {projector.name}",
         weight=costs.RADIOMETRY_S * costs.scale([projector.size_px]),
@@ -67,24 +69,29 @@ def _radiometry_step(projector: RigProjector) -> Step:
 
 
 def _pixels_step(projector: RigProjector) -> Step:
-    plan = plan_patterns(projector.size_px)
     return Step(
         StepId(StepKind.PIXELS, projector.name),
-        lambda context: _pixels(projector, plan, context),
+        lambda context: _pixels(projector, context),
         after=(StepId(StepKind.BLACK), *of_projectors([projector.name], StepKind.RADIOMETRY, StepKind.CODES)),
         title=f"Decoding {projector.name} and fitting its metapixels",
         weight=costs.PIXELS_S * costs.scale([projector.size_px]),
     )
 
 
-def _radiometry(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
+    used = PlanUsed.read(context.folder, projector.name)
     black = read_black(context.folder)
     taken = light_of(projector.name).by_name(context.folder)
     bracket = white_bracket(list(taken.values()))
     white = merge_photographs(bracket)
     context.advance(0.5)
     captures = Developed(taken, {"black": black, "white": white})
-    radiometry, report = measure_radiometry(captures, plan)
+    radiometry, report = measure_radiometry(
+        captures,
+        used.plan(projector.size_px),
+        known_px=used.known_px(context.folder, projector.name),
+        noise=noise_of(bracket[0]),
+    )
     if radiometry.segment:
         context.reporter.say(white_segment(projector.name, radiometry.segment), Level.WARNING)
     matrix = bracket[0].read().camera_to_xyz
@@ -104,15 +111,25 @@ _SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.
 """IEC 61966-2-1; for a camera without its own colour matrix."""
 
 
-def _pixels(projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
+def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     light = Light.read(context.folder, projector.name)
+    used = PlanUsed.read(context.folder, projector.name)
+    plan = used.plan(projector.size_px)
     taken = read_captures(context.folder, projector.name)
-    captures = Developed(taken, {"black": light.black, "white": light.white + light.black})
+    ready = {"black": light.black, "white": light.white + light.black}
+    captures = completed(Developed(taken, ready), plan)
     shifts = colour_shifts(captures, plan, light.white, light.mixing)
     if (said := misaligned(projector.name, shifts)) is not None:
         context.reporter.say(said, Level.WARNING)
     blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5)
-    correspondence = decode(captures, plan, camera_blur_px=blur_px, scratch=context.folder)
+    correspondence = decode(
+        captures,
+        plan,
+        camera_blur_px=blur_px,
+        scratch=context.folder,
+        known_px=used.known_px(context.folder, projector.name),
+        noise=noise_of(taken[plan.sinusoids("phase-x")[0].name]),
+    )
     if not correspondence.valid.any():
         raise CalibrationError(
             "projector-reaches-nothing",

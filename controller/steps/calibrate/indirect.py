@@ -10,12 +10,13 @@ import numpy as np
 
 from controller.artefacts.calibration import read_captures
 from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.photographs import Developed
+from controller.artefacts.modes import PlanUsed
+from controller.artefacts.photographs import Developed, noise_of
 from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
+from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.photometry.separation import indirect_figures, indirect_share, shown_contrast
-from controller.capture.patterns import plan_patterns
 from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -40,15 +41,26 @@ def indirect_step(projector: RigProjector) -> Step:
 
 
 def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
-    folder, name, plan = context.folder, projector.name, plan_patterns(projector.size_px)
+    folder, name = context.folder, projector.name
+    used = PlanUsed.read(folder, name)
+    plan = used.plan(projector.size_px)
     light, pixels = Light.read(folder, name), Pixels.read(folder, name)
-    captures = Developed(read_captures(folder, name), {"black": light.black, "white": light.white + light.black})
+    taken = read_captures(folder, name)
+    captures = completed(Developed(taken, {"black": light.black, "white": light.white + light.black}), plan)
+    noise = noise_of(taken[plan.sinusoids("phase-x")[0].name])
+    known_px = used.known_px(folder, name)
     radiometry = light.radiometry
     for number in range(PASSES):
         context.advance(number / PASSES)
         contrast = shown_contrast(radiometry, light.response)
-        share = indirect_share(captures, plan, light.white, pixels.projector_px, linearity=contrast)
-        radiometry, _ = measure_radiometry(captures, plan, indirect=KnownIndirect(share * light.white, radiometry))
+        share = indirect_share(captures, plan, light.white, pixels.projector_px, linearity=contrast, noise=noise)
+        radiometry, _ = measure_radiometry(
+            captures,
+            plan,
+            indirect=KnownIndirect(share * light.white, radiometry),
+            known_px=known_px,
+            noise=noise,
+        )
     median, p95 = indirect_figures(share, light.white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     figures = IndirectFigures(median, p95, tuple(float(value) for value in change))

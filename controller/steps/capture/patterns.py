@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from controller.artefacts.camera import Exposures
 from controller.artefacts.kinds import StepKind
+from controller.artefacts.modes import PhotographOptions
 from controller.artefacts.names import CAPTURES
-from controller.artefacts.photographs import BLACK, WHITE, codes_of, light_of, white_name
+from controller.artefacts.photographs import BLACK, WHITE, codes_of
 from controller.artefacts.projectors import Light
 from controller.capture.acquire import Shot
 from controller.capture.brackets import choose_brackets, choose_exposure
 from controller.capture.jpeg_response import nominal_response
 from controller.capture.latency import LONGEST_S
-from controller.capture.patterns import CELL_PX, Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
+from controller.capture.patterns import CELL_PX, Pattern, PatternPlan, device_frame, plan_patterns
 from controller.capture.raw import read_photograph
-from controller.core.arrays import ByteImage, Float64
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig, RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
 from controller.steps.capture.camera import delay_step, response_steps
+from controller.steps.capture.light import before_response, expected_plan, named, photograph_light, planned_pattern
 from controller.steps.capture.photographs import Planned, take_all
 
 FIRST_EXPOSURE_S = 1 / 30
@@ -36,15 +37,10 @@ BLACK_BRACKET = (8.0, 32.0)
 """Exposures of the HDR black image, relative to the one at which white is well exposed."""
 
 
-def plans_of(rig: Rig) -> dict[str, PatternPlan]:
-    """The pattern plan of each projector by name."""
-    return {projector.name: plan_patterns(projector.size_px) for projector in rig.projectors}
-
-
-def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
+def capture_steps(rig: Rig, *, longest_exposure_s: float, options: PhotographOptions | None = None) -> list[Step]:
     """All capture steps except the sinusoids, which need the radiometry (see ``code_step``)."""
+    options = options or PhotographOptions()
     inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
-    plans = plans_of(rig)
     a_shot_s = _shot_s(rig)
     steps = [
         Step(
@@ -65,28 +61,33 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
             weight=3 * a_shot_s,
         ),
     ]
+    # with few photographs, the first ones say which others are needed
+    after = [StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY)]
+    after += [StepId(StepKind.BLACK)] if options.inputs() else []
     for projector in rig.projectors:
-        plan = plans[projector.name]
+        plan = expected_plan(projector.size_px, options)
         steps.append(
             Step(
                 StepId(StepKind.LIGHT, projector.name),
-                partial(_photograph_light, rig, projector, plan),
-                inputs={**inputs, "patterns": _patterns(plan)},
-                after=(StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY)),
+                partial(photograph_light, rig, projector, options),
+                inputs={**inputs, "patterns": _patterns(plan), **options.inputs()},
+                after=tuple(after),
                 title=f"Photographing the light of {projector.name}",
-                weight=a_shot_s * (WHITE_EXPOSURES + len(_before_response(plan))),
+                weight=a_shot_s * (WHITE_EXPOSURES + len(before_response(plan))),
             )
         )
     return steps
 
 
-def code_step(rig: Rig, projector: RigProjector) -> Step:
+def code_step(rig: Rig, projector: RigProjector, options: PhotographOptions | None = None) -> Step:
     """The step that photographs the sinusoids and the random pattern, after the radiometry."""
-    plan = plan_patterns(projector.size_px)
+    options = options or PhotographOptions()
+    plan = expected_plan(projector.size_px, options)
+    # the code is photographed before, so the sinusoids are the same whichever it was
     coded = [pattern for pattern in plan if pattern.needs_response]
     return Step(
         StepId(StepKind.CODES, projector.name),
-        lambda context: _photograph_codes(rig, projector, plan, coded, context),
+        lambda context: _photograph_codes(rig, projector, coded, context),
         inputs={"sizes": _sizes(rig), "patterns": _patterns(plan)},
         after=(StepId(StepKind.EXPOSURE), StepId(StepKind.RADIOMETRY, projector.name)),
         title=f"Photographing the patterns of {projector.name}",
@@ -114,7 +115,7 @@ def _find_exposures(rig: Rig, context: Context, longest_s: float) -> Sequence[Pa
 
 def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> Exposures:
     """Photograph white until it is well exposed. These test photographs are not journalled."""
-    white = device_frame(_named(plan_patterns(projector.size_px), WHITE), projector.size_px)
+    white = device_frame(named(plan_patterns(projector.size_px), WHITE), projector.size_px)
     available = [value for value in rig.acquirer.exposures_s() if value <= longest_s]
     exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_s)[0]
     for number in range(EXPOSURE_TRIES):
@@ -147,41 +148,11 @@ def _photograph_black(rig: Rig, context: Context, longest_s: float) -> Sequence[
     return take_all(rig, context, plan, into=BLACK)
 
 
-def _photograph_light(rig: Rig, projector: RigProjector, plan: PatternPlan, context: Context) -> Sequence[Path]:
-    exposures = Exposures.read(context.folder)[projector.name]
-    planned = [
-        _planned(projector, _named(plan, WHITE), exposure_s, None, name=white_name(number))
-        for number, exposure_s in enumerate(exposures.white_s)
-    ]
-    planned += [_planned(projector, pattern, exposures.base_s, None) for pattern in _before_response(plan)]
-    return take_all(rig, context, planned, into=light_of(projector.name))
-
-
-def _before_response(plan: PatternPlan) -> tuple[Pattern, ...]:
-    """Patterns for the response: the Gray code finds the mosaics' tiles."""
-    return plan.of_kind(PatternKind.GRAY) + plan.of_kind(PatternKind.COLOUR_TILES)
-
-
-def _photograph_codes(
-    rig: Rig, projector: RigProjector, plan: PatternPlan, coded: Sequence[Pattern], context: Context
-) -> Sequence[Path]:
+def _photograph_codes(rig: Rig, projector: RigProjector, coded: Sequence[Pattern], context: Context) -> Sequence[Path]:
     response = Light.read(context.folder, projector.name).response
     base_s = Exposures.read(context.folder)[projector.name].base_s
-    planned = [_planned(projector, pattern, base_s, response) for pattern in coded]
+    planned = [planned_pattern(projector, pattern, base_s, response) for pattern in coded]
     return take_all(rig, context, planned, into=codes_of(projector.name))
-
-
-def _planned(
-    projector: RigProjector, pattern: Pattern, exposure_s: float, response: Float64 | None, *, name: str = ""
-) -> Planned:
-    def frames() -> Mapping[str, ByteImage]:
-        return {projector.name: device_frame(pattern, projector.size_px, response)}
-
-    return Planned(name or pattern.name, frames, exposure_s)
-
-
-def _named(plan: PatternPlan, name: str) -> Pattern:
-    return next(pattern for pattern in plan if pattern.name == name)
 
 
 def _patterns(plan: PatternPlan) -> str:
@@ -193,4 +164,4 @@ def _sizes(rig: Rig) -> str:
     return " ".join(f"{p.name}:{p.output}:{p.size_px[0]}x{p.size_px[1]}" for p in rig.projectors)
 
 
-__all__ = ["bracket", "capture_steps", "code_step", "plans_of"]
+__all__ = ["bracket", "capture_steps", "code_step"]

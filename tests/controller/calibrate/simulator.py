@@ -43,6 +43,12 @@ class Scene:
     gamma: float = 2.2
     seed: int = 1
     noisy: bool = True
+    flicker: float = 0.0
+    """Standard deviation of the lamp's strength from one photograph to the next."""
+    indirect: float = 0.0
+    """Share of white that comes by way of other surfaces: of the mean of the whole picture."""
+    no_blue: float = 0.0
+    """Share of the camera's width, from the left, where the paint throws back hardly any blue."""
     mixing: tuple[tuple[float, float, float], ...] = ((0.88, 0.10, 0.02), (0.08, 0.85, 0.07), (0.01, 0.12, 0.87))
 
     def projector_of(self, camera: Float64) -> Float64:
@@ -114,6 +120,7 @@ class Stage:
             self.random.uniform(0.5, 1.0, (rows // 10 + 1, columns // 10 + 1, 3)).repeat(10 * s, 0).repeat(10 * s, 1)
         )
         self._albedo = (smooth * patches[: rows * s, : columns * s]).astype(np.float32)
+        self._albedo[:, : round(scene.no_blue * columns * s), 2] *= np.float32(0.004)
 
     def light(self, linear: FloatImage) -> FloatImage:
         """Noiseless camera image of a linear frame (rows, columns, 3), without the black level."""
@@ -136,7 +143,14 @@ class Stage:
         linear = np.stack([scene.response()[c][device[:, :, c]] for c in range(3)], axis=-1).astype(np.float32)
         # a white segment of the colour wheel shows what the three colours have in common once more
         linear += np.float32(scene.white_segment) * (linear.min(axis=-1, keepdims=True) - linear)
-        image = self.light(0.002 + 0.998 * linear) + 0.003
+        shown = 0.002 + 0.998 * linear
+        if scene.indirect:
+            around = np.broadcast_to(shown.mean(axis=(0, 1)), shown.shape).astype(np.float32)
+            shown += np.float32(scene.indirect) * (around - shown)
+        image = self.light(shown)
+        if scene.flicker:
+            image *= np.float32(1 + scene.flicker * self.random.standard_normal())
+        image = image + 0.003
         if scene.noisy:
             electrons = np.maximum(image, 0) * scene.electrons
             noise = np.sqrt(electrons + scene.read_electrons**2) * self.random.standard_normal(image.shape)
@@ -146,9 +160,9 @@ class Stage:
     def plan(self) -> PatternPlan:
         return plan_patterns(self.scene.projector_px)
 
-    def captures(self) -> dict[str, FloatImage]:
+    def captures(self, plan: PatternPlan | None = None) -> dict[str, FloatImage]:
         """A photograph of every pattern of the plan, encoded with the true response."""
-        plan = self.plan()
+        plan = plan or self.plan()
         response = self.scene.response()
         return {p.name: self.photograph(device_frame(p, plan.size_px, response)) for p in plan}
 
