@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -108,7 +109,20 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         figures[part.name] = _figures(found, why) | _indirect_figures(context.folder, part.name)
         maps[part.name] = ErrorMaps(found.error_map, why.labels)
         pictures.append(attribution_picture(why, calibration, part.name))
-    return write_grade(context.folder, figures, maps, png(np.concatenate(pictures, axis=0)))
+    return write_grade(context.folder, figures, maps, png(_in_rows(pictures)))
+
+
+ACROSS: Final = 3
+"""Pictures in a row: a screen is wider than high."""
+
+
+def _in_rows(pictures: Sequence[ByteImage]) -> ByteImage:
+    """Pictures of one size (rows, columns, 3) beside and below each other, the rest of the last row black."""
+    across = min(ACROSS, len(pictures))
+    missing = -len(pictures) % across
+    filled = [*pictures, *[np.zeros_like(pictures[0])] * missing]
+    rows = [np.concatenate(filled[n : n + across], axis=1) for n in range(0, len(filled), across)]
+    return np.concatenate(rows, axis=0)
 
 
 def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
