@@ -280,8 +280,21 @@ class StageKiosk(FolderKiosk):
         picture = self.fitted(target, fit)
         kept = self.stage / "appearances" / f"{name}.png"
         with service.reconciler.idle():
+            entry = {"name": name, "kind": "picture", "file": str(kept.relative_to(self.stage))}
+            settings.add_appearance(self.stage, entry)
             write_atomically(kept, picture)
-            settings.add_picture(self.stage, name, kept)
+            return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
+
+    def compute_scene(self, name: str, scene: str) -> Job:
+        from controller.blender.run import find_blender
+        from controller.kiosk.api.scenes import entry
+
+        service = self.service
+        settings.check_name(name)
+        added = entry(self.stage, name, scene)
+        find_blender()
+        with service.reconciler.idle():
+            settings.add_appearance(self.stage, added)
             return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def appearances(self) -> Sequence[Appearance]:

@@ -19,7 +19,7 @@ from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
-from controller.kiosk.interface import LiveValue, Schedule, ScheduleRow
+from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -93,7 +93,7 @@ class TestStageKiosk(Contract):
 
     def test_each_projector_names_the_output_that_feeds_it(self, stage: Real) -> None:
         (projector,) = (row for row in stage.kiosk.snapshot().devices if row.kind == "projector")
-        assert (projector.name, LiveValue("Output", "P1") in projector.values) == ("left", True)
+        assert (projector.name, projector.output) == ("left", "P1")
 
     def test_hours_that_close_the_show_say_so_before_they_are_saved(self, stage: Real) -> None:
         stage.kiosk.service.reconciler.step()
