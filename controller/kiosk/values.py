@@ -220,8 +220,8 @@ class EventRow:
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """A solved appearance; ``preview`` is a PNG of how the object will look, or None. ``delta_e``: the newest of its
-    ``Comparison``, None if it was never photographed. ``outputs``: the projectors whose light can be shown;
+    """A solved appearance; ``preview`` is a picture of how the object will look, or None. ``delta_e``: the newest of
+    its ``Comparison``, None if it was never photographed. ``outputs``: the projectors whose light can be shown;
     ``source``: the kind of its target in stage.toml, empty if it is not there.
     """
 

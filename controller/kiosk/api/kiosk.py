@@ -232,23 +232,33 @@ class StageKiosk(FolderKiosk):
         service.bundles.check_name(name)
         service.reconciler.choose(name, fade_s)
         service.reconciler.open()
+        service.hurry()
 
     def rotate(self) -> None:
         service = self.service
         service.reconciler.choose(IN_TURN)
         service.reconciler.open()
+        service.hurry()
 
     def next(self, fade_s: float | None = None) -> None:
-        self.service.reconciler.next(fade_s)
+        service = self.service
+        service.reconciler.next(fade_s)
+        service.hurry()
 
     def black(self, on: bool, fade_s: float | None = None) -> None:
-        self.service.reconciler.black(on, fade_s)
+        service = self.service
+        service.reconciler.black(on, fade_s)
+        service.hurry()
 
     def pause(self, on: bool) -> None:
-        self.service.reconciler.pause(on)
+        service = self.service
+        service.reconciler.pause(on)
+        service.hurry()
 
     def brightness(self, percent: float) -> None:
-        self.service.reconciler.brighten(percent / 100)
+        service = self.service
+        service.reconciler.brighten(percent / 100)
+        service.hurry()
 
     def stop(self) -> None:
         self.service.reconciler.shut()

@@ -15,6 +15,7 @@ from controller.bundle.export import png
 from controller.bundle.install import current, install
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.doctor.values import Examination
+from controller.kiosk import service as service_module
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.hours import WEEKDAYS
@@ -28,6 +29,7 @@ from tests.controller.kiosk import contract
 from tests.controller.kiosk.contract import OTHER, PLAYING, RUN, Contract
 from tests.controller.kiosk.vase import graded_run, vase
 from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.waiting import wait_for
 
 test_every_operation_of_a_kiosk_is_in_the_contract = contract.test_every_operation_of_a_kiosk_is_in_the_contract
 
@@ -103,6 +105,20 @@ class TestStageKiosk(Contract):
         told = stage.kiosk.effect_of_schedule(Schedule("UTC", rows))
         assert told.startswith("The stage closes at once")
         assert stage.kiosk.schedule().rows == ()
+
+    def test_what_a_person_asks_for_waits_for_no_step(self, stage: Real, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(service_module, "STEP_S", 60.0)
+        service, cancel = stage.kiosk.service, threading.Event()
+        thread = threading.Thread(target=service.run, args=(cancel,))
+        thread.start()
+        try:
+            for name in (OTHER, PLAYING, OTHER):
+                stage.kiosk.play(name)
+                wait_for(lambda name=name: (want := service.player.want) is not None and want.appearance == name)
+        finally:
+            cancel.set()
+            service.hurry()
+            thread.join()
 
     def test_a_closed_stage_that_computes_says_so(self, stage: Real) -> None:
         kiosk, service = stage.kiosk, stage.kiosk.service
