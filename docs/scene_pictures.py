@@ -17,6 +17,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.geometry import read_geometry
 from controller.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.blender.run import find_blender, render
+from controller.core.arrays import ByteImage, Mask
 from controller.kiosk.api.scenes import SHIPPED
 from controller.solve.targets.files import read_picture
 from controller.solve.targets.values import linear_to_srgb
@@ -41,12 +42,13 @@ def main(run: Path) -> None:
         )
 
 
-def _framed(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _framed(picture: ByteImage, mask: Mask) -> ByteImage:
     """The object in the middle of a picture of 3:2, on black."""
     rows, columns = np.nonzero(mask)
     top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
     scale = min(0.94 * WIDE / (right - left), 0.94 * HIGH / (bottom - top))
-    cut = cv2.resize(picture[top:bottom, left:right], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    part = picture[top:bottom, left:right]
+    cut = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     framed = np.zeros((HIGH, WIDE, 3), np.uint8)
     y, x = (HIGH - cut.shape[0]) // 2, (WIDE - cut.shape[1]) // 2
     framed[y : y + cut.shape[0], x : x + cut.shape[1]] = cut
