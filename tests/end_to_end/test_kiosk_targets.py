@@ -211,7 +211,8 @@ def test_a_scene_is_looked_at_on_the_object_before_it_is_computed(kiosk: StageKi
     seen = load_arrays(kiosk.stage / "kiosk" / "scenes" / "scene-paint.blend.npz")
     rows, columns = seen["mask"].shape
     # The paint is 0.02 where the object's shape is not known.
-    known = cv2.resize(np.float32(paint.mean(axis=2) > 0.05), (columns, rows), interpolation=cv2.INTER_AREA) > 0.99
+    painted = (paint.mean(axis=2) > 0.05).astype(np.float32)
+    known = np.asarray(cv2.resize(painted, (columns, rows), interpolation=cv2.INTER_AREA)) > 0.99
     paint = cv2.resize(paint.mean(axis=2), (columns, rows), interpolation=cv2.INTER_AREA)
     # Without its edge, where samples of the object and of the room are mixed.
     inside = known & (cv2.erode(seen["mask"].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)

@@ -137,7 +137,11 @@ class Entrance:
         try:
             if panel.by_address.wait_s(address) > 0:
                 raise UsageError("too-many-tries", what="Too many wrong passwords.", remedy="Wait a minute.")
-            known = partial(anyio.to_thread.run_sync, panel.accounts.verify, visitor.name, limiter=panel.hashing)
+
+            async def known(password: str) -> Account | None:
+                verify = partial(panel.accounts.verify, visitor.name, password)
+                return await anyio.to_thread.run_sync(verify, limiter=panel.hashing)
+
             # Who entered with a one-time password typed it a moment ago, and can do nothing but this.
             if not visitor.must_change_password and await known(old) is None:
                 panel.by_address.failed(address)

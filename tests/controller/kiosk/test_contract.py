@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,10 @@ def install_two(stage: Path) -> None:
     install(stage / "made.vel", stage / "bundles", trusted=(), allow_unsigned=True)
 
 
+def is_wanted(service: Service, name: str) -> bool:
+    return service.player.want is not None and service.player.want.appearance == name
+
+
 def endless(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
     cancel.wait(60)
     return Finished(request, Decision("cancelled", "It was cancelled."), failed=True)
@@ -114,7 +119,7 @@ class TestStageKiosk(Contract):
         try:
             for name in (OTHER, PLAYING, OTHER):
                 stage.kiosk.play(name)
-                wait_for(lambda name=name: (want := service.player.want) is not None and want.appearance == name)
+                wait_for(partial(is_wanted, service, name))
         finally:
             cancel.set()
             service.hurry()

@@ -89,7 +89,7 @@ def test_what_the_devices_say_is_known() -> None:
         for call in ast.walk(ast.parse(file.read_text())):
             if isinstance(call, ast.Call) and ast.unparse(call.func) == "LiveValue.said":
                 label, pattern = call.args[:2]
-                said |= {pattern.value} if isinstance(pattern, ast.Constant) else set()
+                said |= {str(pattern.value)} if isinstance(pattern, ast.Constant) else set()
                 assert not isinstance(label, ast.Constant) or label.value in spoken.LABELS
     assert said <= set(spoken.VALUES)
     assert {"{0} pictures", "{0} h"} < said
