@@ -68,10 +68,10 @@ def photograph(browser: Browser, address: str, name: str, target: Path) -> None:
         page.goto("/aiming")
         save(page, "panel-aiming")
     with looked_at(browser, address, name, dark=False) as page:
-        page.goto("/appearances")
-        save(page, "panel-appearances", 1000)
         page.goto("/appearances/new")
         page.set_input_files("#file", target)
+        expect(page.locator(".way canvas").first).to_be_visible()
+        save(page, "panel-new", 1120)
         page.get_by_role("button", name="Upload").click()
         expect(page.locator(".headline")).to_be_visible()
         save(page, "panel-reach", 1300)

@@ -54,12 +54,14 @@ def write_job(
     builtin: str | None,
     scene_file: Path | None,
     settings: RenderSettings,
+    view: Pinhole | None = None,
 ) -> None:
     """Write ``job.json`` and ``mesh.npz`` into ``folder``.
 
     Parameters
     ----------
     mask : (camera rows, columns), the object
+    view : the camera of the picture; by default the calibrated one, whose picture a quick look needs only small
     light : (camera rows, columns, 3), what the camera sees under the white of all projectors; from it and the known
         places of the projectors comes the object's own paint
 
@@ -88,14 +90,14 @@ def write_job(
             "reflectance": np.tile(paint, (2, 1)),
         },
     )
-    margin = margin_px(geometry.camera)
+    view = geometry.camera if view is None else view
+    margin, matrix = margin_px(view), view.matrix
     distance = mesh.vertices_m[:, 2]
-    matrix = geometry.camera.matrix
     job = {
         "builtin": builtin,
         "scene_file": None if scene_file is None else str(scene_file.resolve()),
         "camera": {
-            "size_px": (columns + 2 * margin, rows + 2 * margin),
+            "size_px": (view.size_px[0] + 2 * margin, view.size_px[1] + 2 * margin),
             "fx": float(matrix[0, 0]),
             "fy": float(matrix[1, 1]),
             "cx": float(matrix[0, 2]) + margin,

@@ -41,6 +41,7 @@ from controller.kiosk.values import (
     Reach,
     RecalibrationKind,
     Results,
+    Scene,
     Schedule,
     ScheduleRow,
     Sharpness,
@@ -117,6 +118,21 @@ class Kiosk(Protocol):
     def reach(self, target: Path) -> Reach:
         """How much of the target can be made, and what the object will look like. Seconds. Raises UsageError without
         a calibration.
+        """
+
+    def scenes(self) -> Sequence[Scene]:
+        """What Blender can render on the object: the scenes of Velatura, and those of the stage."""
+
+    def scene_reach(self, scene: str) -> Reach:
+        """As ``reach``, of a quick rendering of the scene. Tens of seconds at the first time.
+
+        Raises UsageError("scene-unknown", "blender-missing", "not-calibrated"), WorkError("blender-failed").
+        """
+
+    def compute_scene(self, name: str, scene: str) -> Job:
+        """Start to render the scene and to solve for it, as the appearance ``name``; each calibration renders it again.
+
+        Raises UsageError("scene-unknown", "blender-missing", "appearance-other").
         """
 
     def appearances(self) -> Sequence[Appearance]: ...
@@ -257,6 +273,7 @@ __all__ = [
     "Reach",
     "RecalibrationKind",
     "Results",
+    "Scene",
     "Schedule",
     "ScheduleRow",
     "Sharpness",

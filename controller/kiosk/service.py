@@ -125,6 +125,11 @@ class Service:
         self._threads: list[Thread] = []
         self.keys = self._keys_supervisor()
         self._known_runs: tuple[float, bool] = (0.0, False)
+        self._asked, self._decided = self._world.event(), self._world.event()
+
+    def hurry(self) -> None:
+        """Decide now, and let the player follow: a person waits for what was asked."""
+        self._asked.set()
 
     def start(self) -> None:
         """Start; the player first, so that it shows pictures before any device has answered."""
@@ -136,7 +141,7 @@ class Service:
             self.log.add(self.problem)
         self._go_on()
         self.reconciler.step()
-        self._thread("player", self.player.step, STEP_S)
+        self._thread("player", self.player.step, STEP_S, sooner=self._decided)
         self._thread("bundles", self.bundle_watch.step, LOOK_S)
         self._thread("disk", self.disk.step, DISK_S)
         self._thread("alerts", self.alerts.step, LOOK_S)
@@ -154,6 +159,8 @@ class Service:
     def run(self, cancel: threading.Event) -> None:
         """Decide, over and over, until ``cancel``."""
         while not cancel.is_set():
+            hurried = self._asked.is_set()
+            self._asked.clear()
             try:
                 self._decide()
             except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
@@ -162,8 +169,10 @@ class Service:
                 self.log.add(Decision("crash", what, "Export the diagnostics.", "error"))
                 cancel.wait(AFTER_CRASH_S)
                 continue
+            if hurried:
+                self._decided.set()
             self.alive()
-            cancel.wait(STEP_S)
+            self._asked.wait(STEP_S)
 
     def _decide(self) -> None:
         self.reconciler.step()
@@ -282,7 +291,10 @@ class Service:
             self.log.add(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
                                    "Switch it off with its remote control.", "error"))  # fmt: skip
 
-    def _thread(self, name: str, step: Callable[[], None], every_s: float, *, first_s: float = 0.0) -> None:
+    def _thread(
+        self, name: str, step: Callable[[], None], every_s: float, *, first_s: float = 0.0,
+        sooner: threading.Event | None = None,
+    ) -> None:  # fmt: skip
         def loop() -> None:
             self._stop.wait(first_s)
             while not self._stop.is_set():
@@ -292,7 +304,9 @@ class Service:
                     what = f"{name} met an unexpected error ({type(error).__name__}: {error})."
                     self.log.add(Decision("crash", what, "Export the diagnostics.", "error"))
                     self._stop.wait(AFTER_CRASH_S)
-                self._stop.wait(every_s)
+                (sooner or self._stop).wait(every_s)
+                if sooner is not None:
+                    sooner.clear()
 
         thread = self._world.thread(loop, name)
         self._threads.append(thread)

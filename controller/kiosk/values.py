@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 RecalibrationKind = Literal["full", "quick"]
 Fit = Literal["fit", "fill", "crop", "wrap"]
@@ -18,10 +18,23 @@ Unsubscribe = Callable[[], None]
 
 @dataclass(frozen=True, slots=True)
 class LiveValue:
-    """One value of a device as text: label "Lamp", text "1,204 h"."""
+    """One value of a device as text: label "Lamp", text "1,204 h".
+
+    ``pattern``: the text with a place for each of ``numbers``, "{0} h", so that a page can say it in another language;
+    empty for a name. ``digits`` after the point.
+    """
 
     label: str
     text: str
+    pattern: str = ""
+    numbers: tuple[float, ...] = ()
+    digits: int = 0
+
+    @classmethod
+    def said(cls, label: str, pattern: str, *numbers: float, digits: int = 0) -> Self:
+        """Of words and numbers, which are rounded, so that a value that reads the same is the same."""
+        kept = tuple(round(float(one), digits) for one in numbers)
+        return cls(label, pattern.format(*(f"{one:,.{digits}f}" for one in kept)), pattern, kept, digits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +42,7 @@ class DeviceRow:
     """One device. ``kind`` is "projector", "camera", "display", "relay", "sensor" or "buttons"; ``problem`` a
     sentence or None.
 
-    ``remedy`` says what to do about the problem, or is empty.
+    ``remedy`` says what to do about the problem, or is empty; ``output``: of the graphics card, that feeds a projector.
     """
 
     name: str
@@ -38,6 +51,7 @@ class DeviceRow:
     values: tuple[LiveValue, ...] = ()
     problem: str | None = None
     remedy: str = ""
+    output: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,8 +221,8 @@ class EventRow:
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """A solved appearance; ``preview`` is a PNG of how the object will look, or None. ``delta_e``: the newest of its
-    ``Comparison``, None if it was never photographed. ``outputs``: the projectors whose light can be shown;
+    """A solved appearance; ``preview`` is a picture of how the object will look, or None. ``delta_e``: the newest of
+    its ``Comparison``, None if it was never photographed. ``outputs``: the projectors whose light can be shown;
     ``source``: the kind of its target in stage.toml, empty if it is not there.
     """
 
@@ -235,6 +249,17 @@ class Reach:
     too_colourful: float
     pictures: dict[str, Path] = field(default_factory=dict)
     coarse: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A scene that Blender can render on the object: its ``name``; ``shipped`` with Velatura, or a .blend file of the
+    stage; ``preview``: a small picture of it, None until it was looked at once.
+    """
+
+    name: str
+    shipped: bool
+    preview: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)

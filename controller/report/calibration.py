@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import tzinfo
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,7 +36,7 @@ from controller.report import plots
 from controller.report.light import light_gallery, whites
 from controller.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.report.pictures import Crop, crop_around, fitted, to_screen
-from controller.report.words import moment, spent
+from controller.report.words import When, moment, spent
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 
@@ -45,11 +47,15 @@ LONGEST_PX: Final = 960
 
 @dataclass(frozen=True, slots=True)
 class StageDescription:
-    """What stage.toml says: the stage's name, its projectors in order, and the largest error in per cent."""
+    """What stage.toml says: the stage's name, its projectors in order, and the largest error in per cent.
+
+    ``zone`` of the times in the report; None: the computer's.
+    """
 
     stage: str
     projectors: tuple[str, ...]
     worst_grade: float
+    zone: tzinfo | None = None
 
 
 def write_calibration_report(run: Path, asked: StageDescription, out: Path | None = None) -> Path:
@@ -69,19 +75,20 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
     _keep(run / BEFORE, before)
     fine = plots.field(_cut(resolution, crop), "camera pixels, smaller is finer", least=0)
     _keep(run / RESOLUTION, fine)
+    when = partial(moment, zone=asked.zone)
     page = Page(
-        title=f"{asked.stage}: calibration of {moment(run.name)}",
+        title=f"{asked.stage}: calibration of {when(run.name)}",
         summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work. "
         f"By projector: {told(run, asked.projectors)}.",
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
-        tables=(_compared(run, figures, earlier[-COMPARED:], last),),
+        tables=(_compared(run, figures, earlier[-COMPARED:], last, when),),
         galleries=(
             ("Maps", "Cropped to the object; dark where nothing is known.",
              (ReportPicture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
             *_blamed(run, figures),
             *light_gallery(calibration, crop),
-            ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures)),
+            ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures, when)),
         ),
         steps=spent(_steps(run)),
     )  # fmt: skip
@@ -168,7 +175,9 @@ def _goals(run: Path, figures: Mapping[str, Any], limit: float) -> tuple[Goal, .
     )
 
 
-def _compared(run: Path, now: Mapping[str, Any], runs: Sequence[Path], last: Sequence[Mapping[str, Any]]) -> PageTable:
+def _compared(
+    run: Path, now: Mapping[str, Any], runs: Sequence[Path], last: Sequence[Mapping[str, Any]], when: When
+) -> PageTable:
     """This calibration beside the last ones, newest first."""
     both = [now, *reversed(last)]
 
@@ -187,7 +196,7 @@ def _compared(run: Path, now: Mapping[str, Any], runs: Sequence[Path], last: Seq
     rows.append(row("reprojection", lambda one: one["geometry"]["reprojection_rms_px"], "{:.3f} px"))
     rows.append(row("photographs", lambda one: one["photographs"], "{}"))
     rows.append(row("work", lambda one: one["seconds"], "{:.0f} s"))
-    header = ("", f"{moment(run.name)} (this one)", *(moment(one.name) for one in reversed(runs)))
+    header = ("", f"{when(run.name)} (this one)", *(when(one.name) for one in reversed(runs)))
     title = "Compared with the last calibrations" if runs else "This is the first calibration"
     return PageTable(title, header, tuple(rows))
 
@@ -238,7 +247,7 @@ def _blamed(run: Path, figures: Mapping[str, Any]) -> tuple[tuple[str, str, tupl
 
 
 def _plots(
-    run: Path, calibration: Calibration, earlier: Sequence[Path], limit: float, figures: Mapping[str, Any]
+    run: Path, calibration: Calibration, earlier: Sequence[Path], limit: float, figures: Mapping[str, Any], when: When
 ) -> tuple[ReportPicture, ...]:
     runs = [*earlier, run]
     grades = [graded(one) or {} for one in runs]
@@ -251,7 +260,7 @@ def _plots(
     }
     return (
         ReportPicture(
-            "Error over the calibrations", plots.history(errors, [moment(one.name) for one in runs], limit), large=True
+            "Error over the calibrations", plots.history(errors, [when(one.name) for one in runs], limit), large=True
         ),
         ReportPicture("Response", plots.responses({p.name: p.radiometry.response for p in calibration.projectors})),
         ReportPicture("Sizes of metapixels", plots.sizes(widths), large=True),

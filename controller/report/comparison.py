@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime, tzinfo
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -31,7 +31,7 @@ from controller.report.page import (
     write_report,
 )
 from controller.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
-from controller.report.words import moment, spent
+from controller.report.words import When, moment, spent
 from controller.run.journal import Journal
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -98,8 +98,10 @@ def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]
     return paths
 
 
-def write_comparison_report(run: Path, stage_name: str, out: Path | None = None) -> Path:
+def write_comparison_report(run: Path, stage_name: str, out: Path | None = None, zone: tzinfo | None = None) -> Path:
     """Write report.html and report.json of a finished run into ``out`` (else its folder); the page's path.
+
+    ``zone`` of the times in it; None: the computer's.
 
     Raises UsageError("run-not-compared").
     """
@@ -112,14 +114,15 @@ def write_comparison_report(run: Path, stage_name: str, out: Path | None = None)
     with Journal(run) as journal:
         steps, shots = journal.steps(), journal.shot_count()
     figures = _figures(run, found, steps, shots)
+    when = partial(moment, zone=zone)
     page = Page(
         title=f"{stage_name}: what {len(found)} appearance{'s' * (len(found) > 1)} achieve{'s' * (len(found) == 1)}",
-        summary=f"{figures['photographs']} photographs of {moment(run.name)}, compared with the targets that were"
-        f" solved on the calibration of {moment(found[0].calibration)}.",
+        summary=f"{figures['photographs']} photographs of {when(run.name)}, compared with the targets that were"
+        f" solved on the calibration of {when(found[0].calibration)}.",
         goals=_goals(found, before),
-        rows=tuple(_row(run, one) for one in found),
-        tables=(_beside(run.name, found, earlier[-COMPARED:], before[-COMPARED:]),),
-        galleries=_course(run.name, found, earlier, before),
+        rows=tuple(_row(run, one, zone) for one in found),
+        tables=(_beside(run.name, found, earlier[-COMPARED:], before[-COMPARED:], when),),
+        galleries=_course(run.name, found, earlier, before, when),
         steps=spent(steps),
     )
     html, _ = write_report(out or run, page, figures)
@@ -156,13 +159,15 @@ def _change(found: Sequence[Compared], before: Sequence[dict[str, Compared]]) ->
     return f"{change:+.2f}", "", None, f"median colour difference, {title}"
 
 
-def _row(run: Path, one: Compared) -> PictureRow:
+def _row(run: Path, one: Compared, zone: tzinfo | None) -> PictureRow:
     known = [(label, form.format(value(one))) for label, value, form in _FIGURES]
     if one.reachable_share is not None:
         known.append(("within reach", f"{100 * one.reachable_share:.1f} % of the object"))
     known.extend(judged_rows({"pixels": one.pixels, "ghosting": one.ghosting, "adapted": one.adapted}))
     known.extend(refined_row(one.refined))
-    known.append(("photographed", time.strftime(MOMENT, time.localtime(one.photographed_unix_s))))
+    known.append(
+        ("photographed", datetime.fromtimestamp(one.photographed_unix_s, UTC).astimezone(zone).strftime(MOMENT))
+    )
     pictures = []
     for kind, caption, note in _SHOWN:
         path = picture_path(run, one.name, kind)
@@ -177,7 +182,7 @@ def _rgb(image: Any) -> ByteImage:
 
 
 def _beside(
-    name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]]
+    name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]], when: When
 ) -> PageTable:
     """This run beside the last ones, newest first."""
     runs = [*reversed(before)]
@@ -185,7 +190,7 @@ def _beside(
         (one.title, *(_short(each[one.name]) if one.name in each else "" for each in ({one.name: one}, *runs)))
         for one in found
     ]
-    header = ("", f"{moment(name)} (this one)", *(moment(folder.name) for folder in reversed(earlier)))
+    header = ("", f"{when(name)} (this one)", *(when(folder.name) for folder in reversed(earlier)))
     comparison = "compared with earlier runs" if earlier else "first run"
     return PageTable(f"Colour difference, median and 95 %, and sharpness: {comparison}", header, tuple(rows))
 
@@ -195,14 +200,14 @@ def _short(one: Compared) -> str:
 
 
 def _course(
-    name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]]
+    name: str, found: Sequence[Compared], earlier: Sequence[Path], before: Sequence[dict[str, Compared]], when: When
 ) -> tuple[tuple[str, str, tuple[ReportPicture, ...]], ...]:
     if not earlier:
         return ()
     held = [*before, {one.name: one for one in found}]
     medians = {one.title: [each[one.name].delta_e00_median if one.name in each else float("nan") for each in held]
                for one in found}  # fmt: skip
-    runs = [*(moment(folder.name) for folder in earlier), moment(name)]
+    runs = [*(when(folder.name) for folder in earlier), when(name)]
     label = "median colour difference, CIEDE2000"
     drawn = plots.history(medians, runs, GOAL_DELTA_E, label=label, unit="")
     return (("How it went", "", (ReportPicture("History", drawn, large=True),)),)

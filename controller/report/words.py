@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from datetime import datetime, tzinfo
 from typing import Final
 
 from controller.artefacts.kinds import StepKind as Kind
@@ -41,12 +41,19 @@ def spent(steps: Mapping[StepId, float]) -> tuple[tuple[str, float], ...]:
     return tuple((text, seconds) for text, seconds in sums.items() if seconds >= LEAST_S)
 
 
-def moment(run: str) -> str:
-    """When a run began, "24 Nov 2026, 14:54" of "20261124-145431-demo"; any other name stays as it is."""
+When = Callable[[str], str]
+"""``moment`` in the zone of a stage."""
+
+
+def moment(run: str, zone: tzinfo | None = None) -> str:
+    """When a run began, "24 Nov 2026, 14:54" of "20261124-145431-demo"; any other name stays as it is.
+
+    The name has the computer's own time, and ``zone`` is that of the answer; None: the computer's.
+    """
     if not re.match(r"[0-9]{8}-[0-9]{6}-", run):
         return run
     try:
-        began = time.strptime(run[:15], "%Y%m%d-%H%M%S")
-    except ValueError:
+        began = datetime.strptime(run[:15], "%Y%m%d-%H%M%S").astimezone(zone)
+    except (ValueError, OverflowError):
         return run
-    return f"{began.tm_mday} {time.strftime('%b %Y, %H:%M', began)}"
+    return f"{began.day} {began:%b %Y, %H:%M}"

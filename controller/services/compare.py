@@ -22,6 +22,7 @@ from controller.run.runner import Step
 from controller.stage.calibrations import finished_calibrations, stage_trust
 from controller.stage.check import Checked, check_stage
 from controller.stage.session import StageSession
+from controller.stage.time_zone import time_zone
 from controller.steps.appearance.compare import compare_steps
 
 
@@ -97,4 +98,4 @@ def installed(checked: Checked, names: Sequence[str], reporter: Reporter) -> Ins
 
 def comparison_report(run: Path, checked: Checked, out: Path | None = None) -> Path:
     """As ``write_comparison_report``, for a run of this stage."""
-    return write_comparison_report(run, checked.stage.tables.stage.name, out)
+    return write_comparison_report(run, checked.stage.tables.stage.name, out, time_zone(checked))

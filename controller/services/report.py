@@ -11,6 +11,7 @@ from controller.core.errors import UsageError
 from controller.report.calibration import StageDescription, graded_runs, write_calibration_report
 from controller.stage.calibrations import worst_grade
 from controller.stage.check import Checked, check_stage
+from controller.stage.time_zone import time_zone
 
 
 def report_of(where: Path, out: Path | None) -> Mapping[str, str]:
@@ -35,7 +36,7 @@ def report_of(where: Path, out: Path | None) -> Mapping[str, str]:
 
 def calibration_report(run: Path, checked: Checked, out: Path | None = None) -> Path:
     """As ``write_calibration_report``, for a run of this stage."""
-    asked = StageDescription(checked.stage.tables.stage.name, checked.names, worst_grade(checked))
+    asked = StageDescription(checked.stage.tables.stage.name, checked.names, worst_grade(checked), time_zone(checked))
     return write_calibration_report(run, asked, out)
 
 

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from playwright.sync_api import expect
 
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.geometry import read_geometry
 from controller.artefacts.solved import read_solved
+from controller.blender.job import own_paint
+from controller.blender.run import find_blender
+from controller.core.arrays import load_arrays
+from controller.core.errors import UsageError
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.interface import Job
 from controller.kiosk.service import Service
@@ -20,11 +29,15 @@ from controller.panel.uploads import Targets, UploadLimits
 from controller.solve.targets.values import srgb_to_linear
 from controller.stage.calibrations import finished_calibration
 from controller.stage.check import check_stage
+from tests.controller.blender.test_render import PAINT_SCENE
+from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
+from tests.controller.panel.served import served
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied, wait_for
 from tests.end_to_end.test_targets import CAMERA_PX, grey_png
 
 pytestmark = pytest.mark.timeout(1500)
+LONG_MS = 800_000
 HEAD = "\n[[appearances]]"
 
 
@@ -64,6 +77,67 @@ def ended(kiosk: StageKiosk, job: Job) -> Job:
     found = kiosk.job(job.number)
     assert found is not None
     return found
+
+
+@contextmanager
+def moved(kiosk: StageKiosk) -> Iterator[None]:
+    """A thread moves its service, as that of ``velatura serve`` does."""
+    over = threading.Event()
+
+    def move() -> None:
+        while not over.wait(0.05):
+            kiosk.service.reconciler.step()
+            kiosk.service.changed()
+
+    thread = threading.Thread(target=move)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
+def test_in_a_browser_an_upload_is_fitted_and_judged_and_a_bad_appearance_stays_in_sight(
+    kiosk: StageKiosk, tmp_path: Path
+) -> None:
+    (tmp_path / "phone.png").write_bytes(grey_png(300, 100))
+    (kiosk.stage / "small.png").write_bytes(grey_png(77, 52))
+    with (kiosk.stage / "stage.toml").open("a") as toml:
+        toml.write(f'{HEAD}\nname = "small"\nkind = "picture"\nfile = "small.png"\n')
+    with (
+        moved(kiosk),
+        served(kiosk, tmp_path / "private") as panel,
+        chromium() as browser,
+        tab(browser, panel.address) as page,
+    ):
+        page.set_default_timeout(LONG_MS)
+        enter(page, "otto")
+        page.goto("/appearances/new")
+        page.get_by_text("fill the view").click()
+        page.set_input_files("#file", tmp_path / "phone.png")
+        page.get_by_role("button", name="Upload").click()
+        expect(page.locator(".headline")).to_be_visible(timeout=LONG_MS)
+        found = kiosk.reach(panel.app.state.panel.targets.path(page.url.rpartition("/")[2]))
+        assert page.locator(".headline b").inner_text() == f"{100 * found.share:.0f} %"
+        legend = [int(text.split()[0]) for text in page.locator(".legend b").all_inner_texts()]
+        assert abs(sum(legend) - 100) <= len(legend), "the whole object"
+        for alt in (
+            "The target on the object",
+            "What the object will look like, calculated",
+            "Map of what can't be reached",
+        ):
+            expect(page.get_by_alt_text(alt)).not_to_have_js_property("naturalWidth", 0)
+        page.get_by_label("Name", exact=True).fill("phone")
+        page.get_by_role("button", name="Compute").click()
+        expect(page.locator(".failed")).to_contain_text("small was not solved: small.png is 77 x 52", timeout=LONG_MS)
+        page.goto("/appearances")
+        expect(page.get_by_role("heading", name="phone")).to_be_visible()
+        expect(page.locator(".failed")).to_be_visible()
+        page.goto("/")
+        page.get_by_role("button", name="Confirm the failures").click()
+        expect(page.locator(".failed")).to_have_count(0)
 
 
 def test_an_upload_of_another_size_becomes_a_target_and_an_appearance(kiosk: StageKiosk, tmp_path: Path) -> None:
@@ -118,6 +192,35 @@ def test_an_upload_is_wrapped_around_the_object_as_an_appearance_of_stage_toml_i
     inside = (picture[..., 3] > 0) & (wanted.max(axis=2) > 0)
     made = srgb_to_linear(picture[..., 2::-1])[inside].mean(axis=1)
     assert np.corrcoef(made, wanted[inside].mean(axis=1))[0, 1] > 0.98
+
+
+def test_a_scene_is_looked_at_on_the_object_before_it_is_computed(kiosk: StageKiosk) -> None:
+    """Of a scene of the stage's own in which the object shines in its own paint, so that the paint is the judge."""
+    own = kiosk.stage / "scenes" / "paint.blend"
+    own.parent.mkdir()
+    maker = kiosk.stage / "make.py"
+    maker.write_text(PAINT_SCENE)
+    subprocess.run([find_blender().command[0], str(maker), str(own)], check=True, timeout=120)
+    assert [(one.name, one.preview) for one in kiosk.scenes() if not one.shipped] == [("paint.blend", None)]
+    found = kiosk.scene_reach("paint.blend")
+    assert 0.2 < found.share <= 1
+    assert kiosk.scene_reach("paint.blend") == found, "it is kept"
+    assert {one.name: one.preview for one in kiosk.scenes()}["paint.blend"] == found.pictures["result"]
+    calibrated = Calibrated(finished_calibration(kiosk.stage), kiosk.service.checked.names)
+    paint = own_paint(read_geometry(calibrated.folder, calibrated.projectors), calibrated.transport.reach())
+    seen = load_arrays(kiosk.stage / "kiosk" / "scenes" / "scene-paint.blend.npz")
+    rows, columns = seen["mask"].shape
+    # The paint is 0.02 where the object's shape is not known.
+    painted = (paint.mean(axis=2) > 0.05).astype(np.float32)
+    known = np.asarray(cv2.resize(painted, (columns, rows), interpolation=cv2.INTER_AREA)) > 0.99
+    paint = cv2.resize(paint.mean(axis=2), (columns, rows), interpolation=cv2.INTER_AREA)
+    # Without its edge, where samples of the object and of the room are mixed.
+    inside = known & (cv2.erode(seen["mask"].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+    assert np.corrcoef(seen["image"].mean(axis=2)[inside], paint[inside])[0, 1] > 0.95
+    kiosk.compute_scene("painted", "paint.blend")
+    assert 'kind = "blender"\nscene = "scenes/paint.blend"' in kiosk.settings()
+    with pytest.raises(UsageError, match="made in another way"):
+        kiosk.compute_scene("checkerboard", "gold")
 
 
 def test_an_outline_keeps_the_light_of_an_appearance_inside_it(kiosk: StageKiosk, tmp_path: Path) -> None:

@@ -10,7 +10,17 @@ from controller.config import load_stage
 from controller.core.errors import VelaturaError
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.changes.watch import since_good, take
-from controller.kiosk.interface import Appearance, Changes, Comparison, EventRow, LampDay, Reach, Results, Schedule
+from controller.kiosk.interface import (
+    Appearance,
+    Changes,
+    Comparison,
+    EventRow,
+    LampDay,
+    Reach,
+    Results,
+    Scene,
+    Schedule,
+)
 from controller.kiosk.store import archive, runs, settings
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
@@ -67,6 +77,16 @@ class FolderKiosk:
         from controller.kiosk.api.reach import reach
 
         return reach(check_stage(self.stage), target)
+
+    def scenes(self) -> Sequence[Scene]:
+        from controller.kiosk.api.scenes import scenes
+
+        return scenes(self.stage)
+
+    def scene_reach(self, scene: str) -> Reach:
+        from controller.kiosk.api.scenes import scene_reach
+
+        return scene_reach(check_stage(self.stage), scene)
 
     def schedule(self) -> Schedule:
         return self._schedule().now

@@ -232,23 +232,33 @@ class StageKiosk(FolderKiosk):
         service.bundles.check_name(name)
         service.reconciler.choose(name, fade_s)
         service.reconciler.open()
+        service.hurry()
 
     def rotate(self) -> None:
         service = self.service
         service.reconciler.choose(IN_TURN)
         service.reconciler.open()
+        service.hurry()
 
     def next(self, fade_s: float | None = None) -> None:
-        self.service.reconciler.next(fade_s)
+        service = self.service
+        service.reconciler.next(fade_s)
+        service.hurry()
 
     def black(self, on: bool, fade_s: float | None = None) -> None:
-        self.service.reconciler.black(on, fade_s)
+        service = self.service
+        service.reconciler.black(on, fade_s)
+        service.hurry()
 
     def pause(self, on: bool) -> None:
-        self.service.reconciler.pause(on)
+        service = self.service
+        service.reconciler.pause(on)
+        service.hurry()
 
     def brightness(self, percent: float) -> None:
-        self.service.reconciler.brighten(percent / 100)
+        service = self.service
+        service.reconciler.brighten(percent / 100)
+        service.hurry()
 
     def stop(self) -> None:
         self.service.reconciler.shut()
@@ -280,8 +290,21 @@ class StageKiosk(FolderKiosk):
         picture = self.fitted(target, fit)
         kept = self.stage / "appearances" / f"{name}.png"
         with service.reconciler.idle():
+            entry = {"name": name, "kind": "picture", "file": str(kept.relative_to(self.stage))}
+            settings.add_appearance(self.stage, entry)
             write_atomically(kept, picture)
-            settings.add_picture(self.stage, name, kept)
+            return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
+
+    def compute_scene(self, name: str, scene: str) -> Job:
+        from controller.blender.run import find_blender
+        from controller.kiosk.api.scenes import entry
+
+        service = self.service
+        settings.check_name(name)
+        added = entry(self.stage, name, scene)
+        find_blender()
+        with service.reconciler.idle():
+            settings.add_appearance(self.stage, added)
             return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def appearances(self) -> Sequence[Appearance]:

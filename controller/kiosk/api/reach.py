@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import ByteImage, FloatImage, Mask
+from controller.core.arrays import ByteImage, FloatImage, Mask, load_arrays
 from controller.core.storage import write_atomically
 from controller.kiosk.store.targets import fitted
 from controller.kiosk.values import Reach
@@ -97,6 +97,10 @@ def _wanted(light: PreviewLight, target: Path) -> Target:
     from controller.solve.targets.values import Target
 
     rows, columns = light.transport.camera_shape
+    if target.suffix == ".npz":
+        # Rendered for these very samples, by ``scenes``.
+        arrays = load_arrays(target)
+        return Target(arrays["image"], arrays["mask"])
     if target.suffix.lower() == ".exr":
         # Rendered for this view already.
         whole = load_target(target, light.camera_px)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.kiosk.api.places import places
-from controller.kiosk.interface import BundleIdentity, DeviceRow, DriftCheck, Grade, Job, KioskState, LiveValue, Place
+from controller.kiosk.interface import BundleIdentity, DeviceRow, DriftCheck, Grade, Job, KioskState, Place
 from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
@@ -74,7 +74,7 @@ class Snapshots:
         """The devices; each projector with the output that feeds it, because cables and windows bear that name."""
         outputs = {table.name: table.output for table in service.checked.stage.tables.projectors}
         return tuple(
-            replace(row, values=(LiveValue("Output", outputs[row.name]), *row.values))
+            replace(row, output=outputs[row.name])
             if row.kind == "projector" and row.name in outputs else row
             for row in service.rows()
         )  # fmt: skip

@@ -64,6 +64,8 @@ OUTLINE: Final = Field(
     "outline", "regions as lists of corners [x, y], each from 0 to 1 of the picture, such as [[[0,0],[1,0],[1,1]]]",
     longest=1 << 16,
 )  # fmt: skip
+SCENE: Final = Field("scene", "a scene's name, as `scenes` lists it", pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,47}$",
+                     longest=48)  # fmt: skip
 _FULL_OR_QUICK: Final = Field(
     "kind", "full or quick", choices=("full", "quick"),
     flag=Flag("--quick", "Redo only what changed since the last calibration.", "quick", "full"),
@@ -167,6 +169,10 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
     Operation("compute", "Compute an appearance from a target picture", OPERATOR, WORKS, (NEW_NAME, TARGET, FIT),
               http=("POST", "/appearances"), said="The computation has started.",
               more="The target is added to stage.toml as an appearance, and installed."),
+    Operation("compute-scene", "Render a scene with Blender, and compute an appearance from it", OPERATOR, WORKS,
+              (NEW_NAME, SCENE), http=("POST", "/appearances/rendered"), within="appearance",
+              said="The computation has started.",
+              more="The scene is added to stage.toml as an appearance; each calibration renders it again."),
     Operation("compare", "Photograph the installed appearances, and compare them with their targets", OPERATOR, WORKS,
               (Field("name", "only this appearance", required=False, pattern=NAME, names="appearance", argument=True),),
               http=("POST", "/comparisons"), said="The appearances are shown and photographed, one after the other."),
@@ -207,6 +213,18 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
     Operation("feasibility", "A map of where the target can't be reached", OPERATOR, LOOKS, (TARGET,), Answer.PICTURE,
               call="reach", part=lambda found, values: found.pictures["map"], offline=True,
               http=("GET", "/targets/{target}/feasibility")),
+    Operation("scenes", "Scenes that Blender can render on the object", OPERATOR, LOOKS, offline=True,
+              within="appearance"),
+    Operation("scene-picture", "A small picture of a scene", OPERATOR, LOOKS, (SCENE,), Answer.PICTURE, call="scenes",
+              take=_nothing, part=lambda found, values: next(
+                  (one.preview for one in found if one.name == values["scene"]), None),
+              offline=True, http=("GET", "/scenes/{scene}/picture"), within="appearance"),
+    Operation("scene-reach", "How much of a scene the projectors can make", OPERATOR, LOOKS, (SCENE,), offline=True,
+              http=("GET", "/scenes/{scene}/reach"), within="appearance"),
+    Operation("scene-reach-picture", "The scene, what it will look like, or a map of what is out of reach", OPERATOR,
+              LOOKS, (SCENE, REACH_PICTURE), Answer.PICTURE, call="scene_reach",
+              take=lambda values: {"scene": values["scene"]}, part=_its_picture, offline=True,
+              http=("GET", "/scenes/{scene}/reach/{picture}"), within="appearance"),
     # -- results
     Operation("comparisons", "How close the photographed appearances are to their targets", VIEWER, LOOKS, offline=True,
               within="results"),

@@ -21,12 +21,14 @@ from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import Turn
 from controller.play.control.protocol import MAX_FADE_S, MAX_SECONDS
 
-PREVIEWS: Final = "kiosk/previews"
+PREVIEWS: Final = "kiosk/thumbnails"
 OUTPUTS: Final = "kiosk/outputs"
 OUTPUT_PX: Final = 320
 """The longer side of a small picture of what an output shows."""
 UNREAD_S: Final = 20.0
 """A bundle that could not be read is read again after this time: the disk may have failed for a moment."""
+QUALITY: Final = 75
+"""Of the small JPEGs: the first page shows many of them."""
 WITHOUT: Final = "bundles-without"
 """Folder of the stage with a subfolder like ``bundles`` for each set of missing projectors."""
 
@@ -35,6 +37,15 @@ def slots_without(stage: Path, missing: Collection[str]) -> Path:
     """The install folder of bundles without these projectors."""
     # "+" in a name is doubled, so that no two sets share a folder.
     return stage / WITHOUT / safe_name(" + ".join(name.replace("+", "++") for name in sorted(missing)))
+
+
+def _as_jpeg(png: bytes) -> bytes | None:
+    """None if it is no picture."""
+    import cv2
+    import numpy as np
+
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR) if png else None
+    return None if picture is None else cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
 class BundleStore:
@@ -89,7 +100,7 @@ class BundleStore:
         return path if appearance in [entry.name for entry in index.appearances] else None
 
     def previews(self) -> dict[str, Path]:
-        """The bundle's preview PNG of each installed appearance that has one.
+        """A small JPEG of the bundle's preview of each installed appearance that has one.
 
         They are extracted once per bundle; those of older bundles are deleted.
         """
@@ -101,7 +112,7 @@ class BundleStore:
         with self._previewing:
             if not folder.is_dir():
                 self._preview(path, index, folder)
-        files = {entry.name: folder / f"{number}.png" for number, entry in enumerate(index.appearances)}
+        files = {entry.name: folder / f"{number}.jpg" for number, entry in enumerate(index.appearances)}
         return {name: file for name, file in files.items() if file.exists()}
 
     def _preview(self, path: Path, index: Index, folder: Path) -> None:
@@ -114,8 +125,8 @@ class BundleStore:
         ):
             fresh.mkdir(parents=True)
             for number, entry in enumerate(index.appearances):
-                if (data := bundle.thumbnail(entry.name)) is not None:
-                    write_atomically(fresh / f"{number}.png", data)
+                if (data := bundle.thumbnail(entry.name)) is not None and (small := _as_jpeg(data)) is not None:
+                    write_atomically(fresh / f"{number}.jpg", small)
             fresh.rename(folder)
 
     def output_picture(self, appearance: str, output: str) -> Path | None:
@@ -146,7 +157,7 @@ class BundleStore:
                 # Those of older bundles.
                 shutil.rmtree(file.parent.parent, ignore_errors=True)
                 file.parent.mkdir(parents=True)
-            write_atomically(file, cv2.imencode(".jpg", small)[1].tobytes())
+            write_atomically(file, cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
         except (BundleError, VelaturaError, OSError):
             return False
         return True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -92,13 +93,18 @@ def check_name(name: str) -> None:
                          remedy="Use 1 to 64 letters, digits, - and _. Start with a letter or digit.")  # fmt: skip
 
 
-def add_picture(stage: Path, name: str, picture: Path) -> None:
-    """Add an appearance of kind "picture" to stage.toml, if it has none of this name. Raises as ``rewrite_stage``."""
-    tables = tables_of(text(stage))
-    if any(table.name == name for table in tables.appearances):
-        return
-    entry = {"name": name, "kind": "picture", "file": str(picture.relative_to(stage))}
-    rewrite_stage(stage / FILE, (), {"appearances": [entry]})
+def add_appearance(stage: Path, entry: Mapping[str, str]) -> None:
+    """Add a table of ``[[appearances]]`` to stage.toml, unless it is there; a table there may have more settings.
+
+    Raises UsageError("appearance-other") if the name has a target of another kind, and as ``rewrite_stage``.
+    """
+    rows = tomllib.loads(text(stage)).get("appearances", [])
+    there = next((row for row in rows if row.get("name") == entry["name"]), None)
+    if there is None:
+        rewrite_stage(stage / FILE, (), {"appearances": [dict(entry)]})
+    elif not entry.items() <= there.items():
+        raise UsageError("appearance-other", what=f"{entry['name']} is an appearance that was made in another way.",
+                         remedy="Choose another name, or remove that appearance first.")  # fmt: skip
 
 
 def remove_picture(stage: Path, name: str) -> None:

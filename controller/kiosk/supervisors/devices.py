@@ -205,8 +205,8 @@ class Devices:
             lux = cast("LightSensor", device).illuminance_lux(deadline=deadline)
             self._report_light(watch.saw(lux, self.scene()))
             self._dose.saw(lux)
-            dark = "dark enough to calibrate" if lux <= table.most_lux else "too bright to calibrate"
-            return (LiveValue("Light", f"{lux:.2f} lux ({dark})"),)
+            dark = DARK_ENOUGH if lux <= table.most_lux else TOO_BRIGHT
+            return (LiveValue.said("Light", dark, lux, digits=2),)
 
         return DeviceSupervisor("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0,
                                 **self._of_the_world())  # fmt: skip
@@ -237,21 +237,23 @@ class Devices:
         return MainsSupervisor(drivers, open_circuits, self._tell, **self._of_the_world())
 
 
+DARK_ENOUGH: Final = "{0} lux (dark enough to calibrate)"
+TOO_BRIGHT: Final = "{0} lux (too bright to calibrate)"
 _DARKEN: Final = "Switch the lights off and close the blinds. Other light makes the appearance pale."
 
 
 def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
     """The row of a projector on the panel."""
-    hours = f"{view.hours:,.0f} h with Velatura, {view.strikes} strikes"
     problem = view.problem
     # The disk has a row of its own, and the lamp is not broken.
     of_disk = problem is not None and problem.code == DISK_FULL
     lamp = Condition.DARK if of_disk and view.condition is Condition.BROKEN else view.condition
-    values = [LiveValue("Lamp", lamp.value), LiveValue("Hours", hours)]
+    hours = LiveValue.said("Hours", "{0} h with Velatura, {1} strikes", view.hours, view.strikes)
+    values = [LiveValue.said("Lamp", lamp.value), hours]
     if view.counter_hours is not None:
-        values.append(LiveValue("Projector's counter", f"{view.counter_hours:,} h"))
+        values.append(LiveValue.said("Projector's counter", "{0} h", view.counter_hours))
     if view.condition is Condition.LIT and view.stable_left_s > 0:
-        values.append(LiveValue("Stable in", f"{view.stable_left_s:.0f} s"))
+        values.append(LiveValue.said("Stable in", "{0} s", view.stable_left_s))
     what, remedy = (None, "") if problem is None or of_disk else (problem.reason, problem.remedy)
     return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy)
 
@@ -262,9 +264,9 @@ def _look_at_camera(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]
     if isinstance(device, WatchedCamera):
         status = device.status(deadline=deadline)
         if status.battery_percent is not None:
-            values.append(LiveValue("Battery", f"{status.battery_percent} %"))
+            values.append(LiveValue.said("Battery", "{0} %", status.battery_percent))
         if status.free_pictures is not None:
-            values.append(LiveValue("Space for", f"{status.free_pictures} pictures"))
+            values.append(LiveValue.said("Space for", "{0} pictures", status.free_pictures))
         if status.warnings:
             values.append(LiveValue("Warnings", ", ".join(status.warnings)))
     return tuple(values)

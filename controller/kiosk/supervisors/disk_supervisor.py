@@ -56,7 +56,7 @@ class DiskSupervisor:
     @property
     def row(self) -> DeviceRow:
         """As the panel shows it among the devices."""
-        values = (LiveValue("Free", f"{self.free_bytes / GB:.1f} GB of {self.total_bytes / GB:.0f} GB"),)
+        values = (LiveValue.said("Free", "{0} GB of {1} GB", self.free_bytes / GB, self.total_bytes / GB, digits=1),)
         problem = self.problem
         what, remedy = (None, "") if problem is None else (problem.reason, problem.remedy)
         return DeviceRow("disk", "disk", "", values, what, remedy)

@@ -71,7 +71,7 @@ class MainsSupervisor(DeviceSupervisor):
         values, failed = [], list[DeviceError]()
         for circuit in boards.circuits:
             try:
-                values.append(LiveValue(circuit.name, act(circuit)))
+                values.append(LiveValue.said(circuit.name, act(circuit)))
             except DeviceError as error:
                 failed.append(error)
         if failed:

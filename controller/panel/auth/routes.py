@@ -13,7 +13,7 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from controller.core.errors import UsageError
 from controller.core.text import printable
-from controller.kiosk.store.accounts import LONGEST_PASSWORD, Account, Role
+from controller.kiosk.store.accounts import FIRST_ACCOUNT, LONGEST_PASSWORD, Account, Role
 from controller.panel.auth.identity import Entry, Visitor, cookie_name, form_pair, form_token, same_origin
 from controller.panel.auth.sessions import LONGEST_S
 from controller.panel.context import Panel
@@ -62,7 +62,9 @@ class Entrance:
 
     def _form(self, problem: str, status: int) -> Response:
         cookie, token = form_pair(self._panel)
-        facts = {"csrf": token, "problem": gettext(problem), "here": "/login"}
+        # Before anybody has entered there is one account, whose name the documentation says.
+        name = "" if self._panel.accounts.entered else FIRST_ACCOUNT
+        facts = {"csrf": token, "problem": gettext(problem), "here": "/login", "name": name}
         page = HTMLResponse(self._drawing.page("login.html", facts), status)
         self._set_cookie(page, cookie_name(self._panel) + "-form", cookie, 3600)
         return page
@@ -135,13 +137,19 @@ class Entrance:
         try:
             if panel.by_address.wait_s(address) > 0:
                 raise UsageError("too-many-tries", what="Too many wrong passwords.", remedy="Wait a minute.")
-            if await anyio.to_thread.run_sync(panel.accounts.verify, visitor.name, old, limiter=panel.hashing) is None:
+
+            async def known(password: str) -> Account | None:
+                verify = partial(panel.accounts.verify, visitor.name, password)
+                return await anyio.to_thread.run_sync(verify, limiter=panel.hashing)
+
+            # Who entered with a one-time password typed it a moment ago, and can do nothing but this.
+            if not visitor.must_change_password and await known(old) is None:
                 panel.by_address.failed(address)
                 panel.refused.add(f"A change of the password of {visitor.name} from {address} was refused")
                 raise UsageError("password-wrong", what="The old password is wrong.", remedy="Type it again.")
             if new != sent.texts.get("again", ""):
                 raise UsageError("password-wrong", what="The two new passwords differ.", remedy="Type them again.")
-            if new == old:
+            if await known(new) is not None:
                 raise UsageError("password-weak", what="The new password is the old one.", remedy="Choose another one.")
             await anyio.to_thread.run_sync(panel.accounts.set_password, visitor.name, new, limiter=panel.hashing)
         except UsageError as error:

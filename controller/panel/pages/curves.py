@@ -9,8 +9,8 @@ from typing import Final
 from controller.kiosk.interface import Comparison, DriftCheck, Grade, Sharpness
 from controller.panel.words import figures
 
-LEFT, RIGHT, TOP, BOTTOM = 44, 632, 16, 176
-"""The drawing's frame, in a view of 640 x 200."""
+LEFT, RIGHT, TOP, BOTTOM = 44, 452, 16, 156
+"""The drawing's frame, in a view of 460 x 180."""
 TICKS: Final = (0.0, 0.5, 1.0)
 STEPS: Final = (1.0, 2.0, 5.0)
 

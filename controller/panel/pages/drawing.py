@@ -127,6 +127,7 @@ class Drawing:
             "sentence": lambda text: text[:1].upper() + text[1:],
             "said": gettext,
             "job_title": spoken.job_title,
+            "value_text": spoken.value_text,
         }
         environment.globals |= {
             "states": STATES, "flags": flags, "holds": holds, "around": around, "language": language,
@@ -134,6 +135,7 @@ class Drawing:
             "drift_moves": curves.drift_moves, "colour_differences": curves.colour_differences,
             "sharpness_of": curves.sharpness_of, "source_word": lambda kind: spoken.SOURCES.get(kind, ""),
             "drift_word": lambda advice: spoken.DRIFTS.get(advice, advice), "nothing_yet": NOTHING_YET,
+            "scene_word": lambda scene: gettext(spoken.SCENES.get(scene.name, scene.name.removesuffix(".blend"))),
         }  # fmt: skip
         self._environment = environment
 

@@ -28,7 +28,9 @@ from controller.panel.words.language import gettext
 
 MOST_FIELDS = 2000
 LEADS_TO: Final = {
-    **dict.fromkeys(("recalibrate", "cancel", "start", "stop", "identify", "compute", "compare", "seen"), "/"),
+    **dict.fromkeys(
+        ("recalibrate", "cancel", "start", "stop", "identify", "compute", "compute-scene", "compare", "seen"), "/"
+    ),
     **dict.fromkeys(("next", "black", "pause", "brightness"), "/"),
     **dict.fromkeys(("play", "rotate", "remove-appearance"), "/appearances"),
     **dict.fromkeys(("backup", "restore", "diagnostics", "test-alerts", "test-backup"), "/care"),
@@ -246,6 +248,8 @@ def _then(operation: Operation, result: Any, values: Values) -> str:
 def _back(operation: Operation, sent: Sent) -> str:
     """The page of a form that failed; its address contains no unchecked input."""
     if operation.name == "upload-target":
+        return "/appearances/new"
+    if operation.name == "compute-scene":
         return "/appearances/new"
     target = sent.texts.get("target", "")
     if operation.name in ("compute", "outline-target") and target.isascii() and target.isalnum():

@@ -7,10 +7,12 @@ import threading
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
+from urllib.parse import quote
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 
+from controller.core.errors import UsageError
 from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
 from controller.kiosk.decide.days import grouped
 from controller.kiosk.operations.fields import parse
@@ -38,7 +40,7 @@ NAVIGATION: Final = (
     ("/care", mark("Backup"), Role.TECHNICIAN, "System"),
     ("/accounts", mark("Accounts"), Role.TECHNICIAN, "System"),
 )
-BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/results"}
+BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/results", "/changes": "/doctor"}
 """Pages that are not in the navigation, and those that they belong to."""
 NO_TARGET: Final[dict[str, Any]] = {"target": None, "reach": None, "outline": "[]", "stamp": 0}
 FRAMED: Final = {
@@ -101,6 +103,7 @@ class Pages:
             ("/password", Role.VIEWER, "password.html", lambda _: {}),
             ("/appearances/new", Role.OPERATOR, "target.html", self._new),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
+            ("/appearances/scenes/{scene}", Role.OPERATOR, "scene.html", self._scene),
             ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
             ("/changes", Role.OPERATOR, "changes.html", lambda _: {"found": self._panel.kiosk.changes()}),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
@@ -124,6 +127,9 @@ class Pages:
             Entry("GET", "/late/doctor", "session", Role.OPERATOR, self._late("late_doctor.html", self._found)),
             Entry(
                 "GET", "/late/reach/{target}", "session", Role.OPERATOR, self._late("late_reach.html", self._reached)
+            ),
+            Entry(
+                "GET", "/late/scenes/{scene}", "session", Role.OPERATOR, self._late("late_reach.html", self._rendered)
             ),
         ]
         entries.append(Entry("GET", "/shown/{run}", "session", Role.VIEWER, self._report))
@@ -236,7 +242,8 @@ class Pages:
         """The page whose form sends this operation, if something is typed into it."""
         return {
             "set-schedule": FormPage("schedule.html", lambda typed: self._hours(typed["rows"])),
-            "upload-target": FormPage("target.html", lambda typed: NO_TARGET),
+            "upload-target": FormPage("target.html", lambda typed: self._untargeted()),
+            "compute-scene": FormPage("scene.html", lambda typed: self._known_scene(str(typed["scene"]))),
             "compute": FormPage("target.html", lambda typed: self._reach(typed["target"])),
         }.get(operation)
 
@@ -280,7 +287,33 @@ class Pages:
                 self._panel.kiosk.view()
 
         threading.Thread(target=prepare, name="prepare-preview", daemon=True).start()
-        return NO_TARGET
+        return self._untargeted()
+
+    def _untargeted(self) -> dict[str, Any]:
+        return NO_TARGET | {"scenes": self._panel.kiosk.scenes(), "view": self._view_px()}
+
+    def _view_px(self) -> tuple[int, int]:
+        """Of the camera; a usual one while it is not known."""
+        return self._panel.kiosk.view_px() or (3, 2)
+
+    def _scene(self, request: Request) -> dict[str, Any]:
+        """Without a script the page has to wait for what Blender renders."""
+        name = request.path_params["scene"]
+        return self._rendered(request) if "wait" in request.query_params else self._known_scene(name)
+
+    def _known_scene(self, name: str) -> dict[str, Any]:
+        scene = next((one for one in self._panel.kiosk.scenes() if one.name == name), None)
+        if scene is None:
+            raise UsageError("scene-unknown", what="There is no such scene.", remedy="Choose one of the list.")
+        return {"scene": scene, "reach": None}
+
+    def _rendered(self, request: Request) -> dict[str, Any]:
+        facts = self._known_scene(request.path_params["scene"])
+        found = self._panel.kiosk.scene_reach(facts["scene"].name)
+        return facts | {
+            "reach": found, "stamp": found.pictures["result"].stat().st_mtime_ns,
+            "at": f"/see/scenes/{quote(facts['scene'].name)}/reach",
+        }  # fmt: skip
 
     def prepare_reach(self, target: str) -> None:
         """Begin to calculate what of a target is in reach; the page that shows it waits for the rest only."""
@@ -299,13 +332,14 @@ class Pages:
         return {"target": target, "reach": None, **self._drawn_on(target)}
 
     def _drawn_on(self, target: str) -> dict[str, Any]:
-        file = self._panel.targets.path(target)
-        return {"outline": self._panel.targets.outline(target), "stamp": file.stat().st_mtime_ns}
+        outline, stamp = self._panel.targets.outline(target), self._panel.targets.path(target).stat().st_mtime_ns
+        return {"outline": outline, "stamp": stamp, "view": self._view_px()}
 
     def _reached(self, request: Request) -> dict[str, Any]:
         target = request.path_params["target"]
         file = self._panel.targets.path(target)
-        return {"target": target, "reach": self._panel.kiosk.reach(file), **self._drawn_on(target)}
+        found = self._panel.kiosk.reach(file)
+        return {"target": target, "reach": found, "at": f"/see/targets/{target}/reach", **self._drawn_on(target)}
 
     def _accounts(self, _: Request) -> dict[str, Any]:
         return self.accounts()

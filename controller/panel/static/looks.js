@@ -59,6 +59,32 @@
     fade();
     typed();
   }
+  // The chosen picture in the camera's view, in each of the ways to fit it, as small as the drawings of them.
+  function fit(ways, picture) {
+    const [width, height] = ways.dataset.view.split(" ").map(Number), WIDE = 80, high = WIDE * height / width;
+    for (const input of ways.querySelectorAll("input")) {
+      const canvas = input.parentElement.querySelector("canvas"), paper = canvas.getContext("2d");
+      const across = WIDE / picture.width, down = high / picture.height;
+      const scale = { fit: Math.min(across, down), crop: WIDE / width }[input.value] || Math.max(across, down);
+      paper.setTransform(canvas.width / 96, 0, 0, canvas.height / 80, 0, 0);
+      paper.clearRect(0, 0, 96, 80);
+      paper.save();
+      paper.beginPath();
+      paper.rect(8, 40 - high / 2, WIDE, high);
+      paper.clip();
+      if (input.value === "wrap") paper.clip(new Path2D(canvas.parentElement.querySelector("path").getAttribute("d")));
+      paper.drawImage(picture, 48 - scale * picture.width / 2, 40 - scale * picture.height / 2, scale * picture.width, scale * picture.height);
+      paper.restore();
+      canvas.hidden = false;
+    }
+  }
+  const file = document.getElementById("file"), ways = document.querySelector(".ways");
+  if (file && ways) file.addEventListener("change", async () => {
+    const picture = file.files[0] && await createImageBitmap(file.files[0]).catch(() => null);
+    if (picture) fit(ways, picture);
+    else for (const canvas of ways.querySelectorAll("canvas")) canvas.hidden = true;
+  });
+
   const place = document.getElementById("on-object");
   if (place) outline(place);
 

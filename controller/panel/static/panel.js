@@ -42,6 +42,7 @@
       }
     }
     follow();
+    reachable();
   }
 
   function say(text) {
@@ -103,6 +104,16 @@
     const shown = document.querySelector(`output[for=${range.id}]`);
     if (shown) range.addEventListener("input", () => { shown.textContent = shown.textContent.replace(/[0-9]+/, range.value); });
   }
+
+  // What is wider than the screen scrolls on its own, also by the keyboard.
+  function reachable() {
+    for (const wide of document.querySelectorAll(".wide")) {
+      if (wide.scrollWidth > wide.clientWidth) wide.tabIndex = 0;
+      else wide.removeAttribute("tabindex");
+    }
+  }
+  addEventListener("resize", reachable);
+  reachable();
 
   // A second press before the first one is answered would start the job twice.
   document.addEventListener("submit", (event) => {

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from controller.kiosk.values import LiveValue
+from controller.panel.words import figures
 from controller.panel.words.language import gettext
 from controller.panel.words.language import mark as _
 
@@ -24,6 +26,8 @@ KINDS: Final = (
     _("projector"),
     _("camera"),
     _("display"),
+    _("keys"),
+    _("key panel"),
     _("relay"),
     _("sensor"),
     _("buttons"),
@@ -35,9 +39,17 @@ ROLES: Final = (_("viewer"), _("operator"), _("technician"))
 RUNS: Final = (_("full"), _("quick"), _("projector"), _("calibrate"), _("demo"))
 MEASURED: Final = (_("test shots"), _("calibration"))
 LABELS: Final = (
-    _("Battery"), _("Free"), _("Hours"), _("Lamp"), _("Light"), _("Model"), _("Output"), _("Projector's counter"),
+    _("Battery"), _("Free"), _("Hours"), _("Lamp"), _("Light"), _("Model"), _("Projector's counter"),
     _("Space for"), _("Stable in"), _("Warnings"),
 )  # fmt: skip
+VALUES: Final = (
+    _("dark"), _("cooling"), _("lighting"), _("lit"), _("lost"), _("broken"),
+    _("{0} h with Velatura, {1} strikes"), _("{0} h"), _("{0} s"), _("{0} %"), _("{0} pictures"), _("{0} GB of {1} GB"),
+    _("{0} lux (dark enough to calibrate)"), _("{0} lux (too bright to calibrate)"),
+    _("on"), _("off"), _("unchanged"), _("on until the lamps have cooled"),
+    _("on, because it is unknown whether the lamps have cooled"),
+)  # fmt: skip
+"""Patterns of the devices' values."""
 REASONS: Final = (
     _("The stage is not set up yet."), _("No lamp gives light."), _("No lamp gave light in time."),
     _("It starts when the lamps are lit and steady."), _("The stage is recalibrated."),
@@ -49,11 +61,22 @@ SOURCES: Final = {
     "picture": _("a picture as seen from the camera"), "blender": _("rendered by Blender"),
 }  # fmt: skip
 """By the kind in stage.toml."""
+SCENES: Final = {
+    "marble": _("Marble"), "gold": _("Gold"), "glazed": _("Blue glaze"), "lowered-head": _("Bent forward"),
+}  # fmt: skip
+"""The scenes that come with Velatura, by their names."""
 DRIFTS: Final = {
     "nothing": _("nothing has moved or dimmed"), "quick": _("a quick recalibration is needed"),
     "full": _("a full recalibration is needed"), "look": _("a person has to look at the stage"),
 }  # fmt: skip
 """By the advice of a drift check."""
+
+
+def value_text(value: LiveValue) -> str:
+    """A device's value with its words and numbers in the language."""
+    if not value.pattern:
+        return value.text
+    return gettext(value.pattern).format(*(figures.number(one, value.digits) for one in value.numbers))
 
 
 def job_title(name: str) -> str:

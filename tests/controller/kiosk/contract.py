@@ -12,6 +12,7 @@ import jsonschema_rs
 import pytest
 from PIL import Image
 
+from controller.blender.job import BUILTIN
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import (
     Aiming,
@@ -26,6 +27,7 @@ from controller.kiosk.interface import (
     KioskState,
     LampDay,
     Results,
+    Scene,
     Schedule,
     TriedDevice,
 )
@@ -38,7 +40,7 @@ from tests.controller.kiosk import vase
 PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"
 """Every kiosk of these tests plays PLAYING, has OTHER installed as well, and the finished calibration RUN."""
 TEXT = f"{vase.TEXT}\n[bundle]\nallow_unsigned = true\n"
-NEEDS_A_CALIBRATION = {"feasibility", "reach", "reach-picture", "view"}
+NEEDS_A_CALIBRATION = {"feasibility", "reach", "reach-picture", "scene-reach-picture", "view"}
 """What no stage of these tests can do: tests/end_to_end/test_kiosk_targets.py asks it of a calibrated one."""
 
 
@@ -152,6 +154,15 @@ CASES: tuple[Case, ...] = (
     Case("compute", {"name": "wood", "target": "BACKUP"}, "target-unreadable"),
     Case("compute", {"name": "two words", "target": "target.png"}, "field-wrong"),
     Case("compute", {"name": "wood", "target": "target.png"}, "busy", first=(FULL,)),
+    Case("scenes", holds=lambda rows, _: every(Scene)(rows, _) and [row.name for row in rows][:4] == list(BUILTIN)),
+    Case("scene-picture", {"scene": "gold"}, holds=a_file),
+    Case("scene-picture", {"scene": "no such"}, holds=lambda found, _: found is None),
+    Case("scene-picture", {"scene": "../stage.toml"}, "field-wrong"),
+    Case("scene-reach", {"scene": "no such"}, "scene-unknown"),
+    Case("compute-scene", {"name": "golden", "scene": "gold"}, holds=a_job),
+    Case("compute-scene", {"name": "golden", "scene": "no such"}, "scene-unknown"),
+    Case("compute-scene", {"name": "two words", "scene": "gold"}, "field-wrong"),
+    Case("compute-scene", {"name": "golden", "scene": "gold"}, "busy", first=(FULL,)),
     Case("compare", holds=a_job),
     Case("compare", {"name": OTHER}, holds=a_job),
     Case("compare", {"name": "no such"}, "appearance-unknown"),

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,12 @@ from controller.bundle.export import png
 from controller.bundle.install import current, install
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.doctor.values import Examination
+from controller.kiosk import service as service_module
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
-from controller.kiosk.interface import LiveValue, Schedule, ScheduleRow
+from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -28,6 +30,7 @@ from tests.controller.kiosk import contract
 from tests.controller.kiosk.contract import OTHER, PLAYING, RUN, Contract
 from tests.controller.kiosk.vase import graded_run, vase
 from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.waiting import wait_for
 
 test_every_operation_of_a_kiosk_is_in_the_contract = contract.test_every_operation_of_a_kiosk_is_in_the_contract
 
@@ -63,6 +66,10 @@ def install_two(stage: Path) -> None:
     install(stage / "made.vel", stage / "bundles", trusted=(), allow_unsigned=True)
 
 
+def is_wanted(service: Service, name: str) -> bool:
+    return service.player.want is not None and service.player.want.appearance == name
+
+
 def endless(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
     cancel.wait(60)
     return Finished(request, Decision("cancelled", "It was cancelled."), failed=True)
@@ -93,7 +100,7 @@ class TestStageKiosk(Contract):
 
     def test_each_projector_names_the_output_that_feeds_it(self, stage: Real) -> None:
         (projector,) = (row for row in stage.kiosk.snapshot().devices if row.kind == "projector")
-        assert (projector.name, LiveValue("Output", "P1") in projector.values) == ("left", True)
+        assert (projector.name, projector.output) == ("left", "P1")
 
     def test_hours_that_close_the_show_say_so_before_they_are_saved(self, stage: Real) -> None:
         stage.kiosk.service.reconciler.step()
@@ -103,6 +110,20 @@ class TestStageKiosk(Contract):
         told = stage.kiosk.effect_of_schedule(Schedule("UTC", rows))
         assert told.startswith("The stage closes at once")
         assert stage.kiosk.schedule().rows == ()
+
+    def test_what_a_person_asks_for_waits_for_no_step(self, stage: Real, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(service_module, "STEP_S", 60.0)
+        service, cancel = stage.kiosk.service, threading.Event()
+        thread = threading.Thread(target=service.run, args=(cancel,))
+        thread.start()
+        try:
+            for name in (OTHER, PLAYING, OTHER):
+                stage.kiosk.play(name)
+                wait_for(partial(is_wanted, service, name))
+        finally:
+            cancel.set()
+            service.hurry()
+            thread.join()
 
     def test_a_closed_stage_that_computes_says_so(self, stage: Real) -> None:
         kiosk, service = stage.kiosk, stage.kiosk.service

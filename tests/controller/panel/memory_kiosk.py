@@ -15,6 +15,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageOps
 
+from controller.blender.job import BUILTIN
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.interface import (
     Achieved,
@@ -44,6 +45,7 @@ from controller.kiosk.interface import (
     Reach,
     RecalibrationKind,
     Results,
+    Scene,
     Schedule,
     ScheduleRow,
     Sharpness,
@@ -61,14 +63,14 @@ TOML = TEXT.replace("The vase", "Head of a boy")
 
 
 def devices() -> tuple[DeviceRow, ...]:
-    lamp = (LiveValue("Power", "on"), LiveValue("Lamp", "1,204 h"), LiveValue("Temperature", "41 °C"))
+    lamp = (LiveValue.said("Lamp", "lit"), LiveValue.said("Hours", "{0} h with Velatura, {1} strikes", 1204, 88))
     lost = "It has not answered for 12 s."
     return (
         DeviceRow("left", "projector", "serial", lamp),
         DeviceRow("middle", "projector", "pjlink", lamp),
         DeviceRow("right", "projector", "serial", lamp[:1], lost, "Check its mains plug and the serial cable."),
-        DeviceRow("camera", "camera", "ptp", (LiveValue("Model", "EOS R5"), LiveValue("Battery", "87 %"))),
-        DeviceRow("display", "display", "player", (LiveValue("Swaps", "60 /s"),)),
+        DeviceRow("camera", "camera", "ptp", (LiveValue("Model", "EOS R5"), LiveValue.said("Battery", "{0} %", 87))),
+        DeviceRow("display", "display", "player", ()),
     )
 
 
@@ -294,6 +296,9 @@ class MemoryKiosk:
         settings.check_name(name)
         self.fitted(target, fit)
         self.asked.append(("compute", (name, target.read_bytes()[:4])))
+        return self._solve(name)
+
+    def _solve(self, name: str) -> Job:
         preview = self._drawn(name)
 
         def finish(_: str) -> None:
@@ -304,6 +309,24 @@ class MemoryKiosk:
     def reach(self, target: Path) -> Reach:
         pictures = {name: self._drawn(name, 200 - 60 * at) for at, name in enumerate(("target", "result", "map"))}
         return Reach(0.45, 0.3, 0.15, 0.05, pictures)
+
+    def scenes(self) -> Sequence[Scene]:
+        shipped = [Scene(name, True, self._drawn(name)) for name in BUILTIN]
+        return [*shipped, Scene("leaves.blend", False)]
+
+    def scene_reach(self, scene: str) -> Reach:
+        self._known_scene(scene)
+        return self.reach(self._folder)
+
+    def _known_scene(self, scene: str) -> None:
+        if scene not in [one.name for one in self.scenes()]:
+            raise UsageError("scene-unknown", what="There is no such scene.", remedy="Choose another.")
+
+    def compute_scene(self, name: str, scene: str) -> Job:
+        settings.check_name(name)
+        self._known_scene(scene)
+        self.asked.append(("compute-scene", (name, scene)))
+        return self._solve(name)
 
     def appearances(self) -> Sequence[Appearance]:
         return list(self._appearances.values())

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from controller.kiosk.decide.hours import WEEKDAYS
+from controller.kiosk.store.accounts import Accounts
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
-from tests.controller.panel.served import Served
+from tests.controller.panel.memory_kiosk import MemoryKiosk
+from tests.controller.panel.served import QUICK_HASH, Served, served
 from tests.controller.panel.test_in_browser import PAGES
 
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
@@ -94,6 +97,30 @@ def test_a_week_with_two_special_days_takes_ten_fields_and_one_save(fresh: Serve
     assert rows == dict.fromkeys(WEEKDAYS, ("10:00", "19:00")) | {
         "2026-12-24": ("", ""), "2026-12-31": ("10:00", "14:00")
     }  # fmt: skip
+
+
+def test_a_cold_stage_plays_three_clicks_and_three_fields_after_the_first_login_began(
+    tmp_path: Path, browser: Browser
+) -> None:
+    kiosk = MemoryKiosk(tmp_path / "pictures")
+    kiosk.change(state="ready", playing="", bundle=None, grades=())
+    accounts = Accounts(tmp_path / "private" / "accounts.json", hasher=QUICK_HASH)
+    password = accounts.first_start()
+    assert password is not None
+    with served(kiosk, tmp_path / "private", accounts=accounts) as running, tab(browser, running.address) as page:
+        page.add_init_script(COUNT)
+        page.goto("/login")
+        page.get_by_label("Password").fill(password)
+        page.get_by_role("button", name="Log in").click()
+        page.wait_for_url("**/password")
+        page.get_by_label("New password, 10 characters or more").fill("seven tall horses")
+        page.get_by_label("New password again").fill("seven tall horses")
+        page.get_by_role("button", name="Change").click()
+        page.get_by_role("button", name="Recalibrate", exact=True).click()
+        expect(page.locator("p.state strong")).to_have_text("Playing")
+        assert counted(page) == (3, 3)
+        page.get_by_role("button", name="Log out").click()
+        assert page.get_by_label("Name").input_value() == "", "it has its own password now"
 
 
 def test_an_appearance_is_switched_with_one_click_and_no_field(fresh: Served, browser: Browser) -> None:

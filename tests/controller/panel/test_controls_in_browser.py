@@ -89,6 +89,65 @@ def test_an_outline_restricts_the_target_and_the_result_is_played(fresh: Served,
         expect(page.get_by_role("button", name="Play now")).to_be_hidden()
 
 
+COLOUR_AT = """([way, x, y]) => {
+  const canvas = document.querySelector(`input[value=${way}] ~ .way canvas`);
+  return [...canvas.getContext("2d").getImageData(x * canvas.width / 96, y * canvas.height / 80, 1, 1).data];
+}"""
+
+
+def test_a_chosen_picture_is_shown_in_each_way_to_fit_it(panel: Served, browser: Browser) -> None:
+    """The view is 240 x 160, drawn as 80 x 53.3 around (48, 40); the picture is 120 x 20, red with a blue left edge."""
+    out = io.BytesIO()
+    chosen = Image.new("RGB", (120, 20), (255, 0, 0))
+    chosen.paste((0, 0, 255), (0, 0, 30, 20))
+    chosen.save(out, "PNG")
+    red, blue, nothing = [255, 0, 0, 255], [0, 0, 255, 255], [0, 0, 0, 0]
+    with tab(browser, panel.address) as page:
+        enter(page, "otto")
+        page.goto("/appearances/new")
+        expect(page.locator(".way canvas").first).to_be_hidden()
+        page.set_input_files("#file", {"name": "t.png", "mimeType": "image/png", "buffer": out.getvalue()})
+        expect(page.locator(".way canvas").first).to_be_visible()
+        for way, at, colour in [
+            ("fit", (48, 40), red), ("fit", (12, 40), blue), ("fit", (48, 20), nothing),
+            ("fill", (12, 18), red), ("fill", (12, 8), nothing),
+            ("crop", (48, 40), red), ("crop", (30, 40), blue), ("crop", (24, 40), nothing), ("crop", (48, 46), nothing),
+            ("wrap", (48, 40), red), ("wrap", (12, 40), nothing),
+        ]:  # fmt: skip
+            assert page.evaluate(COLOUR_AT, [way, *at]) == colour, (way, at)
+        page.set_input_files("#file", {"name": "t.txt", "mimeType": "text/plain", "buffer": b"no picture"})
+        expect(page.locator(".way canvas").first).to_be_hidden()
+
+
+def test_a_scene_is_looked_at_on_the_object_computed_and_played(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.get_by_role("link", name="Appearances").click()
+        page.get_by_role("link", name="New appearance").click()
+        for picture in page.locator(".scenes img").all():
+            picture.scroll_into_view_if_needed()
+            expect(picture).not_to_have_js_property("naturalWidth", 0)
+        named = ["Marble", "Gold", "Blue glaze", "Bent forward", "leaves"]
+        assert page.locator(".scenes li").all_inner_texts() == named
+        assert not violations(page)
+        page.get_by_role("link", name="Gold").click()
+        expect(page.get_by_text("45 % of the object can look like the picture.")).to_be_visible()
+        expect(page.get_by_alt_text("What the object will look like, calculated")).not_to_have_js_property(
+            "naturalWidth", 0
+        )
+        assert not violations(page)
+        page.get_by_label("Name", exact=True).fill("-")
+        page.get_by_role("button", name="Compute").click()
+        expect(page.get_by_role("alert")).to_contain_text("name")
+        assert page.get_by_label("Name", exact=True).input_value() == "-", "what was typed stays"
+        page.get_by_label("Name", exact=True).fill("gold")
+        page.get_by_role("button", name="Compute").click()
+        expect(page.get_by_text("It ended well.")).to_be_visible()
+        page.get_by_role("button", name="Play now").click()
+        expect(page.locator("p.state b")).to_have_text("gold")
+        assert ("compute-scene", ("gold", "gold")) in kiosk_of(fresh).asked
+
+
 def test_pictures_are_compared_by_a_line_and_a_report_opens_in_its_page(fresh: Served, browser: Browser) -> None:
     kiosk = kiosk_of(fresh)
     kiosk.compare()

@@ -6,6 +6,7 @@ import os
 from itertools import combinations
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -24,8 +25,8 @@ from tests.controller.artefacts.names import projectors as stages
 UNSIGNED = Trust((), allow_unsigned=True)
 
 
-def installed(stage: Path, revision: int, names: tuple[str, ...], slots: Path | None = None) -> bytes:
-    """A bundle in which all but the last appearance have a picture; that picture."""
+def installed(stage: Path, revision: int, names: tuple[str, ...], slots: Path | None = None) -> int:
+    """A bundle in which all but the last appearance have a picture, all of one grey; that grey."""
     picture = png(np.full((4, 6, 3), 10 * revision, np.uint8))
     frames = {"P1": np.zeros((8, 8, 3), np.uint8)}
     made = [NewAppearance(name, frames, thumbnail=None if name == names[-1] else picture) for name in names]
@@ -34,7 +35,16 @@ def installed(stage: Path, revision: int, names: tuple[str, ...], slots: Path | 
         appearances=made, key=None, revision=revision,
     )  # fmt: skip
     install(stage / "made.vel", slots or stage / "bundles", trusted=(), allow_unsigned=True)
-    return picture
+    return 10 * revision
+
+
+def grey_of(file: Path) -> int:
+    """Of a picture that is a few bytes, as a browser likes it."""
+    assert file.stat().st_size < 1000
+    picture = cv2.imread(str(file))
+    assert picture is not None
+    assert picture.shape == (4, 6, 3)
+    return round(float(picture.mean()))
 
 
 def test_each_appearance_has_the_picture_of_its_own_bundle_or_none(tmp_path: Path) -> None:
@@ -43,9 +53,9 @@ def test_each_appearance_has_the_picture_of_its_own_bundle_or_none(tmp_path: Pat
     first = installed(tmp_path, 1, ("marble", "a name with spaces", "bare"))
     found = bundles.previews()
     assert sorted(found) == ["a name with spaces", "marble"]
-    assert {file.read_bytes() for file in found.values()} == {first}
+    assert {grey_of(file) for file in found.values()} == {first}
     second = installed(tmp_path, 2, ("marble", "bare"))
-    assert {name: file.read_bytes() for name, file in bundles.previews().items()} == {"marble": second}
+    assert {name: grey_of(file) for name, file in bundles.previews().items()} == {"marble": second}
     assert len(list((tmp_path / PREVIEWS).iterdir())) == 1, "those of the bundle before are gone"
 
 
@@ -71,7 +81,7 @@ def test_pictures_that_the_disk_did_not_take_are_made_when_there_is_space_again(
     failures = [WorkError("no-space", what="The disk is full.", remedy="Free some.")]
 
     def write(path: Path, data: bytes) -> None:
-        if path.name == "1.png" and failures:
+        if path.name == "1.jpg" and failures:
             raise failures.pop()
         write_atomically(path, data)
 

@@ -62,7 +62,7 @@ def test_wrong_first_settings_leave_none(tmp_path: Path) -> None:
 
 def test_an_uploaded_picture_becomes_an_appearance_once(stage: Path) -> None:
     for _ in range(2):
-        settings.add_picture(stage, "moss", stage / "appearances/moss.png")
+        settings.add_appearance(stage, {"name": "moss", "kind": "picture", "file": "appearances/moss.png"})
     assert appearances(stage) == ["marble", "glass", "moss"]
 
 
