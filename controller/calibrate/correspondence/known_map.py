@@ -72,7 +72,7 @@ def check_map(
     black = coloured(captures, "black", known_px.shape[:2])
     white = coloured(captures, "white", black.shape[:2]) - black
     lit = _lit(white)
-    known = np.isfinite(known_px).all(axis=2)
+    known = np.asarray(np.isfinite(known_px).all(axis=2))
     covered = float(np.mean(known[lit])) if lit.any() else 0.0
     agreeing, asked = np.zeros(lit.shape, np.float32), np.zeros(lit.shape, np.float32)
     for pattern in plan.of_kind(PatternKind.COLOUR_TILES):

@@ -221,7 +221,10 @@ def test_a_cue_list_keeps_to_its_role_and_its_rate(
     soon = datetime.now(ZoneInfo("Europe/Vienna")) + timedelta(seconds=1.5)
     (tmp_path / "cues.csv").write_text(f"time,verb,values\n{soon:%H:%M:%S},next\n+0.1,black,true\n")
     text = f'[cues]\nfile = "{tmp_path}/cues.csv"\n{limit}\n'
-    seen = lambda: [code for code, _ in kiosk.recorded if code in ("cue-refused", "done-by")]  # noqa: E731
+
+    def seen() -> list[str]:
+        return [code for code, _ in kiosk.recorded if code in ("cue-refused", "done-by")]
+
     found = limited(kiosk, tmp_path, text, lambda _: wait_for(lambda: len(seen()) == 2))
     assert len(found) == allowed
 
