@@ -33,9 +33,10 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
             remedy=f"Choose one from 1 to {len(calibration.projectors)}.",
         )
     if target.shape != calibration.black.shape:
+        sizes = [" x ".join(map(str, image.shape)) for image in (target, calibration.black)]
         raise UsageError(
             "image-wrong-size",
-            what=f"The target is {target.shape} instead of {calibration.black.shape}.",
+            what=f"The target is {sizes[0]} instead of {sizes[1]}.",
             remedy="Make the target as large as this stage's camera image.",
         )
     if not np.isfinite(target).all():

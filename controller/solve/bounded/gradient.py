@@ -1,4 +1,4 @@
-"""The compiled steps of the bounded solver, on planes (3, ...)."""
+"""The compiled steps of the bounded solver, with the gradient of eq. 3, on planes (3, ...)."""
 
 from __future__ import annotations
 

@@ -11,7 +11,8 @@ BURNING: Final = (LampPhase.WARMING, LampPhase.LIT)
 
 
 class Lines:
-    """Collects commands that end in one byte; with ``start``, each begins at that byte, after any noise."""
+    """Collects commands that end in one byte; with ``start``, each begins at that byte, after any noise, so
+    no command may contain it later on."""
 
     def __init__(self, end: int, start: int | None = None) -> None:
         self._end, self._start = end, start
