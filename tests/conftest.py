@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import shutil
 import signal
-import tempfile
 from collections import Counter
 from typing import Any
 
 import pytest
 from hypothesis import settings
 
+from hal.runtime.caches import SHORTEST, temporary
 from tests.scheduling import LongestFirst
 
 # Workers that share the cores: numeric libraries whose threads wait for each other would take several times as long.
@@ -34,9 +34,9 @@ for number in (signal.SIGHUP, signal.SIGTERM):
 def pytest_configure(config: pytest.Config) -> None:
     """Sockets of the stages of this session lie in a folder of its own, which is short, and goes with it."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
-        folder = tempfile.mkdtemp(prefix="velatura-tests-")
-        os.environ["XDG_RUNTIME_DIR"] = folder
-        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        stack = contextlib.ExitStack()
+        os.environ["XDG_RUNTIME_DIR"] = str(stack.enter_context(temporary(SHORTEST)))
+        config.add_cleanup(stack.close)
 
 
 @pytest.fixture(scope="session", autouse=True)
