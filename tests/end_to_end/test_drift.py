@@ -15,8 +15,6 @@ from typing import Any
 import pytest
 
 from controller.artefacts.grade import graded
-from controller.artefacts.modes import PlanUsed
-from controller.capture.patterns import Code
 from controller.core.errors import CalibrationError
 from controller.run.journal import Journal
 from controller.run.progress import Silent
@@ -145,31 +143,3 @@ def test_nothing_is_published_below_the_set_grade_unless_a_person_accepts_it(bum
         assert not (bumpy.stage / "bundles").exists()
     finally:
         settings.write_text(before)
-
-
-def test_the_fewest_photographs_are_enough_until_the_projector_moves(bumpy: Bumpy) -> None:
-    settings = bumpy.stage / "stage.toml"
-    before = settings.read_text()
-    settings.write_text(before + '\n[calibration]\nphotographs = "fewest"\n')
-    try:
-        bumpy.bump(LEFT, Bump("projector", "right", misconverged_px=0.3))
-        still = _again(bumpy, "right")
-        bumpy.bump(LEFT, Bump("projector", "right", misconverged_px=0.3, shift_px=(9.0, -7.0)))
-        moved = _again(bumpy, "right")
-    finally:
-        settings.write_text(before)
-    then = graded(bumpy.first)
-    assert then is not None
-    for run, code, shown in ((still, Code.KNOWN, 12), (moved, Code.COLOURS, 16)):
-        used, now = PlanUsed.read(run, "right"), graded(run)
-        assert (used.few, used.code) == (True, code)
-        assert ("moved since" in used.because) is (code is Code.COLOURS)
-        kept = {path.stem for kind in ("light", "codes") for path in (run / f"captures/{kind}-right").glob("*.dng")}
-        assert len([name for name in kept if not name.startswith("white")]) == shown
-        assert now is not None
-        assert now["right"] < 1.2 * then["right"], (now, then)
-
-
-def _again(bumpy: Bumpy, name: str) -> Path:
-    session = OwnSession(bumpy.stage)
-    return Path(recalibrate(session=session, projector=name, reporter=Silent(), cancel=threading.Event())["run"])

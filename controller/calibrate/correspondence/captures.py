@@ -8,12 +8,12 @@ second), and hold NaN where they were saturated or not measured.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import CalibrationError
 
 Captures: TypeAlias = Mapping[str, FloatImage]
@@ -47,3 +47,16 @@ def grey(captures: Captures, name: str, shape: tuple[int, ...] | None = None) ->
     if image.ndim == 2:
         return image
     return np.asarray(cv2.transform(image, np.ones((1, 3), np.float32)), np.float32).reshape(image.shape[:2])
+
+
+LIT_SHARE: Final = 0.05
+"""Of the 99th percentile of white: darker camera pixels add noise and stray light."""
+
+
+def lit_pixels(white: FloatImage) -> Mask:
+    """(rows, columns): where white (rows, columns, 3), less black, is known and bright in every channel."""
+    known: Mask = np.asarray(np.isfinite(white).all(axis=2))
+    if not known.any():
+        return known
+    bright = np.percentile(white[known][::7], 99, axis=0)
+    return np.asarray(known & np.all(white > LIT_SHARE * bright, axis=2) & np.all(bright > 0))

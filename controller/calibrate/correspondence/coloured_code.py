@@ -8,18 +8,19 @@ from __future__ import annotations
 
 from typing import Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.calibrate.correspondence.captures import Captures, coloured
+from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.correspondence.gray_code import WEAK_BIT, Cells
 from controller.capture.patterns import PatternKind, PatternPlan
 from controller.capture.profile import CameraNoise
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage
 
 SOME_PIXELS: Final = 20_000
 ROUNDS: Final = 4
-LIT_SHARE: Final = 0.05
+AROUND_PX: Final = (5, 5)
 MOST_NOISE: Final = 0.12
 """Standard deviation of a bit, of the colour's own light: four of them lie between dark and the threshold."""
 LEAST_INDEPENDENCE: Final = 0.02
@@ -41,11 +42,14 @@ def decode_colours(captures: Captures, plan: PatternPlan, noise: CameraNoise) ->
     patterns = plan.of_kind(PatternKind.COLOUR_GRAY)
     separate = _separation(captures, plan, black, white)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sigma = np.sqrt(np.float32(noise.shot) * np.maximum(white / 2, 0) + np.float32(noise.read**2)) / white
+        # where hardly anything comes back, one pixel's white may look like light by its noise, but not those around
+        light = np.minimum(white, cv2.blur(np.nan_to_num(white), AROUND_PX))
+        sigma = np.sqrt(np.float32(noise.shot) * np.maximum(white / 2, 0) + np.float32(noise.read**2)) / light
         # noise of the separated colours
+        sigma[light <= 0] = np.inf
         spread = np.sqrt(np.square(sigma) @ np.square(separate).astype(np.float32).T)
     unsure = ~(spread < MOST_NOISE)
-    del sigma, spread
+    del sigma, spread, light
     cell = [np.zeros(shape, np.int32) for _ in range(2)]
     weak = [np.zeros(shape, np.uint8) for _ in range(2)]
     bit = [np.zeros(shape, np.bool_) for _ in range(2)]
@@ -90,9 +94,5 @@ def _separation(captures: Captures, plan: PatternPlan, black: FloatImage, white:
 
 
 def _some_lit(white: FloatImage) -> npt.NDArray[np.int64]:
-    known: Mask = np.asarray(np.isfinite(white).all(axis=2))
-    if not known.any():
-        return np.empty(0, np.int64)
-    bright = np.percentile(white[known][::7], 99, axis=0)
-    at = np.flatnonzero(known & (white > LIT_SHARE * bright).all(axis=2))
+    at = np.flatnonzero(lit_pixels(white))
     return np.asarray(at[:: max(1, at.size // SOME_PIXELS)], np.int64)

@@ -13,13 +13,11 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.calibrate.correspondence.captures import Captures, coloured
+from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import CELL_PX, PatternKind, PatternPlan, tile_levels
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage
 
-LIT_SHARE: Final = 0.05
-"""Of the 99th percentile of white: darker camera pixels are not asked."""
 BORDER_SHARE: Final = 0.28
 """Of a tile's side, on each side of it, that may show a neighbour's light."""
 WORST_OFF: Final = 0.15
@@ -71,7 +69,7 @@ def check_map(
     """
     black = coloured(captures, "black", known_px.shape[:2])
     white = coloured(captures, "white", black.shape[:2]) - black
-    lit = _lit(white)
+    lit = lit_pixels(white)
     known = np.asarray(np.isfinite(known_px).all(axis=2))
     covered = float(np.mean(known[lit])) if lit.any() else 0.0
     agreeing, asked = np.zeros(lit.shape, np.float32), np.zeros(lit.shape, np.float32)
@@ -110,11 +108,3 @@ def _expected(levels: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], radiometr
     """(cells down, cells across, 3): what the camera's channels see of each cell, of white."""
     light: Float64 = np.stack([radiometry.response[c][levels[..., c]] for c in range(3)], axis=-1)
     return np.asarray(radiometry.emitted(light) @ radiometry.mixing.T, np.float32)
-
-
-def _lit(white: FloatImage) -> Mask:
-    known: Mask = np.asarray(np.isfinite(white).all(axis=2))
-    if not known.any():
-        return known
-    bright = np.percentile(white[known][::7], 99, axis=0)
-    return np.asarray(known & np.all(white > LIT_SHARE * bright, axis=2) & np.all(bright > 0))

@@ -9,15 +9,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.calibrate.correspondence.captures import Captures, coloured
+from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.correspondence.codes import read_code
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternKind, PatternPlan, cells_of_frame, tile_levels
 from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage, Mask
 
-LIT_SHARE = 0.05
-"""Of the 99th percentile of white: darker camera pixels add noise and stray light."""
 BORDER_SHARE = 0.28
 """Of a tile's side, on each side of it, that may contain a neighbour's light."""
 FEWEST_PIXELS = 4
@@ -96,7 +94,7 @@ def measure_tiles(
     between = axes[0].sure & axes[1].sure & framed & ~seen
     if indirect is not None:
         white = white - indirect.white
-    inside = _interior(np.where(seen, tile, -1).astype(np.int32), between, _lit(white))
+    inside = _interior(np.where(seen, tile, -1).astype(np.int32), between, lit_pixels(white))
     number = -(-across // side) * -(-down // side)
     which = tile[inside]
     count = np.bincount(which, minlength=number)
@@ -132,14 +130,6 @@ def _levels_of(cells: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.int64]
 def _sums(light: FloatImage, which: npt.NDArray[np.int32], number: int) -> Float64:
     """(number, 3): ``light`` (pixels, 3) added up by tile; NaN where one pixel of a tile is not known."""
     return np.stack([np.bincount(which, light[:, channel], number) for channel in range(3)], axis=1)
-
-
-def _lit(white: FloatImage) -> Mask:
-    known: Mask = np.asarray(np.isfinite(white).all(axis=2))
-    if not known.any():
-        return known
-    bright = np.percentile(white[known][::7], 99, axis=0)
-    return np.asarray(known & np.all(white > LIT_SHARE * bright, axis=2) & np.all(bright > 0))
 
 
 def _interior(tile: npt.NDArray[np.int32], between: Mask, lit: Mask) -> Mask:

@@ -6,15 +6,18 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 
 from controller.artefacts.camera import Exposures
-from controller.artefacts.modes import PhotographOptions, Photographs, PlanUsed, photographs_named
+from controller.artefacts.kinds import StepKind
+from controller.artefacts.modes import PhotographOptions, Photographs, PlanUsed, photographs_named, told
 from controller.artefacts.photographs import BLACK, light_of
-from controller.artefacts.projectors import Light, Pixels
+from controller.artefacts.projectors import Indirect, Light, Pixels
+from controller.calibrate.geometry.values import CameraPrior
 from controller.capture.acquire import Acquirer
 from controller.capture.patterns import Code, plan_patterns
 from controller.core.errors import CalibrationError, UsageError
@@ -23,6 +26,7 @@ from controller.rig.rig import Rig, RigProjector
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Context
+from controller.steps.calibrate.full import calibration_steps
 from controller.steps.capture.light import photograph_light
 from controller.steps.capture.photographs import Planned, take_all
 from hal.deadline import Deadline, in_seconds
@@ -92,7 +96,7 @@ def stage_of(folder: Path, scene: Scene, journal: Journal) -> Photographed:
     world.time_s += STEADY_S
     acquirer = Acquirer(display, camera, iso=100, aperture_f=None, settle_s=0.0)
     rig = Rig(folder, (RigProjector(NAME, "P1", SCENE.projector_px, guard),), camera, display, acquirer)
-    context = Context(journal.folder, journal, in_seconds(60), Silent(), {}, lambda fraction, note: None)
+    context = Context(journal.folder, journal, in_seconds(600), Silent(), {}, lambda fraction, note: None)
     Exposures.write(context.folder, {NAME: EXPOSURES})
     take_all(rig, context, [Planned(str(n), dict, 2.0 * (n + 1)) for n in range(2)], into=BLACK)
     return Photographed(rig, camera, context, folder / "runs" / "before")
@@ -194,3 +198,26 @@ def test_a_continued_run_decides_the_same_and_takes_nothing_twice(tmp_path: Path
     light_of(NAME).by_name(stage.context.folder)["mosaic-1"].path.unlink()
     assert stage.light("fewest") == first
     assert stage.camera.taken[number:] == ["mosaic-1"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("photographs", "number"), [("few", 17), ("fewest", 14)])
+def test_a_projector_is_measured_from_few_photographs(
+    tmp_path: Path, journal: Journal, photographs: Photographs, number: int
+) -> None:
+    """From the first photograph to its pixels and its indirect light, by the steps of a calibration."""
+    calibrated_before(tmp_path, SCENE)
+    stage = stage_of(tmp_path, SCENE, journal)
+    options = PhotographOptions(photographs, stage.last)
+    steps = calibration_steps(stage.rig, cast("CameraPrior", None), longest_exposure_s=4.0, options=options)
+    wanted = (StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.INDIRECT)
+    for step in steps:
+        if step.id.kind in wanted:
+            step.run(stage.context)
+    run = stage.context.folder
+    pixels, light, indirect = Pixels.read(run, NAME), Light.read(run, NAME), Indirect.read(run, NAME)
+    error = (pixels.projector_px - positions(SCENE))[pixels.seen]
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    assert np.abs(light.response - SCENE.response()).max() < 0.01
+    assert abs(float(np.median(indirect.share[pixels.seen]))) < 0.015
+    assert told(run, [NAME]) == f"left {number} ({photographs})"
