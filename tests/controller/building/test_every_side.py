@@ -229,7 +229,10 @@ def test_a_cue_list_keeps_to_its_role_and_its_rate(
 @pytest.mark.parametrize(("limit", "allowed"), [('role = "viewer"', 0), ("per_second = 0.01", 2)])
 def test_pjlink_keeps_to_its_role_and_its_rate(kiosk: MemoryKiosk, tmp_path: Path, limit: str, allowed: int) -> None:
     async def drive(link: Any) -> None:
-        for ask in (lambda: link.mute.both(True), lambda: link.freeze.set(True), link.power.turn_off):
+        asks: list[Callable[[], Any]] = [
+            lambda: link.mute.both(True), lambda: link.freeze.set(True), lambda: link.power.turn_off(),
+        ]  # fmt: skip
+        for ask in asks:
             with contextlib.suppress(PJLinkERR3):
                 await ask()
 
