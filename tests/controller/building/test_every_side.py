@@ -221,7 +221,10 @@ def test_a_cue_list_keeps_to_its_role_and_its_rate(
     soon = datetime.now(ZoneInfo("Europe/Vienna")) + timedelta(seconds=1.5)
     (tmp_path / "cues.csv").write_text(f"time,verb,values\n{soon:%H:%M:%S},next\n+0.1,black,true\n")
     text = f'[cues]\nfile = "{tmp_path}/cues.csv"\n{limit}\n'
-    seen = lambda: [code for code, _ in kiosk.recorded if code in ("cue-refused", "done-by")]  # noqa: E731
+
+    def seen() -> list[str]:
+        return [code for code, _ in kiosk.recorded if code in ("cue-refused", "done-by")]
+
     found = limited(kiosk, tmp_path, text, lambda _: wait_for(lambda: len(seen()) == 2))
     assert len(found) == allowed
 
@@ -229,10 +232,7 @@ def test_a_cue_list_keeps_to_its_role_and_its_rate(
 @pytest.mark.parametrize(("limit", "allowed"), [('role = "viewer"', 0), ("per_second = 0.01", 2)])
 def test_pjlink_keeps_to_its_role_and_its_rate(kiosk: MemoryKiosk, tmp_path: Path, limit: str, allowed: int) -> None:
     async def drive(link: Any) -> None:
-        asks: list[Callable[[], Any]] = [
-            lambda: link.mute.both(True), lambda: link.freeze.set(True), lambda: link.power.turn_off(),
-        ]  # fmt: skip
-        for ask in asks:
+        for ask in (lambda: link.mute.both(True), lambda: link.freeze.set(True), link.power.turn_off):
             with contextlib.suppress(PJLinkERR3):
                 await ask()
 
