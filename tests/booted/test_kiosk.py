@@ -57,7 +57,8 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module", params=DEBIAN)
 def bare(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kiosk]:
     """Installed, without a stage; the projectors show the way to the panel."""
-    with installed(request.param, tmp_path_factory.mktemp(request.param), versions=("1", "2")) as kiosk:
+    versions = ("1", "2") if request.param == "bookworm" else ("1",)
+    with installed(request.param, tmp_path_factory.mktemp(request.param), versions=versions) as kiosk:
         assert kiosk.machine.wait_for(lambda: kiosk.read_code() != "") < PICTURE_S
         yield kiosk
 
@@ -260,6 +261,7 @@ def told_full(playing: Kiosk, disk: Disk) -> bool:
     return "is full" in playing.problems().get("disk", "")
 
 
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 def test_a_full_disk_is_told_once_and_the_picture_stays(playing: Kiosk) -> None:
     machine = playing.machine
     with disk_of_its_own(machine) as disk:
@@ -289,6 +291,7 @@ def test_a_full_disk_is_told_once_and_the_picture_stays(playing: Kiosk) -> None:
     machine.wait_for(lambda: playing.state == "playing")
 
 
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler (a package of the test set-up)")
 def test_hours_are_not_followed_by_a_clock_that_was_lost(playing: Kiosk) -> None:
     machine = playing.machine
@@ -314,6 +317,7 @@ def test_hours_are_not_followed_by_a_clock_that_was_lost(playing: Kiosk) -> None
     machine.wait_for(lambda: playing.state == "playing")
 
 
+@pytest.mark.parametrize("bare", ["bookworm"], indirect=True)
 def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kiosk) -> None:
     machine = playing.machine
     version = ("dpkg-query", "--show", "--showformat=${Version}", "velatura")
