@@ -16,7 +16,7 @@ import numpy as np
 from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import CELL_PX, PatternKind, PatternPlan, tile_levels
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import Float64, FloatImage, Mask
 
 BORDER_SHARE: Final = 0.28
 """Of a tile's side, on each side of it, that may show a neighbour's light."""
@@ -70,7 +70,7 @@ def check_map(
     black = coloured(captures, "black", known_px.shape[:2])
     white = coloured(captures, "white", black.shape[:2]) - black
     lit = lit_pixels(white)
-    known = np.asarray(np.isfinite(known_px).all(axis=2))
+    known: Mask = np.asarray(np.isfinite(known_px).all(axis=2))
     covered = float(np.mean(known[lit])) if lit.any() else 0.0
     agreeing, asked = np.zeros(lit.shape, np.float32), np.zeros(lit.shape, np.float32)
     for pattern in plan.of_kind(PatternKind.COLOUR_TILES):
