@@ -136,7 +136,7 @@ def test_home_assistant_finds_a_stage_reads_it_and_controls_it(tmp_path: Path, p
             "switch.open": "off", "sensor.state": "cooling", "select.appearance": "unknown",
             "binary_sensor.problem": "off", "sensor.drift": "unknown", "sensor.advice_of_the_drift_check": "look",
         }  # fmt: skip
-        wait_until(lambda: closed.items() <= states(ask(wait=14)).items())
+        wait_until(lambda: closed.items() <= states(ask(wait=15)).items())
         do("switch.turn_on", "open", lambda: state().state == "powering")
     log = (tmp_path / "home-assistant.log").read_text().splitlines()
     assert not [line for line in log if line.startswith(("ERROR", "WARNING")) and "'camera'" not in line]
