@@ -59,10 +59,10 @@ SHARES_NOTHING: Final = (
 )
 """Each of their tests takes long and starts with what it needs itself, so any worker may have it."""
 PARTS: Final[Mapping[str, tuple[str, ...]]] = {
-    "tests/booted/test_kiosk.py": ("[trixie",),
     "tests/real_kernel/test_on_kernel.py": ("::test_keys_",),
 }
-"""Words in the ids of tests that are a file of their own: another machine is booted for them."""
+"""Words in the ids of tests that are a file of their own: another machine is booted for them. The booted Debians stay
+together: two at once share a control group, and systemd of one then fails to signal its services."""
 
 
 def scope_of(test: str) -> str:

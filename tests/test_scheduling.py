@@ -116,9 +116,9 @@ def worker_file(tests: list[str], worker: Worker) -> str:
 @pytest.mark.parametrize(
     ("one", "other", "together"),
     [
-        ("tests/booted/test_kiosk.py::test_a[bookworm]", "tests/booted/test_kiosk.py::test_b[bookworm-x]", True),
-        ("tests/booted/test_kiosk.py::test_a[trixie]", "tests/booted/test_kiosk.py::test_b[trixie-x]", True),
-        ("tests/booted/test_kiosk.py::test_a[bookworm]", "tests/booted/test_kiosk.py::test_a[trixie]", False),
+        ("tests/booted/test_kiosk.py::test_a[bookworm]", "tests/booted/test_kiosk.py::test_a[trixie]", True),
+        ("tests/real_kernel/test_on_kernel.py::test_a", "tests/real_kernel/test_on_kernel.py::test_b", True),
+        ("tests/real_kernel/test_on_kernel.py::test_keys_a", "tests/real_kernel/test_on_kernel.py::test_b", False),
         (f"{SHARES_NOTHING[0]}::test_a", f"{SHARES_NOTHING[0]}::test_b", False),
     ],
 )

@@ -38,7 +38,7 @@ def stride_of(shape: tuple[int, ...]) -> int:
 
 
 def coarse_stripes(plan: PatternPlan) -> tuple[Pattern, ...]:
-    """The patterns whose dark parts tell."""
+    """The patterns whose dark parts tell; none where the code is shown in colours."""
     return tuple(pattern for axis in (0, 1) for pattern in plan.gray(axis)[:COARSE_BITS])
 
 

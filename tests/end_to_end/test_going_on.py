@@ -154,7 +154,7 @@ def test_it_ends_calibrated_without_ever_seeing_the_benchs_truth(story: Story) -
     assert (done.code, done.stderr, done.error) == (0, "", {})
     run = run_of(story.stage)
     assert done.result["run"] == str(run)
-    assert done.result.keys() == {"run", "grade", "map", "error"}
+    assert done.result.keys() == {"run", "grade", "map", "error", "photographs"}
     assert done.result["grade"] in ("A", "B")
     assert (run / "geometry.npz").exists()
     # the solving that was stopped, the one that went on, and what was refined is published

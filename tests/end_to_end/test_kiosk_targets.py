@@ -217,10 +217,12 @@ def test_a_scene_is_looked_at_on_the_object_before_it_is_computed(kiosk: StageKi
     # Without its edge, where samples of the object and of the room are mixed.
     inside = known & (cv2.erode(seen["mask"].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     assert np.corrcoef(seen["image"].mean(axis=2)[inside], paint[inside])[0, 1] > 0.95
-    kiosk.compute_scene("painted", "paint.blend")
-    assert 'kind = "blender"\nscene = "scenes/paint.blend"' in kiosk.settings()
     with pytest.raises(UsageError, match="made in another way"):
         kiosk.compute_scene("checkerboard", "gold")
+    job = ended(kiosk, kiosk.compute_scene("painted", "paint.blend"))
+    assert not job.failed, job.outcome
+    assert "painted" in [one.name for one in kiosk.appearances()]
+    assert 'kind = "blender"\nscene = "scenes/paint.blend"' in kiosk.settings()
 
 
 def test_an_outline_keeps_the_light_of_an_appearance_inside_it(kiosk: StageKiosk, tmp_path: Path) -> None:
