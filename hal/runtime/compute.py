@@ -50,6 +50,8 @@ def prepare_threads() -> None:
     OpenMP's threads spin while they wait. With other busy programs, each spins for a thread that has no CPU, and
     a solve takes up to 40 times as long (docs/decisions/0035). A variable set by the user is kept.
     """
+    # By itself numba prefers TBB where a system has it, and TBB's threads spin, at the end of a process, too.
+    os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     if usable_cpus() < affinity():  # numba uses the affinity, but no control groups
         os.environ.setdefault("NUMBA_NUM_THREADS", str(usable_cpus()))

@@ -92,6 +92,25 @@ def test_threads_wait_without_spinning_and_what_the_user_has_set_stays(tree: Pat
     assert _run(tree, tmp_path, {"OMP_WAIT_POLICY": "active"}, before=show)[-1] == "active"
 
 
+PARALLEL = """
+@compiled(parallel=True)
+def doubled(x):
+    for i in numba.prange(x.size):
+        x[i] *= 2
+
+doubled(np.ones(4))
+print(numba.threading_layer())
+"""
+
+
+def test_kernels_run_on_openmp_also_where_the_system_has_tbb(tree: Path, tmp_path: Path) -> None:
+    # ``.ci/system-packages`` brings libtbb; by itself numba would take it, whose threads spin
+    with (tree / "benchmarks" / "kernel.py").open("a") as file:
+        file.write(PARALLEL)
+    assert _run(tree, tmp_path)[-1] == "omp"
+    assert _run(tree, tmp_path, {"NUMBA_THREADING_LAYER": "workqueue"})[-1] == "workqueue"
+
+
 def test_numba_that_was_loaded_before_gets_the_same_settings(tree: Path, tmp_path: Path) -> None:
     _run(tree, tmp_path)
     assert _run(tree, tmp_path, before="import numba")[1] == "1"
