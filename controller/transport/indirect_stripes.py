@@ -14,6 +14,7 @@ import numpy as np
 from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.capture.patterns import Pattern, PatternPlan, frame
 from controller.core.arrays import FloatImage, Mask
+from controller.core.channels import finite
 from controller.transport.indirect import down
 
 BLOCKS: Final = 1200
@@ -49,7 +50,7 @@ def stripe_parts(pattern: Pattern, size_px: tuple[int, int], position_px: FloatI
     """
     lit = frame(pattern, size_px)
     near = cv2.dilate(lit, np.ones((2 * CLEAR_PX + 1,) * 2, np.uint8))
-    known: Mask = np.asarray(np.isfinite(position_px).all(axis=2))
+    known: Mask = finite(position_px)
     at = np.where(known[..., None], position_px, np.float32(-1e4)).astype(np.float32)
     shown, around = (
         cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond)
@@ -58,11 +59,13 @@ def stripe_parts(pattern: Pattern, size_px: tuple[int, int], position_px: FloatI
     return np.asarray(shown, np.float32), np.asarray(known & (around < 0.01))
 
 
-def dark_light(captures: Captures, plan: PatternPlan, position_px: FloatImage) -> FloatImage:
+def dark_light(captures: Captures, plan: PatternPlan, position_px: FloatImage) -> FloatImage | None:
     """(patterns, blocks, 3): the light of blocks in the dark parts of each coarse pattern, mean over the whole block.
 
     ``captures``: linear photographs in one unit, with ``black`` and ``gray-*``; what is not measured counts as dark.
-    Of the pixels that ``thinned`` keeps. Raises CalibrationError as ``coloured``.
+    Of the pixels that ``thinned`` keeps. None where the plan shows no such patterns.
+
+    Raises CalibrationError as ``coloured``.
     """
     shape = position_px.shape[:2]
     stride, (grid, side) = stride_of(shape), blocks_of(shape)
@@ -73,7 +76,7 @@ def dark_light(captures: Captures, plan: PatternPlan, position_px: FloatImage) -
         light = np.nan_to_num(thinned(coloured(captures, pattern.name, (shape[0], shape[1])), stride) - black)
         kept = np.where(dark[..., None], light, np.float32(0)).astype(np.float32)
         found.append(down(kept, grid, side // stride))
-    return np.stack(found)
+    return np.stack(found) if found else None
 
 
 def thinned(image: FloatImage, stride: int) -> FloatImage:

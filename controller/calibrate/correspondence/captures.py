@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask
+from controller.core.channels import every, finite
 from controller.core.errors import CalibrationError
 
 Captures: TypeAlias = Mapping[str, FloatImage]
@@ -55,8 +56,8 @@ LIT_SHARE: Final = 0.05
 
 def lit_pixels(white: FloatImage) -> Mask:
     """(rows, columns): where white (rows, columns, 3), less black, is known and bright in every channel."""
-    known: Mask = np.asarray(np.isfinite(white).all(axis=2))
+    known: Mask = finite(white)
     if not known.any():
         return known
     bright = np.percentile(white[known][::7], 99, axis=0)
-    return np.asarray(known & np.all(white > LIT_SHARE * bright, axis=2) & np.all(bright > 0))
+    return np.asarray(known & every(white > LIT_SHARE * bright) & np.all(bright > 0))

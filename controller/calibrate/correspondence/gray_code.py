@@ -11,6 +11,7 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.captures import Captures, grey
 from controller.capture.patterns import CELL_PX, PatternPlan
 from controller.core.arrays import FloatImage, Mask
+from controller.core.channels import finite
 from controller.core.jit import compiled
 
 WEAK_BIT = 0.25
@@ -43,7 +44,7 @@ class Cells:
 
 def known_cells(known_px: FloatImage) -> tuple[Cells, Cells]:
     """The cells of x and y of a map from before: (rows, columns, 2), NaN where it tells nothing."""
-    weak = np.where(np.isfinite(known_px).all(axis=2), 0, 2).astype(np.uint8)
+    weak = np.where(finite(known_px), 0, 2).astype(np.uint8)
     with np.errstate(invalid="ignore"):
         cell = np.floor((np.nan_to_num(known_px) + 0.5) / CELL_PX).astype(np.int32)
     return tuple(Cells(np.ascontiguousarray(cell[..., axis]), weak) for axis in range(2))  # type: ignore[return-value]

@@ -17,6 +17,7 @@ from controller.calibrate.correspondence.captures import Captures, coloured, lit
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import CELL_PX, PatternKind, PatternPlan, tile_levels
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import finite
 
 BORDER_SHARE: Final = 0.28
 """Of a tile's side, on each side of it, that may show a neighbour's light."""
@@ -70,7 +71,7 @@ def check_map(
     black = coloured(captures, "black", known_px.shape[:2])
     white = coloured(captures, "white", black.shape[:2]) - black
     lit = lit_pixels(white)
-    known: Mask = np.asarray(np.isfinite(known_px).all(axis=2))
+    known: Mask = finite(known_px)
     covered = float(np.mean(known[lit])) if lit.any() else 0.0
     agreeing, asked = np.zeros(lit.shape, np.float32), np.zeros(lit.shape, np.float32)
     for pattern in plan.of_kind(PatternKind.COLOUR_TILES):
@@ -82,10 +83,10 @@ def check_map(
         row, column = (
             np.clip((at[..., axis] / CELL_PX).astype(np.int64), 0, levels.shape[1 - axis] - 1) for axis in (1, 0)
         )
-        expected = _expected(levels, radiometry)[row, column]
+        cells = _expected(levels, radiometry)
+        expected = cells[row, column]
         if share is not None:
-            mean = _expected(levels, radiometry).reshape(-1, 3).mean(axis=0)
-            expected = expected + share * (mean - expected)
+            expected = expected + share * (cells.reshape(-1, 3).mean(axis=0) - expected)
         with np.errstate(invalid="ignore", divide="ignore"):
             off = np.abs((coloured(captures, pattern.name, lit.shape) - black) / white - expected).max(axis=2)
         use &= np.isfinite(off)

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from controller.calibrate.correspondence.captures import Captures, grey
+from controller.calibrate.correspondence.captures import LIT_SHARE, Captures, grey
 from controller.capture.patterns import Pattern, PatternPlan
 from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage
@@ -20,8 +20,6 @@ from controller.core.arrays import Float64, FloatImage
 SOME_PIXELS: Final = 200_000
 FEWEST_PIXELS: Final = 2_000
 """Fewer tell no strength."""
-LIT_SHARE: Final = 0.05
-"""Of the 99th percentile of white: darker camera pixels tell no strength."""
 ROUNDS, OUTLIER = 8, 5.0
 """Rounds of the fit; times the median deviation, from which a pixel is left out."""
 MOST_FLICKER: Final = 0.03

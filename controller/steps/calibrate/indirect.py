@@ -21,7 +21,7 @@ from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
-from controller.transport.indirect_stripes import coarse_stripes, dark_light
+from controller.transport.indirect_stripes import dark_light
 
 PASSES: Final = 2
 """The share follows from the response by which sinusoids were shown, the response from the share."""
@@ -66,8 +66,7 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     figures = IndirectFigures(median, p95, tuple(float(value) for value in change))
     segment = np.array([radiometry.segment]) if radiometry.segment else None
     known = pixels.phase_map
-    striped = known is not None and coarse_stripes(plan)
-    stripes = dark_light(captures, plan, known.projector_px) if known is not None and striped else None
+    stripes = None if known is None else dark_light(captures, plan, known.projector_px)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes)
     return [found.write(folder, name), figures.write(folder, name)]
 
