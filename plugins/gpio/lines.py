@@ -20,6 +20,8 @@ _WAIT_S: Final = 0.2
 _CLOSE_S: Final = 0.6
 _SILENT_S: Final = 10.0
 """A USB adapter may need some seconds for an answer, and its driver gives up only after several of them."""
+_NOT_NOW: Final = frozenset({errno.EAGAIN, errno.ETIMEDOUT})
+"""An adapter that was busy or missed one question; its lines are looked at again."""
 _NO_EDGES: Final = frozenset({errno.ENXIO, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS, 524})
 """What the kernel answers where a chip has no interrupts; 524 is its own ENOTSUPP."""
 _CONSUMER: Final = "velatura"
@@ -38,15 +40,18 @@ def check_chip() -> None:
 
 
 class Lines:
-    """Requested lines and the thread that reads them. ``edges``: whether the chip tells of changes by itself."""
+    """Requested lines and the thread that reads them.
+
+    ``edges``: whether the chip tells of changes by itself; ``silent_s``: a chip that is silent for longer is lost.
+    """
 
     def __init__(self, chip: Any, request: Any, keys: Mapping[int, int], heard: Callable[[int], None], *,
-                 debounce_s: float, edges: bool) -> None:  # fmt: skip
+                 debounce_s: float, edges: bool, silent_s: float = _SILENT_S) -> None:  # fmt: skip
         info = chip.get_info()
         self.name, self.label = printable(info.name), printable(info.label)
         self.edges = edges
         self._chip, self._request, self._keys, self._heard = chip, request, keys, heard
-        self._debounce_s = debounce_s
+        self._debounce_s, self._silent_s = debounce_s, silent_s
         self._lost: OSError | None = None
         self._answered_s = time.monotonic()
         # A key that is pressed from now on counts.
@@ -62,7 +67,7 @@ class Lines:
         """
         if self._lost is not None:
             raise self._lost
-        if time.monotonic() > self._answered_s + _SILENT_S:
+        if time.monotonic() > self._answered_s + self._silent_s:
             raise OSError(errno.ETIMEDOUT, "no answer")
 
     def close(self) -> None:
@@ -86,7 +91,12 @@ class Lines:
             if self.edges and self._request.wait_edge_events(timedelta(seconds=_WAIT_S)):
                 self._request.read_edge_events()
             # Also without an edge, so that a chip that went is found soon.
-            self._settle()
+            try:
+                self._settle()
+            except OSError as error:
+                if error.errno not in _NOT_NOW:
+                    raise
+                self._end.wait(_LOOK_S)
 
     def _settle(self) -> None:
         """Look until each line has been the same for the time of debouncing; tell of those that are pressed since."""
@@ -104,9 +114,9 @@ class Lines:
     def _values(self, offsets: list[int]) -> dict[int, bool]:
         from gpiod.line import Value
 
-        return {
-            line: value == Value.ACTIVE for line, value in zip(offsets, self._request.get_values(offsets), strict=True)
-        }
+        values = self._request.get_values(offsets)
+        self._answered_s = time.monotonic()
+        return {line: value == Value.ACTIVE for line, value in zip(offsets, values, strict=True)}
 
 
 def opened(settings: KeySettings, heard: Callable[[int], None]) -> Lines:

@@ -1,7 +1,8 @@
 """Emulated USB adapters with GPIO lines, as their data sheets and the kernel's drivers know them.
 
 ``Cp2112`` (Silicon Labs AN495): eight lines; its driver has interrupts. ``Mcp2221`` (Microchip DS20005565): four lines,
-without. ``levels``: what each line has now; ``looks``: how often levels were read.
+without. ``levels``: what each line has now; ``looks``: how often levels were read. ``busy``: that many next looks are
+answered with "not now".
 """
 
 from __future__ import annotations
@@ -59,19 +60,22 @@ class Mcp2221(EmulatedHidDevice):
 
     endpoints = (Endpoint(0x83, INTERRUPT, 64), Endpoint(0x03, INTERRUPT, 64))
     hid_descriptor = _collection(b"\x95\x40\x09\x01\x81\x02\x95\x40\x09\x01\x91\x02")
-    _STATUS, _SET_GPIO, _GET_GPIO = 0x10, 0x50, 0x51
-    _INPUT = 1
+    _STATUS, _SET_GPIO, _GET_GPIO, _GET_SETTINGS = 0x10, 0x50, 0x51, 0x61
+    _INPUT, _BUSY, _UNKNOWN = 1, 1, 1
 
     def __init__(self) -> None:
         super().__init__(UsbNames(0x04D8, 0x00DD, "Microchip", "MCP2221", "GPIO-2"))
         self.levels = [True] * 4
-        self.looks = 0
+        self.looks = self.busy = 0
         self._directions = [self._INPUT] * 4
 
     def out(self, endpoint: int, data: bytes) -> None:
         command, told = data[0], bytearray(64)
         told[0] = command
-        if command == self._GET_GPIO:
+        if command == self._GET_GPIO and self.busy > 0:
+            self.busy -= 1
+            told[1] = self._BUSY
+        elif command == self._GET_GPIO:
             self.looks += 1
             for line, (level, direction) in enumerate(zip(self.levels, self._directions, strict=True)):
                 told[2 + 2 * line : 4 + 2 * line] = level, direction
@@ -80,6 +84,9 @@ class Mcp2221(EmulatedHidDevice):
             for line in range(4):
                 if data[4 + 4 * line]:
                     self._directions[line] = data[5 + 4 * line]
+        elif command == self._GET_SETTINGS:
+            # Each pin is a GPIO. A driver that is not told asks for this ten times a second, for ever.
+            told[22:26] = bytes(direction << 3 for direction in self._directions)
         elif command != self._STATUS:
-            told[1] = 1  # what it does not know
+            told[1] = self._UNKNOWN
         self.send(0x83, bytes(told))
