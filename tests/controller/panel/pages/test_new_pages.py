@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import html
 import io
+import re
 import time
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
+from controller.calibrate.verify.error_attribution import COLOURS, WORDS
 from controller.kiosk.interface import Aiming, EventRow, ProjectorAim
 from controller.kiosk.store.accounts import Role
 from tests.controller.panel.memory_kiosk import MemoryKiosk
@@ -138,6 +140,17 @@ def test_appearances_are_photographed_and_the_results_show_the_newest_and_the_hi
             assert f"/see/appearances/warm%20wood/pictures/{kind}?" in wood
         assert vera.get("/see/appearances/glass/pictures/error").status_code == 404
         assert 'action="/do/compare"' not in vera.get("/results").text
+
+
+def test_the_legend_of_the_error_map_has_the_maps_names_and_colours(fresh: Served) -> None:
+    page = text_of(fresh, "/results")
+    with fresh.client() as anybody:
+        style = anybody.get("/static/style.css").text
+    shown = dict(re.findall(r'<span class="swatch (\w+)"></span>([^<]+)</li>', page))
+    asked = {cause.name.lower(): WORDS[cause][0] for cause in COLOURS}
+    assert shown == asked
+    for cause, colour in COLOURS.items():
+        assert f".swatch.{cause.name.lower()}{{background:#{bytes(colour).hex()}}}" in style
 
 
 def test_the_api_photographs_and_tells_what_was_achieved(fresh: Served) -> None:
