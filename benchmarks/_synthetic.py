@@ -15,6 +15,8 @@ import numpy as np
 from controller.artefacts.projectors import Light, Pixels
 from controller.calibrate.values import Calibration, Metapixels, PhaseMap, ProjectorCalibration, Radiometry
 from controller.core.arrays import FloatImage, Mask
+from controller.transport.indirect import IndirectLight
+from controller.transport.indirect_stripes import blocks_of
 
 PROJECTOR: Final = {
     "small": (210, 280), "medium": (526, 700), "paper": (1050, 1400), "hd": (1200, 1920), "uhd": (2160, 3840),
@@ -66,6 +68,20 @@ def write_synthetic_run(
         Pixels(found.projector_px, seen.astype(np.float32), seen, pixels.centre_px, pixels.covariance_px2, pixels.valid,
                found.projector_px, found.spread_px2, MOSAIC).write(folder, name)  # fmt: skip
     return names
+
+
+def synthetic_indirect(calibration: Calibration, lit: Mask) -> IndirectLight:
+    """A sixth of the light of such a stage by way of other surfaces, in as many blocks as a calibration has.
+
+    ``lit`` (rows, columns): camera pixels whose direct light the transport knows
+    """
+    grid, side = blocks_of(calibration.black.shape)
+    y, x = np.divmod(np.arange(grid[0] * grid[1]), grid[1])
+    near = np.exp(-0.5 * (np.subtract.outer(x, x) ** 2 + np.subtract.outer(y, y) ** 2) / 9)
+    factors = near / near.sum(axis=1, keepdims=True) + 1 / len(x)
+    white = np.sum([part.white for part in calibration.projectors], axis=0)
+    paint = white / max(float(white.max()), 1e-30)
+    return IndirectLight((factors / 4).astype(np.float32), paint.astype(np.float32), lit, grid, side)
 
 
 TO_XYZ: Final = np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]])

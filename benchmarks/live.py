@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks import Row, at_least, at_most
-from benchmarks._synthetic import synthetic_calibration, synthetic_target
+from benchmarks._synthetic import synthetic_calibration, synthetic_indirect, synthetic_target
 from controller.bundle.live_maps import LiveMaps, compensate
 from controller.calibrate.values import Calibration, Radiometry
 from controller.core.arrays import ByteImage, FloatImage
@@ -42,6 +42,7 @@ from plugins.display.player import DRIVER, PlayerDisplay
 BRIGHTNESS: Final = 0.25
 """The radiance of white: most of the synthetic target is within reach of it."""
 REPEATS: Final = 15
+TURNS: Final = 40
 STREAMED_S: Final = 12.0
 AS_FAST_HZ: Final = 1000.0
 DIFFERENT: Final = 6
@@ -61,6 +62,9 @@ def measure(size: str) -> list[Row]:
     target = np.asarray(np.rint(255 * linear_to_srgb(small)), np.uint8)
     scaler = Interactive(maps, transport.camera_shape)
     rows = _speeds(scaler, np.float32(BRIGHTNESS) * wanted, target, paper=paper)
+    thrown = synthetic_indirect(calibration, transport.object_mask)
+    with_g = scaling_maps(transport, base, calibration.black, radiometries, ["P1", "P2", "P3"], indirect=thrown)
+    rows += _indirect(scaler, Interactive(with_g, transport.camera_shape), target)
     rows += _errors(scaler, target, paper=paper)
     radiance = np.float32(BRIGHTNESS) * wanted
     exact = scale_frames(transport, base, radiance, calibration.black)
@@ -89,10 +93,10 @@ class _Spent:
         )
 
 
-def _spent(work: Callable[[], object]) -> _Spent:
+def _spent(work: Callable[[], object], repeats: int = REPEATS) -> _Spent:
     work()
     found = _Spent([], [])
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         began, cpu = time.perf_counter(), time.process_time()
         work()
         found.wall_ms.append(1e3 * (time.perf_counter() - began))
@@ -120,6 +124,31 @@ def _speeds(scaler: Interactive, radiance: FloatImage, target: ByteImage, *, pap
             how=str(live),
         ),
     ]
+
+
+def _indirect(without: Interactive, with_g: Interactive, target: ByteImage) -> list[Row]:
+    """What indirect light costs a live target: both ways turn about, so that what else runs slows both alike."""
+    frames = without.blank()
+    ways = [lambda: without.show_picture(target, BRIGHTNESS, frames),
+            lambda: with_g.show_picture(target, BRIGHTNESS, frames)]  # fmt: skip
+    spent = [_Spent([], []), _Spent([], [])]
+    for _ in range(TURNS):
+        for way, so_far in zip(ways, spent, strict=True):
+            once = _spent(way, 1)
+            so_far.wall_ms.extend(once.wall_ms)
+            so_far.cpu_ms.extend(once.cpu_ms)
+    plain, more = spent
+    blocks = 0 if with_g.maps.indirect is None else len(with_g.maps.indirect.factors)
+    how = f"{TURNS} of each, turn about, {blocks} blocks; without {plain}; with {more}"
+    apart = statistics.median(np.subtract(more.wall_ms, plain.wall_ms))
+    return [
+        at_most("a live target with indirect light, more than without", apart, 2.0, unit="ms",
+                how=f"median of the differences; {how}"),
+        at_most("the same, processor time of all threads", statistics.median(np.subtract(more.cpu_ms, plain.cpu_ms)),
+                None, unit="ms", how="median of the differences"),
+        at_most("the same, to that without", statistics.median(more.wall_ms) / statistics.median(plain.wall_ms), None,
+                unit="x", how="of the medians"),
+    ]  # fmt: skip
 
 
 def _errors(scaler: Interactive, target: ByteImage, *, paper: bool) -> list[Row]:

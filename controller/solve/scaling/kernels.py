@@ -43,10 +43,14 @@ class Thrown(NamedTuple):
 def thrown_back(thrown: Thrown, row: int, first: Index, last: Index, out: FloatImage) -> None:
     """Light by way of other surfaces in a row of the target, at columns ``first`` to ``last``; ``out`` is a row."""
     i, part, values = np.int64(thrown.up[row]), thrown.part_up[row], thrown.falling.shape[1]
-    above, below = thrown.falling[i], thrown.falling[min(i + 1, thrown.falling.shape[0] - 1)]
-    surface = thrown.surface[row * values : (row + 1) * values]
-    for k in range(3 * first, 3 * last):
-        out[k] = surface[k] * (above[k] + part * (below[k] - above[k]))
+    # slices that begin with the first element: an index that might be negative can't be vectorised
+    start, end = 3 * first, 3 * last
+    above = thrown.falling[i, start:end]
+    below = thrown.falling[min(i + 1, thrown.falling.shape[0] - 1), start:end]
+    surface = thrown.surface[row * values + start : row * values + end]
+    taken = out[start:end]
+    for k in range(taken.size):
+        taken[k] = surface[k] * (above[k] + part * (below[k] - above[k]))
 
 
 @compiled(parallel=True)
