@@ -1,59 +1,37 @@
 """Counts starts of the player that led to no picture; after three with one bundle, the one before plays again.
 
-The count lies in ``bundles/starts.json`` and is written before the bundle is touched, so a start that ends in a crash,
-a hang or a power cut stays counted. A start that is ready, and was not asked for a picture of the bundle, does not
-count: power cuts at night say nothing about a bundle. A folder that can not be written never keeps the player from
-playing.
+The count (``starts``) is written before the bundle is touched, so a start that ends in a crash, a hang or a power cut
+stays counted. A start that is ready, and was not asked for a picture of the bundle, does not count: power cuts at night
+say nothing about a bundle. A folder that can not be written never keeps the player from playing.
 """
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final
 
-from controller.bundle.install import CURRENT, STARTS, current, previous, switch_back
+from controller.bundle.install import CURRENT, current, previous, switch_back
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER
+from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError
-from controller.core.storage import write_atomically
 
 MOST_FAILED_STARTS: Final = 3
 MISSING: Final = "missing"
 """What was given up, where the bundle's file is gone."""
-_LARGEST_BYTES: Final = 4096
 
 
-@dataclass(frozen=True, slots=True)
-class Starts:
-    """What is known of the starts with one bundle.
-
-    ``bundle``: its file's name; ``failed``: starts in a row without a picture, the one that goes on now among them;
-    ``given_up``: the file's name of a bundle that is not gone back to, because it failed itself.
+def chosen(folder: Path) -> Path | None:
+    """The file that the player starts with: the current one, or the previous one where the player has gone back to it
+    and the links could not be changed, because the disk is full. None where none is installed.
     """
-
-    bundle: str = ""
-    failed: int = 0
-    given_up: str | None = None
-
-    @classmethod
-    def read(cls, folder: Path) -> Self:
-        """The count in ``folder``; none where the file is missing or is not ours."""
-        try:
-            with (folder / STARTS).open("rb") as file:
-                values: Any = json.loads(file.read(_LARGEST_BYTES))
-            found = cls(values["bundle"], values["failed"], values["given_up"])
-        except (OSError, ValueError, TypeError, KeyError, RecursionError):
-            return cls()
-        sound = isinstance(found.bundle, str) and type(found.failed) is int and found.failed >= 0
-        return found if sound and isinstance(found.given_up, str | None) else cls()
-
-    def write(self, folder: Path) -> None:
-        """Replace the count in ``folder``. Raises WorkError("cannot-write" or "no-space")."""
-        write_atomically(folder / STARTS, json.dumps(asdict(self)).encode())
+    now, earlier, starts = current(folder), previous(folder), Starts.read(folder)
+    name = MISSING if now is None else now.name
+    went_back = earlier is not None and (starts.bundle, starts.given_up) == (earlier.name, name)
+    return earlier if went_back else now
 
 
 class CountedStart:
@@ -68,7 +46,7 @@ class CountedStart:
         self._folder, self._tell = folder, tell
         self._writing: threading.Thread | None = None
         self._asked, self._counted = False, True
-        before, now = Starts.read(folder), current(folder)
+        before, linked, now = Starts.read(folder), current(folder), chosen(folder)
         name = "" if now is None else now.name
         starts = before if before.bundle == name else Starts(name, 0, before.given_up)
         earlier = previous(folder)
@@ -82,8 +60,8 @@ class CountedStart:
         if now is not None:
             self._kept(lambda: self._starts.write(folder))
         # After the count, which says what was given up: otherwise a power cut here lets two bad bundles take turns.
-        if now is not None and now.name != name:
-            self._kept(lambda: switch_back(folder, away_from=folder / name if name else None))
+        if now != linked:
+            self._kept(lambda: switch_back(folder, away_from=linked))
 
     def ready(self) -> None:
         """The bundle is loaded, and the player waits: until it is asked for a picture, its end says nothing."""

@@ -16,13 +16,12 @@ from typing import Final
 from controller.bundle.format import Index
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
+from controller.bundle.starts import forget
 from controller.core.errors import BundleError
 from controller.core.storage import exclusive, sha256_of, stream_atomically, sync_folder
 
 CURRENT: Final = "current"
 PREVIOUS: Final = "previous"
-STARTS: Final = "starts.json"
-"""How often the player was started with the current bundle without showing a picture (``fallback``)."""
 _INCOMING: Final = ".incoming.vel"
 _LOCK: Final = ".install.lock"
 _INSTALLED: Final = re.compile(r"[0-9a-f]{64}\.vel")
@@ -64,7 +63,7 @@ def install(
         finally:
             incoming.unlink(missing_ok=True)
         # Before the switch: a counter that is lost with the old bundle does no harm.
-        (folder / STARTS).unlink(missing_ok=True)
+        forget(folder)
         sync_folder(folder)
         _switch(folder, target)
     return target
@@ -75,7 +74,7 @@ def rollback(folder: Path) -> Path:
 
     It gets its starts again (``fallback``). Raises BundleError("bundle-no-previous").
     """
-    (folder / STARTS).unlink(missing_ok=True)
+    forget(folder)
     return switch_back(folder)
 
 

@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from controller.bundle.fallback import Starts
 from controller.bundle.install import current, previous
 from controller.bundle.reader import Bundle
+from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.service import Service

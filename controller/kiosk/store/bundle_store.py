@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Final
 
 from controller.artefacts.names import safe_name
-from controller.bundle.fallback import Starts
+from controller.bundle.fallback import chosen
 from controller.bundle.format import Index
 from controller.bundle.install import current, previous
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
+from controller.bundle.starts import Starts
 from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import Turn
@@ -58,7 +59,7 @@ class BundleStore:
 
     def bundle(self) -> Path | None:
         """The installed bundle's file, even if it can't be read: the player then goes back to the previous one."""
-        return current(self._stage / "bundles")
+        return chosen(self._stage / "bundles")
 
     def installed(self) -> Sequence[Path]:
         """The files of the bundle that plays and of the one before."""
@@ -82,7 +83,7 @@ class BundleStore:
     def given_up(self) -> str:
         """The file's name of the bundle that showed no picture, so that the one before plays; empty if none."""
         folder = self._stage / "bundles"
-        starts, now = Starts.read(folder), current(folder)
+        starts, now = Starts.read(folder), chosen(folder)
         fell_back = starts.given_up is not None and now is not None and starts.bundle == now.name != starts.given_up
         return str(starts.given_up) if fell_back else ""
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from controller.bundle.fallback import chosen
 from controller.core.errors import VelaturaError, WorkError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
 from controller.kiosk.store.event_log import Decision
@@ -180,8 +181,8 @@ class PlayerSupervisor:
         self._identities = {}
         installed = self._settings(True).bundle
         if hello.get("bundle") and installed is not None:
-            # The player may have gone back to the bundle before while it started; then the link has moved, too.
-            self._identities[str(hello["bundle"])] = installed.resolve()
+            # The player may have gone back to the bundle before while it started.
+            self._identities[str(hello["bundle"])] = chosen(installed.parent) or installed.resolve()
         self._tell(Decision("player-started", "The player is running."))
 
     def _player(self, settings: PlayerSettings) -> Process:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.bundle.fallback import CountedStart, Starts
-from controller.bundle.install import STARTS, install, rollback
+from controller.bundle.fallback import CountedStart
+from controller.bundle.install import install, rollback
+from controller.bundle.starts import NAME, Starts
 from tests.controller.bundle.test_install import made, plays
 
 
@@ -137,7 +138,7 @@ def test_who_installs_a_bundle_or_goes_back_to_it_gives_it_its_starts_again(
      b'{"bundle": "x", "failed": -1, "given_up": null}'],
 )  # fmt: skip
 def test_a_foreign_count_counts_nothing(folder: Path, content: bytes) -> None:
-    (folder / STARTS).write_bytes(content)
+    (folder / NAME).write_bytes(content)
     start(folder)
     assert plays(folder) == 2
     assert Starts.read(folder).failed == 1

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.bundle.fallback import CountedStart, Starts
+from controller.bundle.fallback import CountedStart
 from controller.bundle.install import current, install
+from controller.bundle.starts import Starts
 from tests.controller.bundle.power_cuts import every_cut
 from tests.controller.bundle.test_install import made, plays
 
