@@ -32,7 +32,7 @@ from controller.core.errors import WorkError
 from controller.solve.appearance import base_image
 from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
 from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.smoothness import TIE_STEPS
+from controller.solve.bounded.smoothness import EDGE_WEIGHT_STEPS
 from controller.solve.bounded.solver import smoothness_term
 from controller.transport import LightTransport, build_transport
 from controller.transport.camera_box import CameraBox
@@ -164,7 +164,7 @@ class _Theirs(LightTransport):
 def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) -> tuple[int, float, float]:
     """Sweeps until the objective is no higher, their seconds without those of looking, and the objective then."""
     across, down = _smooth(theirs)
-    majoriser = 2 * _ties(transport, across, down)
+    majoriser = 2 * _edge_sums(transport, across, down)
     ones, light, reach = np.ones_like(majoriser), transport.sensor_buffer(), transport.sensor_buffer()
     data = np.zeros_like(majoriser)
     for n in range(len(transport.sizes)):
@@ -174,10 +174,10 @@ def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) 
         transport.adjoint_of_buffer(n, light, data)
     majoriser += data
     wanted: FloatImage = theirs["tgt"]
-    tie = float(max(across.max(), down.max())) / TIE_STEPS
-    right, below = (np.rint(part / np.float32(tie)).astype(np.uint16) for part in (across, down))
+    strength_per_step = float(max(across.max(), down.max())) / EDGE_WEIGHT_STEPS
+    right, below = (np.rint(part / np.float32(strength_per_step)).astype(np.uint16) for part in (across, down))
     weights = np.ones(transport.camera_shape, np.float32)
-    problem = Problem(transport, wanted, np.zeros_like(wanted), weights, right, below, tie, majoriser)
+    problem = Problem(transport, wanted, np.zeros_like(wanted), weights, right, below, strength_per_step, majoriser)
     start = _start(transport, wanted, reach)
     block_coordinate_descent(problem, start.copy(), IterationControl(0, 1))
     seen: list[tuple[int, float, float]] = []
@@ -210,8 +210,8 @@ def _start(transport: _Theirs, wanted: FloatImage, reach: FloatImage) -> FloatIm
     return np.clip(share / np.maximum(whole, np.finfo(np.float32).tiny), 0, 1)
 
 
-def _ties(transport: _Theirs, across: FloatImage, down: FloatImage) -> FloatImage:
-    """The sum of each pixel's ties (3, pixels)."""
+def _edge_sums(transport: _Theirs, across: FloatImage, down: FloatImage) -> FloatImage:
+    """The sum of the weights of each pixel's edges (3, pixels)."""
     total = across + down
     for n, size in enumerate(transport.sizes):
         frame, right, below = (v[:, transport.span(n)].reshape(3, *size) for v in (total, across, down))

@@ -77,12 +77,12 @@ def base_peak_bytes(size: StageSize) -> int:
     built = size.transport + 3 * size.count * C + 12 * P + max(28 * C, 12 * C + means)
     # the picture and the weights stay during the solve
     solving = size.transport + 12 * C + 4 * C
-    ties = solving + 12 * P + 12 * C + 12 * P + 12 * P + own + means
+    smoothed = solving + 12 * P + 12 * C + 12 * P + 12 * P + own + means
     begun = solving + 24 * P + 12 * C + 12 * P + 2 * own + means
     swept = solving + 24 * P + 36 * P + 5 * 4 * S
     ended = solving + 36 * P + 24 * C
     prepared = size.transport + 24 * C + 12 * P + 3 * C + max(12 * C + 12 * P + means, 15 * C + 36 * P)
-    return int(SPARE * max(built, ties, begun, swept, ended, prepared)) + PROGRAM
+    return int(SPARE * max(built, smoothed, begun, swept, ended, prepared)) + PROGRAM
 
 
 def calibration_peak_bytes(size: StageSize) -> int:

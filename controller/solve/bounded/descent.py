@@ -69,7 +69,7 @@ def block_coordinate_descent(
             transport.normal_residual(light_y, problem.weights, right_hand_side, residual)
             transport.adjoint_of_buffer(n, residual, step)
             start, segment = transport.span(n).start, transport.segment(n)
-            smoothness = problem.majoriser, problem.across, problem.down, problem.tie
+            smoothness = problem.majoriser, problem.across, problem.down, problem.strength_per_step
             a, b = projected_step(y, x, step, *smoothness, start, rows, columns, segment)
             squared_step, uphill = squared_step + a, uphill + b
             transport.accumulate_forward(n, step, light_y)

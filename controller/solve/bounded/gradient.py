@@ -7,7 +7,7 @@ from numba import prange
 
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
-from controller.solve.bounded.problem import Ties
+from controller.solve.bounded.problem import EdgeWeights
 
 
 @compiled(parallel=True, fastmath=True)
@@ -30,9 +30,11 @@ def weighted_residual(light: FloatImage, target: FloatImage, weights: FloatImage
 
 
 @compiled(fastmath=True)
-def _add_differences(into: FloatImage, here: FloatImage, there: FloatImage, weight: Ties, tie: np.float32) -> None:
+def _add_differences(
+    into: FloatImage, here: FloatImage, there: FloatImage, weight: EdgeWeights, strength_per_step: np.float32
+) -> None:
     for i in range(into.size):
-        into[i] += tie * np.float32(weight[i]) * (here[i] - there[i])
+        into[i] += strength_per_step * np.float32(weight[i]) * (here[i] - there[i])
 
 
 @compiled(fastmath=True)
@@ -92,9 +94,9 @@ def projected_step(
     x: FloatImage,
     gradient: FloatImage,
     majoriser: FloatImage,
-    across: Ties,
-    down: Ties,
-    tie: float,
+    across: EdgeWeights,
+    down: EdgeWeights,
+    strength_per_step: float,
     start: int,
     rows: int,
     columns: int,
@@ -105,11 +107,11 @@ def projected_step(
     All arrays (3, pixels of all projectors), each projector row by row. ``gradient`` is that of the data; that of the
     smoothness is added here. Returns two sums: majoriser x step^2, whose size measures the KKT residual, and
     majoriser x (y - new) x (new - x), positive where the momentum points uphill; new is y + step.
-    ``across``, ``down``: in steps of ``tie``
+    ``across``, ``down``, ``strength_per_step``: as in ``Problem``
     ``segment``: the projector's share of white that only greys get; see ``LightTransport.segments``
     """
     sums = np.zeros((rows, 2), np.float64)
-    unit = np.float32(tie)
+    unit = np.float32(strength_per_step)
     for v in prange(rows):
         a = start + v * columns
         e = a + columns
@@ -187,29 +189,29 @@ def scale_base(
 
 
 @compiled(parallel=True, fastmath=True)
-def add_smoothness(
-    data: FloatImage,
-    across: Ties,
-    down: Ties,
-    tie: float,
+def add_smoothness_to_majoriser(
+    majoriser: FloatImage,
+    across: EdgeWeights,
+    down: EdgeWeights,
+    strength_per_step: float,
     start: int,
     rows: int,
     columns: int,
 ) -> None:
-    """Make one projector's smoothness weights 0 beside dark pixels; add twice their sums to ``data``.
+    """Make one projector's edge weights 0 beside dark pixels; add twice their sums to ``majoriser``.
 
-    All (3, pixels of all projectors); dark is a pixel without ``data``, and stays so. ``start``, ``rows``,
-    ``columns``: the projector; ``across``, ``down``: in steps of ``tie``
+    All (3, pixels of all projectors). ``majoriser`` holds the data's part; a pixel is dark where it is 0, and stays so.
+    ``start``, ``rows``, ``columns``: the projector
     """
-    twice = np.float32(2 * tie)
+    twice = np.float32(2 * strength_per_step)
     for v in prange(rows):
         for c in range(3):
             for x in range(columns):
                 i = start + v * columns + x
-                lit = data[c, i] > 0
-                if not (lit and x + 1 < columns and data[c, i + 1] > 0):
+                lit = majoriser[c, i] > 0
+                if not (lit and x + 1 < columns and majoriser[c, i + 1] > 0):
                     across[c, i] = 0
-                if not (lit and v + 1 < rows and data[c, i + columns] > 0):
+                if not (lit and v + 1 < rows and majoriser[c, i + columns] > 0):
                     down[c, i] = 0
     for v in prange(rows):
         for c in range(3):
@@ -218,7 +220,7 @@ def add_smoothness(
                 edges = np.int64(across[c, i]) + np.int64(down[c, i])
                 edges += np.int64(across[c, i - 1]) if x > 0 else 0
                 edges += np.int64(down[c, i - columns]) if v > 0 else 0
-                data[c, i] += twice * np.float32(edges)
+                majoriser[c, i] += twice * np.float32(edges)
 
 
 @compiled(parallel=True, fastmath=True)

@@ -11,8 +11,8 @@ from controller.core.arrays import FloatImage
 from controller.transport import LightTransport
 from controller.transport.planes import planes_above
 
-Ties = npt.NDArray[np.uint16]
-"""Squared smoothness weights (3, pixels) in steps of ``Problem.tie``: half a step off at most (decision 55)."""
+EdgeWeights = npt.NDArray[np.uint16]
+"""Squared weights of the smoothness edges (3, pixels), in steps of 1 / EDGE_WEIGHT_STEPS (docs/decisions/0055)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +21,9 @@ class Problem:
 
     ``picture``, ``black`` (camera rows, columns, 3): what is wanted, and the black image; not copies
     ``weights`` (camera rows, columns): 0 off the object
-    ``across``, ``down`` (3, pixels of all projectors) uint16: squared smoothness weights to the right and lower
-    neighbour, in steps of ``tie``
+    ``across``, ``down`` (3, pixels of all projectors) uint16: squared weights of the smoothness edges to the right
+    and lower neighbour, in steps of 1 / EDGE_WEIGHT_STEPS
+    ``strength_per_step``: factor in the objective of an edge whose stored weight is 1
     ``majoriser`` (3, pixels): the diagonal that bounds each projector's own Hessian, 0 where a pixel lights nothing
     """
 
@@ -30,9 +31,9 @@ class Problem:
     picture: FloatImage
     black: FloatImage
     weights: FloatImage
-    across: Ties
-    down: Ties
-    tie: float
+    across: EdgeWeights
+    down: EdgeWeights
+    strength_per_step: float
     majoriser: FloatImage
 
     def target(self) -> FloatImage:

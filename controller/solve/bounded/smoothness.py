@@ -13,22 +13,22 @@ from numba import prange
 
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
-from controller.solve.bounded.problem import Ties
+from controller.solve.bounded.problem import EdgeWeights
 from controller.transport import LightTransport
 
-TIE_STEPS: Final = 65535
+EDGE_WEIGHT_STEPS: Final = 65535
 """Squared weights, 0 to 1, are kept in so many steps: 2 bytes instead of 4, and at most 1/131070 off."""
 
 FAINTEST: Final = 1e-3
 """Fraction of a projector's brightest observed pixel below which a pixel counts as in shadow."""
 
 
-def squared_edge_weights(transport: LightTransport, wanted: FloatImage) -> tuple[Ties, Ties]:
+def squared_edge_weights(transport: LightTransport, wanted: FloatImage) -> tuple[EdgeWeights, EdgeWeights]:
     """alpha squared for all projectors; alpha is 0 beside a pixel that contributes nothing (paper 2.4, eq. 3).
 
     ``wanted`` (3, camera rows, columns): the light to be made, without the black image; overwritten. Returns two arrays
-    (3, pixels) in steps of 1 / TIE_STEPS: from each pixel to its right neighbour, and to the one below; 0 at the last
-    column and row.
+    (3, pixels) in steps of 1 / EDGE_WEIGHT_STEPS: from each pixel to its right neighbour, and to the one below; 0 at
+    the last column and row.
     """
     count = transport.pixels
     across, down = np.zeros((3, count), np.uint16), np.zeros((3, count), np.uint16)
@@ -51,7 +51,7 @@ def _squared_alike(target: float, observed: float, other: float, other_observed:
     a, b = target / observed, other / other_observed
     larger = max(a, b)
     alpha = min(a, b) / larger if larger > 0 else 1.0
-    return int(TIE_STEPS * alpha * alpha + 0.5)
+    return int(EDGE_WEIGHT_STEPS * alpha * alpha + 0.5)
 
 
 @compiled(parallel=True)
@@ -62,8 +62,8 @@ def _squared(
     start: int,
     rows: int,
     columns: int,
-    across: Ties,
-    down: Ties,
+    across: EdgeWeights,
+    down: EdgeWeights,
 ) -> None:
     """The squared weights of one projector; ``observed`` (3, its pixels), the others of all projectors."""
     for y in prange(rows):

@@ -19,10 +19,10 @@ import numpy.typing as npt
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.solve.bounded.descent import IterationControl
-from controller.solve.bounded.gradient import add_smoothness, inner, weighted_residual
+from controller.solve.bounded.gradient import add_smoothness_to_majoriser, inner, weighted_residual
 from controller.solve.bounded.initial_estimate import initial_estimate
 from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.smoothness import TIE_STEPS, squared_edge_weights
+from controller.solve.bounded.smoothness import EDGE_WEIGHT_STEPS, squared_edge_weights
 from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, plane_frames, plane_image, planes_above
@@ -145,10 +145,10 @@ def build_problem(
     if transport.beside is not None:
         # A pixel without data stays dark: what little it lights of the object is not worth light on the wall.
         diagonal[:, transport.beside] = 0
-    tie = smoothness * scale / TIE_STEPS
+    strength_per_step = smoothness * scale / EDGE_WEIGHT_STEPS
     for n, (rows, columns) in enumerate(transport.sizes):
-        add_smoothness(diagonal, across, down, tie, transport.span(n).start, rows, columns)
-    return Problem(transport, target, black, counted, across, down, tie, diagonal)
+        add_smoothness_to_majoriser(diagonal, across, down, strength_per_step, transport.span(n).start, rows, columns)
+    return Problem(transport, target, black, counted, across, down, strength_per_step, diagonal)
 
 
 def _majoriser(transport: LightTransport, counted: FloatImage) -> tuple[FloatImage, float]:
@@ -195,4 +195,4 @@ def smoothness_term(problem: Problem, x: FloatImage) -> float:
         for frame, across, down in zip(*(_frame_view(problem.transport, n, v) for v in planes), strict=True):
             total += float((across[:, :-1] * np.diff(frame, axis=1) ** 2).sum(dtype=np.float64))
             total += float((down[:-1] * np.diff(frame, axis=0) ** 2).sum(dtype=np.float64))
-    return problem.tie * total
+    return problem.strength_per_step * total

@@ -36,7 +36,7 @@ class _Frames:
     y: Buffer
     x: Buffer
     majoriser: Buffer
-    ties: Buffer
+    edge_weights: Buffer
     step: Buffer
     values: Buffer
     pixels: int
@@ -97,12 +97,12 @@ class DeviceDescent:
         problem, transport = self._problem, self._transport
         span = problem.transport.span(n)
         rows, columns = transport.sizes[n]
-        ties = problem.across[:, span].astype(np.uint32) | problem.down[:, span].astype(np.uint32) << 16
+        edge_weights = problem.across[:, span].astype(np.uint32) | problem.down[:, span].astype(np.uint32) << 16
         start = np.ascontiguousarray(x[:, span])
         head = constants([columns, rows, rows * columns, first, 0, 0], transport.mixing[n])
-        head[4:6] = np.array([problem.tie, problem.transport.segment(n)], np.float32).view(np.uint32)
+        head[4:6] = np.array([problem.strength_per_step, problem.transport.segment(n)], np.float32).view(np.uint32)
         y, x_there, majoriser, packed = (
-            self._held.put(part, "frames") for part in (start, start, problem.majoriser[:, span], ties)
+            self._held.put(part, "frames") for part in (start, start, problem.majoriser[:, span], edge_weights)
         )
         step = self._held.room(start.nbytes, "frames")
         return _Frames(y, x_there, majoriser, packed, step, self._device.uniform(head), rows * columns)
@@ -113,8 +113,8 @@ class DeviceDescent:
         device, transport = self._device, self._transport
         steps: list[Step] = [Copy(self._light_y, self._before)]
         for n, frames in enumerate(self._frames):
-            bound = [frames.values, frames.y, frames.x, frames.majoriser, frames.ties, frames.step, transport.shown,
-                     self._partials, self._state]  # fmt: skip
+            bound = [frames.values, frames.y, frames.x, frames.majoriser, frames.edge_weights, frames.step,
+                     transport.shown, self._partials, self._state]  # fmt: skip
             steps += transport.residual_of(self._light_y, self._wanted, self._weights)
             steps += transport.adjoint(n, frames.step)
             steps.append(device.work(device.kernel("frame", "state", "step"), bound, frames.pixels))

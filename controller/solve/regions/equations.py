@@ -68,7 +68,7 @@ def _smoothness(
         pairs = np.unique(pairs, axis=1)
         for index, c in enumerate(channels):
             here = pairs[:, edges[c, pairs[0]] > 0]
-            alpha = np.sqrt(problem.tie * edges[c, here[0]].astype(np.float64))
+            alpha = np.sqrt(problem.strength_per_step * edges[c, here[0]].astype(np.float64))
             known = np.zeros(alpha.size)
             for pixel, sign in ((here[0], 1.0), (here[1], -1.0)):
                 at = np.minimum(np.searchsorted(unknown, pixel), unknown.size - 1)

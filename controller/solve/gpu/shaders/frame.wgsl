@@ -5,7 +5,7 @@ struct Frame {
   pixels: u32,
   // where this projector's partial sums begin
   partials: u32,
-  tie: f32,
+  strength_per_step: f32,
   // share of white that only greys get
   segment: f32,
   // rows: camera channel by projector channel, or its inverse

@@ -2,8 +2,8 @@
 @group(0) @binding(1) var<storage, read> y: array<f32>;
 @group(0) @binding(2) var<storage, read> x: array<f32>;
 @group(0) @binding(3) var<storage, read> majoriser: array<f32>;
-// squared weights of smoothness in steps of frame.tie: to the right neighbour (low half), and to the one below
-@group(0) @binding(4) var<storage, read> ties: array<u32>;
+// squared weights of smoothness in steps of frame.strength_per_step: to the right neighbour (low half), and to the one below
+@group(0) @binding(4) var<storage, read> edge_weights: array<u32>;
 // the gradient before, the step after
 @group(0) @binding(5) var<storage, read_write> step: array<f32>;
 @group(0) @binding(6) var<storage, read_write> shown: array<f32>;
@@ -16,11 +16,11 @@ fn smooth_gradient(c: u32, at: u32, row: u32, column: u32) -> f32 {
   let i = c * frame.pixels + at;
   let here = y[i];
   var total = 0.0;
-  if (column + 1u < frame.columns) { total += f32(ties[i] & 0xffffu) * (here - y[i + 1u]); }
-  if (column > 0u) { total += f32(ties[i - 1u] & 0xffffu) * (here - y[i - 1u]); }
-  if (row + 1u < frame.rows) { total += f32(ties[i] >> 16u) * (here - y[i + frame.columns]); }
-  if (row > 0u) { total += f32(ties[i - frame.columns] >> 16u) * (here - y[i - frame.columns]); }
-  return frame.tie * total;
+  if (column + 1u < frame.columns) { total += f32(edge_weights[i] & 0xffffu) * (here - y[i + 1u]); }
+  if (column > 0u) { total += f32(edge_weights[i - 1u] & 0xffffu) * (here - y[i - 1u]); }
+  if (row + 1u < frame.rows) { total += f32(edge_weights[i] >> 16u) * (here - y[i + frame.columns]); }
+  if (row > 0u) { total += f32(edge_weights[i - frame.columns] >> 16u) * (here - y[i - frame.columns]); }
+  return frame.strength_per_step * total;
 }
 
 // The nearest colour to p that a projector with a white segment can show, by majoriser d; as in bounded/gradient.py.

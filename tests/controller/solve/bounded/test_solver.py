@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from controller.calibrate.values import Calibration, Metapixels
 from controller.core.errors import UsageError, WorkError
-from controller.solve.bounded.smoothness import TIE_STEPS, squared_edge_weights
+from controller.solve.bounded.smoothness import EDGE_WEIGHT_STEPS, squared_edge_weights
 from controller.solve.bounded.solver import SMOOTHNESS, Solution, build_problem, smoothness_term, solve_bounded
 from controller.transport import LightTransport, build_transport
 from controller.transport.planes import frame_planes, image_planes, plane_frames
@@ -23,7 +23,7 @@ from tests.controller.solve.bounded.smoothness_reference import smoothness_weigh
 
 Stage = Callable[..., Calibration]
 Matrix = npt.NDArray[np.float64]
-HALF_A_STEP = 0.5 / TIE_STEPS
+HALF_A_STEP = 0.5 / EDGE_WEIGHT_STEPS
 few = settings(
     max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
 )
@@ -253,8 +253,10 @@ def test_the_weights_of_the_smoothness_equations_are_those_of_the_paper(stage: S
         edges = smoothness_weights(transport.gaussian_mean(wanted, n), transport.gaussian_mean(white, n))
         kept = (part[:, transport.span(n)].astype(np.float32) for part in (across, down))
         right, below = (plane_frames(part, [size])[0] for part in kept)
-        np.testing.assert_allclose(right[:, :-1] / TIE_STEPS, edges.across**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
-        np.testing.assert_allclose(below[:-1] / TIE_STEPS, edges.down**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
+        np.testing.assert_allclose(
+            right[:, :-1] / EDGE_WEIGHT_STEPS, edges.across**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6
+        )
+        np.testing.assert_allclose(below[:-1] / EDGE_WEIGHT_STEPS, edges.down**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
         assert not right[:, -1].any()
         assert not below[-1].any()
 
@@ -292,5 +294,5 @@ def test_weights_in_steps_change_the_objective_by_half_a_step_of_each_difference
             lit = (np.delete(lights, 0, axis) > 0) & (np.delete(lights, -1, axis) > 0)
             exact += float((lit * alpha.astype(np.float64) ** 2 * apart).sum())
             most += float(apart.sum())
-    strength = problem.tie * TIE_STEPS
+    strength = problem.strength_per_step * EDGE_WEIGHT_STEPS
     assert abs(smoothness_term(problem, x) - strength * exact) <= strength * (HALF_A_STEP * most + 1e-5 * exact)

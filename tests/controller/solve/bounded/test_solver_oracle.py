@@ -28,12 +28,12 @@ def equations(problem: Problem) -> tuple[sp.csr_matrix[np.float64], Float64]:
     for n, (height, width) in enumerate(transport.sizes):
         span = transport.span(n)
         index = np.arange(height * width).reshape(height, width) + span.start
-        for ties, a, b in (
+        for edge_weights, a, b in (
             (problem.across, index[:, :-1], index[:, 1:]),
             (problem.down, index[:-1], index[1:]),
         ):
             for c in range(3):
-                weight = np.sqrt(problem.tie * ties[c, a.ravel()].astype(np.float64))
+                weight = np.sqrt(problem.strength_per_step * edge_weights[c, a.ravel()].astype(np.float64))
                 k = np.arange(a.size)
                 shape = (a.size, 3 * transport.pixels)
                 offset = c * transport.pixels
