@@ -9,6 +9,7 @@ use it when you add a kernel.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import importlib
 import json
@@ -75,7 +76,8 @@ class Compilation:
     def _feed(self, process: subprocess.Popen[str]) -> None:
         assert process.stdin is not None
         assert process.stdout is not None
-        with process:
+        # A process that `close` ended leaves a name in the pipe, which can't be written any more.
+        with contextlib.suppress(BrokenPipeError), process:
             while True:
                 with self._lock:
                     if self._closed or not self._waiting:

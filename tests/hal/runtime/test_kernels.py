@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -92,6 +94,27 @@ def test_a_compilation_that_is_closed_ends_its_processes_at_once(
         assert compilation.share < 1
     assert compilation.wait(0)
     assert not are_compiled()
+
+
+def test_a_compilation_whose_process_was_killed_names_what_is_missing_and_ends_without_a_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VELATURA_CACHE", str(tmp_path))
+    raised: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", raised.append)
+    before = _children()
+    with Compilation(processes=1) as compilation:
+        for process in _children() - before:
+            os.kill(process, signal.SIGKILL)
+        assert compilation.wait(60)
+        assert compilation.failed
+    assert raised == []
+
+
+def _children() -> set[int]:
+    """Of this process, started by any of its threads."""
+    listed = Path("/proc/self/task").glob("*/children")
+    return {int(number) for children in listed for number in children.read_text().split()}
 
 
 def test_a_module_that_does_not_exist_fails_and_says_so_in_its_exit_code(tmp_path: Path) -> None:
