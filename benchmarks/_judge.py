@@ -47,12 +47,18 @@ def radiometry_errors(truth: Truth, n: int, radiometry: Radiometry) -> dict[str,
     }
 
 
-def map_errors(truth: Truth, n: int, run: Path) -> dict[str, float]:
-    """Decoded against true projector positions, projector px."""
+def map_errors(truth: Truth, n: int, run: Path, *, without_offset: bool = False) -> dict[str, float]:
+    """Decoded against true projector positions, projector px.
+
+    ``without_offset``: the median is taken off, where red and blue do not lie on green, whose place the true one is
+    """
     name = truth.bench.projectors[n].name
     measured = Pixels.read(run, name).projector_px.astype(np.float64)
     true = truth.projector_px(n)
-    error = np.hypot(*np.moveaxis(measured - true, 2, 0))
+    off = measured - true
+    if without_offset:
+        off -= np.nanmedian(off, axis=(0, 1))
+    error = np.hypot(*np.moveaxis(off, 2, 0))
     seen = np.isfinite(error)
     gross = seen & (error > 1.0)
     slope = np.full(error.shape, np.inf)

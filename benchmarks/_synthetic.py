@@ -20,14 +20,21 @@ from controller.transport.indirect_stripes import blocks_of
 
 PROJECTOR: Final = {
     "small": (210, 280), "medium": (526, 700), "paper": (1050, 1400), "hd": (1200, 1920), "uhd": (2160, 3840),
+    "eight-uhd": (2160, 3840),
 }  # fmt: skip
 CAMERA: Final = {
     "small": (520, 776), "medium": (1296, 1944), "paper": (2592, 3888), "hd": (2880, 4320), "uhd": (5464, 8192),
+    "eight-uhd": (5464, 8192),
 }  # fmt: skip
 """(rows, columns)"""
-COUNT: Final = {"hd": 4, "uhd": 4}
+COUNT: Final = {"hd": 4, "uhd": 4, "eight-uhd": 8}
 """Projectors, where they are not three."""
-NAMES: Final = ("left", "middle", "right", "above")
+NAMES: Final = ("left", "middle", "right", "above", "below", "far-left", "far-right", "high")
+FORESHORTENING: Final = (0.0, 0.25, -0.25, 0.15, -0.15, 0.3, -0.3, 0.1)
+ANGLE: Final = (0.0, 0.12, -0.1, 0.06, -0.06, 0.16, -0.14, 0.03)
+SIDE: Final = (0.0, 0.5, -0.5, 0.25, -0.25, 0.6, -0.6, 0.1)
+SPILL: Final = (0.0, 0.05, 0.08, 0.03, 0.06, 0.02, 0.04, 0.07)
+"""One value for each projector."""
 MARGIN_PX: Final = 6
 """Of a crop, in projector pixels."""
 
@@ -153,7 +160,7 @@ def _projector(
     rows, columns = size
     row, column = np.mgrid[0:rows, 0:columns].astype(np.float64)
     p, q = (column + 0.5) / columns * 2 - 1, (row + 0.5) / rows * 2 - 1
-    foreshortening, angle = (0.0, 0.25, -0.25, 0.15)[n], (0.0, 0.12, -0.1, 0.06)[n]
+    foreshortening, angle = FORESHORTENING[n], ANGLE[n]
     a, b = p + 0.6 * foreshortening * (p * p - 1), q + 0.03 * np.sin(3 * p + n)
     aspect = camera[1] / camera[0]
     c, s = np.cos(angle), np.sin(angle)
@@ -168,8 +175,8 @@ def _projector(
     inside = (x >= 0) & (y >= 0) & (x < camera[1]) & (y < camera[0])
     at_x, at_y = np.clip(x.astype(int), 0, camera[1] - 1), np.clip(y.astype(int), 0, camera[0] - 1)
     valid: Mask = inside & (albedo[at_y, at_x, 0] > 0)
-    falloff = (0.5 + 0.1 * n) * np.clip(1 - 0.5 * (u - (0.0, 0.5, -0.5, 0.25)[n]) ** 2 - 0.3 * v**2, 0, None)
-    spill = (0.0, 0.05, 0.08, 0.03)[n]
+    falloff = (0.5 + 0.1 * (n % 4)) * np.clip(1 - 0.5 * (u - SIDE[n]) ** 2 - 0.3 * v**2, 0, None)
+    spill = SPILL[n]
     mixing = (1 - spill) * np.eye(3) + spill / 3
     response = np.tile(np.linspace(0, 1, 256) ** 2.2, (3, 1))
     metapixels = Metapixels(centre.astype(np.float32), packed.astype(np.float32), valid)
@@ -180,7 +187,7 @@ def _projector(
 
 def _phase_map(n: int, size: tuple[int, int], camera: tuple[int, int], mask: Mask) -> PhaseMap:
     """The inverse of the centres of ``_projector``, in closed form."""
-    foreshortening, angle = (0.0, 0.25, -0.25, 0.15)[n], (0.0, 0.12, -0.1, 0.06)[n]
+    foreshortening, angle = FORESHORTENING[n], ANGLE[n]
     y, x = np.mgrid[0 : camera[0], 0 : camera[1]].astype(np.float32)
     aspect = camera[1] / camera[0]
     c, s = np.cos(angle), np.sin(angle)

@@ -1,0 +1,80 @@
+"""How many photographs a calibration takes with each set of them, and what it loses: random stages, real devices.
+
+Red and blue of every projector lie 0.3 px beside green. Each stage is calibrated three times: with all photographs
+(`full`), with `few`, and with `fewest` from the map of the calibration before, where nothing moved. BENCH_STAGES says
+how many stages (default 5, seeds 701 to 705).
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from benchmarks import Row, at_most
+from benchmarks._judge import map_errors
+from benchmarks._stage import FIRST_SEED, over, prepared_stage
+from benchmarks._truth import Truth
+from controller.artefacts.grade import worst_of
+from controller.run.journal import Journal
+from controller.run.progress import Silent
+from controller.services.calibrate import calibrate
+from controller.stage.bench import BenchProcess
+from controller.stage.check import check_stage
+from controller.stage.session import OwnSession
+from plugins.emulated.optics.bumps import Bump, write_bumps
+
+MISCONVERGED_PX: Final = 0.3
+SETS: Final = ("full", "few", "fewest")
+MOST: Final = {"few": 20.0, "fewest": 15.0}
+GRADE: Final = 1.3
+IN_FOCUS: Final = 0.02
+ROOMS: Final = ("dark", "room")
+
+
+def measure(size: str) -> list[Row]:
+    """For each room and set: photographs a projector, grade, and positions on the projector's image."""
+    stages = int(os.environ.get("BENCH_STAGES", "5"))
+    rooms = os.environ.get("BENCH_ROOMS", ",".join(ROOMS)).split(",")
+    return [row for room in rooms for row in _of_room(size, room, stages)]
+
+
+def _of_room(size: str, room: str, stages: int) -> Iterator[Row]:
+    found: dict[tuple[str, str], list[float]] = {}
+    for seed in range(FIRST_SEED, FIRST_SEED + stages):
+        with prepared_stage(size, seed, room=room) as stage:
+            names = check_stage(stage).names
+            write_bumps(stage, *[Bump("projector", name, misconverged_px=MISCONVERGED_PX) for name in names])
+            with BenchProcess(stage, cancel=threading.Event()):
+                for which in SETS:
+                    for figure, values in _calibrated(stage, which).items():
+                        found.setdefault((which, figure), []).extend(values)
+    for (which, figure), values in found.items():
+        goal = {"photographs a projector": MOST.get(which), "grade": GRADE, "in focus": IN_FOCUS}.get(figure)
+        unit = {"photographs a projector": "", "grade": "% rms", "off by more than 1 px": "%"}.get(figure, "px rms")
+        finite = [value for value in values if np.isfinite(value)]
+        yield at_most(f"{room}, {which}: {figure}", max(finite), goal, unit=unit, how=over(finite))
+
+
+def _calibrated(stage: Path, which: str) -> dict[str, Sequence[float]]:
+    cancel = threading.Event()
+    done = calibrate(
+        session=OwnSession(stage), reporter=Silent(), cancel=cancel, photographs=which, accept_grade=True
+    )  # fmt: skip
+    run, names, truth = Path(str(done["run"])), check_stage(stage).names, Truth(stage)
+    with Journal(run) as journal:
+        taken = journal.shot_count() / len(names)
+    worst = worst_of(run)
+    assert worst is not None
+    places = [map_errors(truth, n, run, without_offset=True) for n in range(len(names))]
+    return {
+        "photographs a projector": [taken],
+        "grade": [worst[1]],
+        "in focus": [place["map in focus px"] for place in places],
+        "all": [place["map px"] for place in places],
+        "off by more than 1 px": [100 * place["map gross"] for place in places],
+    }
